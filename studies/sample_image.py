@@ -17,7 +17,7 @@ from psfcore.instruments.model import load_instrument
 from psfcore.simulate.observe import demo_image
 
 SIZE_PX, PSF_PX, SEED = 512, 1024, 4
-QUANTIZE = 4  # levels in one standard deviation of the noise
+QUANTIZE = 1  # levels in one standard deviation of the noise; the dither keeps means unbiased
 FILE = Path(__file__).parents[1] / "service" / "pages" / "sample.fits"
 
 

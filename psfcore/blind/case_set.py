@@ -2,7 +2,9 @@
 
 DIR/set.json                  the plan of the set: seed, sizes, number of cases
 DIR/cases/NNNN/transit/       the input of the diagnosis of case NNNN
-DIR/cases/NNNN/report.json    the report of this diagnosis (gap/1)
+DIR/cases/NNNN/expected/      images without noise, the input of the ideal observer; the diagnosis does not see them
+DIR/cases/NNNN/report.json    the report of this diagnosis (gap/1 or gap/2)
+DIR/cases/NNNN/ideal.json     what an ideal observer could know (gap-ideal/1)
 DIR/cases/NNNN/run.json       time and memory of the diagnosis, and the reason if it gave no report
 DIR/truth/NNNN.json           salt and truth
 DIR/seals.jsonl               one line for each case: {"case", "sha256"}
@@ -21,6 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
@@ -28,8 +31,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.blind.cases import Case, draw_case
-from psfcore.blind.make_case import make, seal_of, sealed, write_transit
+from psfcore.blind.cases import DRAW, Case, draw_case
+from psfcore.blind.make_case import make, seal_of, sealed, write_expected, write_transit
+from psfcore.blind.simulator import simulate_case, simulator_of, source_sha256
 from psfcore.comparison import array_sha256
 from psfcore.errors import DataError
 from psfcore.whole_files import write_whole
@@ -40,7 +44,11 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class SetPlan:
-    """The plan of a set. cases: number of cases. first: the number of the first case. The other fields are those of `draw_case`."""
+    """The plan of a set. cases: number of cases. first: the number of the first case.
+
+    simulator: a file or module whose cases the set consists of (`simulator`); empty: cases are drawn. The other fields are those
+    of `draw_case`; a simulator gets only seed, size_px and images.
+    """
 
     cases: int
     seed: int
@@ -51,12 +59,15 @@ class SetPlan:
     clean_only: bool = False
     built_diffraction: bool = True
     left_pct: tuple[float, ...] = ()
+    simulator: str = ""
 
     @property
     def numbers(self) -> range:
         """The numbers of the cases."""
         return range(self.first, self.first + self.cases)
 
+
+Job = Callable[[], "_Attempt"]  # makes one case
 
 LOCK = "lock"  # the file by which a run locks the folder of its set
 
@@ -88,6 +99,14 @@ class BlindSet:
     def report(self, number: int) -> Path:
         """The file with the report of a case."""
         return self.case_folder(number) / "report.json"
+
+    def expected(self, number: int) -> Path:
+        """The folder with the images of a case without noise: `make_case.write_expected`."""
+        return self.case_folder(number) / "expected"
+
+    def ideal(self, number: int) -> Path:
+        """The file with what an ideal observer of a case could know."""
+        return self.case_folder(number) / "ideal.json"
 
     def truth_file(self, number: int) -> Path:
         """The file with salt and truth of a case."""
@@ -154,19 +173,24 @@ def make_set(
     """Make and seal the missing cases of a set. Returns the set, and the reasons why cases could not be made, by number.
 
     scenes: images [y, x] in DN/s, from which scenes are cut. Raises DataError "other-set" if the folder contains a set that
-    was made with another plan or other scenes, "bad-seals", and the errors of `draw_case`. All of these are raised before
-    the first case is made.
+    was made with another plan, other scenes or another simulator, "bad-seals", "bad-simulator", and the errors of `draw_case`.
+    All of these are raised before the first case is made.
     """
     made = BlindSet(folder)
     _remember(made, plan, scenes)
     (folder / "truth").mkdir(parents=True, exist_ok=True)
     sealed_before = made.seals()
     missing = [n for n in plan.numbers if not (n in sealed_before and made.truth_file(n).is_file())]
-    cases = [_drawn(plan, number) for number in missing]
+    jobs: list[Job]
+    if plan.simulator:
+        simulator_of(plan.simulator)
+        jobs = [partial(_simulate_one, made, plan, number) for number in missing]
+    else:
+        jobs = [partial(_make_one, made, _drawn(plan, number), scenes) for number in missing]
     for number in missing:
         shutil.rmtree(made.case_folder(number), ignore_errors=True)  # an interrupted run may have left it
     not_made: dict[int, str] = {}
-    for done, attempt in enumerate(_made(made, cases, scenes, processes), 1):
+    for done, attempt in enumerate(_made(jobs, processes), 1):
         so_far = f"in {attempt.seconds:.1f} s ({done} of {len(missing)})"
         if attempt.why_not:
             not_made[attempt.case] = attempt.why_not
@@ -183,10 +207,20 @@ def make_set(
 
 def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
     """Write the plan of the set; if the folder contains a set, check that it has the same plan."""
-    about = json.loads(json.dumps(asdict(plan) | {"scenes": [array_sha256(scene) for scene in scenes]}))
+    own = {
+        "scenes": [array_sha256(scene) for scene in scenes],
+        "draw": DRAW,
+        "simulator": source_sha256(plan.simulator) if plan.simulator else "",
+    }
+    about = json.loads(json.dumps(asdict(plan) | own))
     file = made.folder / "set.json"
     if file.is_file():
-        before = {"scenes": []} | json.loads(file.read_text("utf-8"))  # older sets have no "scenes"
+        older: dict[str, Any] = {
+            "scenes": [],
+            "draw": 1,
+            "simulator": "",
+        }  # what sets of earlier versions do not state
+        before = older | json.loads(file.read_text("utf-8"))
         same = {key: value for key, value in before.items() if key != "cases"}
         if same != {key: value for key, value in about.items() if key != "cases"}:
             raise DataError(
@@ -225,18 +259,16 @@ def _end_cut_line(file: Path) -> None:
         file.write_text(text.rpartition("\n")[0] + "\n" if "\n" in text else "", "utf-8")
 
 
-def _made(
-    made: BlindSet, cases: Sequence[Case], scenes: Sequence[Plane], processes: int
-) -> Iterator[_Attempt]:
-    """Make the cases. The attempts are yielded in the order in which they end."""
-    if processes <= 1 or len(cases) <= 1:
-        yield from (_make_one(made, case, scenes) for case in cases)
+def _made(jobs: Sequence[Job], processes: int) -> Iterator[_Attempt]:
+    """Make cases. The attempts are yielded in the order in which they end."""
+    if processes <= 1 or len(jobs) <= 1:
+        yield from (job() for job in jobs)
         return
     # With the start method "fork", the child processes would inherit locks that threads of this process hold.
     with ProcessPoolExecutor(
         processes, mp_context=get_context("spawn"), initializer=_end_with_parent
     ) as pool:
-        waiting = [pool.submit(_make_one, made, case, scenes) for case in cases]
+        waiting = [pool.submit(job) for job in jobs]
         for future in as_completed(waiting):
             yield future.result()
 
@@ -273,6 +305,28 @@ def _make_one(made: BlindSet, case: Case, scenes: Sequence[Plane]) -> _Attempt:
     except DataError as error:
         return _Attempt(case.number, time.perf_counter() - started, why_not=f"{error.code}: {error.message}")
     write_transit(result, case.plan, made.transit(case.number))
-    seal, kept = sealed(result.truth)
-    write_whole(made.truth_file(case.number), json.dumps(kept, allow_nan=False))
-    return _Attempt(case.number, time.perf_counter() - started, seal)
+    write_expected(result, case.plan, made.expected(case.number))
+    return _sealed(made, case.number, result.truth, started)
+
+
+def _simulate_one(made: BlindSet, plan: SetPlan, number: int) -> _Attempt:
+    started = time.perf_counter()
+    try:
+        truth = simulate_case(
+            plan.simulator,
+            seed=plan.seed,
+            number=number,
+            size_px=plan.size_px,
+            images=plan.images,
+            transit=made.transit(number),
+            expected=made.expected(number),
+        )
+    except DataError as error:
+        return _Attempt(number, time.perf_counter() - started, why_not=f"{error.code}: {error.message}")
+    return _sealed(made, number, truth, started)
+
+
+def _sealed(made: BlindSet, number: int, truth: dict[str, Any], started: float) -> _Attempt:
+    seal, kept = sealed(truth)
+    write_whole(made.truth_file(number), json.dumps(kept, allow_nan=False))
+    return _Attempt(number, time.perf_counter() - started, seal)

@@ -1,8 +1,17 @@
 """The content of each case of a blind set, drawn at random from the seed of the set and the number of the case.
 
-The same seed and number always give the same case. Of 24 consecutive cases, 8 are clean: they have no effect. 10 cases
-have one known effect, 2 have two known effects, and 4 have one unknown effect. An effect is known if the gap library
-contains it.
+The same seed and number always give the same case. An effect is known if the gap library contains it. Of 24 consecutive cases
+
+- 8 are clean: they have no effect;
+- 9 have one known effect; every known effect occurs once before any occurs again;
+- 4 have one unknown effect, in turn as well;
+- 3 have two known effects: two that are drawn at random, a strong one beside a changing Sun (`scene_evolution`), and two strong
+  ones. Strong effects beside a changing Sun also occur in turn.
+
+The target of an effect is the residual that it should leave alone in the discs after a refit. It is drawn log-uniformly from
+USUAL_PCT, for a strong effect from STRONG_PCT. Every fourth case with one known effect is strong too. An effect whose largest
+plausible strength leaves less than its target gets this strength. The Sun beside a strong effect has no target, because the
+discs hardly show its changes; their relative rms is drawn log-uniformly from SUN_RMS.
 """
 
 from __future__ import annotations
@@ -27,10 +36,16 @@ from psfcore.simulate.pointings import drawn_scene, scene_from_image
 from psfcore.simulate.scatter_truth import ScatterTruth
 
 Plane = NDArray[np.float64]
+Range = tuple[float, float]
 CLEAN, SINGLE, PAIR, FOREIGN = "clean", "single", "pair", "unknown"
 KINDS = (CLEAN, SINGLE, PAIR, FOREIGN)
-_BLOCK = (CLEAN,) * 8 + (SINGLE,) * 10 + (PAIR,) * 2 + (FOREIGN,) * 4
-_TARGET_PCT = (0.5, 10.0)
+DRAW = 2  # raise it when the same seed and number give another case
+_BLOCK = (CLEAN,) * 8 + (SINGLE,) * 9 + (PAIR,) * 3 + (FOREIGN,) * 4
+USUAL_PCT, STRONG_PCT = (0.5, 10.0), (10.0, 30.0)
+SUN_RMS = (0.02, 0.3)
+_STRONG_SINGLES = 4  # one in this number of cases with one known effect is strong
+_SUN = "scene_evolution"
+_BESIDE_SUN = tuple(name for name in KNOWN if name != _SUN)
 _BUILT_SHARE = 0.5  # fraction of cases with the diffraction PSF of the instrument
 _SATURATING_SHARE = 0.25  # fraction of cases with a saturation level
 _KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
@@ -41,7 +56,8 @@ class Case:
     """One case before it is made.
 
     kind: one of KINDS. law, glass: the true scatter and the known part of the PSF. effects: at their nominal strengths.
-    target_pct: the residual that each effect should leave in the discs after a refit, percent. headroom: the saturation
+    target_pct: the residual that each effect should leave in the discs after a refit, percent; None: the effect has its strength
+    already. headroom: the saturation
     level divided by the brightest pixel; None: no saturation.
     """
 
@@ -52,7 +68,7 @@ class Case:
     law: ScatterTruth
     glass: Glass
     effects: tuple[Effect, ...]
-    target_pct: tuple[float, ...]
+    target_pct: tuple[float | None, ...]
     headroom: float | None
 
     def as_json(self) -> dict[str, Any]:
@@ -82,45 +98,63 @@ def draw_case(
     only: names of effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction: half
     of the cases have the diffraction PSF of the instrument, and the others a synthetic one; False: all have a synthetic one.
     left_pct: the residuals (percent) that an effect should leave in the discs after a refit. The values are used in turn,
-    each for all names of `only`; empty: drawn at random. Raises DataError "unknown-effect", "bad-plan".
+    each for all names of `only`; empty: drawn at random, for the names of `only` from USUAL_PCT. Raises DataError "unknown-effect", "bad-plan".
     """
-    kind, names = _what(seed, number, only, clean_only)
+    kind, names, ranges = _what(seed, number, only, clean_only)
     rng = np.random.default_rng([seed, number, _TRUTH_STREAM])
     plan = _plan(size_px, images, rng)
     law = ScatterTruth(rng.uniform(3, 9), rng.uniform(2.3, 2.8), rng.uniform(0.25, 0.5))
     glass = _glass(size_px, rng, built_diffraction)
     headroom = float(rng.uniform(1.2, 2.0)) if rng.random() < _SATURATING_SHARE else None
     own = np.random.default_rng([seed, number, _EFFECT_STREAM])
-    effects = tuple(effect_named(name).drawn(effect_named(name).nominal, plan, own) for name in names)
-    low, high = (float(np.log(pct)) for pct in _TARGET_PCT)
-    targets = np.exp(own.uniform(low, high, len(names)))
-    if left_pct:
-        targets[:] = left_pct[number // max(len(only), 1) % len(left_pct)]
+    effects = [effect_named(name).drawn(effect_named(name).nominal, plan, own) for name in names]
+    targets: list[float | None] = []
+    for n, (low, high) in enumerate(ranges):
+        value = float(np.exp(own.uniform(np.log(low), np.log(high))))
+        if (low, high) == SUN_RMS:
+            effects[n] = effects[n].at(value)
+            targets.append(None)
+        else:
+            targets.append(left_pct[number // max(len(only), 1) % len(left_pct)] if left_pct else value)
     own_seed = int(own.integers(2**31))
-    return Case(number, own_seed, kind, plan, law, glass, effects, tuple(float(t) for t in targets), headroom)
+    return Case(number, own_seed, kind, plan, law, glass, tuple(effects), tuple(targets), headroom)
 
 
-def _what(seed: int, number: int, only: Sequence[str], clean_only: bool) -> tuple[str, tuple[str, ...]]:
-    """The kind of a case and the names of its effects."""
+def _what(
+    seed: int, number: int, only: Sequence[str], clean_only: bool
+) -> tuple[str, tuple[str, ...], tuple[Range, ...]]:
+    """The kind of a case, the names of its effects, and the ranges of their targets (percent); SUN_RMS is one of strengths."""
     if clean_only:
-        return CLEAN, ()
+        return CLEAN, (), ()
     if only:
         name = only[number % len(only)]
         effect_named(name)
-        return (SINGLE if name in KNOWN else FOREIGN), (name,)
+        return (SINGLE if name in KNOWN else FOREIGN), (name,), (USUAL_PCT,)
     block, place = divmod(number, len(_BLOCK))
     kinds = _kinds(seed, block)
     kind = kinds[place]
     count = block * _BLOCK.count(kind) + kinds[:place].count(kind)  # number of earlier cases of this kind
     if kind == SINGLE:
-        return kind, (_in_turn(seed, count, KNOWN, 0),)
+        strong = count % _STRONG_SINGLES == _STRONG_SINGLES - 1
+        return kind, (_in_turn(seed, count, KNOWN, 0),), (STRONG_PCT if strong else USUAL_PCT,)
     if kind == FOREIGN:
-        return kind, (_in_turn(seed, count, UNKNOWN, 1),)
+        return kind, (_in_turn(seed, count, UNKNOWN, 1),), (USUAL_PCT,)
     if kind == PAIR:
-        rng = np.random.default_rng([seed, count, _KIND_STREAM, 2])
-        first, second = rng.choice(len(KNOWN), size=2, replace=False)
-        return kind, (KNOWN[first], KNOWN[second])
-    return CLEAN, ()
+        return kind, *_pair(seed, count)
+    return CLEAN, (), ()
+
+
+def _pair(seed: int, count: int) -> tuple[tuple[str, str], tuple[Range, Range]]:
+    """The names of two effects, and their ranges as from `_what`. count: the number of earlier pairs."""
+    turn, place = divmod(count, 3)
+    if place == 1:
+        return (_in_turn(seed, turn, _BESIDE_SUN, 2), _SUN), (STRONG_PCT, SUN_RMS)
+    rng = np.random.default_rng([seed, count, _KIND_STREAM, 2])
+    # Two strong effects without the Sun, whose largest plausible change leaves little in the discs.
+    names = _BESIDE_SUN if place else KNOWN
+    first, second = rng.choice(len(names), size=2, replace=False)
+    reach = STRONG_PCT if place else USUAL_PCT
+    return (names[first], names[second]), (reach, reach)
 
 
 def _kinds(seed: int, block: int) -> list[str]:

@@ -1,10 +1,12 @@
 """Make a case: write its transit into one folder and its truth into another, and seal the truth.
 
-    DIR/cases/NNNN/transit/   the images, diffraction.fits and transit.json; none of these files names an effect
-    DIR/truth/NNNN.json       salt and truth
-    DIR/seals.jsonl           one line for each case: SHA-256 of salt and truth, computed before any diagnosis
+    DIR/cases/NNNN/transit/    the images, diffraction.fits and transit.json; none of these files names an effect
+    DIR/cases/NNNN/expected/   two transits without noise, with_effects/ and without_effects/, for the ideal observer; a clean
+                               case has none. The diagnosis does not see them
+    DIR/truth/NNNN.json        salt and truth
+    DIR/seals.jsonl            one line for each case: SHA-256 of salt and truth, computed before any diagnosis
 
-Each case has a target for each effect: the residual (percent) that the effect should leave in the discs after a refit of
+Each case has a target for most effects: the residual (percent) that the effect should leave in the discs after a refit of
 the PSF. The strength of the effect is set to reach this target, but at most to the largest plausible strength. The
 residual that the effect then leaves is measured, and is a part of the truth.
 """
@@ -15,7 +17,7 @@ import hashlib
 import json
 import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +37,18 @@ from psfcore.transit.transit import Frame, Place
 
 Plane = NDArray[np.float64]
 SCHEMA = "transit/1"
+WITH_EFFECTS, WITHOUT_EFFECTS = "with_effects", "without_effects"
 TRIALS = 2
 STRENGTH_WITHIN = 1.4  # a strength is accepted if its residual is within this factor of the target
 _PLACE_STREAM = 2003
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFree:
+    """The images of a transit without noise [y, x], DN/s. saturation_dn: the level at which they are clipped; None: they are not."""
+
+    rates: list[Plane]
+    saturation_dn: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +56,8 @@ class Made:
     """A case that was made.
 
     exposures: [y, x] in whole DN. reported: the positions of the occulter, with errors. saturation_dn: the level at which
-    high-only images clip, None: no clipping. diffraction: the known PSF. truth: as in the truth file.
+    high-only images clip, None: no clipping. diffraction: the known PSF. truth: as in the truth file. expected: the images
+    without noise, by WITH_EFFECTS and WITHOUT_EFFECTS; empty for a clean case.
     """
 
     exposures: list[Plane]
@@ -53,6 +65,7 @@ class Made:
     saturation_dn: float | None
     diffraction: Plane
     truth: dict[str, Any]
+    expected: dict[str, NoiseFree] = field(default_factory=dict)
 
 
 def make(case: Case, images: Sequence[Plane] = ()) -> Made:
@@ -78,7 +91,8 @@ def make(case: Case, images: Sequence[Plane] = ()) -> Made:
     expected = chain.all_expected() if effects else clean_rates
     own_level = chain.saturation_dn(expected) or level
     exposures = _clipped(chain.read_out(expected, case.seed), case.plan, own_level)
-    left = _left(case, chain, expected, estimator, diffraction, own_level)
+    mean = chain.mean_rate(expected, case.seed) if effects else clean_rates
+    left = _left(case, chain, mean, estimator, diffraction, own_level)
     truth = case.as_json() | {
         "effects": [effect.as_json() | _left_alone(by_itself, left) for effect, by_itself in alone],
         "psf": {"b": case.law.b_px, "c": case.law.c, "total": case.law.total},
@@ -86,17 +100,23 @@ def make(case: Case, images: Sequence[Plane] = ()) -> Made:
         "plan": case.plan.as_json() | {"saturation_dn": own_level},
         **left,
     }
-    return Made(exposures, _reported(case), own_level, diffraction, truth)
+    noise_free = {WITH_EFFECTS: NoiseFree(mean, own_level), WITHOUT_EFFECTS: NoiseFree(clean_rates, None)}
+    return Made(
+        exposures, _reported(case), own_level, diffraction, truth, expected=noise_free if effects else {}
+    )
 
 
 def _at_target(
-    effect: Effect, target_pct: float, case: Case, effect_free: EffectFree, estimator: LinearEstimator
+    effect: Effect, target_pct: float | None, case: Case, effect_free: EffectFree, estimator: LinearEstimator
 ) -> tuple[Effect, Left]:
     """Two results: the effect with its strength set, and the residual that it leaves.
 
-    The strength is chosen to leave a residual of about target_pct, but is at most the largest plausible strength.
+    The strength is chosen to leave a residual of about target_pct, but is at most the largest plausible strength. None: the
+    strength is not changed.
     """
     tried, found = effect, _quick_left(effect, case, effect_free, estimator)
+    if target_pct is None:
+        return effect, found
     for _ in range(TRIALS):
         short = target_pct / max(found.after_refit_pct, 1e-6)
         if max(short, 1 / short) < STRENGTH_WITHIN:
@@ -114,8 +134,8 @@ def _quick_left(effect: Effect, case: Case, effect_free: EffectFree, estimator: 
     """The residual that one effect alone leaves in the discs, to first order."""
     chain = Chain(effect_free, (effect,))
     expected = chain.all_expected()
-    rates = _rates(chain, case, expected, chain.saturation_dn(expected))
-    return estimator.left(dict(enumerate(rates)))
+    level = chain.saturation_dn(expected)
+    return estimator.left(_pixels(_frames(case.plan, chain.mean_rate(expected, case.seed), level)))
 
 
 def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
@@ -129,12 +149,9 @@ def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
     return {"left_alone_pct": by_itself.after_refit_pct, "left_alone_chi2": float(shown)}
 
 
-def _rates(chain: Chain, case: Case, expected: Sequence[Plane], level: float | None) -> list[Plane]:
-    """Nearly noise-free images [y, x], DN/s, prepared as for a fit: clipped pixels are filled."""
-    return [
-        np.asarray(frame.pixels, dtype=np.float64)
-        for frame in _frames(case.plan, chain.mean_rate(expected, case.seed), level)
-    ]
+def _pixels(frames: Sequence[Frame]) -> dict[int, Plane]:
+    """The pixels [y, x] of frames, DN/s, by image number."""
+    return {n: np.asarray(frame.pixels, dtype=np.float64) for n, frame in enumerate(frames)}
 
 
 def _frames(plan: Plan, rates: Sequence[Plane], level: float | None) -> tuple[Frame, ...]:
@@ -163,22 +180,21 @@ def _frames(plan: Plan, rates: Sequence[Plane], level: float | None) -> tuple[Fr
 def _left(
     case: Case,
     chain: Chain,
-    expected: Sequence[Plane],
+    mean: Sequence[Plane],
     estimator: LinearEstimator,
     diffraction: Plane,
     level: float | None,
 ) -> dict[str, Any]:
     """The residual that all effects of a case leave in the discs: percent, rms over images and for each image.
 
-    level: the level (DN) at which high-only images clip; None: no clipping.
+    mean: the images without noise [y, x], DN/s. level: the level (DN) at which high-only images clip; None: no clipping.
     """
     clean_after = estimator.clean_left_pct()
     clean_rms = float(np.sqrt(np.mean(np.square(list(clean_after.values())))))
     if not chain.effects:
         return {"left_before_refit_pct": 0.0, "left_after_refit_pct": 0.0, "clean_left_pct": clean_rms}
-    rates = _rates(chain, case, expected, level)
-    quick = estimator.left(dict(enumerate(rates)))
-    frames = _frames(case.plan, chain.mean_rate(expected, case.seed), level)
+    frames = _frames(case.plan, mean, level)
+    quick = estimator.left(_pixels(frames))
     whole = refitted(frames, diffraction, case.law, case.plan.noise)
     return {
         "left_before_refit_pct": quick.before_refit_pct,
@@ -220,10 +236,29 @@ def _reported(case: Case) -> list[Place]:
 
 def write_transit(made: Made, plan: Plan, folder: Path) -> None:
     """Write the transit of a case, without its truth, into a new folder."""
+    whole_dn = [dn.astype(np.int32) for dn in made.exposures]
+    _write(made, plan, folder, whole_dn, made.saturation_dn)
+
+
+def write_expected(made: Made, plan: Plan, folder: Path) -> None:
+    """Write the transits without noise of a case into new folders inside `folder`. A clean case has none."""
+    for name, noise_free in made.expected.items():
+        shots = zip(noise_free.rates, plan.shots, strict=True)
+        exposures = [rate * shot.exposure_s for rate, shot in shots]
+        _write(made, plan, folder / name, exposures, noise_free.saturation_dn)
+
+
+def _write(
+    made: Made,
+    plan: Plan,
+    folder: Path,
+    exposures: Sequence[NDArray[Any]],
+    level: float | None,
+) -> None:
+    """Write exposures [y, x] in DN as a transit. level: at which high-only images clip, DN; None: no clipping."""
     folder.mkdir(parents=True)
-    for n, dn in enumerate(made.exposures):
-        cards = _frame_cards(plan, n, made.saturation_dn)
-        write_plane(folder / f"{n:03d}.fits", dn.astype(np.int32), cards=cards)
+    for n, dn in enumerate(exposures):
+        write_plane(folder / f"{n:03d}.fits", dn, cards=_frame_cards(plan, n, level))
     write_plane(folder / "diffraction.fits", made.diffraction, cards=_cards(HRI_EUV.values()))
     entries = [
         {
@@ -270,4 +305,4 @@ def seal_of(salt: str, truth: dict[str, Any]) -> str:
     return hashlib.sha256((salt + canonical).encode()).hexdigest()
 
 
-__all__ = ["Made", "make", "seal_of", "sealed", "write_transit"]
+__all__ = ["Made", "NoiseFree", "make", "seal_of", "sealed", "write_expected", "write_transit"]

@@ -12,7 +12,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from psfcore.blind.effects.registry import KNOWN, UNKNOWN
+from psfcore.blind.cases import CLEAN, PAIR
+from psfcore.blind.effects.registry import KNOWN
 from psfcore.blind.score_table import Score
 from psfcore.blind.scoring import INCONCLUSIVE, NONE, UNKNOWN_VERDICT
 from psfcore.drawing.plots import INK, write_png
@@ -57,7 +58,9 @@ def _matrix(axes: Axes, found: Score) -> None:
             corner = (column - 0.5, row - 0.5)
             axes.add_patch(_frame(corner))
     axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right", fontsize=9)
-    axes.set_yticks(range(len(rows)), [f"{name} *" if name in UNKNOWN else name for name in rows], fontsize=9)
+    axes.set_yticks(
+        range(len(rows)), [f"{name} *" if _is_foreign(name) else name for name in rows], fontsize=9
+    )
     axes.set(
         xlabel="first effect named, or verdict",
         ylabel="truth (* not in the library)",
@@ -68,7 +71,12 @@ def _matrix(axes: Axes, found: Score) -> None:
 def _right_columns(truth: str) -> tuple[str, ...]:
     if truth == "clean":
         return (NONE,)
-    return (UNKNOWN_VERDICT, INCONCLUSIVE) if truth in UNKNOWN else (truth,)
+    return (UNKNOWN_VERDICT, INCONCLUSIVE) if _is_foreign(truth) else (truth,)
+
+
+def _is_foreign(truth: str) -> bool:
+    """Whether a row is of an effect that is not in the library; a simulator may have effects with any names."""
+    return truth not in (*KNOWN, CLEAN, PAIR)
 
 
 def _frame(corner: tuple[float, float]):  # type: ignore[no-untyped-def]

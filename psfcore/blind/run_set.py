@@ -3,6 +3,9 @@
 The copy is in a temporary folder whose name does not contain the number of the case. The process runs in this folder. Its
 report is copied to the set when it is complete. A case that has a report is not diagnosed again. If a diagnosis fails, the
 failure is written to run.json, and the next run tries the case again.
+
+A further process computes what an ideal observer could know about the case, from its images without noise. These images stay
+in the set; the diagnosis runs elsewhere and is told no path of the set.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,7 +28,8 @@ from psfcore.blind.scoring import Judged
 from psfcore.errors import DataError
 from psfcore.whole_files import write_whole
 
-REPORT_SCHEMA = "gap/1"
+REPORT_SCHEMAS = ("gap/1", "gap/2")
+IDEAL_SCHEMA = "gap-ideal/1"
 LONGEST_S = 1800.0
 _KIB = 1024
 _LAST_WORDS = 2000
@@ -55,6 +59,7 @@ def run_set(
     command: Sequence[str],
     *,
     processes: int = 1,
+    ideal: Sequence[str] = (),
     keep: bool = False,
     longest_s: float = LONGEST_S,
     progress: Progress = lambda line: None,
@@ -62,31 +67,41 @@ def run_set(
     """Diagnose the cases that have no report yet. Returns one run for each of these cases, in the order of `numbers`.
 
     command: a program and its arguments; {transit} and {report} stand for the paths. processes: number of diagnoses at the
-    same time. keep: whether to keep a transit after its diagnosis. longest_s: a diagnosis that takes longer is killed.
+    same time. ideal: a program, and its arguments, that computes what an ideal observer could know; {expected} and {ideal}
+    stand for the paths. Empty: this is not computed. It may fail without effect on the diagnosis; the next run tries it
+    again. keep: whether to keep the images of a case after their use. longest_s: a process that takes longer is killed.
     Raises DataError "bad-command", "bad-seals", and "not-sealed" if a case has no seal.
     """
-    if not all(any(mark in part for part in command) for mark in ("{transit}", "{report}")):
-        raise DataError(
-            "bad-command", f"expected {{transit}} and {{report}} in the command; got {' '.join(command)}"
-        )
+    _check(command, ("{transit}", "{report}"))
+    if ideal:
+        _check(ideal, ("{expected}", "{ideal}"))
     for number in numbers:
         if not made.is_made(number):
             raise DataError(
                 "not-sealed",
                 f"case {number:04d}: expected a truth that was sealed before the diagnosis; got no seal: make the case again",
             )
-    missing = [number for number in numbers if not has_report(made, number)]
 
-    def one(number: int) -> Run:
-        run = _diagnose(made, number, command, longest_s)
-        if not run.failed and not keep:
-            shutil.rmtree(made.transit(number))
-        what = f"failed: {run.error.splitlines()[-1]:.100}" if run.failed else "diagnosed"
-        progress(f"case {number:04d} {what}, {run.wall_s:.1f} s, {run.peak_mib:.0f} MiB")
+    def one(number: int) -> Run | None:
+        run = None if has_report(made, number) else _diagnose(made, number, command, longest_s)
+        if run is not None:
+            if not run.failed and not keep:
+                shutil.rmtree(made.transit(number))
+            what = f"failed: {run.error.splitlines()[-1]:.100}" if run.failed else "diagnosed"
+            progress(f"case {number:04d} {what}, {run.wall_s:.1f} s, {run.peak_mib:.0f} MiB")
+        if ideal and made.expected(number).is_dir():
+            _compute_ideal(made, number, ideal, keep, longest_s, progress)
         return run
 
     with ThreadPoolExecutor(max(1, processes)) as pool:
-        return list(pool.map(one, missing))
+        return [run for run in pool.map(one, numbers) if run is not None]
+
+
+def _check(command: Sequence[str], marks: Sequence[str]) -> None:
+    if not all(any(mark in part for part in command) for mark in marks):
+        raise DataError(
+            "bad-command", f"expected {' and '.join(marks)} in the command; got {' '.join(command)}"
+        )
 
 
 def has_report(made: BlindSet, number: int) -> bool:
@@ -109,6 +124,11 @@ def run_of(made: BlindSet, number: int) -> Run | None:
     return Run(**json.loads(file.read_text("utf-8"))) if file.is_file() else None
 
 
+def ideal_of(made: BlindSet, number: int) -> dict[str, Any] | None:
+    """What an ideal observer could know about a case (gap-ideal/1); None if it was not computed."""
+    return _ideal_in(made.ideal(number))
+
+
 def judged_cases(made: BlindSet, numbers: Sequence[int]) -> tuple[list[Judged], dict[int, str]]:
     """Two results: the cases that have a report; the reasons why the other cases have none, by number.
 
@@ -123,29 +143,34 @@ def judged_cases(made: BlindSet, numbers: Sequence[int]) -> tuple[list[Judged], 
         except DataError as error:
             failures[number] = run.error if run is not None and run.failed else error.message
             continue
-        judged.append(Judged(number, truth, report, run.wall_s if run else 0.0))
+        judged.append(Judged(number, truth, report, run.wall_s if run else 0.0, ideal_of(made, number)))
     return judged, failures
 
 
 def _checked_report(file: Path) -> dict[str, Any]:
+    wanted = " or ".join(REPORT_SCHEMAS)
     try:
         report = json.loads(file.read_text("utf-8"))
     except (OSError, ValueError) as error:
-        raise DataError(
-            "bad-report", f"expected a report of schema {REPORT_SCHEMA}; got {error!s:.120}"
-        ) from error
-    if not isinstance(report, dict) or report.get("schema") != REPORT_SCHEMA or "verdict" not in report:
-        raise DataError("bad-report", f"expected schema {REPORT_SCHEMA} and a verdict; got {report!s:.80}")
+        raise DataError("bad-report", f"expected a report of schema {wanted}; got {error!s:.120}") from error
+    if not isinstance(report, dict) or report.get("schema") not in REPORT_SCHEMAS or "verdict" not in report:
+        raise DataError("bad-report", f"expected schema {wanted} and a verdict; got {report!s:.80}")
     return report
+
+
+def _ideal_in(file: Path) -> dict[str, Any] | None:
+    try:
+        found = json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) and found.get("schema") == IDEAL_SCHEMA else None
 
 
 def _diagnose(made: BlindSet, number: int, command: Sequence[str], longest_s: float) -> Run:
     with tempfile.TemporaryDirectory(prefix="transit-") as temporary:
         transit, report = Path(temporary) / "transit", Path(temporary) / "report.json"
         shutil.copytree(made.transit(number), transit)
-        filled = [
-            part.replace("{transit}", str(transit)).replace("{report}", str(report)) for part in command
-        ]
+        filled = _filled(command, {"{transit}": transit, "{report}": report})
         status, wall_s, peak_mib, said = _watched(filled, Path(temporary), longest_s)
         error = ""
         if status:
@@ -161,6 +186,32 @@ def _diagnose(made: BlindSet, number: int, command: Sequence[str], longest_s: fl
         if not run.failed:
             write_whole(made.report(number), report.read_text("utf-8"))
         return run
+
+
+def _compute_ideal(
+    made: BlindSet, number: int, command: Sequence[str], keep: bool, longest_s: float, progress: Progress
+) -> None:
+    """Compute what an ideal observer of a case could know, if the case lacks it, and remove the images without noise."""
+    if ideal_of(made, number) is None:
+        with tempfile.TemporaryDirectory(prefix="ideal-") as temporary:
+            result = Path(temporary) / "ideal.json"
+            paths = {"{expected}": made.expected(number).resolve(), "{ideal}": result}
+            status, wall_s, _, said = _watched(_filled(command, paths), Path(temporary), longest_s)
+            if status or _ideal_in(result) is None:
+                progress(f"case {number:04d} has no ideal observer: {said.splitlines()[-1]:.100}")
+                return
+            write_whole(made.ideal(number), result.read_text("utf-8"))
+            progress(f"case {number:04d} observed ideally, {wall_s:.1f} s")
+    if not keep:
+        shutil.rmtree(made.expected(number))
+
+
+def _filled(command: Sequence[str], paths: Mapping[str, Path]) -> list[str]:
+    """A command with paths in place of its marks."""
+    filled = list(command)
+    for mark, path in paths.items():
+        filled = [part.replace(mark, str(path)) for part in filled]
+    return filled
 
 
 def _watched(command: Sequence[str], folder: Path, longest_s: float) -> tuple[int, float, float, str]:

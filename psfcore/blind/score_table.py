@@ -1,9 +1,5 @@
 """The score of a blind set: a table of figures that judge the diagnosis, the confusion matrix, and the power.
 
-The interval of a fraction p of n cases is the Wilson interval:
-
-    (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)                             Eq. (1)
-
 Each row of the table has its own selection of cases. "Left" is the residual that the effects leave in the discs after the
 refit of the PSF. The answer of a report is the set of effects that the verdict `attributed` or `tie` names. An effect is
 "known" if the gap library contains it, otherwise "unknown".
@@ -23,13 +19,16 @@ refit of the PSF. The answer of a report is the set of effects that the verdict 
 | 90 % interval contains the true closure | single known effects, 2 % or more, with an answer | the ci90 of the closure by the true effect contains the true closure |
 | strongest axis is right | single known effects that have axes in `scoring.AXES`, 2 % or more, verdict not `none` | the first axis of the report's `where` is an axis of the effect |
 | time | all | wall time of the slowest case, s |
+
+`set_rows` explains the rows that judge the set of hypotheses in reports of schema gap/2. The interval of a fraction is the Wilson
+interval (`rows`).
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import mean, median
@@ -37,6 +36,8 @@ from typing import Any
 
 from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE
 from psfcore.blind.effects.registry import KNOWN, UNKNOWN
+from psfcore.blind.rows import Row, of_values, share
+from psfcore.blind.rows import wilson as wilson
 from psfcore.blind.scoring import (
     AXES,
     INCONCLUSIVE,
@@ -56,38 +57,11 @@ from psfcore.blind.scoring import (
     shown_chi2,
     true_label,
 )
+from psfcore.blind.set_rows import set_rows
 
 SCHEMA = "gap-blind/1"
-Z95 = 1.959963984540054
 LEVEL_PCT = 2.0
 POWER_EDGES_PCT = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)
-
-
-@dataclass(frozen=True)
-class Row:
-    """A row of the table.
-
-    interval95: Eq. (1), if the value is a fraction of cases; otherwise None. met: whether the value reaches the goal; None if
-    there is no goal or no case.
-    """
-
-    figure: str
-    cases: int
-    value: float | None
-    interval95: tuple[float, float] | None
-    goal: str
-    met: bool | None
-
-    def to_json(self) -> dict[str, Any]:
-        """The row as JSON."""
-        return {
-            "figure": self.figure,
-            "n": self.cases,
-            "value": self.value,
-            "wilson95": None if self.interval95 is None else list(self.interval95),
-            "goal": self.goal,
-            "met": self.met,
-        }
 
 
 @dataclass(frozen=True)
@@ -118,16 +92,6 @@ class Score:
         }
 
 
-def wilson(hits: float, cases: int, z: float = Z95) -> tuple[float, float]:
-    """Eq. (1) for hits / cases; (0, 1) if there is no case."""
-    if cases == 0:
-        return 0.0, 1.0
-    p, spread = hits / cases, z**2 / cases
-    middle = (p + spread / 2) / (1 + spread)
-    half = z * math.sqrt(p * (1 - p) / cases + spread / (4 * cases)) / (1 + spread)
-    return max(0.0, middle - half), min(1.0, middle + half)
-
-
 def score(judged: Sequence[Judged], failures: dict[int, str] | None = None) -> Score:
     """Score the cases that have a report. failures: the reasons why the other cases have no report, by number."""
     return Score(
@@ -148,24 +112,24 @@ def _rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
     return (
         *_alarm_rows([case for case in judged if case.kind == CLEAN]),
         *_answer_rows(known, strong),
-        _share(
+        share(
             "first effect is the true one",
             single,
             lambda case: case.first == case.true_names[0],
             ">= 0.85",
             lambda p: p >= 0.85,
         ),
-        _share(
+        share(
             "one wrong effect named with confidence", judged, names_one_wrong, "<= 0.02", lambda p: p <= 0.02
         ),
-        _value(
+        of_values(
             "mean number of named effects",
             [float(len(case.answer)) for case in strong if case.answer],
             mean,
             "<= 1.5",
             lambda value: value <= 1.5,
         ),
-        _share(
+        share(
             "unknown effects called unknown or inconclusive",
             foreign,
             lambda case: case.verdict in (UNKNOWN_VERDICT, INCONCLUSIVE),
@@ -174,7 +138,8 @@ def _rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
         ),
         *_closure_rows([case for case in single if case.answer]),
         _axis_row(single),
-        _value(
+        *set_rows(judged),
+        of_values(
             "time of the slowest case, s", [case.wall_s for case in judged], max, "<= 180", lambda s: s <= 180
         ),
     )
@@ -182,43 +147,41 @@ def _rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
 
 def _alarm_rows(clean: Sequence[Judged]) -> tuple[Row, ...]:
     return (
-        _share("false alarms on clean data", clean, raises_alarm, "<= 0.01", lambda p: p <= 0.01),
-        _share("inconclusive on clean data", clean, lambda case: case.verdict == INCONCLUSIVE, "", None),
+        share("false alarms on clean data", clean, raises_alarm, "<= 0.01", lambda p: p <= 0.01),
+        share("inconclusive on clean data", clean, lambda case: case.verdict == INCONCLUSIVE),
     )
 
 
 def _answer_rows(known: Sequence[Judged], strong: Sequence[Judged]) -> tuple[Row, ...]:
     return (
-        _share(
+        share(
             "answer contains the truth, >= 2 % left", strong, contains_truth, ">= 0.95", lambda p: p >= 0.95
         ),
-        _share(
+        share(
             "the same, >= 1 % left, inconclusive = 1/2",
             [case for case in known if case.left_pct >= LOWER_LEVEL_PCT],
             lambda case: 0.5 if case.verdict == INCONCLUSIVE else contains_truth(case),
             ">= 0.80",
             lambda p: p >= 0.8,
         ),
-        _share(
+        share(
             "the same, >= 2 % left, shown by the discs",
             [case for case in strong if is_shown(case)],
             contains_truth,
-            "",
-            None,
         ),
     )
 
 
 def _closure_rows(answered: Sequence[Judged]) -> tuple[Row, ...]:
     return (
-        _value(
+        of_values(
             "closure by the first effect / by the true effect",
             [share for share in map(closure_share, answered) if share is not None],
             median,
             ">= 0.95",
             lambda value: value >= 0.95,
         ),
-        _share(
+        share(
             "90 % interval contains the true closure",
             [case for case in answered if has_interval(case)],
             interval_holds,
@@ -230,37 +193,7 @@ def _closure_rows(answered: Sequence[Judged]) -> tuple[Row, ...]:
 
 def _axis_row(single: Sequence[Judged]) -> Row:
     noticed = [case for case in single if case.verdict != NONE and case.true_names[0] in AXES]
-    return _share("strongest axis is right", noticed, axis_is_right, ">= 0.90", lambda p: p >= 0.9)
-
-
-def _share(
-    figure: str,
-    cases: Sequence[Judged],
-    holds: Callable[[Judged], float],
-    goal: str,
-    met: Callable[[float], bool] | None,
-) -> Row:
-    hits = float(sum(holds(case) for case in cases))
-    value = hits / len(cases) if cases else None
-    return Row(
-        figure,
-        len(cases),
-        value,
-        wilson(hits, len(cases)) if cases else None,
-        goal,
-        None if met is None or value is None else met(value),
-    )
-
-
-def _value(
-    figure: str,
-    values: Sequence[float],
-    of: Callable[[Sequence[float]], float],
-    goal: str,
-    met: Callable[[float], bool],
-) -> Row:
-    value = float(of(values)) if values else None
-    return Row(figure, len(values), value, None, goal, None if value is None else met(value))
+    return share("strongest axis is right", noticed, axis_is_right, ">= 0.90", lambda p: p >= 0.9)
 
 
 def _confusion(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
@@ -268,7 +201,13 @@ def _confusion(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
     table: dict[str, Counter[str]] = {}
     for case in judged:
         table.setdefault(true_label(case), Counter())[said_label(case)] += 1
-    order = ("clean", *KNOWN, *UNKNOWN, "pair")
+    order = (
+        "clean",
+        *KNOWN,
+        *UNKNOWN,
+        *sorted(set(table) - {"pair"}),
+        "pair",
+    )  # a simulator may have other names
     return {name: dict(table[name]) for name in order if name in table}
 
 
@@ -297,30 +236,35 @@ def _power(judged: Sequence[Judged]) -> tuple[dict[str, Any], ...]:
 
 def _case(case: Judged) -> dict[str, Any]:
     """The entry of one case in score.json."""
+    known = case.known
     return {
         "case": case.number,
         "kind": case.kind,
         "truth": list(case.true_names),
-        "strength": [effect["strength"] for effect in case.truth["effects"]],
-        "left_before_refit_pct": case.truth["left_before_refit_pct"],
-        "left_after_refit_pct": case.left_pct,
+        "strength": [effect.get("strength") for effect in case.truth["effects"]],
+        "left_before_refit_pct": case.truth.get("left_before_refit_pct"),
+        "left_after_refit_pct": None if math.isnan(case.left_pct) else case.left_pct,
         "clean_left_pct": case.truth.get("clean_left_pct"),
         "shown_chi2": shown_chi2(case.truth),
         "verdict": case.verdict,
         "answer": list(case.answer),
         "first": case.first,
+        "set": None if case.members is None else [list(member) for member in case.members],
+        "noncentrality": None if known is None else known.noncentrality,
+        "rival": None if known is None else known.rival,
+        "ideal_alone": None if known is None else known.alone,
         "wall_s": case.wall_s,
     }
 
 
 def table(found: Score) -> str:
     """The table as plain text."""
-    lines = [f"{'figure':<50}{'n':>5}{'value':>9}  {'95 % (Wilson)':<16}{'goal':<13}met"]
+    lines = [f"{'figure':<58}{'n':>5}{'value':>9}  {'95 % (Wilson)':<16}{'goal':<13}met"]
     for row in found.rows:
         value = "-" if row.value is None else f"{row.value:.3f}"
         interval = "" if row.interval95 is None else f"{row.interval95[0]:.3f} - {row.interval95[1]:.3f}"
         met = {None: "", True: "yes", False: "NO"}[row.met]
-        lines.append(f"{row.figure:<50}{row.cases:>5}{value:>9}  {interval:<16}{row.goal:<13}{met}")
+        lines.append(f"{row.figure:<58}{row.cases:>5}{value:>9}  {interval:<16}{row.goal:<13}{met}")
     clean = found.rows[0]
     if clean.value == 0.0 and clean.cases:
         lines.append(

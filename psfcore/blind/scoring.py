@@ -6,19 +6,32 @@ Eq. (1) is the closure that a perfect model of the true effect would reach on no
 image i with the effect, after the PSF was refitted. s_i is the residual without the effect, which the sampling on pixels
 causes. n_i is the noise. The true closure is below 1, because the residual s_i stays in the images. The library and the
 blind set describe the same effect by different formulas; this difference counts as an error of the diagnosis.
+
+A report of schema gap/2 also states a set of hypotheses. Each is a list of effects that act together, `["unknown"]`, or `[]` for
+no gap. A hypothesis covers the truth if it names every required effect (`Judged.required_names`); further effects do no harm.
+For an effect that is not in the library it must be `["unknown"]`, for clean data `[]`. The second effect of a pair is not required
+if it leaves less than LOWER_LEVEL_PCT alone: a hypothesis with the first effect alone then covers the pair, because the discs
+hardly show the second one. If both effects leave less, both are required. A set is right and alone if it has one member, which
+covers the truth and names no effect that is not true.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-from psfcore.blind.cases import CLEAN, PAIR
+from psfcore.blind.bounds import CLEAN as KNOWN_OF_CLEAN
+from psfcore.blind.bounds import Known, known
+from psfcore.blind.cases import CLEAN, FOREIGN, PAIR
 
 LOWER_LEVEL_PCT = 1.0
 SHOWN_CHI2 = 30.0  # corresponds to 5.5 sigma, if one known pattern is searched for
 LEAST_CLOSURE = 0.1  # if the closure by the true effect is smaller, the ratio of closures has no meaning
 NONE, ATTRIBUTED, TIE, UNKNOWN_VERDICT, INCONCLUSIVE = "none", "attributed", "tie", "unknown", "inconclusive"
+NOTHING: tuple[str, ...] = ()
+UNKNOWN_HYPOTHESIS = ("unknown",)
 
 _DETECTOR = ("detector_x", "detector_y")
 # The axes along which each effect varies. `saturation_fill` has no entry: it depends on exposure and on the Sun's brightness.
@@ -45,12 +58,13 @@ AXES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Judged:
-    """One case: its truth, its report, and the wall time of its diagnosis."""
+    """One case: its truth, its report, the wall time of its diagnosis, and what an ideal observer could know (gap-ideal/1)."""
 
     number: int
     truth: dict[str, Any]
     report: dict[str, Any]
     wall_s: float
+    ideal: dict[str, Any] | None = None
 
     @property
     def kind(self) -> str:
@@ -77,8 +91,34 @@ class Judged:
 
     @property
     def left_pct(self) -> float:
-        """The residual that the effects leave in the discs after the refit, percent, rms over images."""
-        return float(self.truth["left_after_refit_pct"])
+        """The residual that the effects leave in the discs after the refit, percent, rms over images.
+
+        If the truth does not state it, it is that of the ideal observer; NaN if nobody computed it.
+        """
+        if self.truth.get("left_after_refit_pct") is not None:
+            return float(self.truth["left_after_refit_pct"])
+        return math.nan if self.ideal is None else float(self.ideal["left_after_refit_pct"])
+
+    @cached_property
+    def known(self) -> Known | None:
+        """What an ideal observer could know about the case; None if it was not computed."""
+        if self.kind == CLEAN:
+            return KNOWN_OF_CLEAN
+        if self.ideal is None:
+            return None
+        in_library = self.kind != FOREIGN
+        return known(self.ideal, self.required_names, self.true_names, in_library=in_library)
+
+    @property
+    def noncentrality(self) -> float:
+        """What the effects leave after the PSF is refitted, chi2; NaN if it was not computed."""
+        return math.nan if self.known is None else self.known.noncentrality
+
+    @property
+    def members(self) -> tuple[tuple[str, ...], ...] | None:
+        """The hypotheses in the set of the report; None if the report has no set."""
+        stated = self.report.get("set")
+        return None if stated is None else tuple(tuple(member) for member in stated["members"])
 
     @property
     def verdict(self) -> str:
@@ -114,6 +154,35 @@ def raises_alarm(case: Judged) -> bool:
 def contains_truth(case: Judged) -> bool:
     """Whether the answer names every required effect."""
     return set(case.required_names) <= set(case.answer)
+
+
+def covers(case: Judged, hypothesis: tuple[str, ...]) -> bool:
+    """Whether a hypothesis covers the truth of the case."""
+    if case.kind == CLEAN:
+        return hypothesis == NOTHING
+    if case.kind == FOREIGN:
+        return hypothesis == UNKNOWN_HYPOTHESIS
+    return set(case.required_names) <= set(hypothesis)
+
+
+def set_covers_truth(case: Judged) -> bool:
+    """Whether a member of the set covers the truth."""
+    return any(covers(case, member) for member in case.members or ())
+
+
+def is_right_and_alone(case: Judged) -> bool:
+    """Whether the set has one member, which covers the truth and names no effect that is not true."""
+    if case.members is None or len(case.members) != 1 or not covers(case, case.members[0]):
+        return False
+    return case.kind == FOREIGN or set(case.members[0]) <= set(case.true_names)
+
+
+def has_only_wrong_effects(case: Judged) -> bool:
+    """Whether the set has one member, which names effects, and none of them is true."""
+    if case.members is None or len(case.members) != 1:
+        return False
+    (member,) = case.members
+    return member not in (NOTHING, UNKNOWN_HYPOTHESIS) and not set(member) & set(case.true_names)
 
 
 def names_one_wrong(case: Judged) -> bool:

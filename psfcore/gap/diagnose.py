@@ -6,11 +6,11 @@ The steps, in this order:
 2. Fit the PSF.
 3. Simulate the transit from this fit, fit the simulation, and keep its residuals: the expected gap.
 4. Compute how the discs and the unocculted field respond to every effect.
-5. Judge which effect causes the gap. The effects that the verdict names are called "the named effects" here
+5. Compute the posterior of all hypotheses about the cause, with full refits where the linear model is not exact enough.
+6. Read the verdict off the posterior. The effects that the verdict names are called "the named effects" here
    (`Judgement.answer`, "answer" in the report).
-6. Make full refits with the named effects in the model. For a tie, refit with each tied effect, at most MOST_REFITS
-   fits. The verdict may also request refits; each refit is made only once.
-7. Locate the gap, and compute gap and closure on held-out images.
+7. Make full refits with the named effects in the model, at most MOST_REFITS. Each refit is made only once.
+8. Locate the gap, and compute gap and closure on held-out images.
 """
 
 from __future__ import annotations
@@ -21,13 +21,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfcore.errors import DataError
+from psfcore.gap.cautions import cautions_of
 from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.expected_gap import ExpectedGap, expected_gap
-from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
+from psfcore.gap.evidence.gap_test import p_value_of_gap
+from psfcore.gap.evidence.linear_model import FLOOR, LinearModel, Step
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
 from psfcore.gap.library.registry import LIBRARY
-from psfcore.gap.library.scene import MOST_POINTINGS
+from psfcore.gap.verdict.calibration import COVERAGE, Calibration, shipped_calibration
 from psfcore.gap.verdict.closure import (
     HeldOut,
     Interval,
@@ -38,8 +41,11 @@ from psfcore.gap.verdict.closure import (
     pointings,
     time_blocks,
 )
-from psfcore.gap.verdict.correction import Corrected, add_to_model, beyond
-from psfcore.gap.verdict.judge import LEAST_IMAGES, Judgement, Tried, judge
+from psfcore.gap.verdict.correction import Corrected
+from psfcore.gap.verdict.limits import Limits, limits
+from psfcore.gap.verdict.refits import Refits
+from psfcore.gap.verdict.settled import settled_posterior
+from psfcore.gap.verdict.verdict import Judgement, verdict_of
 from psfcore.gap.verdict.where import Axis, where
 from psfcore.gap.view import View
 from psfcore.psf import Psf
@@ -68,12 +74,18 @@ class Diagnosis:
     """The diagnosis of one transit.
 
     Three values of the gap: before_refit, with the PSF that was fitted together with the named effects, but without these
-    effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. shrinking: by the
-    label of the effects. corrected: the full refits; the refit with the best effects comes first. residual, residual_after: held-out
-    images without and with the best effects. cautions: sentences on everything that weakens the result.
+    effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear fits of
+    all effects, the most probable first, then those of the pairs in the answer set. p_value: of the gap. limits: what these data could have shown. shrinking: by the
+    label of the effects. corrected: the full refits with the named effects; the refit with the best effects comes first.
+    residual, residual_after: held-out images without and with the best effects. cautions: sentences on everything that
+    weakens the result.
     """
 
     judgement: Judgement
+    calibration: Calibration
+    fits: tuple[EffectFit, ...]
+    p_value: float
+    limits: Limits
     solution: Solution
     model: LinearModel
     expected: ExpectedGap
@@ -108,6 +120,8 @@ def diagnose(
     start: Vector | None = None,
     seed: int = 1,
     refit: bool = True,
+    coverage: float = COVERAGE,
+    calibration: Calibration | None = None,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
     solution: Solution | Inverter | None = None,
@@ -118,19 +132,26 @@ def diagnose(
     make full refits with the named effects in the model. seed: seeds the simulation and the bootstrap of the intervals.
     solution: a solution of this transit, shape and start that was made before, or a function that makes it; None: `invert`.
     If the images show other noise than the transit states, it must be the solution with the noise that they show. Raises
-    the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError "bad-library" if the library contains only
-    probes, and "bad-effects" if an added effect fails.
+    the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError "bad-library" if the library is empty,
+    "bad-coverage", and "bad-effects" if an added effect fails.
     """
-    if not any(effect.named for effect in library):
-        raise DataError(
-            "bad-library",
-            "expected a library with at least one effect that is not a probe; got only probes: add an effect",
-        )
+    if not library:
+        raise DataError("bad-library", "expected a library with at least one effect; got none: add an effect")
+    (calibration or shipped_calibration()).threshold(coverage)  # refuses a coverage before the long fit
     noise = measured_noise(transit)
     if noise is not None and not noise.agrees:
         transit = replace(transit, noise=noise.noise)
     made = solution_of(transit, shape, solution, start=start, threads=threads, progress=progress)
-    return diagnose_solution(made, noise=noise, library=library, seed=seed, refit=refit, progress=progress)
+    return diagnose_solution(
+        made,
+        noise=noise,
+        library=library,
+        seed=seed,
+        refit=refit,
+        coverage=coverage,
+        calibration=calibration,
+        progress=progress,
+    )
 
 
 def start_of(psf: Psf) -> tuple[Shape, Vector]:
@@ -154,39 +175,52 @@ def diagnose_solution(
     library: Sequence[Effect] = LIBRARY,
     seed: int = 1,
     refit: bool = True,
+    coverage: float = COVERAGE,
+    calibration: Calibration | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Diagnosis:
     """Diagnose an existing fit. noise: the measured noise, if any. The other arguments and the errors are those of `diagnose`."""
+    calibration = calibration or shipped_calibration()
     view = View(solution)
     model, expected = linear_model_of(view, library, seed=seed, progress=progress)
-    evidence = model.evidence
-    refits = _Refits(view, model, progress)
-    found = judge(model, refits.model, refits.beyond) if refit else judge(model)
-    fits = refits.of(found) if refit else ()
+    refits = Refits(view, model, progress)
+    settled, failed = settled_posterior(model, refits.weighed if refit else None)
+    found = verdict_of(
+        settled, calibration, images=len(model.evidence.discs), coverage=coverage, failed=failed
+    )
+    fits = _fits(model, found)
+    best = next((fit for fit in fits if fit.names == found.best), None)
+    corrected = (
+        refits.of(found.named[:MOST_REFITS]) if refit and found.verdict in ("attributed", "tie") else ()
+    )
     rng = np.random.default_rng(seed)
-    shrinking, before, after = _shrinking(model, found, refits.made, rng)
-    favoured = [axis for effect in evidence.effects if effect.name in _likely(found) for axis in effect.axes]
+    shrinking, before, after = _shrinking(model, found, fits, refits.made, rng)
     nothing = Interval(0.0, 0.0, 0.0)
     rms = gap(before, rng) if before is not None else nothing
     gone = found.verdict in ("attributed", "tie") and after is not None
+    explained = best.step if best is not None and found.answer else None
     return Diagnosis(
         judgement=found,
+        calibration=calibration,
+        fits=fits,
+        p_value=p_value_of_gap(model),
+        limits=_limits(model, calibration, coverage, corrected),
         solution=solution,
         model=model,
         expected=expected,
         noise=noise,
-        where=where(model, rng, favoured, found.best.step if found.answer and found.best else None),
-        before_refit=_before_refit(model, found, rng) or rms,
+        where=where(model, rng, _favoured(model, found), explained),
+        before_refit=_before_refit(model, explained, rng) if gone and explained is not None else rms,
         rms=rms,
         after=gap(after, rng) if gone and after is not None else rms,
         noise_pct=float(np.sqrt(np.mean(before.noise_pct**2)))
         if before is not None
-        else _noise_pct(evidence),
+        else _noise_pct(model.evidence),
         shrinking=shrinking,
-        corrected=fits,
+        corrected=corrected,
         residual=before,
         residual_after=after if gone else None,
-        cautions=(*_cautions(solution, noise, evidence), *refits.failures, *_rejected(found)),
+        cautions=(*cautions_of(solution, noise, model.evidence), *refits.failures),
     )
 
 
@@ -213,32 +247,59 @@ def linear_model_of(
     return model, expected
 
 
-def _likely(found: Judgement) -> tuple[str, ...]:
-    """The effects that explain most of the gap; for a tie, the best of the tied effects."""
-    return () if found.verdict == "none" or found.best is None else found.best.names
+def _favoured(model: LinearModel, found: Judgement) -> list[str]:
+    """The axes of the most probable effects; none if no gap is the verdict."""
+    if found.verdict == "none" or found.best is None:
+        return []
+    return [axis for effect in model.evidence.effects if effect.name in found.best for axis in effect.axes]
+
+
+def _limits(
+    model: LinearModel, calibration: Calibration, coverage: float, refits: Sequence[Corrected]
+) -> Limits:
+    """What these data could have shown; the limits of refitted effects come from the best refit with them."""
+    found = limits(model, threshold=calibration.threshold(coverage), temperature=calibration.temperature)
+    for fit in reversed(refits):
+        for effect in fit.effects:
+            if effect.name in found.effects:
+                found = found.after_refit(effect, fit.parameters(effect.name))
+    return found
+
+
+def _fits(model: LinearModel, found: Judgement) -> tuple[EffectFit, ...]:
+    """The linear fits of all effects, the most probable first, then those of the pairs in the answer set and of the best pair."""
+    effects = {effect.name: effect for effect in model.evidence.effects}
+    ordered = sorted(effects, key=lambda name: -found.effects.get(name, 0.0))
+    singles = [(name,) for name in ordered]
+    pairs = [names for names in dict.fromkeys((found.best or (), *found.named)) if len(names) > 1]
+    return tuple(fit_effects(model, [effects[name] for name in names]) for names in (*singles, *pairs))
 
 
 def _shrinking(
-    model: LinearModel, found: Judgement, fits: Sequence[Corrected], rng: np.random.Generator
+    model: LinearModel,
+    found: Judgement,
+    fits: Sequence[EffectFit],
+    refits: Sequence[Corrected],
+    rng: np.random.Generator,
 ) -> tuple[dict[str, Shrinking], HeldOut | None, HeldOut | None]:
-    """Three results: the closure of every fit in `found.tried`; held-out residuals without any effect; those with the best effect.
+    """Three results: the closure of every fit; held-out residuals without any effect; those with the best effects.
 
     If an effect has a full refit, its closure is computed with the model of that refit.
     """
     schemes = (time_blocks(model), pointings(model))
     before = [hold_out(model, (), scheme) for scheme in schemes]
-    real = {fit.label: fit.model for fit in fits}  # including refits that the verdict rejected
+    real = {fit.label: fit.model for fit in refits}
     out: dict[str, Shrinking] = {}
     best: HeldOut | None = None
     base = len(model.evidence.base)
-    for tried in found.tried:
-        after = [hold_out(model, tried.step.columns[base:], scheme) for scheme in schemes]
-        if tried.label in real:
+    for fit in fits:
+        after = [hold_out(model, fit.step.columns[base:], scheme) for scheme in schemes]
+        if fit.label in real:
             after = [
-                _better_known(_held_out_by(real[tried.label], scheme), linear)
+                _better_known(_held_out_by(real[fit.label], scheme), linear)
                 for scheme, linear in zip(schemes, after, strict=True)
             ]
-        if found.best is not None and tried.label == found.best.label:
+        if fit.names == found.best:
             best = after[0]
         closures = [
             closure(b, a, rng, model.scale_error)
@@ -247,7 +308,7 @@ def _shrinking(
             for b, a in zip(before, after, strict=True)
         ]
         falls = fall(before[0], after[0]) if before[0] is not None and after[0] is not None else None
-        out[tried.label] = Shrinking(closures[0], closures[1], falls)
+        out[fit.label] = Shrinking(closures[0], closures[1], falls)
     return out, before[0], best
 
 
@@ -262,81 +323,11 @@ def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | Non
     return real if same else linear
 
 
-class _Refits:
-    """Full refits with effects in the model. Each refit is made only once."""
+def _before_refit(model: LinearModel, step: Step, rng: np.random.Generator) -> Interval:
+    """The gap with the PSF that was fitted together with the best effects (`step`), but without these effects.
 
-    def __init__(self, view: View, model: LinearModel, progress: Progress) -> None:
-        self._view, self._model, self._progress = view, model, progress
-        self._made: dict[str, Corrected | None] = {}
-        self.failures: list[str] = []
-
-    def model(self, tried: Tried) -> LinearModel | None:
-        """The linear model at the full refit with these effects; None if the refit failed."""
-        made = self._fit(tried)
-        return None if made is None else made.model
-
-    def beyond(self, tried: Tried) -> LinearModel | None:
-        """The linear model at the same refit, with the rest of the library added; None if the refit failed."""
-        made = self._fit(tried)
-        if made is None:
-            return None
-
-        def say(stage: str, step: int, steps: int) -> None:
-            self._progress(f"further effects beside {tried.label}: {stage}", step, steps)
-
-        return beyond(made, self._model.evidence.effects, self._model, progress=say)
-
-    @property
-    def made(self) -> tuple[Corrected, ...]:
-        """All refits that succeeded."""
-        return tuple(fit for fit in self._made.values() if fit is not None)
-
-    def of(self, found: Judgement) -> tuple[Corrected, ...]:
-        """The refits with the named effects, the best first; at most MOST_REFITS.
-
-        For a tie: one refit with each tied effect, together with the certain effects if there are any.
-        """
-        if found.verdict not in ("attributed", "tie") or found.best is None:
-            return ()
-        chosen: list[Tried] = [found.best]
-        if found.verdict == "tie":
-            count = len(found.best.names)
-            chosen += [
-                t
-                for t in found.tried
-                if len(t.names) == count and set(t.names) <= set(found.answer) and t is not found.best
-            ]
-        fits = (self._fit(tried) for tried in chosen[:MOST_REFITS])
-        return tuple(fit for fit in fits if fit is not None)
-
-    def _fit(self, tried: Tried) -> Corrected | None:
-        if tried.label in self._made:
-            return self._made[tried.label]
-
-        def say(stage: str, step: int, steps: int) -> None:
-            self._progress(f"full refit with {tried.label}: {stage}", step, steps)
-
-        effects = {effect.name: effect for effect in self._model.evidence.effects}
-        chosen = [effects[name] for name in tried.names]
-        made: Corrected | None = None
-        try:
-            made = add_to_model(
-                self._view.solution, chosen, tried, self._model, view=self._view, progress=say
-            )
-        except DataError as error:  # the fit may fail if the subtracted effect is not in the images
-            self.failures.append(f"The full refit with {tried.label} in the model failed: {error}")
-        self._made[tried.label] = made
-        return made
-
-
-def _before_refit(model: LinearModel, found: Judgement, rng: np.random.Generator) -> Interval | None:
-    """The gap with the PSF that was fitted together with the best effects, but without these effects.
-
-    A refit of the PSF without the effects absorbs a part of this gap. None if the verdict names no effect.
+    A refit of the PSF without the effects absorbs a part of this gap.
     """
-    if found.best is None or found.verdict not in ("attributed", "tie"):
-        return None
-    step = found.best.step
     base = list(model.evidence.base)
     rows = []
     for disc in model.evidence.discs:
@@ -349,63 +340,3 @@ def _before_refit(model: LinearModel, found: Judgement, rng: np.random.Generator
 
 def _noise_pct(evidence: Evidence) -> float:
     return float(np.sqrt(np.mean([(100 * d.mean_noise / d.level) ** 2 for d in evidence.discs])))
-
-
-def _rejected(found: Judgement) -> tuple[str, ...]:
-    return tuple(
-        f"In the linear model {label.replace('_', ' ')} explains much of the gap, but the full refit with this effect explains less than "
-        "half of that. The effect was therefore excluded, in spite of its score."
-        for label in found.amiss
-    )
-
-
-def _cautions(solution: Solution, noise: MeasuredNoise | None, evidence: Evidence) -> tuple[str, ...]:
-    """Sentences on everything in these data that weakens the verdict."""
-    out = []
-    if noise is None:
-        out.append(
-            "The stated noise could not be checked. Either too few consecutive images have the same pointing, gain mode and "
-            "exposure, or their differences do not look like noise."
-        )
-    elif not noise.agrees:
-        out.append(
-            f"The variance of the noise in the images is {noise.ratio:.2f} times the stated variance. The measured noise was used: "
-            f"{noise.noise.photon_gain_dn:.2f} DN per photon, read noise {noise.noise.read_noise_dn:.2f} DN."
-        )
-    left_out = solution.inversion.left_out
-    if left_out:
-        out.append(
-            f"{len(left_out)} images were not used. Examples: "
-            + "; ".join(f"{k}: {v}" for k, v in list(left_out.items())[:3])
-        )
-    unmatched = [
-        evidence.image_info[disc.index].file
-        for disc in evidence.discs
-        if not evidence.image_info[disc.index].described
-    ]
-    if unmatched:
-        out.append(
-            f"In {len(unmatched)} images ({', '.join(unmatched[:3])}{', …' if len(unmatched) > 3 else ''}) the scene around the "
-            "occulter differs from the scene in the neighbouring images, or no neighbouring image shows it. The fitted position of the "
-            "occulter may be wrong in these images, and the wrong position may cause the residuals in their discs."
-        )
-    images = len(evidence.discs)
-    if images < LEAST_IMAGES:
-        out.append(
-            f"With only {images} images, no image can be held out. Closure and the gap on held-out images are therefore missing."
-        )
-    aimed = len({taken.pointing for taken in evidence.image_info})
-    if aimed > MOST_POINTINGS:
-        out.append(
-            f"Light from outside the field was tested only in the first {MOST_POINTINGS} of the {aimed} pointings."
-        )
-    if aimed == 1:
-        out.append(
-            "All images have the same pointing: effects that differ between pointings cannot be detected, and no pointing can be held out."
-        )
-    exposures = {taken.exposure_s for taken in evidence.image_info}
-    if len(exposures) == 1:
-        out.append(
-            "All images have the same exposure time: an error of every readout (in DN) and an error of the rate (in DN/s) look the same."
-        )
-    return tuple(out)

@@ -59,12 +59,9 @@ class Effect:
     changes(view): one change for each parameter. An effect that is fitted for each pointing may return fewer or more changes
     than it has parameters. Changes and parameters are then paired in order, and the rest is not fitted. why_not(view): the
     reason why these data cannot show the effect; None if they can.
-    trials: about how many positions or templates the effect searches; the search lowers its score. named: whether a verdict
-    may name this effect as a cause. An effect that no verdict may name is a probe: a pattern that is typical of gaps of
-    unknown cause. If a probe fits best, the cause is probably not in the library.
+    trials: about how many positions or templates the effect searches; the search lowers its evidence.
     held(view): for an effect that searches for a position or a template, the same effect with the result of the search
-    fixed. field: whether the parameters describe a random field, in which each parameter is about as large as `likely`. The
-    score of a random field is reduced by the information gained about the parameters, not by their number.
+    fixed. field: whether the parameters describe a random field, in which each parameter is about as large as `likely`.
     """
 
     name: str
@@ -76,6 +73,5 @@ class Effect:
     changes: Callable[[View], Sequence[Change]]
     why_not: Callable[[View], str | None] = lambda view: None
     trials: int = 1
-    named: bool = True
     held: Callable[[View], Effect] | None = None
     field: bool = False

@@ -1,7 +1,7 @@
 """The header keywords of a simulated image: those that real images of the imitated instrument have.
 
-HRI_EUV images get the keywords of level 2 files of EUI. AIA images get those of level 1 files of the 171 A channel, which
-have no DETECTOR and no gain modes. Images of any other instrument get the keywords by which its TOML file recognises
+HRI_EUV images get the keywords of level 2 files of EUI. AIA images get those of level 1 files, which have no
+DETECTOR and no gain modes. Images of any other instrument get the keywords by which its TOML file recognises
 it, its wavelength and its plate scale.
 """
 
@@ -15,10 +15,8 @@ from psfcore.instruments.model import Instrument
 from psfcore.simulate.plan import Shot
 
 _START = datetime(2023, 1, 3, 3, 42)
-_OWN_TEXTS = {
-    "hri_euv": {"TELESCOP": "SOLO/EUI/HRI_EUV", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV"},
-    "aia_171": {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVEUNIT": "angstrom"},
-}
+_TEXTS_OF_HRI = {"TELESCOP": "SOLO/EUI/HRI_EUV", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV"}
+_TELESCOPES_OF_AIA = {94: 4, 131: 1, 171: 3, 193: 2, 211: 2, 304: 4, 335: 1}  # Lemen et al. (2012)
 _COMMENTS = {
     "ORIGIN": "not an observation",
     "TELESCOP": "telescope imitated",
@@ -36,6 +34,7 @@ _COMMENTS = {
     "BUNIT": "unit of the pixels",
     "SATURATE": "[DN] level at which pixels clip",
     "FOV": "pointing",
+    "PSFSUM": "this file is a PSF: sum of its weights",
     "MARGIN": "[pixel] width beyond the field on each side",
 }
 
@@ -76,23 +75,36 @@ class Imitated:
         return values | {"BUNIT": unit}
 
 
-HRI_EUV = Imitated("hri_euv", _OWN_TEXTS["hri_euv"], 174, 0.492)
+HRI_EUV = Imitated("hri_euv", _TEXTS_OF_HRI, 174, 0.492)
 
 
 def imitated(instrument: Instrument) -> Imitated:
     """The keywords with which headers imitate `instrument`."""
     if instrument.name == HRI_EUV.name:
         return HRI_EUV
-    is_aia = instrument.name.startswith("aia_")
+    channel = round(instrument.wavelength_angstrom)
+    is_aia = instrument.name.startswith("aia_") and channel in _TELESCOPES_OF_AIA
     return Imitated(
         name=instrument.name,
-        texts=_OWN_TEXTS.get(instrument.name, instrument.match),
-        wavelength_angstrom=round(instrument.wavelength_angstrom),
+        texts=_texts_of_aia(channel) if is_aia else _matched_texts(instrument),
+        wavelength_angstrom=channel,
         plate_scale_arcsec=instrument.detector.plate_scale_arcsec,
         date_key="DATE-OBS" if is_aia else "DATE-BEG",
         exposure_key="EXPTIME" if is_aia else "XPOSURE",
         has_gain_modes=not is_aia,
     )
+
+
+def _texts_of_aia(channel: int) -> dict[str, str]:
+    return {
+        "TELESCOP": "SDO/AIA",
+        "INSTRUME": f"AIA_{_TELESCOPES_OF_AIA[channel]}",
+        "WAVEUNIT": "angstrom",
+    }
+
+
+def _matched_texts(instrument: Instrument) -> dict[str, str]:
+    return {key: text for key, text in instrument.match.items() if isinstance(text, str)}
 
 
 def commented(values: dict[str, CardValue]) -> dict[str, tuple[CardValue, str]]:

@@ -133,7 +133,7 @@ def plan_from_json(content: dict[str, Any]) -> Plan:
             "views": tuple(content["views"]),
         }
         return Plan(**known)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise DataError(
             "bad-plan", f"expected a plan written by `heliopsf simulate transit`; got: {error}"
         ) from None

@@ -50,7 +50,10 @@ def write(simulated: SimulatedTransit, folder: str | Path) -> None:
     for pointing, scene in simulated.scenes.items():
         about: dict[str, CardValue] = {"BUNIT": "DN/s", "FOV": pointing, "MARGIN": simulated.plan.margin_px}
         write_plane(folder / "scenes" / f"fov{pointing}.fits", scene, cards=commented(of_instrument | about))
-    write_plane(folder / DIFFRACTION_FILE, simulated.sky.diffraction, cards=commented(of_instrument))
+    diffraction = simulated.sky.diffraction
+    # PSFSUM says that the file is a PSF, see `content_of`; otherwise it would be deconvolved like an image of the folder.
+    is_psf: dict[str, CardValue] = {"PSFSUM": float(diffraction.sum())}
+    write_plane(folder / DIFFRACTION_FILE, diffraction, cards=commented(of_instrument | is_psf))
     _write_json(folder / "transit.json", _transit_json(simulated))
     _write_json(folder / TRUTH_FILE, simulated.truth.as_json() | {"plan": simulated.plan.as_json()})
 

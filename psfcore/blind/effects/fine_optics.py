@@ -19,7 +19,7 @@ The simulation bins the light only at the detector.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -129,11 +129,12 @@ def _pupil(name: str, size: int) -> Kernel:
 
 def _with_fine_pixels(instrument: Instrument) -> Instrument:
     detector = instrument.detector
-    changes = {
-        "pixel_pitch_um": detector.pixel_pitch_um / FINE,
-        "plate_scale_arcsec": detector.plate_scale_arcsec / FINE,
-    }
-    return instrument.model_copy(update={"detector": detector.model_copy(update=changes)})
+    fine = replace(
+        detector,
+        pixel_pitch_um=detector.pixel_pitch_um / FINE,
+        plate_scale_arcsec=detector.plate_scale_arcsec / FINE,
+    )
+    return replace(instrument, detector=fine)
 
 
 @dataclass(frozen=True, eq=False)

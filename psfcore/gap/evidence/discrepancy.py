@@ -5,6 +5,10 @@ position on the detector, time, intensity, exposure time, pointing, radius and a
 along each of these orders, times the expected light, with random coefficients. It is independent of the library and of
 the images: it changes the data themselves, and a cause with any of these orders resembles it.
 
+A cause may also follow no order at all: then every disc has its own change, every block of the detector has its own change
+that is the same in all readouts, or both. These alternatives have many coefficients, so they are probable only if every
+other hypothesis leaves much more than noise.
+
 One order may vary, or several. Each set of orders in ALTERNATIVES is one way in which the data may depart from the model;
 the hypothesis "unknown" is all of them with equal probability.
 """
@@ -32,6 +36,8 @@ DEGREE = 3
 DETECTOR = ("x", "y")
 OF_DISCS = (*DETECTOR, "time", "intensity", "exposure", "pointing", "radius", "azimuth")
 OF_BLOCKS = ("unocculted_time", "unocculted_exposure", "unocculted_intensity")
+# Without any order: each disc by itself, its cells too, and each block of the detector in every readout.
+EACH_DISC, EACH_CELL, EACH_READOUT = "disc", "cell", "readout"
 ALTERNATIVES: tuple[tuple[str, ...], ...] = (
     ("x",),
     ("y",),
@@ -48,6 +54,10 @@ ALTERNATIVES: tuple[tuple[str, ...], ...] = (
     ("azimuth",),
     OF_DISCS,
     (*OF_DISCS, *OF_BLOCKS),
+    (EACH_DISC,),
+    (EACH_DISC, EACH_CELL),
+    (EACH_READOUT,),
+    (EACH_DISC, EACH_READOUT),
 )
 # What each order is called in a report.
 WORDS = {
@@ -62,6 +72,9 @@ WORDS = {
     "unocculted_time": "the time, in the unocculted field",
     "unocculted_exposure": "the exposure time, in the unocculted field",
     "unocculted_intensity": "the intensity, in the unocculted field",
+    EACH_DISC: "the disc, without any order",
+    EACH_CELL: "the place in each disc",
+    EACH_READOUT: "the place on the detector, the same in every readout",
 }
 
 
@@ -128,6 +141,8 @@ def _of_discs(evidence: Evidence) -> dict[str, list[Matrix]]:
         ],
         "radius": patterns[:1],
         "azimuth": patterns[1:],
+        EACH_DISC: [whole(one) for one in np.eye(len(infos))],
+        EACH_CELL: [one[:, None] * pattern for pattern in patterns for one in np.eye(len(infos))],
     }
     return _that_vary(found)
 
@@ -154,6 +169,7 @@ def _of_blocks(evidence: Evidence) -> dict[str, list[Matrix]]:
         "unocculted_time": [form(term[:, None]) for term in times for form in forms],
         "unocculted_exposure": [form(readouts) for form in forms[1:]],
         "unocculted_intensity": [mean * term for term in np.moveaxis(legvander(bright, DEGREE), -1, 0)[1:]],
+        EACH_READOUT: [readouts * usual * block for block in np.eye(mean.shape[1])],
     }
     return _that_vary(found)
 

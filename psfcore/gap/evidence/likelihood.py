@@ -23,7 +23,7 @@ Gaussian prior of width w, its likely size times one of SCALES with equal probab
 
     ln E = ln L + ln det(1 + w N w)^-1/2 + terms of the prior                             Eq. (3)
 
-The integral is that of Laplace. A parameter that cannot be negative has a half Gaussian. A hypothesis whose template was
+N is the normal matrix of the strengths with the PSF free (its Schur complement). The integral is that of Laplace. A parameter that cannot be negative has a half Gaussian. A hypothesis whose template was
 chosen among many pays the logarithm of their number. Each number that was measured in the blocks to build a template adds
 MEASURED to their chi2: it gains 1 from noise alone, and nothing is known of its likely size.
 """
@@ -75,7 +75,7 @@ class Weighed:
 
     log_evidence: ln E of Eq. (3), up to a constant that all hypotheses of one model share; minus infinity if no parameter can
     act. columns: of the parameters that act, without those of the PSF. values: their best values. visible_error: chi2 that
-    a template error of TEMPLATE_ERROR would add in all data: above 1, first order is not enough.
+    a template error of TEMPLATE_ERROR of what is not subtracted would add in all data: above 1, first order is not enough.
     """
 
     log_evidence: float
@@ -170,6 +170,35 @@ class Likelihood:
         assert parts is not None
         return self._weighed(parts, theta, scales, columns, taken, trials)
 
+    def normal(self, columns: Sequence[int]) -> Matrix:
+        """The normal matrix of some columns for noise alone, with PSF, scenes and brightness free: no template error, no prior."""
+        first = len(self._base)
+        parts = self._parts([list(columns)], np.zeros(first + len(columns)), np.zeros(len(columns)))
+        whole = _together(parts, (1.0, 1.0))[0]
+        across = whole[:first, first:]
+        return np.asarray(
+            whole[first:, first:] - across.T @ scaled_inverse(whole[:first, :first], weakest=WEAKEST) @ across
+        )
+
+    def gained(self, decrease: Vector) -> Vector:
+        """The gain of ln L, Eq. (2), if chi2 of the discs decreases by these amounts to the value that noise alone has."""
+        whole = self._stiffness + self._cells
+        return np.asarray(whole * (1 - (1 + decrease / whole) ** -CORRELATED) / (2 * CORRELATED))
+
+    def fitted(self, columns: Sequence[int], values: Sequence[float]) -> tuple[Vector, Matrix]:
+        """Two results of a fit of the columns of one effect: their values (of any sign), and the covariance.
+
+        values: about the values that the fit finds; the template error is that of this strength.
+        """
+        first = len(self._base)
+        theta = np.concatenate([np.zeros(first), np.asarray(values, dtype=np.float64)])
+        nothing = np.zeros(len(columns))
+        parts = self._parts([list(columns)], theta, nothing)
+        found, scales = self._fit(parts, columns, nothing)
+        prior = np.diag(self._prior(columns, SCALES[-1]))
+        covariance = scaled_inverse(_together(parts, scales)[0] + prior, weakest=WEAKEST)
+        return found[first:], np.asarray(covariance[first:, first:])
+
     @cached_property
     def _positive(self) -> NDArray[np.bool_]:
         out = np.zeros(self._jacobian.shape[2], dtype=np.bool_)
@@ -245,6 +274,8 @@ class Likelihood:
             size, log_det = np.sqrt(np.diag(normal) + prior), 0.0
             log_det = float(np.linalg.slogdet((normal + np.diag(prior)) / np.outer(size, size))[1])
             log_det += 2 * float(np.log(size).sum())
+            # The PSF has no prior: what it could be must not count, because it differs between refits.
+            log_det -= float(np.linalg.slogdet(normal[:base, :base])[1])
             quadratic = float(step @ normal @ step - 2 * gradient @ step + prior @ (whole + step) ** 2)
             above = (whole + step)[base:][positive] / np.sqrt(np.diag(inverse)[base:][positive])
             half = float(np.sum(math.log(2) + log_ndtr(above)))
@@ -253,13 +284,13 @@ class Likelihood:
             float(logsumexp(found)) - math.log(len(found)) - math.log(trials),
             tuple(columns),
             theta[base:],
-            self._visible_error(columns, whole),
+            self._visible_error(columns, theta),
         )
 
-    def _visible_error(self, columns: Sequence[int], whole: Vector) -> float:
+    def _visible_error(self, columns: Sequence[int], theta: Vector) -> float:
         if not columns:
             return 0.0
-        values = whole[len(self._base) :]
+        values = theta[len(self._base) :]
         change = TEMPLATE_ERROR * (self._jacobian[:, :, columns] @ values)
         seen = float(np.sum(change * np.linalg.solve(self._covariance, change[..., None])[..., 0]))
         for pointing in self._blocks:

@@ -42,7 +42,7 @@ from psfcore.least_squares import scaled_inverse
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
-FLOOR = 0.003  # f of Eq. (2): the verdict is first made with this value
+FLOOR = 0.003  # f of Eq. (2)
 UNLIKELY = 10.0  # width of the prior of a parameter, in units of its likely size
 WEAKEST = 1e-9  # eigenvalues of a scaled normal matrix below this fraction of the largest one count as zero
 

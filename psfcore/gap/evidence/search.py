@@ -9,7 +9,7 @@ coarse grid. Let r be the residuals of the discs that remain after the fit of th
 
     gain(d) = (sum r T)^2 / sum T^2                        Eq. (2)
 
-if sum r T has the sign that the amplitude of the template must have; otherwise the gain is 0. Here r and T are in units
+if sum r T is positive, because these templates add light; otherwise the gain is 0. Here r and T are in units
 of the noise, without the component that a change of the PSF can absorb. In the same way, a change K of the PSF changes
 the mean of disc n by
 
@@ -111,7 +111,7 @@ class PlaceSearch:
             for kernel in kernels
         ]
         means = np.array(of_discs, dtype=np.float64).T / self._sigma[:, None]
-        return int(np.argmax(self._gain(means, 1.0, cells)))
+        return int(np.argmax(self._gain(means, cells)))
 
     @cached_property
     def copy(self) -> tuple[float, int, int]:
@@ -135,7 +135,7 @@ class PlaceSearch:
             return linear_convolve(q, copy[::-1, ::-1], (rows, columns))
 
         dy, dx = (_displacements(n) for n in (rows, columns))
-        gain = self._gains(response, 1.0)
+        gain = self._gains(response)
         gain[np.hypot(dy[:, None], dx[None, :]) < self._nearest_px] = -1.0
         at = int(np.argmax(gain))
         return int(dx[at % columns]), int(dy[at // columns])
@@ -157,45 +157,29 @@ class PlaceSearch:
             )
             of_cells.append(self._near.of_copies(n, copy, places))
         means = np.array(of_means) / self._sigma[:, None]
-        gain = self._gain(means, 1.0, np.concatenate(of_cells), least=SEEN)
+        gain = self._gain(means, np.concatenate(of_cells), least=SEEN)
         best = int(np.argmax(gain))
         return float(gain[best]), *places[best]
 
-    def place(self, width_px: float, *, of_image: bool, sign: float) -> tuple[float, float]:
-        """The position (x, y) in px of the Gaussian patch that explains most of the residuals.
-
-        width_px: standard deviation of the patch. of_image: whether the patch is proportional to the image; otherwise it is
-        the same light in every image. sign: +1 for added light, -1 for lost light.
-        """
-
-        def response(n: int, q: Plane) -> Plane:
-            seen = q * _binned(self._expected[n], STEP_PX) if of_image else q
-            return np.asarray(gaussian_filter(seen, width_px / STEP_PX, mode="constant"))
-
-        gain = self._gains(response, sign)
-        row, column = np.unravel_index(int(np.argmax(gain)), gain.shape)
-        return (float(column) + 0.5) * STEP_PX - 0.5, (float(row) + 0.5) * STEP_PX - 0.5
-
-    def _gains(self, response: Callable[[int, Plane], Plane], sign: float) -> Plane:
+    def _gains(self, response: Callable[[int, Plane], Plane]) -> Plane:
         """Eq. (2) at every position of the coarse grid [y, x]."""
         responses = np.array(
             [response(n, q) / s for (n, q), s in zip(self._planes.items(), self._sigma, strict=True)]
         )
-        gain = self._gain(responses.reshape(self._sigma.size, -1), sign, least=SEEN)
+        gain = self._gain(responses.reshape(self._sigma.size, -1), least=SEEN)
         return np.asarray(gain.reshape(responses.shape[1:]))
 
-    def _gain(self, means: Plane, sign: float, cells: Plane | None = None, *, least: float = 0.0) -> Vector:
+    def _gain(self, means: Plane, cells: Plane | None = None, *, least: float = 0.0) -> Vector:
         """Eq. (2) of some templates (templates,).
 
         means: T of the means of the discs (discs, templates), in units of the noise. cells: T of the cells (cells, templates);
-        None: use the means alone. sign: the sign that the amplitude of a template must have. least: a template gains 0 if its
-        sum T^2 is below this fraction of the largest sum T^2.
+        None: use the means alone. least: a template gains 0 if its sum T^2 is below this fraction of the largest sum T^2.
         """
         left, responses = (
             (self._of_means, means) if cells is None else (self._of_all, np.concatenate([means, cells]))
         )
         flat = left.of(responses)
-        size, along = (flat**2).sum(axis=0), sign * (left.residual @ flat)
+        size, along = (flat**2).sum(axis=0), left.residual @ flat
         seen = size > max(least * float(size.max()), UNSEEN)
         return np.asarray(np.where(seen & (along > 0), along**2 / np.where(seen, size, 1.0), 0.0))
 

@@ -49,7 +49,8 @@ class UnoccultedBlocks:
     (DN/s)^2. free: whether a block is away from the disc and from filled pixels. means: the mean of each block in the mean
     image of the pointing. errors: (columns, images, blocks), the change by one unit of the parameter of each column.
     pointing: (images,). kind: (images,), one number for each combination of pointing, gain mode and exposure. part:
-    (images,), whether an image is used. across: the number of blocks in a row of blocks.
+    (images,), whether an image is used. across: the number of blocks in a row of blocks. given_gain_width: the width of the
+    prior of g_n; None: the spread of g_n in these images.
     """
 
     levels: Matrix
@@ -61,6 +62,7 @@ class UnoccultedBlocks:
     kind: NDArray[np.int64]
     part: NDArray[np.bool_]
     across: int
+    given_gain_width: float | None = None
 
     def with_flickering_blocks(self) -> UnoccultedBlocks:
         """The same blocks, with the variance of flickering blocks raised to their observed variance."""
@@ -84,7 +86,9 @@ class UnoccultedBlocks:
 
     @cached_property
     def gain_width(self) -> float:
-        """The rms spread of g_n among images of one kind: the width of the prior of g_n."""
+        """The width of the prior of g_n: the given one, or the rms spread of g_n among images of one kind."""
+        if self.given_gain_width is not None:
+            return self.given_gain_width
         free = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
         spread: list[float] = []
         for kind in np.unique(self.kind[self.part]):

@@ -1,1 +1,1 @@
-"""The library of effects, sorted by stage; the probes; and the effects that users or operators add."""
+"""The library of effects, sorted by stage, and the effects that users or operators add."""

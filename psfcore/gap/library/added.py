@@ -7,22 +7,18 @@ the line, for the author of the code.
 
 from __future__ import annotations
 
-import hashlib
 import importlib
-import importlib.util
 import sys
-import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from psfcore.errors import DataError
+from psfcore.extensions.user_code import is_file, module_in_file, named_errors
 from psfcore.gap.effect import Change, Effect
-from psfcore.gap.effect_sources import is_file, sha256_of_source
+from psfcore.gap.effect_sources import bad_effects, sha256_of_source
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.view import Field, View
 
@@ -45,7 +41,7 @@ def added_effects(sources: Sequence[str]) -> tuple[Added, ...]:
     for one in found:
         for effect in one.effects:
             if effect.name in taken:
-                raise _bad(
+                raise bad_effects(
                     one.source,
                     f"expected unique effect names; got {effect.name!r:.60} twice: rename this effect",
                 )
@@ -60,11 +56,11 @@ def library_with(added: Sequence[Added]) -> tuple[Effect, ...]:
 
 def _added(source: str) -> Added:
     sha256 = sha256_of_source(source)
-    with _theirs(source):
-        module = _of_file(Path(source)) if is_file(source) else _of_name(source)
+    with named_errors(source, bad_effects):
+        module = module_in_file(Path(source), "heliopsf_effects_") if is_file(source) else _of_name(source)
     found = getattr(module, NAME, None)
     if not isinstance(found, (tuple, list)) or not found or not all(isinstance(e, Effect) for e in found):
-        raise _bad(source, f"expected {NAME} to be a tuple of Effect; got {_words(found)}")
+        raise bad_effects(source, f"expected {NAME} to be a tuple of Effect; got {_words(found)}")
     for effect in found:
         _check(effect, source)
     return Added(source, sha256, tuple(_guarded(e, source) for e in found))
@@ -76,59 +72,28 @@ def _of_name(name: str) -> ModuleType:
     return importlib.import_module(name) if before is None else importlib.reload(before)
 
 
-def _of_file(path: Path) -> ModuleType:
-    """The module in a file, imported again, under a name that no other module has."""
-    name = "heliopsf_effects_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{path} cannot be imported")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look up their module in sys.modules
-    spec.loader.exec_module(module)
-    return module
-
-
 def _check(effect: Effect, source: str) -> None:
     if not effect.name.isidentifier():
-        raise _bad(source, f"expected an effect name of letters, digits and _; got {effect.name!r:.60}")
+        raise bad_effects(
+            source, f"expected an effect name of letters, digits and _; got {effect.name!r:.60}"
+        )
     if not effect.parameters:
-        raise _bad(source, f"{effect.name}: expected at least one parameter; got none")
+        raise bad_effects(source, f"{effect.name}: expected at least one parameter; got none")
 
 
 # --- errors of added code ----------------------------------------------------------------------------------
-
-
-@contextmanager
-def _theirs(source: str) -> Iterator[None]:
-    """Turn every error that the added code raises into a DataError that names the line."""
-    try:
-        yield
-    except DataError:
-        raise
-    # Added code may raise any error. A full traceback would mainly show the code of this software.
-    except Exception as error:
-        raise _bad(source, f"{type(error).__name__}: {error}{_line(error, source)}") from error
-
-
-def _line(error: Exception, source: str) -> str:
-    """The line of the added code that raised an error, as text; empty if the line is unknown."""
-    if isinstance(error, SyntaxError):
-        return ""  # the message of a SyntaxError contains the line
-    name = Path(source).name if is_file(source) else f"{source.rpartition('.')[2]}.py"
-    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name == name]
-    return f" (line {lines[-1]})" if lines else ""
 
 
 def _guarded(effect: Effect, source: str) -> Effect:
     """The effect with checks: it must return one Change for each parameter, and finite images of the right shape."""
 
     def changes(view: View) -> list[Change]:
-        with _theirs(source):
+        with named_errors(source, bad_effects):
             made = list(effect.changes(view))
         wanted = len(effect.parameters)
         if len(made) != wanted or not all(isinstance(change, Change) for change in made):
             kinds = ", ".join(sorted({type(change).__name__ for change in made}))
-            raise _bad(
+            raise bad_effects(
                 source,
                 f"{effect.name}: expected {wanted} Change, one per parameter; got {len(made)} of type {kinds}",
             )
@@ -138,7 +103,7 @@ def _guarded(effect: Effect, source: str) -> Effect:
         ]
 
     def why_not(view: View) -> str | None:
-        with _theirs(source):
+        with named_errors(source, bad_effects):
             return effect.why_not(view)
 
     return replace(effect, changes=changes, why_not=why_not, held=_held(effect, source))
@@ -150,7 +115,7 @@ def _held(effect: Effect, source: str) -> Callable[[View], Effect] | None:
     hold = effect.held
 
     def held(view: View) -> Effect:
-        with _theirs(source):
+        with named_errors(source, bad_effects):
             return _guarded(hold(view), source)
 
     return held
@@ -160,7 +125,7 @@ def _checked(
     change: Callable[[int, Sequence[Field]], Field], shape: tuple[int, int], name: str, source: str
 ) -> Callable[[int, Sequence[Field]], Field]:
     def checked(n: int, images: Sequence[Field]) -> Field:
-        with _theirs(source):
+        with named_errors(source, bad_effects):
             field = np.asarray(change(n, images))
         if field.shape != shape or not np.isfinite(field).all():
             got = (
@@ -168,14 +133,10 @@ def _checked(
                 if field.shape == shape
                 else f"an array of shape {field.shape}"
             )
-            raise _bad(source, f"{name}: expected an image of shape {shape} [y, x]; got {got}")
+            raise bad_effects(source, f"{name}: expected an image of shape {shape} [y, x]; got {got}")
         return field
 
     return checked
-
-
-def _bad(source: str, what: str) -> DataError:
-    return DataError("bad-effects", f"effects of {source}: {what}")
 
 
 def _words(found: object) -> str:

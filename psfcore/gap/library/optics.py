@@ -45,11 +45,6 @@ def by_psf(view: View, blur: Blur, weight: Field | None = None) -> Change:
     return Change(lambda n, images: view.blurred(n, blur, weight), unocculted=False)
 
 
-def by_psf_in_time(view: View, blur: Blur, factor: Callable[[int], float]) -> Change:
-    """The change of the images by a change of the PSF (`blur`), times factor(n) for image n."""
-    return Change(lambda n, images: view.blurred(n, blur) * np.float32(factor(n)), unocculted=False)
-
-
 def shape_slopes(view: View, shape: str, parameters: tuple[int, ...]) -> list[Blur]:
     """Derivatives of the total PSF with respect to coordinates of another shape, evaluated at the fit.
 
@@ -69,13 +64,6 @@ def not_a_power_law(view: View) -> str | None:
         if name == SOFTENED_POWER_LAW.name
         else f"this effect needs the softened power law; the fitted shape is {name}"
     )
-
-
-def core_slope(view: View) -> Blur:
-    """The change of the PSF by a Gaussian blur with variance 1 px^2 along each axis: half the Laplacian of the PSF."""
-    kernel = view.kernel
-    neighbours = sum(np.roll(kernel, step, axis) for axis in (0, 1) for step in (-1, 1))
-    return _blur(view, (neighbours - 4 * kernel) / 2)
 
 
 def _blur(view: View, kernel: Kernel) -> Blur:

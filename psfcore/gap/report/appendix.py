@@ -25,7 +25,6 @@ from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.report.report import best_words, words
 from psfcore.gap.verdict.correction import ROUNDS
-from psfcore.gap.verdict.judge import ENOUGH
 from psfcore.scatter.inversion import Inversion
 
 Report = dict[str, Any]
@@ -124,12 +123,12 @@ def made_of(found: Diagnosis, report: Report) -> list[Part]:
                 "floor",
                 f"{100 * FLOOR:g}",
                 unit="%",
-                meaning="relative error, common to all cells of a disc, that allows for unknown causes; the verdict is made again with half and with twice this value",
+                meaning="relative error, common to all cells of a disc, that allows for unknown causes",
             ),
             Value(
-                "limit of the p-value of residuals",
-                f"{ENOUGH:g}",
-                meaning="an effect explains the gap if the residuals after it have a larger p-value",
+                "calibration",
+                f"{report['calibration']['cases']} simulated transits",
+                meaning="made by " + report["calibration"]["command"],
             ),
             *(
                 Value("rounds of the full refit", str(one.rounds), meaning=f"at most {ROUNDS}")

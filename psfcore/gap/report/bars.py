@@ -11,7 +11,7 @@ import numpy as np
 
 from psfcore.drawing.plots import INK
 from psfcore.evaluation.plot import tidy
-from psfcore.gap.report.report import fits_of
+from psfcore.gap.report.report import fits_of, percent_words
 
 Report = dict[str, Any]
 
@@ -44,7 +44,7 @@ def p_words(p_value: float) -> str:
 
 
 def draw_effects(axes: Any, report: Report) -> None:
-    """Draw the closure by each effect, with its 90 % interval and its score. The named or tied effects are blue."""
+    """Draw the closure by each effect, with its 90 % interval and its probability. The named or tied effects are blue."""
     rows = fits_of(report)[:MOST_EFFECTS]
     at = np.arange(len(rows))[::-1]
     names = []
@@ -52,10 +52,12 @@ def draw_effects(axes: Any, report: Report) -> None:
         chosen = _chosen(row, report)
         colour = _ANSWER if chosen else _OTHER
         _draw_closure(axes, float(y), row["closure"], colour)
-        axes.text(1.52, y, f"{row['score']:.1f}", va="center", ha="right", fontsize=9)
+        axes.text(1.52, y, percent_words(row["probability"]), va="center", ha="right", fontsize=9)
         mark = {"attributed": "named", "tie": "tied"}.get(report["verdict"], "") if chosen else ""
         names.append(row["name"].replace("_", " ") + (f"  ({mark})" if mark else ""))
-    axes.text(1.52, at.max(initial=0) + 0.75, "score", va="center", ha="right", fontsize=9, color="#555555")
+    axes.text(
+        1.52, at.max(initial=0) + 0.75, "probability", va="center", ha="right", fontsize=9, color="#555555"
+    )
     axes.set_yticks(at, names)
     for tick, row in zip(axes.get_yticklabels(), rows, strict=True):
         if _chosen(row, report):
@@ -68,12 +70,11 @@ def draw_effects(axes: Any, report: Report) -> None:
 
 
 def _chosen(row: Report, report: Report) -> bool:
-    """Whether a row of the report is the fit of the named effects or, for a tie, of one of the tied effects."""
+    """Whether a row of the report is the fit of the named effects or, for a tie, of one of the tied hypotheses."""
     names, answer = set(row["name"].split(" + ")), set(report["answer"])
     if report["verdict"] != "tie":
         return names == answer
-    certain = answer.difference(*report["ties"])
-    return certain <= names <= answer and names != certain
+    return names <= answer and names in [set(member) for member in report["set"]["members"]]
 
 
 def _draw_closure(axes: Any, y: float, closure: dict[str, Any] | None, colour: str) -> None:

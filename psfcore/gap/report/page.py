@@ -22,6 +22,7 @@ from psfcore.drawing.page import (
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.report.appendix import doubts, made_of, psf_parts
 from psfcore.gap.report.bars import MOST_EFFECTS
+from psfcore.gap.report.limits_tables import limits_parts
 from psfcore.gap.report.plot import (
     SLICE_ROWS,
     cells_png,
@@ -36,24 +37,25 @@ from psfcore.gap.report.plot import (
 from psfcore.gap.report.report import (
     AXIS_WORDS,
     best_words,
-    discs_unexplained_words,
     fits_of,
+    hypothesis_words,
     in_short_if_many,
+    percent_words,
     tied_words,
     words,
 )
-from psfcore.gap.verdict.judge import ALARM, TIE, TIE_SHARE
 from psfcore.gap.verdict.where import SIGN_FLIPS
 
 Report = dict[str, Any]
 
 VERDICTS = {
-    "none": "there is no gap: noise and the error of the fit explain the residuals",
-    "attributed": "there is a gap, and its cause is identified",
-    "tie": "there is a gap, and several effects explain it about equally well",
-    "unknown": "there is a gap, and no effect of the library explains it",
-    "inconclusive": "these data do not show whether there is a gap, or which effect causes it",
+    "none": "most probably there is no gap: noise and the error of the fit explain the residuals",
+    "attributed": "there is a gap, and the answer set contains one cause",
+    "tie": "there is a gap, and the answer set contains several effects or pairs of effects",
+    "unknown": "there is a gap, and the answer set contains no effect of the library",
+    "inconclusive": "the answer set contains different kinds of causes, for example an effect and an unknown cause",
 }
+MOST_HYPOTHESES = 8
 AXIS_UNITS = {
     "detector_x": "px",
     "detector_y": "px",
@@ -65,7 +67,7 @@ AXIS_UNITS = {
 
 
 def gap_page(found: Diagnosis, report: Report) -> Page:
-    """The page of a diagnosis. report: its report (schema gap/1).
+    """The page of a diagnosis. report: its report (schema gap/2).
 
     The optional entry "provenance" of the report states the software, the libraries, the seed and the PSF at which the fit
     started.
@@ -75,6 +77,7 @@ def gap_page(found: Diagnosis, report: Report) -> Page:
         Section("What was found", _found(found, report)),
         Section("Where the gap lies", _where(found, report)),
         Section("Which effect causes the gap", _which(found, report)),
+        Section("What these data could have shown", limits_parts(found.limits)),
         Section(
             "The PSF, without and with the named effects" if found.corrected else "The PSF", psf_parts(found)
         ),
@@ -96,11 +99,23 @@ def _found(found: Diagnosis, report: Report) -> list[Part]:
     unsure = report["verdict"] == "inconclusive" and bool(report["answer"])
     values = [
         Value("verdict", report["verdict"], meaning=VERDICTS[report["verdict"]]),
-        Value("best effect so far" if unsure else "named effects", answer, meaning=_answer_meaning(report)),
+        Value(
+            "most probable effects" if unsure else "named effects", answer, meaning=_answer_meaning(report)
+        ),
+        Value(
+            "answer set",
+            "; ".join(hypothesis_words(tuple(names)) for names in report["set"]["members"]),
+            meaning=f"the hypotheses that belong to the answer; on data like the simulated ones, this set contains the true cause in {100 * report['set']['coverage']:.0f} % of the cases",
+        ),
+        Value(
+            "probability of no gap",
+            percent_words(report["probabilities"]["none"]),
+            meaning="probability that no effect and no unknown cause acts",
+        ),
         Value(
             "p-value of the gap",
             f"{gap['p_value']:.2g}",
-            meaning=f"probability of residuals at least as large as these if there is no gap; below {ALARM:g}, the report claims a gap",
+            meaning="probability of residuals at least as large as these if there is no gap",
         ),
     ]
     answered = report["verdict"] in ("attributed", "tie")
@@ -171,12 +186,12 @@ def interval_words(interval: dict[str, Any]) -> str:
 
 
 def _looks_like(report: Report) -> list[Part]:
-    rows = [[one["form"], f"{one['score']:.1f}", f"{one['p_value']:.2g}"] for one in report["looks_like"]]
+    rows = [[one["form"], percent_words(one["probability"])] for one in report["looks_like"]]
     return [
         Table(
-            ["pattern", "score", "p-value"],
+            ["pattern", "probability"],
             rows,
-            "Patterns that the gap resembles, best first. They are typical of causes that the library does not contain, and do not identify a cause. The score is the decrease of chi2 by the pattern, minus the decrease that noise alone could give.",
+            "If the cause is not in the library: the patterns that the gap resembles, the most probable first. They do not identify a cause.",
         )
     ]
 
@@ -260,31 +275,14 @@ def _residuals_caption(report: Report) -> str:
 
 
 def _which(found: Diagnosis, report: Report) -> list[Part]:
-    parts: list[Part] = []
-    if report["verdict"] == "none":
-        parts.append(
-            "There is no gap, so no effect is needed. All effects were tested, and no effect decreases chi2 significantly more than noise would."
-        )
-    elif report["verdict"] == "unknown":
-        parts.append(
-            "No effect and no pair of effects explains the gap. Either the residuals after the best fit are still significant, or a pattern "
-            "that is typical of causes outside the library fits clearly better."
-        )
-    elif found.judgement.discs_unexplained:
-        parts.append(
-            f"The report names no effect: {discs_unexplained_words(found.judgement)}. The positions of all occulters are reliable, so wrong positions do not cause this gap."
-        )
-    elif report["verdict"] == "inconclusive":
-        parts.append(
-            "These data do not show which effect causes the gap, or whether there is a gap. There are four possible reasons. The best effect changes with the assumed floor, which is the error that is "
-            "allowed for unknown causes, as a fraction of the light of a disc. Or the best effect does not improve the prediction of held-out images. Or a pattern of unknown cause fits about as "
-            "well. Or there are too few images."
-        )
-    elif report["ties"]:
-        parts.append(
-            f"Tied: {tied_words(found.judgement)}. Either the scores of these effects differ by less than {TIE:g}, or by less than {100 * TIE_SHARE:g} % of the best gain (the limit is wider "
-            "if an effect searched for its position). Or their order changes with the assumed floor, which is the error that is allowed for unknown causes."
-        )
+    said = {
+        "none": "Most probably there is no gap. An effect that is in the answer set or in the table may still act, but too weakly for these data.",
+        "unknown": "No effect of the library and no pair of effects is in the answer set. A smooth change of the data that no effect describes is more probable.",
+        "inconclusive": "These data do not decide between the hypotheses of the answer set.",
+        "tie": f"Tied: {tied_words(found.judgement)}. All these effects are in the answer set.",
+    }
+    parts: list[Part] = [said[report["verdict"]]] if report["verdict"] in said else []
+    parts += [_hypotheses_table(report), _probabilities_note(report)]
     if report["verdict"] != "none":
         parts.append(_effects_figure(report))
     parts.append(_effects_table(report))
@@ -293,20 +291,52 @@ def _which(found: Diagnosis, report: Report) -> list[Part]:
     return parts
 
 
+def _hypotheses_table(report: Report) -> Table:
+    members = [tuple(names) for names in report["set"]["members"]]
+    rows = [
+        [
+            hypothesis_words(tuple(one["effects"])),
+            percent_words(one["probability"]),
+            "yes" if tuple(one["effects"]) in members else "",
+        ]
+        for one in report["hypotheses"][:MOST_HYPOTHESES]
+    ]
+    return Table(
+        ["hypothesis", "probability", "in the answer set"],
+        rows,
+        f"The most probable hypotheses about the cause (at most {MOST_HYPOTHESES}). A pair of effects is listed only if it is more probable than each of its effects alone.",
+    )
+
+
+def _probabilities_note(report: Report) -> str:
+    made = report["calibration"]
+    return (
+        f"The limits of the answer set come from {made['cases']} simulated transits of known cause. {made['holds_for']} On data that "
+        "differ from these, the stated coverage is not guaranteed."
+    )
+
+
 def _effects_figure(report: Report) -> Figure:
     return Figure(
         effects_png(report),
-        f"The effects of the library, best first (at most {MOST_EFFECTS}). Effects that fail in a full refit come last. Each bar is the closure by one effect: the fraction of the gap in "
-        "held-out images that disappears when the effect is added to the model. The line is its 90 % interval; an arrow marks where the chart cuts it. Blue: the named effects, or the tied effects. A wrong effect may also close much of a gap, so the score decides. "
-        "The score is the decrease of chi2 (the gain), minus the decrease that noise alone could give through the parameters of the effect and the search for its position. Effects are tied with the best effect if their scores differ by less than "
-        f"{TIE:g}, or by less than {100 * TIE_SHARE:g} % of the best gain.",
+        f"The effects of the library, the most probable first (at most {MOST_EFFECTS}). Each bar is the closure by one effect: the fraction of the gap in "
+        "held-out images that disappears when the effect is added to the model. The line is its 90 % interval; an arrow marks where the chart cuts it. Blue: the named effects, or the tied effects. A wrong effect may also close much of a gap, so the probability decides. "
+        "The probability is that of the effect acting alone or with another effect; for a pair it is that of the pair.",
         "Bars of held-out closure by effect",
     )
 
 
 def _effects_table(report: Report) -> Table:
     return Table(
-        ["effect", "parameters", "score", "delta chi2, held out", "closure (%)", "90 % interval", "p-value"],
+        [
+            "effect",
+            "probability",
+            "parameters",
+            "delta chi2, held out",
+            "closure (%)",
+            "90 % interval",
+            "p-value",
+        ],
         [_effect_row(effect) for effect in fits_of(report)],
         "Every effect that was tested. Each was fitted together with the PSF. First come effects that act together, then single effects. Errors are one standard deviation. For the named effects, the parameters are those of "
         "the full refit. Delta chi2, held out: the decrease of -2 ln likelihood of the held-out images, including the errors of the parameters.",
@@ -321,8 +351,8 @@ def _effect_row(effect: Report) -> list[str]:
     fall = effect["delta_chi2_held_out"]
     return [
         words(effect["name"]),
+        percent_words(effect["probability"]),
         in_short_if_many([p["value"] for p in effect["parameters"].values()]) or numbers,
-        f"{effect['score']:.1f}",
         DASH if fall is None else f"{fall:.1f}",
         *_closure_cells(effect["closure"]),
         f"{effect['p_value']:.2g}",

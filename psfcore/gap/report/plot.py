@@ -286,7 +286,12 @@ def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> NDAr
 
 
 def gap_png(found: Diagnosis, report: Report) -> bytes:
-    """All figures as one picture, below the summary sentence."""
+    """The figure of `gap_figure` as PNG."""
+    return _png(gap_figure(found, report))
+
+
+def gap_figure(found: Diagnosis, report: Report) -> Figure:
+    """All figures as one figure, below the summary sentence."""
     figure = Figure(figsize=(15.0, 13.2), dpi=100, facecolor="white", layout="constrained")
     words = "\n".join(textwrap.wrap(report["sentence"], 165))
     figure.suptitle(words, fontsize=12.5, color=INK, x=0.012, ha="left", linespacing=1.4)
@@ -299,9 +304,7 @@ def gap_png(found: Diagnosis, report: Report) -> bytes:
     where, effects = bands[2].subfigures(1, 2, width_ratios=(0.85, 1.15))
     draw_where(where.subplots(), report)
     draw_effects(effects.subplots(), report)
-    out = BytesIO()
-    write_png(figure, out)
-    return out.getvalue()
+    return figure
 
 
 def has_after(report: Report) -> bool:

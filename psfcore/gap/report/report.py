@@ -1,4 +1,4 @@
-"""The gap report as JSON (schema gap/1), and its summary sentence.
+"""The gap report as JSON (schema gap/2), and its summary sentence.
 
 The named effects are those that the verdict names as the cause of the gap. The report lists them under "answer".
 """
@@ -14,15 +14,21 @@ from scipy.special import chdtrc
 
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.effect import Effect
-from psfcore.gap.library.probes import PROBES
+from psfcore.gap.evidence.discrepancy import WORDS
+from psfcore.gap.evidence.effect_fits import EffectFit
 from psfcore.gap.verdict.closure import Interval
 from psfcore.gap.verdict.correction import Corrected
-from psfcore.gap.verdict.judge import ALARM, LEAST_IMAGES, TIE, Judgement, Tried
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names
+from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement
 from psfcore.scatter.inversion import Inversion
 
-SCHEMA = "gap/1"
+SCHEMA = "gap/2"
 MOST_READ = 12  # if an effect has more parameters, the report summarises them
-PROBE_NAMES = {probe.name for probe in PROBES}
+LIKELY_ORDER = 0.05  # an unknown cause resembles the patterns with at least this probability
+LEAST_SHARE = 1e-3  # hypotheses with a smaller probability are not listed
+MOST_ORDERS = 3
+MOST_LISTED = 4  # hypotheses in the summary sentence
+VISIBLE_P = 0.005  # the discs show a gap if its p-value is below this
 AXIS_WORDS = {
     "detector_x": "along detector x",
     "detector_y": "along detector y",
@@ -38,10 +44,11 @@ AXIS_WORDS = {
 
 
 def gap_report(found: Diagnosis) -> dict[str, Any]:
-    """The report of a diagnosis, schema gap/1."""
+    """The report of a diagnosis, schema gap/2."""
     judged = found.judgement
     refits = {c.label: c for c in found.corrected}
-    fits = [(tried, _effect(found, tried, refits.get(tried.label))) for tried in judged.tried]
+    fits = [(fit, _effect(found, fit, refits.get(fit.label))) for fit in found.fits]
+    stated = found.limits.as_json()
     return {
         "schema": SCHEMA,
         "sentence": sentence(found),
@@ -50,28 +57,27 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
             "rms_pct": found.rms.to_json(),
             "after_pct": found.after.to_json(),
             "noise_pct": found.noise_pct,
-            "p_value": judged.p_value,
+            "p_value": found.p_value,
         },
         "where": [axis.to_json() for axis in found.where],
         "verdict": judged.verdict,
         "answer": list(judged.answer),
-        "effects": [
-            fit for tried, fit in sorted(fits, key=lambda fit: _place(found, fit[0])) if len(tried.names) == 1
+        "set": {"coverage": judged.coverage, "members": [list(names) for names in judged.members]},
+        "hypotheses": [
+            {"effects": list(names), "probability": share}
+            for names, share in judged.hypotheses.items()
+            if share >= LEAST_SHARE or names in judged.members
         ],
-        "together": [fit for tried, fit in fits if len(tried.names) > 1],
+        "probabilities": dict(judged.effects),
+        "limits": stated["limits"],
+        "alike": stated["alike"],
+        "calibration": found.calibration.to_json(),
+        "effects": [fit for one, fit in fits if len(one.names) == 1],
+        "together": [fit for one, fit in fits if len(one.names) > 1],
         "ties": [list(judged.tied)] if judged.verdict == "tie" else [],
         "would_separate": would_separate(found),
-        "untestable": [
-            {"name": name, "why": why}
-            for name, why in found.evidence.untestable.items()
-            if name not in PROBE_NAMES
-        ],
-        "looks_like": [
-            {"form": _by_name(found, probe.names[0]).cause, "score": probe.score, "p_value": probe.p_value}
-            for probe in judged.probes[:3]
-        ]
-        if judged.verdict in ("unknown", "inconclusive")
-        else [],
+        "untestable": [{"name": name, "why": why} for name, why in found.evidence.untestable.items()],
+        "looks_like": [{"form": form, "probability": share} for form, share in looks_like(judged)],
         "cautions": list(found.cautions),
         "expected": {
             "residual_pct": found.expected.residual_pct,
@@ -91,16 +97,19 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _place(found: Diagnosis, tried: Tried) -> tuple[bool, bool]:
-    """Sort key of a fit. The named effects come first, because each may explain little without the other.
+def looks_like(judged: Judgement) -> list[tuple[str, float]]:
+    """If the cause may be unknown: the patterns that the gap resembles, and their probabilities, the most probable first."""
+    if UNKNOWN not in judged.members:
+        return []
+    ordered = sorted(judged.orders.items(), key=lambda one: -one[1])
+    return [(order_words(orders), share) for orders, share in ordered if share >= LIKELY_ORDER]
 
-    Among the named effects, an effect that was measured in the unocculted field comes last, because it fits that field
-    whatever the cause.
-    """
-    best = found.judgement.best
-    together = best is not None and len(best.names) > 1
-    here = tried.names[0] in found.judgement.answer
-    return not here, here and together and found.evidence.numbers_of(tried.step.columns) > 0
+
+def order_words(orders: Names) -> str:
+    """A change along some orders of the data, as text."""
+    if len(orders) > MOST_ORDERS:
+        return "a change along many orders of the data"
+    return "a change that varies with " + " and ".join(WORDS[order] for order in orders)
 
 
 def fits_of(report: dict[str, Any]) -> list[dict[str, Any]]:
@@ -125,23 +134,24 @@ def _by_name(found: Diagnosis, name: str) -> Effect:
     return next(effect for effect in found.evidence.effects if effect.name == name)
 
 
-def _effect(found: Diagnosis, tried: Tried, refit: Corrected | None) -> dict[str, Any]:
-    shrinking = found.shrinking[tried.label]
-    values = tried.values if refit is None else refit.values
+def _effect(found: Diagnosis, fit: EffectFit, refit: Corrected | None) -> dict[str, Any]:
+    shrinking = found.shrinking[fit.label]
+    values = fit.values if refit is None else refit.values
+    share = found.judgement.effects.get(fit.names[0], 0.0) if len(fit.names) == 1 else None
     return {
-        "name": tried.label,
+        "name": fit.label,
+        "probability": found.judgement.hypotheses.get(fit.names, 0.0) if share is None else share,
         "parameters": {
             name: {"value": value, "sigma": sigma, "unit": unit}
             for name, (value, sigma, unit) in values.items()
         },
-        "p_value": tried.p_value,
-        "delta_chi2": tried.gain,
-        "score": tried.score,
+        "p_value": fit.p_value,
+        "delta_chi2": fit.gain,
         "delta_chi2_held_out": shrinking.held_out_fall,
         "closure": _interval(shrinking.closure),
         "closure_by_pointing": _interval(shrinking.closure_by_pointing),
         "refitted": refit is not None,
-        "cause": " ".join(_by_name(found, name).cause for name in tried.names),
+        "cause": " ".join(_by_name(found, name).cause for name in fit.names),
     }
 
 
@@ -191,24 +201,20 @@ def would_separate(found: Diagnosis) -> str:
 
 
 def sentence(found: Diagnosis) -> str:
-    """The summary of a diagnosis: one to four sentences."""
+    """The summary of a diagnosis: two to four sentences."""
     judged = found.judgement
     images = len(found.evidence.discs)
-    if judged.verdict == "inconclusive" and judged.p_value > ALARM:
-        return (
-            f"No gap is visible in these {images} images (p = {judged.p_value:.2g}), but a gap may exist. With fewer than "
-            f"{LEAST_IMAGES} images, no image can be held out, and only a large gap can be excluded."
-        )
     left = f"{found.rms.value:.1f} % ({found.rms.low:.1f} to {found.rms.high:.1f})"
-    if judged.verdict == "none" and found.residual is None:
+    probable = f"with a probability of {percent_words(judged.effects['none'])} there is none"
+    if judged.members[0] == NONE:
+        if found.residual is None:
+            return (
+                f"No gap is visible in these {images} images ({probable}), but a gap may exist. With fewer than {LEAST_IMAGES} images, no "
+                "image can be held out, and only a large gap can be excluded."
+            )
         return (
-            f"No gap is visible in these {images} images (p = {judged.p_value:.2g}). There are too few images to hold any of them out, so the "
-            "largest gap that noise could hide is unknown."
-        )
-    if judged.verdict == "none":
-        return (
-            f"No gap beyond noise and the error of the fit was found: on held-out images the gap is {left}, the noise is "
-            f"{found.noise_pct:.1f} %, and p = {judged.p_value:.2g}."
+            f"No gap beyond noise and the error of the fit was found: {probable}; on held-out images the gap is {left}, and the noise is "
+            f"{found.noise_pct:.1f} %.{_not_excluded(judged)}"
         )
     strongest = found.where[0]
     lead = f"There is a gap of {left}. It varies most {AXIS_WORDS[strongest.name]} and is largest in {_pointings(strongest.at)}."
@@ -217,25 +223,59 @@ def sentence(found: Diagnosis) -> str:
             f"There is a gap in the unocculted field, and it varies most {AXIS_WORDS[strongest.name]}. The discs do not show it "
             f"(the gap in the discs is {left})."
         )
-    best = judged.best
-    if judged.verdict == "unknown" or best is None:
-        like = _by_name(found, judged.probes[0].names[0]).cause if judged.probes else ""
-        close = f"; the gap most resembles {like}" if like and judged.probes[0].score > 0 else ""
-        return f"{lead} No effect of the library explains the gap{close}."
+    if judged.verdict == "unknown":
+        like = looks_like(judged)
+        close = f"; it most resembles {like[0][0]}" if like else ""
+        return f"{lead} Its cause is not in the library{close}."
     if judged.verdict == "tie":
         return (
             f"{lead} These data cannot show which effect causes the gap: {tied_words(judged)}. To separate these effects, take "
             f"{would_separate(found)}."
         )
-    if judged.discs_unexplained:
-        return f"{lead} {_capital(discs_unexplained_words(judged))}."
     if judged.verdict == "inconclusive":
         return (
-            f"{lead} This gap is likely (p = {judged.p_value:.2g}), but its cause is uncertain: the best effect changes with the "
-            "assumed floor, does not improve the prediction of held-out images, or fits no better than a pattern of unknown cause. "
-            f"The best effect so far is {words(best.label)}."
+            f"{lead if NONE not in judged.members else 'There may be a gap.'} These data do not decide its cause: "
+            f"{_listed(judged.members, judged)}."
         )
-    return f"{lead} {_explained(found, best)}.{_excluded(found, best)}"
+    return f"{lead} {_explained(found)}.{_not_excluded(judged)}"
+
+
+def _not_excluded(judged: Judgement) -> str:
+    """What the answer set contains beyond the verdict, as a sentence; empty if there is nothing."""
+    decided = 1 if judged.verdict == "none" else len(judged.deciding)
+    others = judged.members[decided:]
+    return f" These data do not exclude {_listed(others, judged)}." if others else ""
+
+
+def _listed(members: Sequence[Names], judged: Judgement) -> str:
+    """Hypotheses with their probabilities, as text; at most MOST_LISTED, the most probable first."""
+    shown = [
+        f"{hypothesis_words(names)} ({percent_words(judged.hypotheses[names])})"
+        for names in members[:MOST_LISTED]
+    ]
+    more = len(members) - len(shown)
+    rest = [f"{more} other{'s' if more > 1 else ''} of smaller probability"] if more else []
+    *first, last = [*shown, *rest]
+    return f"{', '.join(first)} or {last}" if first else last
+
+
+def hypothesis_words(names: Names) -> str:
+    """A hypothesis as text."""
+    if names == NONE:
+        return "no gap"
+    return (
+        "a cause outside the library"
+        if names == UNKNOWN
+        else " together with ".join(words(name) for name in names)
+    )
+
+
+def percent_words(share: float) -> str:
+    """A probability as text. It is never written as certain."""
+    percent = 100 * share
+    if percent >= 99.5:
+        return "> 99 %"
+    return "< 1 %" if percent < 0.5 else f"{percent:.0f} %"
 
 
 def _unocculted_alone(found: Diagnosis) -> bool:
@@ -247,12 +287,14 @@ def _unocculted_alone(found: Diagnosis) -> bool:
     unocculted = model.evidence.steady_unocculted
     return bool(
         chdtrc(freedom, cells)
-        > ALARM
+        > VISIBLE_P
         > chdtrc(unocculted.freedom, max(model.left_unocculted(model.base), 0.0))
     )
 
 
-def _explained(found: Diagnosis, best: Tried) -> str:
+def _explained(found: Diagnosis) -> str:
+    judged = found.judgement
+    best = next(fit for fit in found.fits if fit.names == judged.best)
     values = found.corrected[0].values if found.corrected else best.values
     numbers = [
         f"{words(name)} {value:.3g} ± {sigma:.2g} {unit}".strip()
@@ -260,8 +302,9 @@ def _explained(found: Diagnosis, best: Tried) -> str:
     ]
     in_short = in_short_if_many([value for value, _, _ in values.values()])
     return (
-        f"The gap is explained by {words(best.label)} ({in_short or ', '.join(numbers)}): on held-out images it falls from "
-        f"{found.rms.value:.1f} % to {found.after.value:.1f} %, and the noise is {found.noise_pct:.1f} %"
+        f"The gap is explained by {words(best.label)} ({in_short or ', '.join(numbers)}), with a probability of "
+        f"{percent_words(judged.hypotheses[best.names])}: on held-out images it falls from {found.rms.value:.1f} % to "
+        f"{found.after.value:.1f} %, and the noise is {found.noise_pct:.1f} %"
     )
 
 
@@ -269,15 +312,8 @@ def tied_words(judged: Judgement) -> str:
     """The tied effects, and the certain effects that act together with them, as text."""
     among = " or ".join(words(name) for name in judged.tied)
     beside = " and ".join(words(name) for name in judged.certain)
-    return f"{beside}, together with {among}" if beside else among
-
-
-def discs_unexplained_words(judged: Judgement) -> str:
-    """The statement that an effect explains the unocculted field, but not the gap in the discs."""
-    shown = words(judged.best.label) if judged.best is not None else "an effect"
-    return (
-        f"{shown} explains the unocculted field, but the cause of the gap in the discs cannot be identified"
-    )
+    alone = " alone or" if any(set(names) == set(judged.certain) for names in judged.named) else ""
+    return f"{beside},{alone} together with {among}" if beside else among
 
 
 def in_short_if_many(values: Sequence[float]) -> str | None:
@@ -287,29 +323,9 @@ def in_short_if_many(values: Sequence[float]) -> str | None:
     return f"{len(values)} parameters, root sum of squares {float(np.linalg.norm(values)):.2g}"
 
 
-def _excluded(found: Diagnosis, best: Tried) -> str:
-    """A sentence that says why the next best effect was excluded; empty if there is no such effect."""
-    gone = found.judgement.amiss  # the cautions name these effects
-    others = [t for t in found.judgement.tried if not set(t.names) & set(best.names) and t.label not in gone]
-    if not others:
-        return ""
-    next_best = max(others, key=lambda t: t.score)
-    name = words(next_best.label)
-    if best.score - next_best.score < TIE:  # the held-out images excluded it
-        return f" {_capital(name)} fits about equally well, but predicts held-out images clearly worse."
-    sigmas = (best.score - next_best.score) ** 0.5
-    shrunk = found.shrinking[next_best.label].closure
-    closes = "" if shrunk is None else f" closes {100 * max(shrunk.value, 0.0):.0f} % of the gap and"
-    return f" The next best effect, {name},{closes} is excluded at {sigmas:.1f} sigma."
-
-
 def _pointings(at: dict[str, Any]) -> str:
     numbers = at.get("pointings", [])
     return f"pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def words(name: str) -> str:

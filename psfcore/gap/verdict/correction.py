@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, left_chi2
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.verdict.judge import Tried, fitted, label_of, left_chi2
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.transit.transit import Transit
@@ -55,6 +55,15 @@ class Corrected:
         """The names of the effects, as the report writes them."""
         return label_of([effect.name for effect in self.effects])
 
+    def parameters(self, effect: str) -> dict[str, tuple[float, float]]:
+        """Value and error of each parameter of an effect."""
+        alone = len(self.effects) == 1
+        return {
+            label if alone else label.removeprefix(f"{effect}."): (value, sigma)
+            for label, (value, sigma, _) in self.values.items()
+            if alone or label.startswith(f"{effect}.")
+        }
+
     @property
     def covariance(self) -> Vector:
         """Covariance of the coordinates of the PSF, with the parameters of the effects free (coordinates, coordinates)."""
@@ -79,7 +88,7 @@ def images_without(transit: Transit, view: View, effects: Sequence[Effect], thet
 def add_to_model(
     solution: Solution,
     effects: Sequence[Effect],
-    found: Tried,
+    found: EffectFit,
     model: LinearModel,
     *,
     view: View | None = None,
@@ -167,7 +176,7 @@ class _Remaining:
     """
 
     model: LinearModel
-    left: Tried
+    left: EffectFit
     theta: Vector
     start: Vector | None
 
@@ -188,7 +197,7 @@ def _fit_remaining(
     """Fit what remains of the effects. out: the current parameters. in_images: whether the parameter was subtracted."""
     evidence = _with_noise_of(model.evidence, gather(view.solution, held, view=view, progress=progress))
     again = replace(model, evidence=evidence)
-    left = fitted(again, evidence.effects, any_sign=True)
+    left = fit_effects(again, evidence.effects, any_sign=True)
     found = np.array([value for value, _, _ in left.values.values()])
     if found.size != out.size:
         raise DataError(
@@ -243,24 +252,6 @@ def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[
     return out
 
 
-def beyond(
-    added: Corrected,
-    library: Sequence[Effect],
-    model: LinearModel,
-    *,
-    progress: Progress = lambda stage, step, steps: None,
-) -> LinearModel:
-    """The linear model at a full refit, with all effects of a library; the effects of the refit are always fitted.
-
-    Raises DataError "bad-effects" if an added effect fails.
-    """
-    whole = with_library(added, library, model, progress=progress)
-    evidence, names = whole.evidence, {effect.name for effect in added.effects}
-    base = len(evidence.base) + sum(len(evidence.columns.get(name, ())) for name in names)
-    effects = tuple(effect for effect in evidence.effects if effect.name not in names)
-    return replace(whole, evidence=replace(evidence, base=tuple(range(base)), effects=effects))
-
-
 def with_library(
     added: Corrected,
     library: Sequence[Effect],
@@ -304,7 +295,7 @@ def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
     )
 
 
-def _acting(effect: Effect, found: Tried, effects: int) -> Effect:
+def _acting(effect: Effect, found: EffectFit, effects: int) -> Effect:
     """The effect with only those parameters that the fit `found` contains. effects: the number of effects in the fit."""
     labels = [p.name if effects == 1 else f"{effect.name}.{p.name}" for p in effect.parameters]
     return _with_part(effect, [k for k, label in enumerate(labels) if label in found.values])

@@ -65,7 +65,7 @@ class Posterior:
     def with_evidence(self, evidence: Mapping[Names, Weighed], effects: int) -> Posterior:
         """The same posterior with another evidence of some hypotheses. effects: the number of effects in the library."""
         weights = {names: w.log_evidence + _log_prior(names, effects) for names, w in evidence.items()}
-        errors = dict.fromkeys(evidence, 0.0)
+        errors = {names: w.visible_error for names, w in evidence.items()}
         return replace(
             self, log_weights=self.log_weights | weights, visible_error=self.visible_error | errors
         )
@@ -80,9 +80,10 @@ def without_idle(probabilities: Mapping[Names, float]) -> dict[Names, float]:
     out = dict(probabilities)
     for names, share in probabilities.items():
         if kind_of(names) == "pair":
-            alone = max(((name,) for name in names), key=lambda one: probabilities.get(one, 0.0))
-            if share <= probabilities.get(alone, 0.0):
-                out[alone] += out.pop(names)
+            alone = [(name,) for name in names if (name,) in probabilities]  # a failed refit leaves one out
+            likelier = max(alone, key=lambda one: probabilities[one], default=None)
+            if likelier is not None and share <= probabilities[likelier]:
+                out[likelier] += out.pop(names)
     return _sorted(out)
 
 
@@ -92,7 +93,7 @@ def _sorted(probabilities: Mapping[Names, float]) -> dict[Names, float]:
 
 def posterior(model: LinearModel) -> Posterior:
     """The posterior in the linear model, without any full refit."""
-    evidence = _without_probes(model.evidence)
+    evidence = model.evidence
     further = discrepancy(evidence)
     likelihood = Likelihood(model, further.directions)
     weighed = {names: weigh(likelihood, evidence, names) for names in _hypotheses(evidence.effects)}
@@ -112,11 +113,6 @@ def posterior(model: LinearModel) -> Posterior:
     )
 
 
-def _without_probes(evidence: Evidence) -> Evidence:
-    """The evidence with only those effects that a verdict may name."""
-    return replace(evidence, effects=tuple(effect for effect in evidence.effects if effect.named))
-
-
 def at_refit(
     refit: LinearModel,
     before: LinearModel,
@@ -129,7 +125,7 @@ def at_refit(
     refit: the linear model at the refit, with the effects that may act. before: the linear model without any effect. taken: by
     effect, what the refit subtracted from the images, by parameter.
     """
-    after = _with_blocks_of(before.evidence, _without_probes(refit.evidence), taken)
+    after = _with_blocks_of(before.evidence, refit.evidence, taken)
     refit = replace(refit, evidence=after)
     likelihood = Likelihood(refit)
     others = [e.name for e in effects if e.name not in names] if len(names) == 1 else []

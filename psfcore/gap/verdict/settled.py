@@ -1,11 +1,14 @@
 """The settled posterior: the linear model is replaced by full refits where it is not exact enough.
 
 A plausible hypothesis is refitted if an error of its template (`likelihood.TEMPLATE_ERROR`) would be visible in the data. The most
-probable one comes first. The refits end when no plausible hypothesis needs one.
+probable one comes first. Before a pair, the more probable of its effects is refitted alone: this also weighs all pairs with this effect,
+and a strong effect that is not linear can make a pair look better than the effect alone. The refits end when no plausible
+hypothesis needs one.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
@@ -22,12 +25,17 @@ PLAUSIBLE = 0.02
 Refit = Callable[[Names], "Mapping[Names, Weighed] | None"]
 
 
-def settled_posterior(model: LinearModel, refit: Refit) -> tuple[Posterior, tuple[Names, ...]]:
-    """Two results: the posterior after the full refits; the hypotheses whose refit failed, which are left out."""
-    effects = sum(effect.named for effect in model.evidence.effects)
+def settled_posterior(model: LinearModel, refit: Refit | None) -> tuple[Posterior, tuple[Names, ...]]:
+    """Two results: the posterior after the full refits; the hypotheses whose refit failed, which are left out.
+
+    refit: None: the posterior of the linear model.
+    """
+    effects = len(model.evidence.effects)
     found = posterior(model)
     failed: list[Names] = []
     done: set[Names] = set()
+    if refit is None:
+        return found, ()
     for _ in range(MOST_REFITS):
         chosen = _to_refit(found, done)
         if chosen is None:
@@ -47,6 +55,10 @@ def _to_refit(found: Posterior, done: set[Names]) -> Names | None:
     for names, share in found.probabilities().items():
         if share < PLAUSIBLE:
             return None
-        if names not in done and found.visible_error.get(names, 0.0) > VISIBLE:
-            return names
+        if names in done or found.visible_error.get(names, 0.0) <= VISIBLE:
+            continue
+        alone = [(name,) for name in names]
+        if len(alone) > 1 and not done.intersection(alone):
+            return max(alone, key=lambda one: found.log_weights.get(one, -math.inf))
+        return names
     return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections import Counter
 from collections.abc import Sequence
@@ -32,11 +33,45 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> BlindSet:
 
 def test_kinds_have_their_shares_and_effects_occur_in_turn() -> None:
     cases = [draw_case(1, n, SIZE_PX, IMAGES) for n in range(72)]
-    assert Counter(case.kind for case in cases) == {CLEAN: 24, SINGLE: 30, PAIR: 6, FOREIGN: 12}
+    assert Counter(case.kind for case in cases) == {CLEAN: 24, SINGLE: 27, PAIR: 9, FOREIGN: 12}
     names = Counter(case.effects[0].name for case in cases if case.kind == SINGLE)
     assert set(names) == set(KNOWN)
     assert max(names.values()) - min(names.values()) <= 1
     assert all(len({effect.name for effect in case.effects}) == 2 for case in cases if case.kind == PAIR)
+
+
+def test_strong_effects_occur_alone_in_pairs_and_beside_a_changing_sun() -> None:
+    cases = [draw_case(2, n, SIZE_PX, IMAGES) for n in range(17 * 24)]
+    pairs = [case for case in cases if case.kind == PAIR]
+    beside_sun = [case for case in pairs[1::3] if case.effects[1].name == "scene_evolution"]
+    assert len(beside_sun) == len(pairs[1::3]) == 17
+    # Every other known effect stands beside the Sun once.
+    assert {case.effects[0].name for case in beside_sun} == set(KNOWN) - {"scene_evolution"}
+    assert {case.target_pct[1] for case in beside_sun} == {None}
+    assert all(0.02 <= case.effects[1].strength <= 0.3 for case in beside_sun)
+    targets = np.array([[*case.target_pct, np.nan][:2] for case in pairs], dtype=float)
+    assert (targets[1::3, 0] >= 10).all()
+    assert ((targets[2::3] >= 10) & (targets[2::3] <= 30)).all()
+    assert ((targets[0::3] >= 0.5) & (targets[0::3] <= 10)).all()
+    single = np.array([case.target_pct[0] for case in cases if case.kind == SINGLE], dtype=float)
+    np.testing.assert_array_equal(single >= 10, np.arange(single.size) % 4 == 3)
+
+
+def test_the_sun_beside_a_strong_effect_keeps_the_strength_that_was_drawn() -> None:
+    cases = (draw_case(2, n, SIZE_PX, IMAGES, built_diffraction=False) for n in range(96))
+    case = next(case for case in cases if case.target_pct[1:] == (None,))
+    truth = make(case).truth
+    assert truth["effects"][1]["strength"] == case.effects[1].strength
+    assert truth["effects"][0]["strength"] != case.effects[0].strength
+    assert truth["target_pct"][1] is None
+
+
+def test_a_set_of_an_earlier_draw_is_not_continued(tmp_path: Path) -> None:
+    plan = SetPlan(1, 3, SIZE_PX, IMAGES)
+    older = dataclasses.asdict(plan) | {"scenes": []}  # written before sets stated their draw
+    (tmp_path / "set.json").write_text(json.dumps(older))
+    with pytest.raises(DataError, match="other-set"):
+        make_set(tmp_path, plan)
 
 
 def test_a_case_is_the_same_for_its_seed_and_number() -> None:
@@ -99,6 +134,26 @@ def test_the_transit_contains_nothing_of_the_truth(made: BlindSet) -> None:
         }
 
 
+def test_the_images_without_noise_are_kept_apart_from_the_transit(made: BlindSet) -> None:
+    limits = FitsLimits(max_pixels=SIZE_PX**2)
+    seen = read_transit(made.transit(0), limits)
+    with_effects, without = (
+        read_transit(made.expected(0) / name, limits) for name in ("with_effects", "without_effects")
+    )
+    assert with_effects.noise == seen.noise
+    noisy, mean, clean = (np.array([f.pixels for f in t.frames]) for t in (seen, with_effects, without))
+    exposure = np.array([frame.exposure_s for frame in seen.frames])[:, None, None]
+    variance = np.array(
+        [seen.noise.variance(m, t) for m, t in zip(mean.astype(float), exposure.ravel(), strict=True)]
+    )
+    rounded = 1 / 12 / exposure**2  # the transit is in whole DN
+    chi2 = float(np.mean((noisy - mean) ** 2 / (variance + rounded)))
+    assert chi2 == pytest.approx(1.0, abs=0.02)
+    change = mean - clean  # a plane, the same in all images
+    np.testing.assert_allclose(change, np.broadcast_to(change[0], change.shape), atol=2e-3)
+    assert np.abs(change).max() > 0.01
+
+
 def test_the_truth_contains_what_an_effect_leaves(made: BlindSet) -> None:
     truth = made.truth(0)
     assert truth["effects"][0]["name"] == "intensity_gradient"
@@ -114,6 +169,7 @@ def test_a_clean_case_has_no_effect() -> None:
     assert result.truth["effects"] == []
     assert result.truth["left_after_refit_pct"] == 0.0
     assert result.truth["clean_left_pct"] < 0.8
+    assert result.expected == {}, "an ideal observer of clean data needs no images"
     assert all(np.array_equal(dn, np.rint(dn)) for dn in result.exposures)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from psfcore.blind.case_set import BlindSet
 from psfcore.blind.make_case import sealed
-from psfcore.blind.run_set import has_report, judged_cases, report_of, run_of, run_set
+from psfcore.blind.run_set import has_report, ideal_of, judged_cases, report_of, run_of, run_set
 from psfcore.errors import DataError
 
 TRUTH = {"kind": "clean", "effects": [], "left_before_refit_pct": 0.0, "left_after_refit_pct": 0.0}
@@ -32,6 +32,7 @@ def blind(tmp_path: Path) -> BlindSet:
     (made.folder / "truth").mkdir(parents=True)
     for number in range(3):
         made.transit(number).mkdir(parents=True)
+        made.expected(number).mkdir()
         (made.transit(number) / "transit.json").write_text(f"case {number}")
         seal, kept = sealed(TRUTH)
         made.truth_file(number).write_text(json.dumps(kept))
@@ -84,6 +85,54 @@ def test_failures_are_kept_apart_and_tried_again(blind: BlindSet, tmp_path: Path
     assert ([case.number for case in judged], list(failures)) == ([0], [1])
 
 
+IDEAL = """
+import json, pathlib, sys
+expected, ideal, log = map(pathlib.Path, sys.argv[1:4])
+with open(log, "a") as lines:
+    lines.write(f"ideal of {expected.parent.name}\\n")
+ideal.write_text(json.dumps({"schema": "gap-ideal/1", "found": sorted(p.name for p in expected.iterdir())}))
+"""
+
+
+def ideal(log: Path, code: str = IDEAL) -> list[str]:
+    return [sys.executable, "-c", code, "{expected}", "{ideal}", str(log)]
+
+
+def test_the_ideal_observer_sees_the_images_without_noise_once(blind: BlindSet, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    (blind.expected(1) / "with_effects").mkdir()
+    (run,) = run_set(blind, [1], command(log), ideal=ideal(log))
+    assert not run.failed
+    assert ideal_of(blind, 1) == {"schema": "gap-ideal/1", "found": ["with_effects"]}
+    assert not blind.expected(1).exists(), "the images are deleted after their use"
+    assert run_set(blind, [1], command(log), ideal=ideal(log)) == []
+    assert log.read_text().splitlines() == ["case 1", "ideal of 0001"]
+    judged, _ = judged_cases(blind, [1])
+    assert judged[0].ideal == ideal_of(blind, 1)
+
+
+def test_an_ideal_observer_that_fails_is_tried_again_without_a_new_diagnosis(
+    blind: BlindSet, tmp_path: Path
+) -> None:
+    log, said = tmp_path / "log", list[str]()
+    run_set(blind, [0], command(log), ideal=ideal(log, "import sys; sys.exit('dark')"), progress=said.append)
+    assert said[-1] == "case 0000 has no ideal observer: dark"
+    assert ideal_of(blind, 0) is None
+    assert has_report(blind, 0) and blind.expected(0).is_dir()
+    run_set(blind, [0], command(log), ideal=ideal(log), keep=True)
+    assert ideal_of(blind, 0) is not None
+    assert blind.expected(0).is_dir(), "kept on request"
+    assert log.read_text().splitlines() == ["case 0", "ideal of 0000"]
+
+
+def test_reports_with_a_set_are_accepted_and_others_refused(blind: BlindSet, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    run_set(blind, [0], command(log, DIAGNOSIS.replace("gap/1", "gap/2")))
+    assert report_of(blind, 0)["schema"] == "gap/2"
+    (other,) = run_set(blind, [1], command(log, DIAGNOSIS.replace("gap/1", "gap/9")))
+    assert "expected schema gap/1 or gap/2" in other.error
+
+
 def test_a_diagnosis_that_takes_too_long_is_killed(blind: BlindSet, tmp_path: Path) -> None:
     (late,) = run_set(blind, [0], command(tmp_path / "log", "import time; time.sleep(60)"), longest_s=0.5)
     assert late.failed
@@ -94,6 +143,8 @@ def test_a_diagnosis_that_takes_too_long_is_killed(blind: BlindSet, tmp_path: Pa
 def test_bad_commands_and_unsealed_cases_are_refused(blind: BlindSet, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="bad-command"):
         run_set(blind, [0], ["heliopsf", "gap", "{transit}"])
+    with pytest.raises(DataError, match="bad-command"):
+        run_set(blind, [0], command(tmp_path / "log"), ideal=["observe", "{expected}"])
     with pytest.raises(DataError, match="not-sealed"):
         run_set(blind, [7], command(tmp_path / "log"))
 

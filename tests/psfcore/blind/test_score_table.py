@@ -32,7 +32,7 @@ def report(
         for name, (value, low, high) in closures.items()
     ]
     return {
-        "schema": "gap/1",
+        "schema": "gap/2",
         "verdict": verdict,
         "answer": list(answer),
         "effects": entries,

@@ -52,3 +52,25 @@ def about_fit_with(name: str, model: LinearModel, *, left: float) -> LinearModel
         model,
         evidence=replace(evidence, discs=discs, unocculted=unocculted, effects=effects, columns=columns),
     )
+
+
+def drawn(model: LinearModel, values: dict[tuple[str, int], float], seed: int) -> LinearModel:
+    """The model with data drawn from it: noise, and the change by these parameters. values: by effect and number of the parameter."""
+    evidence, rng = model.evidence, np.random.default_rng(seed)
+    theta = np.zeros(evidence.size)
+    for (name, k), value in values.items():
+        theta[evidence.columns[name][k]] = value
+    discs = []
+    for disc in evidence.discs:
+        covariance = disc.covariance * model.disc_scale + model.floor**2 * np.outer(
+            disc.expected, disc.expected
+        )
+        noise = rng.multivariate_normal(0 * disc.expected, covariance, check_valid="ignore")
+        discs.append(replace(disc, residual=disc.jacobian.T @ theta + noise))
+    blocks = evidence.unocculted
+    levels = blocks.means + np.tensordot(theta, blocks.errors, axes=1)
+    levels += rng.normal(size=levels.shape) * np.sqrt(blocks.variance * model.unocculted_scale)
+    levels += blocks.means * blocks.gain_width * rng.normal(size=(levels.shape[0], 1))
+    changed = replace(evidence, discs=tuple(discs), unocculted=replace(blocks, levels=levels))
+    changed.unocculted.__dict__["gain_width"] = blocks.gain_width  # known, as the prior of the model has it
+    return replace(model, evidence=changed)

@@ -18,12 +18,11 @@ from tests.transit_files import TRUTH, diffraction
 
 OFFSET_DN = 6.0
 QUICK = patch.object(where, "SIGN_FLIPS", 99)  # quicker than 999
-# Effects of each stage, one that these data cannot show, and a probe: a diagnosis with them takes seconds.
+# Effects of each stage, and two that these data cannot show: a diagnosis with them takes seconds.
 FEW = tuple(
     effect
     for effect in LIBRARY
-    if effect.name
-    in ("dark_offset", "gain_mismatch", "core_blur", "scene_evolution", "saturation_fill", "patch_of_light")
+    if effect.name in ("dark_offset", "gain_mismatch", "core_blur", "scene_evolution", "saturation_fill")
 )
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from psfcore.gap.evidence.discrepancy import ALTERNATIVES, OF_BLOCKS, discrepancy
+from psfcore.gap.evidence.discrepancy import ALTERNATIVES, EACH_READOUT, OF_BLOCKS, discrepancy
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Likelihood
 from psfcore.gap.evidence.linear_model import LinearModel
@@ -42,7 +42,9 @@ def test_every_order_has_columns_that_change_the_data(evidence: Evidence) -> Non
     assert set(found.orders) == {order for orders in ALTERNATIVES for order in orders}
     for order, some in found.orders.items():
         planes = (
-            found.directions.unocculted if order in OF_BLOCKS else np.moveaxis(found.directions.discs, 2, 0)
+            found.directions.unocculted
+            if order in (*OF_BLOCKS, EACH_READOUT)
+            else np.moveaxis(found.directions.discs, 2, 0)
         )
         assert all(planes[column].any() for column in some)
 

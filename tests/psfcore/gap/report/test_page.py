@@ -12,19 +12,31 @@ import numpy as np
 import pytest
 
 from psfcore.drawing.page import with_error
-from psfcore.gap.diagnose import Diagnosis, Shrinking
+from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.report import bars
 from psfcore.gap.report import plot as gap_plot
 from psfcore.gap.report.bars import draw_effects
 from psfcore.gap.report.page import gap_page, interval_words, unit_words
 from psfcore.gap.report.plot import cell_means, draw_cells, draw_map, gap_png, simulated_of
-from psfcore.gap.report.report import gap_report
-from psfcore.gap.verdict.judge import fitted
+from psfcore.gap.report.report import gap_report, hypothesis_words, percent_words
+from psfcore.gap.verdict.limits import Alike
+from psfcore.gap.verdict.posterior import UNKNOWN
 from tests.blank_figures import blank_figures
 from tests.html_page import Tag, check_stands_alone, read_page
+from tests.psfcore.gap.report.judged import (
+    HOLDS_FOR,
+    LEAST,
+    OFFSET_BLUR,
+    OFFSET_GAIN,
+    SHARES,
+    judged,
+    with_shares,
+)
 from tests.psfcore.gap.small_gaps import OFFSET_DN, found
 
 MADE_BY = {"software_version": "1.2.3", "seed": 5, "libraries": {"numpy": "9.9"}, "started_from_psf": None}
+
+EFFECT_COLUMNS = 7  # of the table of effects; the other tables that begin with an effect have fewer columns
 
 
 def report_of(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -52,17 +64,18 @@ def blank() -> Iterator[None]:
         yield
 
 
-def judged(verdict: Any, *answer: str) -> Diagnosis:
-    """The same numbers with another verdict."""
-    changed = replace(found().judgement, verdict=verdict, answer=answer)
-    if verdict == "tie":
-        return replace(found(), judgement=changed)
-    return replace(found(), judgement=changed, corrected=(), residual_after=None)
-
-
 def text_of(page: str) -> str:
     body = next(tag for tag in read_page(page) if tag.name == "body")
     return body.text.replace("\N{NO-BREAK SPACE}", " ")
+
+
+def rows_of(page: str) -> list[list[str]]:
+    """The cells of every row of every table."""
+    rows: dict[int, list[str]] = {}
+    for tag in read_page(page):
+        if tag.name == "td":
+            rows.setdefault(id(tag.within[-1]), []).append(tag.text.replace("\xa0", " "))
+    return list(rows.values())
 
 
 def pictures(tags: list[Tag]) -> list[str]:
@@ -101,14 +114,16 @@ def test_the_page_has_all_figures_and_one_picture_combines_them() -> None:
 
 
 def test_the_tables_list_all_effects_with_closure_and_those_not_tested() -> None:
-    cells = [t.text.replace("\xa0", " ") for t in read_page(html()) if t.name == "td"]
+    rows = rows_of(html())
+    tested = {row[0]: row for row in rows if len(row) == EFFECT_COLUMNS}
     for effect in report_of(found())["effects"]:
-        row = cells.index(effect["name"].replace("_", " "))
+        row = tested[effect["name"].replace("_", " ")]
+        assert row[1] == percent_words(effect["probability"])
         for name, p in effect["parameters"].items():
-            assert f"{name} {with_error(p['value'], p['sigma'])}" in cells[row + 1]
+            assert f"{name} {with_error(p['value'], p['sigma'])}" in row[2]
         low, high = (round(100 * one) for one in effect["closure"]["ci90"])
-        assert cells[row + 5] == f"{low + 0} to {high + 0}"
-    assert cells[cells.index("saturation fill") + 1] == "no pixel was filled in"
+        assert row[5] == f"{low + 0} to {high + 0}"
+    assert ["saturation fill", "no pixel was filled in"] in rows
 
 
 def test_the_psf_is_shown_before_and_with_the_answer() -> None:
@@ -134,82 +149,99 @@ def test_images_inputs_and_provenance_are_listed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("verdict", "answer", "told"),
+    ("verdict", "told"),
     [
-        ("none", (), "There is no gap, so no effect is needed"),
-        ("unknown", (), "No effect and no pair of effects explains the gap"),
-        ("inconclusive", (), "changes with the assumed floor"),
-        ("tie", ("dark_offset", "gain_mismatch"), "Tied: dark offset or gain mismatch."),
+        (
+            "none",
+            "Most probably there is no gap. An effect that is in the answer set or in the table may still act",
+        ),
+        ("attributed", "To confirm the named effects, take a dark exposure"),
+        ("unknown", "No effect of the library and no pair of effects is in the answer set"),
+        ("inconclusive", "These data do not decide between the hypotheses of the answer set"),
+        ("tie", "Tied: dark offset or gain mismatch."),
     ],
 )
-def test_every_verdict_is_explained_on_its_page(
-    verdict: str, answer: tuple[str, ...], told: str, blank: None
-) -> None:
-    diagnosis = judged(verdict, *answer)
+def test_every_verdict_is_explained_on_its_page(verdict: str, told: str, blank: None) -> None:
+    diagnosis = judged(verdict)
     page = gap_page(diagnosis, report_of(diagnosis)).html()
     check_stands_alone(page)
-    text = text_of(page)
+    text, answered = text_of(page), verdict in ("attributed", "tie")
     assert told in text and values(read_page(page))["verdict"] == verdict
-    assert ("No effect was added to the model" in text) is (verdict != "tie")
+    assert ("No effect was added to the model" in text) is not answered
     # Slices are shown only if an effect was added to the model.
-    assert any(name.startswith("Observed") for name in pictures(read_page(page))) is (verdict == "tie")
+    assert any(name.startswith("Observed") for name in pictures(read_page(page))) is answered
     # Bars of closure are shown only if there is a gap.
     assert ("Bars of held-out closure by effect" in pictures(read_page(page))) is (verdict != "none")
     assert ("To separate the tied effects, take a dark exposure" in text) is (verdict == "tie")
     assert ("with the named effects” means with the best of the tied effects: dark offset" in text) is (
         verdict == "tie"
     )
-    assert ("a patch of added light" in text) is (verdict in ("unknown", "inconclusive"))
+    unknown = UNKNOWN in diagnosis.judgement.members
+    assert ("If the cause is not in the library: the patterns that the gap resembles" in text) is unknown
+    assert ("a change that varies with the position along detector x and the pointing" in text) is unknown
 
 
-def test_an_unexplained_gap_in_the_discs_is_reported_separately(blank: None) -> None:
-    diagnosis = judged("inconclusive")
-    diagnosis = replace(diagnosis, judgement=replace(diagnosis.judgement, discs_unexplained=True))
-    report = report_of(diagnosis)
-    told = "dark offset explains the unocculted field, but the cause of the gap in the discs cannot be identified"
-    assert told[1:] in report["sentence"] and "assumed floor" not in report["sentence"]
-    text = text_of(gap_page(diagnosis, report).html())
-    assert f"The report names no effect: {told}." in text and "assumed floor" not in text
+@pytest.mark.parametrize("verdict", list(SHARES))
+def test_the_page_shows_the_hypotheses_and_for_which_data_the_coverage_holds(
+    verdict: str, blank: None
+) -> None:
+    diagnosis = judged(verdict)
+    page = gap_page(diagnosis, report_of(diagnosis)).html()
+    text = text_of(page)
+    assert HOLDS_FOR in text and "19 simulated transits of known cause" in text
+    assert "the stated coverage is not guaranteed" in text
+    rows = rows_of(page)
+    for names, share in SHARES[verdict].items():
+        assert [hypothesis_words(names), percent_words(share), "yes" if share >= LEAST else ""] in rows
+    said = values(read_page(page))
+    assert said["answer set"] == "; ".join(map(hypothesis_words, diagnosis.judgement.members))
+    assert said["probability of no gap"] == percent_words(SHARES[verdict][()])
+    assert "in 90 % of the cases" in text
+    name = "most probable effects" if verdict == "inconclusive" else "named effects"
+    assert said[name] == (", ".join(diagnosis.judgement.answer).replace("_", " ") or "none")
+
+
+def test_the_page_shows_what_the_data_could_have_shown_and_what_they_cannot_tell_apart(blank: None) -> None:
+    rows = rows_of(html())
+    for limit in found().limits.effects.values():
+        one = limit.leading
+        shown = [f"{one.found_90:.3g}", f"{one.excluded_95:.3g}", one.unit]
+        assert [limit.effect.replace("_", " "), one.name, *shown] in rows
+    assert "No two effects are closer than 3 sigma" in text_of(html())
+    pair = Alike(("dark_offset", "core_blur"), 1.4, "a series of exposure times")
+    close = replace(found(), limits=replace(found().limits, alike=(pair,)))
+    page = gap_page(close, report_of(close)).html()
+    assert ["dark offset and core blur", "1.40", "a series of exposure times"] in rows_of(page)
+    assert "No two effects are closer" not in text_of(page)
 
 
 def test_a_tie_names_the_certain_and_the_tied_effects(coarse: None) -> None:
-    both = judged("tie", "core_blur", "dark_offset", "gain_mismatch")
-    both = replace(both, judgement=replace(both.judgement, certain=("dark_offset",)))
+    both = with_shares({OFFSET_BLUR: 0.5, OFFSET_GAIN: 0.45, UNKNOWN: 0.03, (): 0.02})
     report = report_of(both)
     assert report["ties"] == [["core_blur", "gain_mismatch"]]
-    told = "dark offset, together with core blur or gain mismatch"
-    assert f"These data cannot show which effect causes the gap: {told}." in report["sentence"]
-    assert "a dark exposure" not in report["would_separate"] and "both gain modes" in report["would_separate"]
-    assert f"Tied: {told}." in text_of(gap_page(both, report).html())
+    assert "Tied: dark offset, together with core blur or gain mismatch." in text_of(
+        gap_page(both, report).html()
+    )
     rows = [
         {"name": name}
-        for name in ("dark_offset", "core_blur", "core_blur + dark_offset", "persistence + dark_offset")
+        for name in ("dark_offset", "core_blur", "dark_offset + core_blur", "dark_offset + persistence")
     ]
     assert [bars._chosen(row, report) for row in rows] == [False, False, True, False]
 
 
-def test_effects_of_a_pair_come_before_effects_that_explain_more_alone(blank: None) -> None:
-    judgement = found().judgement
-    alone = [one for one in judgement.tried if one.label != "dark_offset"]
-    last = alone[-1].label
-    names = ("dark_offset", last)
-    pair = replace(
-        fitted(found().model, [e for e in found().evidence.effects if e.name in names]), left_p_value=0.5
-    )
-    both = replace(
-        found(), judgement=replace(judgement, answer=pair.names, tried=(pair, *judgement.tried), best=pair)
-    )
-    both = replace(both, shrinking=found().shrinking | {pair.label: Shrinking(None, None, None)})
+def test_a_tie_of_an_effect_and_a_pair_with_it_marks_both(coarse: None) -> None:
+    report = report_of(with_shares({("dark_offset",): 0.4, OFFSET_BLUR: 0.55, UNKNOWN: 0.03, (): 0.02}))
+    assert report["verdict"] == "tie"
+    rows = [{"name": name} for name in ("dark_offset", "core_blur", "dark_offset + core_blur")]
+    assert [bars._chosen(row, report) for row in rows] == [True, False, True]
+
+
+def test_effects_of_a_pair_come_before_single_effects(blank: None) -> None:
+    both = with_shares({OFFSET_BLUR: 0.93, UNKNOWN: 0.04, (): 0.03})
     report = report_of(both)
-    assert [fit["name"] for fit in report["effects"]][:2] == ["dark_offset", last]
-    assert len(report["effects"]) == len(judgement.tried)
-    assert [fit["name"] for fit in report["together"]] == [pair.label]
-    # An effect measured in the unocculted field comes second, because it fits that field whatever the other does.
-    measured = replace(both.evidence, numbers={both.evidence.columns["dark_offset"][0]: 9})
-    report_so = report_of(replace(both, model=replace(both.model, evidence=measured)))
-    assert [fit["name"] for fit in report_so["effects"]][:2] == [last, "dark_offset"]
-    rows = [tag.text for tag in read_page(gap_page(both, report).html()) if tag.name == "td"]
-    at = [rows.index(name.replace("_", " ")) for name in (pair.label, "dark_offset", last)]
+    (label,) = (fit["name"] for fit in report["together"])
+    effects = [row[0] for row in rows_of(gap_page(both, report).html()) if len(row) == EFFECT_COLUMNS]
+    at = [effects.index(name.replace("_", " ")) for name in (label, "dark_offset", "gain_mismatch")]
     assert at == sorted(at)
 
 

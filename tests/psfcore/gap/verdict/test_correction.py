@@ -1,9 +1,10 @@
-"""Full refits with effects in the model, and a second effect after the first."""
+"""Full refits with effects in the model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.effect_fits import fit_effects
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.search import displaced
@@ -19,39 +21,11 @@ from psfcore.gap.library.optics import (
     _copy,
 )
 from psfcore.gap.verdict import correction
-from psfcore.gap.verdict import judge as judging
-from psfcore.gap.verdict.correction import _with_noise_of, add_to_model, beyond, images_without
-from psfcore.gap.verdict.judge import fitted
+from psfcore.gap.verdict.correction import Corrected, _with_noise_of, add_to_model, images_without
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
 from psfcore.transit.transit import Transit
 from tests.psfcore.gap.small_transits import clean, effect
-
-
-@pytest.mark.slow
-def test_a_second_effect_is_found_in_the_discs_after_one_of_the_unocculted_field() -> None:
-    """A gain mismatch, which the discs do not show, and a light leak, which only the discs show."""
-    transit = clean()
-    x = np.indices(transit.shape)[1] / 128 - 0.5
-    frames = tuple(
-        replace(
-            frame,
-            pixels=(
-                (frame.pixels + 6.0 + 20.0 * x) * (1.1 if (frame.gain_mode or "") == "combined" else 1.0)
-            ).astype(np.float32),
-        )
-        for frame in transit.frames
-    )
-    found = invert(replace(transit, frames=frames))
-    library = [effect(name) for name in ("gain_mismatch", "intensity_gradient", "dark_offset", "core_blur")]
-    model = LinearModel(gather(found, library), FLOOR)
-    best = fitted(model, [library[0]])
-    added = add_to_model(found, [library[0]], best, model)
-    second = judging._beside(model, best, lambda tried: beyond(added, library, model))
-    assert second is not None and second.verdict == "attributed"
-    assert second.answer == ("gain_mismatch", "intensity_gradient")
-    nothing = judging._beside(model, best, judging.no_refit)
-    assert nothing is None
 
 
 def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,10 +51,31 @@ def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch:
 
     monkeypatch.setattr(correction, "images_without", spoiled)
     monkeypatch.setattr(correction, "SETTLED", 0.0)
-    added = add_to_model(found, [offset], fitted(model, [offset]), model)
+    added = add_to_model(found, [offset], fit_effects(model, [offset]), model)
     value, sigma, _ = added.values["offset"]
     assert len(taken_out) == 2 and added.rounds == 1
     assert value == pytest.approx(1.0, abs=4 * sigma)
+    assert added.parameters("dark_offset") == {"offset": (value, sigma)}
+    assert added.subtracted["dark_offset"] == pytest.approx((1.0,), abs=4 * sigma)
+
+
+def test_a_refit_gives_the_parameters_of_each_effect() -> None:
+    """The names of the parameters, without the name of the effect that precedes them if several effects are fitted together."""
+
+    def refit(names: Sequence[str], values: dict[str, tuple[float, float, str]]) -> Corrected:
+        kept: Any = None  # not read
+        return Corrected(tuple(effect(name) for name in names), kept, kept, kept, values, {}, 1)
+
+    alone = refit(["ghost"], {"share": (0.1, 0.01, "")})
+    assert alone.parameters("ghost") == {"share": (0.1, 0.01)} and alone.label == "ghost"
+    both = refit(
+        ["ghost", "column_smear"],
+        {"ghost.share": (0.1, 0.01, ""), "column_smear.share_below": (0.2, 0.02, "")},
+    )
+    assert both.parameters("ghost") == {"share": (0.1, 0.01)}
+    assert both.parameters("column_smear") == {"share_below": (0.2, 0.02)}
+    assert both.parameters("dark_offset") == {}
+    assert both.label == "ghost + column_smear"
 
 
 def test_a_share_of_light_cannot_be_negative() -> None:
@@ -92,7 +87,7 @@ def test_a_share_of_light_cannot_be_negative() -> None:
     )
     found = invert(replace(clean(), frames=frames))
     model = LinearModel(gather(found, [smear]), FLOOR)
-    below = fitted(model, [smear], any_sign=True)
+    below = fit_effects(model, [smear], any_sign=True)
     assert all(value < 0 for value, _, _ in below.values.values())
     with pytest.raises(DataError, match="expected column_smear to add light") as caught:
         add_to_model(found, [smear], below, model)

@@ -1,15 +1,13 @@
-"""The posterior: probabilities of hypotheses, full refits that replace the linear model, and blocks at a refit."""
+"""The posterior: probabilities of hypotheses, and blocks at a refit."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence
-from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict.posterior import (
     NONE,
@@ -20,14 +18,9 @@ from psfcore.gap.verdict.posterior import (
     posterior,
     without_idle,
 )
-from psfcore.gap.verdict.settled import VISIBLE, settled_posterior
 from tests.psfcore.gap.linear_models import with_residuals
 
 OFFSET: Names = ("dark_offset",)
-
-
-def weighed(log_evidence: float) -> Weighed:
-    return Weighed(log_evidence, (), np.zeros(0), 0.0)
 
 
 def strong_offset(evidence: Evidence) -> LinearModel:
@@ -57,32 +50,12 @@ def test_a_pair_that_the_data_do_not_show_counts_to_its_effect() -> None:
     assert [kind_of(names) for names in (NONE, UNKNOWN, *found)][:3] == ["none", "unknown", "single"]
 
 
-def test_a_strong_effect_is_refitted_and_the_evidence_of_the_refit_counts(evidence: Evidence) -> None:
-    asked: list[Names] = []
-
-    def refit(names: Names) -> Mapping[Names, Weighed]:
-        asked.append(names)
-        return {names: weighed(-1e6)}
-
-    model = strong_offset(evidence)
-    assert posterior(model).visible_error[OFFSET] > VISIBLE
-    found, failed = settled_posterior(model, refit)
-    assert asked[0] == OFFSET and failed == ()
-    assert len(set(asked)) == len(asked)
-    assert OFFSET not in list(found.probabilities())[:2]
-
-
-def test_a_hypothesis_whose_refit_fails_is_left_out(evidence: Evidence) -> None:
-    found, failed = settled_posterior(strong_offset(evidence), lambda names: None)
-    assert failed[0] == OFFSET
-    assert not set(failed) & set(found.probabilities())
-
-
-def test_a_weak_effect_needs_no_refit(evidence: Evidence) -> None:
-    def refit(names: Names) -> Mapping[Names, Weighed]:
-        raise AssertionError(f"{names} was refitted")
-
-    settled_posterior(replace(with_residuals(evidence, {}, noise=0.5), scale_error=0.1), refit)
+def test_after_a_failed_refit_a_pair_without_any_weight_counts_to_its_other_effect() -> None:
+    """One effect alone was left out. The pair is so improbable that its share is 0."""
+    only, pair = ("b",), ("a", "b")
+    assert without_idle({NONE: 1.0, only: 0.0, pair: 0.0}) == {NONE: 1.0, only: 0.0}
+    assert without_idle({NONE: 1.0, pair: 0.0}) == {NONE: 1.0, pair: 0.0}
+    assert without_idle({NONE: 0.5, only: 0.1, pair: 0.4}) == {NONE: 0.5, pair: 0.4, only: 0.1}
 
 
 def test_the_blocks_of_a_refit_keep_their_noise_and_lose_the_effect(evidence: Evidence) -> None:

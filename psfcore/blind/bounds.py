@@ -1,0 +1,107 @@
+"""What could be known about a case: how probably an ideal observer names its cause, and nothing else.
+
+The ideal observer knows the noise and the form of every effect. It says for every hypothesis h about the cause what chi2 the
+hypothesis leaves of the noise-free gap after everything unknown is refitted (ideal.json, gap-ideal/1). The truth leaves 0. With
+lambda_h, that chi2 plus the cost of h minus the cost of the truth, the noise of one transit gives
+
+    chi2 of h - chi2 of the truth  ~  Normal(lambda_h, 4 lambda_h)                                   Eq. (1)
+
+because it is twice the logarithm of a likelihood ratio of two Gaussians (Kay, Fundamentals of Statistical Signal Processing II,
+1998, section 4.3). A hypothesis with fewer effects than the truth is simpler, and only significant data exclude it:
+
+    P = Phi(sqrt(lambda_h) - z),   z = Phi^-1(1 - LEVEL / (2 M))                                     Eq. (2)
+
+This is the power of a two-sided test of one among M effects (a noncentral chi2 of one degree of freedom, with the level
+divided by M after Bonferroni): for 18 effects it is 0.5, 0.9 and 0.99 at lambda 9, 18 and 28. A hypothesis with as many effects
+as the truth is as probable as the truth beforehand, and the one with the smallest chi2 is named. The truth is named if it is
+the best of all of them:
+
+    P = integral of phi(u) product over h of Phi(u + sqrt(lambda_h / 2)) du                          Eq. (3)
+
+For one rival this is Phi(sqrt(lambda) / 2). For M equally distant ones it is the forced choice between M + 1 alternatives, a
+maximum of Gaussian variables (Green and Swets, Signal Detection Theory and Psychophysics, 1966, chapter 2). Hypotheses with more
+effects than the truth contain it or are less probable; they are left out, and so are those that a right answer may name
+(`scoring`). The bound is the smallest of Eq. (2), for all hypotheses with fewer effects, and Eq. (3). A true effect that a right
+answer need not name counts as an effect of the truth if Eq. (2) finds it beside the others with a probability of one half or more:
+a rival then has to explain it too.
+
+Of an effect that is in no library every hypothesis of the library is a simpler one: unknown is what remains when all are excluded.
+On clean data the ideal observer names an effect with the probability LEVEL.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import log_ndtr, ndtr, ndtri
+
+Effects = frozenset[str]
+
+LEVEL = 0.05
+SCHEMA = "gap-ideal/1"
+_U = np.linspace(-9.0, 9.0, 721)
+_PHI = np.exp(-0.5 * _U**2) / math.sqrt(2 * math.pi) * (_U[1] - _U[0])
+
+
+@dataclass(frozen=True)
+class Known:
+    """What an ideal observer could know about a case.
+
+    noncentrality: what the effects leave after the PSF is refitted. rival: lambda of the nearest hypothesis that is not true;
+    None for clean data. alone: the probability that the observer names the truth, and only the truth.
+    """
+
+    noncentrality: float
+    rival: float | None
+    alone: float
+
+
+CLEAN = Known(0.0, None, 1 - LEVEL)
+
+
+def known(ideal: dict[str, Any], required: Sequence[str], true: Sequence[str], *, in_library: bool) -> Known:
+    """What could be known about a case. ideal: gap-ideal/1. required: the true effects that a right answer contains.
+
+    true: all true effects. in_library: whether the library contains them.
+    """
+    left = {
+        frozenset(one["effects"]): (float(one["chi2"]), float(one["cost"])) for one in ideal["hypotheses"]
+    }
+    among = max(sum(len(h) == 1 for h in left), 1)
+    shown = _shown(left, frozenset(required), frozenset(true), among)
+    own_cost = left[shown][1] if in_library and shown in left else 0.0
+    size = len(shown) if in_library else math.inf
+    others = {
+        h: max(chi2 + cost - own_cost, 0.0)
+        for h, (chi2, cost) in left.items()
+        if len(h) <= size and not (in_library and h >= frozenset(required))
+    }
+    simpler = [lam for h, lam in others.items() if len(h) < size]
+    equal = [lam for h, lam in others.items() if len(h) == size]
+    alone = min([excluded(lam, among) for lam in simpler] + [best_of(equal)])
+    return Known(float(ideal["noncentrality"]), min(simpler + equal, default=None), alone)
+
+
+def _shown(left: dict[Effects, tuple[float, float]], required: Effects, true: Effects, among: int) -> Effects:
+    """The true effects that count: all of them if the data show those that are not required, otherwise the required ones."""
+    if required == true or required not in left or true not in left:
+        return required
+    gain = sum(left[required]) - sum(left[true])
+    return true if excluded(max(gain, 0.0), among) >= 0.5 else required
+
+
+def excluded(lam: float, among: int) -> float:
+    """Eq. (2): the probability that a simpler hypothesis is excluded. among: M, the number of effects that are tested."""
+    return float(ndtr(math.sqrt(lam) - ndtri(1 - LEVEL / (2 * among))))
+
+
+def best_of(lams: Sequence[float]) -> float:
+    """Eq. (3): the probability that the truth leaves less chi2 than every rival. 1 without rivals."""
+    if not lams:
+        return 1.0
+    above = _U[:, None] + np.sqrt(np.asarray(lams, dtype=np.float64) / 2)
+    return float(min(np.sum(_PHI * np.exp(log_ndtr(above).sum(axis=1))), 1.0))

@@ -1,0 +1,109 @@
+"""The rows of the table that judge the set of hypotheses in reports of schema gap/2.
+
+"Covers", "right and alone" and the members of a set are explained in `scoring`. "Noncentrality" and "rival" are figures of the
+ideal observer (`bounds`): what the effects leave after the PSF is refitted, and the distance to the nearest hypothesis that is
+not true. Rows that need them count only cases for which they were computed.
+
+| row | cases | counted |
+|---|---|---|
+| set covers the truth: all, clean, single, pair, not in the library | all, or of one kind | a member covers the truth |
+| mean number of members | all; cases with a noncentrality of SEEN or more | number of members of the set |
+| right and alone / ideal observer | cases with an ideal observer, and clean cases | the sets that are right and alone, divided by the number that is expected of the ideal observer |
+| clean data: set without [] | clean | no member is [] |
+| one wrong effect alone in the set | all | the only member names effects, none of which is true |
+| not in the library: unknown in the set | effects that are not in the library, with a noncentrality, or a rival, of SEEN or more | a member is ["unknown"] |
+| strong effects | cases with STRONG_PCT left or more | a member covers the truth |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import mean
+
+from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE
+from psfcore.blind.rows import Row, of_values, share, share_of_expected
+from psfcore.blind.scoring import (
+    NOTHING,
+    Judged,
+    has_only_wrong_effects,
+    is_right_and_alone,
+    set_covers_truth,
+)
+
+SEEN = 30.0  # chi2: among eighteen effects, one that leaves this is found with a probability of 0.99
+STRONG_PCT = 10.0
+KIND_WORDS = {CLEAN: "clean", SINGLE: "one effect", PAIR: "two effects", FOREIGN: "not in the library"}
+
+
+def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
+    """The rows. Empty if no report states a set."""
+    stated = [case for case in judged if case.members is not None]
+    if not stated:
+        return ()
+    seen = [case for case in stated if case.noncentrality >= SEEN]
+    foreign = [case for case in stated if case.kind == FOREIGN]
+    return (
+        share("set covers the truth", stated, set_covers_truth, ">= 0.90", lambda p: p >= 0.9),
+        *(
+            share(
+                f"the same, {words}",
+                [case for case in stated if case.kind == kind],
+                set_covers_truth,
+            )
+            for kind, words in KIND_WORDS.items()
+        ),
+        of_values("mean number of members of the set", [_size(case) for case in stated], mean),
+        of_values(
+            "the same, noncentrality >= 30",
+            [_size(case) for case in seen],
+            mean,
+            "<= 1.5",
+            lambda value: value <= 1.5,
+        ),
+        _against_ideal("right and alone / ideal observer", stated),
+        _against_ideal("the same, without clean data", [case for case in stated if case.kind != CLEAN]),
+        share(
+            "clean data: set without []",
+            [case for case in stated if case.kind == CLEAN],
+            lambda case: NOTHING not in (case.members or ()),
+        ),
+        share(
+            "one wrong effect alone in the set",
+            stated,
+            has_only_wrong_effects,
+            "<= 0.02",
+            lambda p: p <= 0.02,
+        ),
+        share(
+            "not in the library, noncentrality >= 30: unknown in set",
+            [case for case in foreign if case.noncentrality >= SEEN],
+            set_covers_truth,
+            ">= 0.80",
+            lambda p: p >= 0.8,
+        ),
+        share(
+            "the same, nearest rival >= 30",
+            [case for case in foreign if case.known is not None and (case.known.rival or 0.0) >= SEEN],
+            set_covers_truth,
+        ),
+        share(
+            "set covers the truth, >= 10 % left",
+            [case for case in stated if case.left_pct >= STRONG_PCT],
+            set_covers_truth,
+            ">= 0.95",
+            lambda p: p >= 0.95,
+        ),
+    )
+
+
+def _size(case: Judged) -> float:
+    return float(len(case.members or ()))
+
+
+def _against_ideal(figure: str, cases: Sequence[Judged]) -> Row:
+    return share_of_expected(
+        figure,
+        [case for case in cases if case.known is not None],
+        is_right_and_alone,
+        lambda case: 0.0 if case.known is None else case.known.alone,
+    )

@@ -1,0 +1,125 @@
+"""The linear fit of some effects, as a report states it: parameters, gain and p-value.
+
+The gain of an effect is the decrease of chi2 when its parameters are fitted together with the PSF. From noise alone, a
+free parameter gains a chi2 variable with one degree of freedom, and the parameters of a random field gain less
+(`linear_model`, Eq. (3)). If an effect searched among many templates, its p-value is multiplied by their number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.linear_model import LinearModel, Step
+
+Vector = NDArray[np.float64]
+
+COST_OF_NUMBERS = 2.0  # a change that was measured in the blocks must gain this much for each measured number
+
+
+@dataclass(frozen=True, eq=False)
+class EffectFit:
+    """The linear fit of one effect, or of several effects, together with the PSF.
+
+    values: value, error and unit of each parameter; the key is "parameter", or "effect.parameter" if there are several
+    effects. gain: the decrease of chi2. p_value: of the gain. step: the fit.
+    """
+
+    names: tuple[str, ...]
+    values: dict[str, tuple[float, float, str]]
+    gain: float
+    p_value: float
+    step: Step
+
+    @property
+    def label(self) -> str:
+        """The names of the effects, as the report writes them."""
+        return label_of(self.names)
+
+
+def label_of(names: Sequence[str]) -> str:
+    """Names of effects, as the report writes them."""
+    return " + ".join(names)
+
+
+def fit_effects(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool = False) -> EffectFit:
+    """Fit the coordinates of the PSF together with these effects.
+
+    A parameter that must be positive is left out if its fitted value is not positive. A parameter whose change was measured
+    in the unocculted field is left out if its gain is smaller than the cost of the measured numbers. any_sign: keep all
+    parameters, whatever their sign and gain.
+    """
+    columns = {
+        column: (effect, parameter)
+        for effect in effects
+        # An effect that is fitted for each pointing may have fewer or more changes than parameters.
+        for column, parameter in zip(model.evidence.columns[effect.name], effect.parameters, strict=False)
+    }
+    step = model.fit(tuple(columns))
+    base = len(model.evidence.base)
+    while not any_sign:
+        idle = _not_worth_its_numbers(model, step)
+        if idle is not None:
+            del columns[idle]
+            step = model.fit(tuple(columns))
+            continue
+        below = {
+            column: float(value)
+            for column, value in zip(step.columns[base:], step.values[base:], strict=True)
+            if columns[column][1].positive and value <= 0
+        }
+        if not below:
+            break
+        del columns[min(below, key=lambda column: below[column])]
+        step = model.fit(tuple(columns))
+    sigma = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
+    values = {}
+    for k, (effect, parameter) in enumerate(columns.values(), base):
+        label = parameter.name if len(effects) == 1 else f"{effect.name}.{parameter.name}"
+        values[label] = (float(step.values[k]), float(sigma[k]), parameter.unit)
+    gain = model.gain(step)
+    return EffectFit(
+        names=tuple(effect.name for effect in effects),
+        values=values,
+        gain=gain,
+        p_value=_p_value(model, tuple(columns), gain, math.prod(effect.trials for effect in effects)),
+        step=step,
+    )
+
+
+def left_chi2(model: LinearModel, step: Step) -> Vector:
+    """chi2 after a fit: two values, for the discs and for the unocculted field."""
+    return np.array([sum(float(one @ one) for one in model.left(step)), model.left_unocculted(step)])
+
+
+def _p_value(model: LinearModel, columns: Sequence[int], gain: float, trials: float) -> float:
+    """The probability that noise alone gains at least `gain`: a chi2 distribution with the mean and variance of that gain."""
+    learned = model.learned(columns)
+    shares = learned / (1 + learned)
+    free = len(columns) - learned.size + model.evidence.numbers_of(columns)
+    mean, half_variance = free + float(shares.sum()), free + float((shares**2).sum())
+    if half_variance <= 0:
+        return 1.0
+    scale = mean / half_variance
+    return min(1.0, trials * float(chdtrc(mean * scale, gain * scale)))
+
+
+def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
+    """The column of a fit that gains least, among the columns that gain less than their measured numbers cost.
+
+    None if every column gains at least as much as its measured numbers cost.
+    """
+    columns = step.columns[len(model.evidence.base) :]
+    idle = {}
+    for column in columns:
+        numbers = model.evidence.numbers_of([column])
+        gain = step.fall - model.fit([c for c in columns if c != column]).fall if numbers else 0.0
+        if numbers and gain < COST_OF_NUMBERS * (1 + numbers):
+            idle[column] = gain
+    return min(idle, key=lambda column: idle[column]) if idle else None

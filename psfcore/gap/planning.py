@@ -1,0 +1,191 @@
+"""A planned transit: which effects its images would show, and which effects they could not tell apart.
+
+The images of the plan are simulated without noise and fitted; the limits then follow from the linear model of this fit, whose
+noise is that of the planned exposures. The scene does not change, but the brightness of the images varies by
+BRIGHTNESS_SPREAD, because the Sun and the shutter do. Without it, any difference between images would seem to be an effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.fits.header import FitsLimits
+from psfcore.gap.diagnose import linear_model_of
+from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.verdict.calibration import shipped_calibration
+from psfcore.gap.verdict.limits import Limits, limits
+from psfcore.gap.view import View
+from psfcore.instruments.files import instrument_names
+from psfcore.scatter.inversion import Progress, invert
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW
+from psfcore.simulate.from_files import LARGEST_DIFFRACTION_PX, diffraction_kernel
+from psfcore.simulate.plan import Plan
+from psfcore.simulate.read_plan import read_plan
+from psfcore.simulate.scatter_truth import ScatterTruth
+from psfcore.simulate.sky import true_sky
+from psfcore.simulate.transit import observed_transit
+from psfcore.transit.transit import Transit
+
+Kernel = NDArray[np.float64]
+
+SCHEMA = "gap-plan/1"
+INSTRUMENT = "hri_euv"
+SCATTER = ScatterTruth(6.15, 2.53, 0.411)  # that of HRI_EUV (Hofmeister et al.)
+BRIGHTNESS_SPREAD = 0.01
+LEAST_IMAGES = 3  # the fit of a PSF needs as many
+MEASURED = "its form is measured in the images, so it can be tested only after the observation"
+_BRIGHTNESS_STREAM = 3001
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """The limits of a plan.
+
+    searched: effects that search for a position or form; their limits hold for the one that was found. settled_by: by effect,
+    the observation that confirms it. left_out: images that the fit cannot use, by the name that the simulation gives them, with
+    the reasons.
+    """
+
+    plan: Plan
+    limits: Limits
+    searched: tuple[str, ...]
+    settled_by: dict[str, str]
+    left_out: dict[str, str]
+
+    @property
+    def pointings(self) -> list[dict[str, Any]]:
+        """For each pointing: its number, what it shows, the number of images, and the exposure times in s."""
+        rows = []
+        for pointing in self.plan.pointings:
+            shots = [shot for shot in self.plan.shots if shot.pointing == pointing]
+            exposures = sorted({shot.exposure_s for shot in shots})
+            view = self.plan.views[pointing - 1]
+            rows.append({"pointing": pointing, "view": view, "images": len(shots), "exposures_s": exposures})
+        return rows
+
+    def as_json(self) -> dict[str, Any]:
+        """The plan and its limits, schema gap-plan/1. A limit `excluded_95` needs data, so it is missing here."""
+        found = self.limits.as_json()
+        return {
+            "schema": SCHEMA,
+            "plan": {
+                "images": len(self.plan.shots),
+                "size_px": self.plan.size_px,
+                "pointings": self.pointings,
+            },
+            "answer": {
+                "threshold": shipped_calibration().threshold(),
+                "temperature": shipped_calibration().temperature,
+            },
+            "limits": {name: _without_excluded(one) for name, one in found["limits"].items()},
+            "alike": found["alike"],
+            "distances": [
+                {"pair": list(pair), "distance": distance}
+                for pair, distance in sorted(self.limits.distances.items(), key=lambda one: one[1])
+            ],
+            "settled_by": self.settled_by,
+            "searched": list(self.searched),
+            "left_out": self.left_out,
+            "untestable": found["untestable"],
+        }
+
+
+def _without_excluded(limit: dict[str, Any]) -> dict[str, Any]:
+    kept = {key: value for key, value in limit.items() if key != "excluded_95"}
+    if "parameters" in kept:
+        kept["parameters"] = {name: _without_excluded(one) for name, one in kept["parameters"].items()}
+    return kept
+
+
+def limits_of_file(
+    path: str | Path,
+    fits_limits: FitsLimits,
+    *,
+    instrument: str | None = None,
+    diffraction: Path | None = None,
+    seed: int = 1,
+    threads: int = 1,
+    progress: Progress = lambda stage, step, steps: None,
+) -> Planned:
+    """The limits of the plan in a file, or of a transit (`read_plan`).
+
+    instrument: whose diffraction PSF is used; None: that of the transit, or else INSTRUMENT. diffraction: a file with a
+    diffraction PSF; None: the file that the transit names, or else that of the instrument. Raises the errors of `read_plan`,
+    of reading or building a diffraction PSF, and of `planned_limits`.
+    """
+    found = read_plan(path, fits_limits)
+    _check_images(found.plan)
+    known = diffraction or (found.known_psf if instrument is None else None)
+    stated = found.instrument if found.instrument in instrument_names() else INSTRUMENT
+    size = min(2 * found.plan.size_px, LARGEST_DIFFRACTION_PX)
+    kernel = diffraction_kernel(instrument or stated or INSTRUMENT, known, size, fits_limits, threads=threads)
+    return planned_limits(found.plan, kernel, seed=seed, threads=threads, progress=progress)
+
+
+def planned_limits(
+    plan: Plan,
+    diffraction: Kernel,
+    *,
+    scatter: ScatterTruth = SCATTER,
+    library: Sequence[Effect] = LIBRARY,
+    seed: int = 1,
+    threads: int = 1,
+    progress: Progress = lambda stage, step, steps: None,
+) -> Planned:
+    """The limits of a plan. diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: of scenes and noise.
+
+    Raises DataError "too-few-images", and the errors of `true_sky` and `invert`.
+    """
+    _check_images(plan)
+    transit = _noise_free(plan, scatter, diffraction, seed, threads)
+    start = SOFTENED_POWER_LAW.coordinates({"b_px": scatter.b_px, "c": scatter.c, "total": scatter.total})
+    solution = invert(transit, start=start, near=True, threads=threads, progress=progress)
+    model, _ = linear_model_of(View(solution), library, seed=seed, progress=progress)
+    model = _without_measured(model)
+    effects = model.evidence.effects
+    made = shipped_calibration()
+    return Planned(
+        plan,
+        limits(model, threshold=made.threshold(), temperature=made.temperature, observed=False),
+        tuple(effect.name for effect in effects if effect.held is not None),
+        {effect.name: effect.settled_by for effect in effects},
+        dict(solution.inversion.left_out),
+    )
+
+
+def _check_images(plan: Plan) -> None:
+    if len(plan.shots) < LEAST_IMAGES:
+        raise DataError(
+            "too-few-images",
+            f"expected a plan with at least {LEAST_IMAGES} images, which the fit of a PSF needs; got {len(plan.shots)}: add images",
+        )
+
+
+def _noise_free(plan: Plan, scatter: ScatterTruth, diffraction: Kernel, seed: int, threads: int) -> Transit:
+    sky = true_sky(plan, scatter, diffraction, seed, threads=threads)
+    transit = observed_transit(sky, seed).transit
+    rng = np.random.default_rng([seed, _BRIGHTNESS_STREAM])
+    brightness = 1 + BRIGHTNESS_SPREAD * rng.normal(size=len(plan.shots))
+    frames = tuple(
+        replace(frame, pixels=(factor * sky.expected(n)).astype(np.float32))
+        for n, (frame, factor) in enumerate(zip(transit.frames, brightness, strict=True))
+    )
+    return replace(transit, frames=frames)
+
+
+def _without_measured(model: LinearModel) -> LinearModel:
+    """The model without those effects whose form is measured in the images: there are no images yet."""
+    evidence = model.evidence
+    measured = {e.name for e in evidence.effects if evidence.numbers_of(evidence.columns[e.name])}
+    effects = tuple(effect for effect in evidence.effects if effect.name not in measured)
+    untestable = evidence.untestable | dict.fromkeys(sorted(measured), MEASURED)
+    return replace(model, evidence=replace(evidence, effects=effects, untestable=untestable))

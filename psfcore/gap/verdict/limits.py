@@ -1,0 +1,498 @@
+"""The limits: what the data of a transit could have shown, and which effects they cannot tell apart.
+
+The strength of an effect is the value t of one of its parameters while its other parameters are 0. Near the fit the data
+change by t times a column j of the Jacobian. Let N be the normal matrix of all columns, with PSF, scenes and brightness free
+(`Likelihood.normal`). Consider a hypothesis h with columns H and a prior of the widths W. The eigenvalues of W N_HH W are l_i, its
+eigenvectors V. The decrease of chi2 by the fit of h is a weighted sum of noncentral chi2 variables with one degree of freedom:
+
+    q_h = sum of w_i chi2_1(d_i^2),   w_i = l_i / (1 + l_i),   d_i^2 = t^2 (V^T W N_Hj)_i^2 / l_i      Eq. (1)
+    ln(weight of h / weight of no effect) = o_h - sum of ln(1 + l_i) / 2 + q_h / 2                     Eq. (2)
+
+In place of q_h / 2, the code uses the gain of Eq. (2) of `evidence.likelihood`, which is a little smaller.
+o_h contains the prior probability of h, the number of templates among which it chose, and ln 2 for a parameter that cannot be
+negative. d^2 is the noncentrality. The cumulants of q_h are c_r = sum of w_i^r (1 + r d_i^2), without the factor 2^(r-1) (r-1)!.
+Its quantiles follow from those of chi2 by the first three cumulants (Imhof 1961, Biometrika 48, 419), and the latter by the
+formula of Wilson & Hilferty. Where the prior has several widths, Eq. (2) is averaged over them.
+
+found_90 is the smallest strength at which the effect belongs to the answer, and "no effect" does not, if the q_h of all hypotheses have
+their 10 % quantiles. These q_h vary together where the hypotheses are alike; those of other hypotheses hardly count.
+
+The strength of a random field is the standard deviation of its coefficients. The coefficients then are random too, so that q_h
+has the covariance N_HH + t^2 N_HE S^2 N_EH in place of a noncentrality; S are the likely sizes of the coefficients.
+
+excluded_95 is the 95 % quantile of the strength after the fit of the effect: a Gaussian with the fitted value and its error,
+cut at 0 for a parameter that cannot be negative. The error contains the template error of `evidence.likelihood`.
+
+The distance of two effects is the square root of the chi2 that remains if the second one is fitted to the change by the first
+one at found_90. Below ALIKE the data cannot tell them apart.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq, nnls
+from scipy.special import logsumexp, ndtr, ndtri
+
+from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.discrepancy import ALTERNATIVES, LIKELY, Discrepancy, discrepancy
+from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.likelihood import MEASURED, SCALES, Likelihood
+from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
+from psfcore.gap.verdict.posterior import PRIOR, Kind
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+FOUND, EXCLUDED = 0.9, 0.95
+ALIKE = 3.0  # in sigma: a difference of chi2 of 9
+# Strengths between these multiples of the error of the parameter are tried.
+WEAKEST_TRIED, STRONGEST_TRIED, TRIED = 0.5, 3000.0, 80
+CREDIBLE = 1000.0  # a strength above this multiple of the likely size is not stated
+ENDLESS = "the likely size of a parameter is infinite, so no strength is plausible"
+RMS = "rms"  # the parameter of a random field: the standard deviation of its coefficients
+
+
+@dataclass(frozen=True)
+class ParameterLimits:
+    """The limits of one parameter, in its unit.
+
+    likely: the largest plausible size. found_90: None if no strength would be found. excluded_95: None before there are data.
+    """
+
+    name: str
+    unit: str
+    likely: float
+    found_90: float | None
+    excluded_95: float | None
+
+    def as_json(self) -> dict[str, Any]:
+        """The limits for a report."""
+        return {"unit": self.unit, "found_90": self.found_90, "excluded_95": self.excluded_95}
+
+
+@dataclass(frozen=True)
+class EffectLimits:
+    """The limits of one effect: of each parameter, while the other parameters are 0."""
+
+    effect: str
+    parameters: tuple[ParameterLimits, ...]
+
+    @property
+    def leading(self) -> ParameterLimits:
+        """The parameter that stands for the effect: the first that would be found at its likely size.
+
+        If there is none, it is the parameter that would be found at the smallest multiple of its likely size.
+        """
+
+        def multiple(one: ParameterLimits) -> float:
+            return math.inf if one.found_90 is None else one.found_90 / one.likely
+
+        first = next((one for one in self.parameters if multiple(one) <= 1), None)
+        return first or min(self.parameters, key=multiple)
+
+    def as_json(self) -> dict[str, Any]:
+        """The limits of the leading parameter; those of all parameters, if there are several."""
+        found = {"parameter": self.leading.name} | self.leading.as_json()
+        if len(self.parameters) > 1:
+            found["parameters"] = {one.name: one.as_json() for one in self.parameters}
+        return found
+
+
+@dataclass(frozen=True)
+class Alike:
+    """Two effects that these data cannot tell apart. distance: in sigma. would_separate: an observation that would."""
+
+    pair: tuple[str, str]
+    distance: float
+    would_separate: str
+
+    def as_json(self) -> dict[str, Any]:
+        """The pair for a report."""
+        return {"pair": list(self.pair), "distance": self.distance, "would_separate": self.would_separate}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The limits of all effects, by name. distances: of every pair of effects, in sigma. untestable: the reasons, by name."""
+
+    effects: Mapping[str, EffectLimits]
+    distances: Mapping[tuple[str, str], float]
+    alike: tuple[Alike, ...]
+    untestable: Mapping[str, str]
+
+    def after_refit(self, effect: Effect, fitted: Mapping[str, tuple[float, float]]) -> Limits:
+        """The same limits, with excluded_95 of an effect from a full refit. fitted: value and error by parameter."""
+        positive = {parameter.name: parameter.positive for parameter in effect.parameters}
+        parameters = tuple(
+            replace(one, excluded_95=upper_limit(*fitted[one.name], positive[one.name]))
+            if one.name in fitted
+            else one
+            for one in self.effects[effect.name].parameters
+        )
+        return replace(self, effects={**self.effects, effect.name: EffectLimits(effect.name, parameters)})
+
+    def as_json(self) -> dict[str, Any]:
+        """`limits`, `alike` and `untestable` as in a report."""
+        return {
+            "limits": {name: found.as_json() for name, found in self.effects.items()},
+            "alike": [one.as_json() for one in self.alike],
+            "untestable": [{"name": name, "why": why} for name, why in self.untestable.items()],
+        }
+
+
+def limits(
+    model: LinearModel,
+    *,
+    threshold: float,
+    temperature: float,
+    prior: Mapping[Kind, float] = PRIOR,
+    observed: bool = True,
+) -> Limits:
+    """The limits of all effects.
+
+    threshold, temperature, prior: of the answer and of the posterior. observed: whether the residuals of the model are data, so
+    that they exclude strengths.
+    """
+    every = model.evidence.effects
+    endless = [e.name for e in every if not all(math.isfinite(p.likely) for p in e.parameters)]
+    evidence = replace(model.evidence, effects=tuple(e for e in every if e.name not in endless))
+    unknown = discrepancy(evidence)
+    found = _Limits(Likelihood(model, unknown.directions), evidence, unknown, prior)
+    need = _Need(threshold, temperature)
+    effects = {
+        effect.name: EffectLimits(effect.name, found.parameters(effect, need, observed))
+        for effect in evidence.effects
+    }
+    distances = found.distances(effects)
+    settled_by = {effect.name: effect.settled_by for effect in evidence.effects}
+    alike = (
+        Alike(pair, distance, "; or ".join(dict.fromkeys(settled_by[name] for name in pair)))
+        for pair, distance in distances.items()
+        if distance < ALIKE
+    )
+    untestable = evidence.untestable | dict.fromkeys(endless, ENDLESS)
+    return Limits(effects, distances, tuple(sorted(alike, key=lambda one: one.distance)), untestable)
+
+
+@dataclass(frozen=True)
+class _Need:
+    """What a hypothesis needs to belong to the answer."""
+
+    threshold: float
+    temperature: float
+
+    def margin(self, log_odds: Matrix, own: int) -> Vector:
+        """At least 0 where hypothesis `own` belongs to the answer and "no effect" does not.
+
+        log_odds: (strengths, hypotheses), of each hypothesis against "no effect".
+        """
+        against = log_odds / self.temperature
+        whole = logsumexp(np.pad(against, ((0, 0), (0, 1))), axis=1)
+        none_is_out = whole + math.log(self.threshold)
+        rivals = np.pad(np.delete(against, own, axis=1), ((0, 0), (0, 1))).max(axis=1)
+        best = against[:, own] - rivals  # the most probable hypothesis always belongs to the answer
+        return np.asarray(
+            np.minimum(none_is_out, np.maximum(best, against[:, own] - whole - math.log(self.threshold)))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Hypothesis:
+    """The columns of a hypothesis. widths: of the prior (scales, columns). offset: o_h of Eq. (2)."""
+
+    columns: NDArray[np.intp]
+    widths: Matrix
+    offset: float
+    one_sided: bool = False
+
+
+class _Limits:
+    """The normal matrix of all columns, and the hypotheses."""
+
+    def __init__(
+        self, likelihood: Likelihood, evidence: Evidence, unknown: Discrepancy, prior: Mapping[Kind, float]
+    ) -> None:
+        self._likelihood, self._evidence = likelihood, evidence
+        self._columns = {
+            e.name: [c for c, _ in zip(evidence.columns[e.name], e.parameters, strict=False)]
+            for e in evidence.effects
+        }
+        orders = [columns for one in ALTERNATIVES if (columns := unknown.columns(one, evidence.size))]
+        shown = sorted({c for columns in (*self._columns.values(), *orders) for c in columns})
+        number = {column: k for k, column in enumerate(shown)}
+        self._normal = likelihood.normal(shown)
+        self._of = {name: np.array([number[c] for c in some]) for name, some in self._columns.items()}
+        self._prior = prior
+        self._single = {effect.name: self._hypothesis(effect) for effect in evidence.effects}
+        scales = np.array(SCALES)[:, None]
+        self._unknown = [
+            _Hypothesis(
+                np.array([number[c] for c in columns]),
+                scales * np.full(len(columns), LIKELY),
+                math.log(prior["unknown"] / len(orders) / prior["none"]),
+            )
+            for columns in orders
+        ]
+
+    def _hypothesis(self, effect: Effect, kept: Sequence[int] | None = None) -> _Hypothesis:
+        """An effect as a hypothesis. kept: the numbers of the parameters that act; None: all."""
+        columns = self._columns[effect.name]
+        part = np.arange(len(columns)) if kept is None else np.array(kept)
+        likely = np.array([effect.parameters[k].likely for k in part])
+        # The sizes of the coefficients of a random field are known.
+        scales = np.ones(1) if effect.field else np.array(SCALES)
+        prior = self._prior["single"] / len(self._evidence.effects) / self._prior["none"]
+        offset = math.log(prior / effect.trials)
+        offset -= MEASURED * self._evidence.numbers_of([columns[k] for k in part]) / 2
+        one_sided = part.size == 1 and effect.parameters[part[0]].positive
+        return _Hypothesis(self._of[effect.name][part], scales[:, None] * likely, offset, one_sided)
+
+    # --- strengths that would be found ------------------------------------------------------------------
+
+    def parameters(self, effect: Effect, need: _Need, observed: bool) -> tuple[ParameterLimits, ...]:
+        """The limits of every parameter of an effect; of its rms, if it is a random field."""
+        if effect.field:
+            return (self._of_field(effect, need, observed),)
+        excluded = self._excluded(effect) if observed else [None] * self._of[effect.name].size
+        return tuple(
+            ParameterLimits(
+                parameter.name, parameter.unit, parameter.likely, self._found(effect, k, need), limit
+            )
+            for k, (parameter, limit) in enumerate(zip(effect.parameters, excluded, strict=False))
+        )
+
+    def _found(self, effect: Effect, k: int, need: _Need) -> float | None:
+        column = self._of[effect.name][k]
+        seen = float(self._normal[column, column])
+        if seen <= 0:
+            return None
+        change = self._normal[:, column]
+        positive = [p.positive for p in effect.parameters[: self._of[effect.name].size]]
+        # A fit leaves out a positive parameter that it finds negative. For a parameter that is 0 this is as probable as not, so
+        # that the mean of ln E is between that of all parameters and that of those that cannot be left out.
+        fewer = [m for m in range(len(positive)) if m == k or not positive[m]]
+        own = (self._single[effect.name], self._hypothesis(effect, fewer))
+        sided = math.log(2) if positive[k] else 0.0
+        # A rival that would have to be negative cannot act.
+        rivals = [h for h in self._rivals(effect) if not (h.one_sided and change[h.columns[0]] <= 0)]
+        ways = [_odds_of(h, self._normal, change, self._likelihood.gained) for h in (*own, *rivals)]
+
+        def margin(strengths: Vector) -> Vector:
+            odds = np.array([way(strengths) for way in ways]).T
+            both = (odds[:, 0] + odds[:, 1]) / 2 + sided
+            return need.margin(np.concatenate([both[:, None], odds[:, 2:]], axis=1), 0)
+
+        return _first_found(margin, 1 / math.sqrt(seen), CREDIBLE * effect.parameters[k].likely)
+
+    def _rivals(self, effect: Effect) -> list[_Hypothesis]:
+        """All hypotheses except an effect and "no effect"."""
+        return [*(h for name, h in self._single.items() if name != effect.name), *self._unknown]
+
+    def _of_field(self, effect: Effect, need: _Need, observed: bool) -> ParameterLimits:
+        """The limits of the standard deviation of the coefficients of a random field."""
+        columns = self._of[effect.name]
+        likely = np.array([effect.parameters[k].likely for k in range(columns.size)])
+        change = self._normal[:, columns] * (likely / likely[0])
+        hypotheses = (self._single[effect.name], *self._rivals(effect))
+        ways = [_odds_of(h, self._normal, change, self._likelihood.gained) for h in hypotheses]
+        typical = math.sqrt(1 / max(float(np.diag(self._normal)[columns].mean()), 1e-300))
+
+        def margin(strengths: Vector) -> Vector:
+            return need.margin(np.array([way(strengths) for way in ways]).T, 0)
+
+        found = _first_found(margin, typical, CREDIBLE * float(likely[0]))
+        excluded = self._excluded_rms(effect, likely) if observed else None
+        return ParameterLimits(RMS, effect.parameters[0].unit, float(likely[0]), found, excluded)
+
+    # --- strengths that are excluded ----------------------------------------------------------------------
+
+    def _excluded(self, effect: Effect) -> list[float | None]:
+        """The 95 % quantile of each parameter."""
+        columns = self._columns[effect.name]
+        weighed = self._likelihood.weigh([columns])
+        values = dict(zip(weighed.columns, weighed.values.tolist(), strict=True))
+        out: list[float | None] = []
+        for k, column in enumerate(columns):
+            acting = [c for c in columns if c in values or c == column]
+            found, covariance = self._likelihood.fitted(acting, [values.get(c, 0.0) for c in acting])
+            own = acting.index(column)
+            sigma = math.sqrt(max(float(covariance[own, own]), 0.0))
+            out.append(upper_limit(float(found[own]), sigma, effect.parameters[k].positive))
+        return out
+
+    def _excluded_rms(self, effect: Effect, likely: Vector) -> float | None:
+        """The 95 % quantile of the standard deviation t of the coefficients of a random field, for a constant prior of t.
+
+        With the eigenvalues l of S N S for t = 1, and the scores z in units of their noise without the field, ln L(t) is
+        sum of (z^2 t^2 l / (1 + t^2 l) - ln(1 + t^2 l)) / 2.
+        """
+        columns = self._columns[effect.name]
+        found, covariance = self._likelihood.fitted(columns, np.zeros(len(columns)).tolist())
+        shape = likely / likely[0]
+        precision = np.linalg.pinv(covariance, hermitian=True)
+        score = (
+            precision @ found
+        )  # the prior of the fit is a part of the precision, and does not shift the score
+        information = precision - np.diag(likely**-2.0)
+        values, vectors = np.linalg.eigh(information * np.outer(shape, shape))
+        seen = values > WEAKEST * max(float(values[-1]), 1e-300)
+        if not seen.any():
+            return None
+        size = values[seen]
+        z2 = (vectors[:, seen].T @ (shape * score)) ** 2 / size
+        unit = 1 / math.sqrt(float(size.max()))
+        tried = unit * np.concatenate([[0.0], np.geomspace(1e-2, 1e5, 2000)])
+        grown = tried[:, None] ** 2 * size
+        log_like = ((z2 * grown / (1 + grown)) - np.log1p(grown)).sum(axis=1) / 2
+        likelihood = np.exp(log_like - log_like.max())
+        steps = np.diff(tried) * (likelihood[1:] + likelihood[:-1]) / 2
+        total = np.concatenate([[0.0], np.cumsum(steps)])
+        return float(np.interp(EXCLUDED * total[-1], total, tried))
+
+    # --- effects that look alike --------------------------------------------------------------------------
+
+    def distances(self, effects: Mapping[str, EffectLimits]) -> dict[tuple[str, str], float]:
+        """The distance of every pair of effects: the smaller of both directions."""
+        out = {}
+        for one, other in itertools.combinations(self._evidence.effects, 2):
+            both = (
+                self._distance(one, other, effects[one.name].leading),
+                self._distance(other, one, effects[other.name].leading),
+            )
+            known = [distance for distance in both if distance is not None]
+            if known:
+                out[one.name, other.name] = min(known)
+        return out
+
+    def _distance(self, acting: Effect, fitted: Effect, at: ParameterLimits) -> float | None:
+        """The chi2, as its square root, that `fitted` leaves of the change by `acting` at its found_90."""
+        if at.found_90 is None:
+            return None
+        rival = self._single[fitted.name]
+        columns = self._of[acting.name]
+        inner = self._normal[np.ix_(rival.columns, rival.columns)] + np.diag(rival.widths[-1] ** -2.0)
+        if acting.field:
+            likely = np.array([acting.parameters[k].likely for k in range(columns.size)])
+            size = at.found_90 * likely / likely[0]
+            across = self._normal[np.ix_(rival.columns, columns)] * size
+            own = float((np.diag(self._normal)[columns] * size**2).sum())
+            return math.sqrt(max(own - float(np.sum(across * np.linalg.solve(inner, across))), 0.0))
+        names = [parameter.name for parameter in acting.parameters]
+        column = columns[names.index(at.name)]
+        change = self._normal[rival.columns, column] * at.found_90
+        own = float(self._normal[column, column]) * at.found_90**2
+        positive = np.array([p.positive for p in fitted.parameters[: rival.columns.size]])
+        signs = (1.0,) if acting.parameters[names.index(at.name)].positive else (1.0, -1.0)
+        explained = max(_explained(inner, sign * change, positive) for sign in signs)
+        return math.sqrt(max(own - explained, 0.0))
+
+
+def _explained(inner: Matrix, score: Vector, positive: NDArray[np.bool_]) -> float:
+    """The decrease of chi2 by a fit; parameters that cannot be negative stay at 0 or above."""
+    values = np.linalg.solve(inner, score)
+    if (values[positive] < 0).any():
+        # A parameter of any sign is the difference of two that are not negative.
+        lower = np.linalg.cholesky(inner)
+        design = np.concatenate([lower.T, -lower.T[:, ~positive]], axis=1)
+        found, _ = nnls(design, np.linalg.solve(lower, score))
+        return float(np.sum((design @ found) ** 2))
+    return float(score @ values)
+
+
+def _odds_of(
+    hypothesis: _Hypothesis, normal: Matrix, change: Matrix | Vector, gained: Callable[[Vector], Vector]
+) -> Callable[[Vector], Vector]:
+    """A function of the strength: Eq. (2) with the 1 - FOUND quantile of q_h.
+
+    change: the columns of N that belong to what acts: one for a fixed change, several for a random field. gained: the gain of
+    ln L by a decrease of chi2.
+    """
+    inner = normal[np.ix_(hypothesis.columns, hypothesis.columns)]
+    spread, cumulants = [], []
+    for widths in hypothesis.widths:
+        values, vectors = np.linalg.eigh(inner * np.outer(widths, widths))
+        values = np.maximum(values, 0.0)
+        to_score = vectors.T * widths @ change[hypothesis.columns]
+        spread.append(float(np.log1p(values).sum()))
+        cumulants.append(
+            _cumulants(values, to_score) if change.ndim == 1 else _cumulants_of_field(values, to_score)
+        )
+    offsets = hypothesis.offset - np.array(spread) / 2
+
+    def odds(strengths: Vector) -> Vector:
+        powers = strengths[:, None] ** (2 * np.arange(4))
+        found = [
+            offset + gained(_quantile_of_sum(powers @ c.T, 1 - FOUND))
+            for offset, c in zip(offsets, cumulants, strict=True)
+        ]
+        return np.asarray(np.logaddexp.reduce(found) - math.log(len(found)))
+
+    return odds
+
+
+def _cumulants(values: Vector, score: Vector) -> Matrix:
+    """c_1, c_2, c_3 of Eq. (1) as polynomials of the squared strength (3, powers). score: V^T W N_Hj."""
+    out = np.zeros((3, 4))
+    for r in (1, 2, 3):
+        out[r - 1, 0] = np.sum((values / (1 + values)) ** r)
+        out[r - 1, 1] = r * np.sum(values ** (r - 1) * score**2 / (1 + values) ** r)
+    return out
+
+
+def _cumulants_of_field(values: Vector, score: Matrix) -> Matrix:
+    """The same for a random field. score: (eigenvectors, columns of the field)."""
+    shrink = 1 / (1 + values)
+    noise = np.diag(values * shrink)
+    field = shrink[:, None] * (score @ score.T)
+    out = np.zeros((3, 4))
+    out[0, :2] = np.trace(noise), np.trace(field)
+    out[1, :3] = np.sum(noise * noise), 2 * np.sum(noise * field), np.sum(field * field.T)
+    out[2, 0] = np.trace(noise @ noise @ noise)
+    out[2, 1] = 3 * np.trace(noise @ noise @ field)
+    out[2, 2] = 3 * np.trace(noise @ field @ field)
+    out[2, 3] = np.trace(field @ field @ field)
+    return out
+
+
+def _quantile_of_sum(cumulants: Matrix, probability: float) -> Vector:
+    """The quantile of a weighted sum of noncentral chi2 variables, at least 0. cumulants: (strengths, 3)."""
+    first, second, third = np.maximum(cumulants, 1e-300).T
+    freedom = second * (second / third) ** 2
+    share = 2 / (9 * freedom)
+    quantile = freedom * np.maximum(1 - share + float(ndtri(probability)) * np.sqrt(share), 0.0) ** 3
+    return np.asarray(np.maximum(first + (quantile - freedom) * third / second, 0.0))
+
+
+def _first_found(margin: Callable[[Vector], Vector], unit: float, most: float) -> float | None:
+    """The smallest strength whose margin is at least 0; None if there is none up to `most`. unit: the error of the strength."""
+    if most <= WEAKEST_TRIED * unit:
+        return None
+    tried = np.geomspace(WEAKEST_TRIED * unit, min(STRONGEST_TRIED * unit, most), TRIED)
+    reached = np.flatnonzero(margin(tried) >= 0)
+    if reached.size == 0:
+        return None
+    first = int(reached[0])
+    between = np.geomspace(tried[max(first - 1, 0)], tried[first], TRIED)
+    return float(between[np.flatnonzero(margin(between) >= 0)[0]])
+
+
+def upper_limit(value: float, sigma: float, positive: bool) -> float:
+    """excluded_95 for a fitted value and its error: the 95 % quantile of the strength.
+
+    The strength is a Gaussian, cut at 0, if the parameter cannot be negative; else the absolute value of a Gaussian.
+    """
+    if positive:
+        below = float(ndtr(value / sigma)) if sigma > 0 else 1.0
+        return value + sigma * -float(ndtri((1 - EXCLUDED) * below)) if below > 0 else sigma
+
+    def beyond(strength: float) -> float:
+        return float(ndtr((strength - value) / sigma) - ndtr((-strength - value) / sigma)) - EXCLUDED
+
+    return float(brentq(beyond, 0.0, abs(value) + 5 * sigma)) if sigma > 0 else abs(value)

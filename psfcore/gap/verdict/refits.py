@@ -1,0 +1,107 @@
+"""The full refits of a diagnosis. Each is made only once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.errors import DataError
+from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of
+from psfcore.gap.evidence.likelihood import Weighed
+from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.verdict.correction import Corrected, add_to_model, with_library
+from psfcore.gap.verdict.posterior import Names, at_refit
+from psfcore.gap.view import View
+from psfcore.scatter.inversion import Progress
+
+VISIBLE_SIGMA = 2.0
+
+
+class Refits:
+    """Full refits of a fit with effects in the model. view: of the fit. model: its linear model. failures: sentences."""
+
+    def __init__(
+        self, view: View, model: LinearModel, progress: Progress = lambda stage, step, steps: None
+    ) -> None:
+        self._view, self._model, self._progress = view, model, progress
+        self._made: dict[Names, Corrected | None] = {}
+        self.failures: list[str] = []
+
+    def weighed(self, names: Names) -> Mapping[Names, Weighed] | None:
+        """The evidence at the refit of a hypothesis (`posterior.at_refit`); None if the refit failed."""
+        made = self._fit(names)
+        if made is None:
+            return None
+        effects = self._model.evidence.effects
+        model = made.model
+        if len(names) == 1:  # the pairs with this effect are weighed at the same refit
+            model = with_library(made, effects, self._model, progress=self._say(f"effects beside {names[0]}"))
+        return at_refit(model, self._model, names, made.subtracted, effects)
+
+    @property
+    def made(self) -> tuple[Corrected, ...]:
+        """All refits that succeeded."""
+        return tuple(fit for fit in self._made.values() if fit is not None)
+
+    def of(self, hypotheses: Sequence[Names]) -> tuple[Corrected, ...]:
+        """The refits of some hypotheses, in this order, without those that failed."""
+        fits = (self._fit(names) for names in hypotheses)
+        return tuple(fit for fit in fits if fit is not None)
+
+    @property
+    def departures(self) -> dict[Names, float]:
+        """How far each refit of a visible effect departs from first order: the template error, measured.
+
+        The rms difference between what the linear fit and the refit leave in the cells, in units of the change of the cells by the
+        effect. Without those refits whose effects change the cells by less than VISIBLE_SIGMA, because noise dominates there.
+        """
+        out = {}
+        for names, made in self._made.items():
+            if made is None or made.evidence.images != self._model.evidence.images:
+                continue
+            linear = fit_effects(self._model, made.effects, any_sign=True).step
+            left = self._model.left(linear)
+            real = made.model.left(made.model.fit(made.evidence.of_effects))
+            base = len(self._model.evidence.base)
+            own = list(linear.columns[base:])
+            change = [disc.jacobian[own].T @ linear.values[base:] for disc in self._model.discs]
+            size = _rms(change)
+            if size > VISIBLE_SIGMA:
+                out[names] = _rms([a - b for a, b in zip(left, real, strict=True)]) / size
+        return out
+
+    def _fit(self, names: Names) -> Corrected | None:
+        if names not in self._made:
+            chosen = [effect for effect in self._model.evidence.effects if effect.name in names]
+            label = label_of(names)
+            try:
+                self._made[names] = add_to_model(
+                    self._view.solution,
+                    chosen,
+                    self._start(chosen),
+                    self._model,
+                    view=self._view,
+                    progress=self._say(f"full refit with {label}"),
+                )
+            except DataError as error:  # the fit may fail if the subtracted effect is not in the images
+                self.failures.append(f"The full refit with {label} in the model failed: {error}")
+                self._made[names] = None
+        return self._made[names]
+
+    def _start(self, effects: Sequence[Effect]) -> EffectFit:
+        """The linear fit from which a refit starts: with every parameter, if an effect would keep none of its parameters."""
+        start = fit_effects(self._model, effects)
+        kept = set(start.step.columns)
+        if all(kept.intersection(self._model.evidence.columns[effect.name]) for effect in effects):
+            return start
+        return fit_effects(self._model, effects, any_sign=True)
+
+    def _say(self, what: str) -> Progress:
+        return lambda stage, step, steps: self._progress(f"{what}: {stage}", step, steps)
+
+
+def _rms(vectors: Sequence[NDArray[np.float64]]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(vectors) ** 2)))

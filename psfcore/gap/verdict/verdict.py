@@ -1,0 +1,136 @@
+"""The verdict: one word and the named effects, read off the answer set of the posterior.
+
+The answer set contains the hypotheses whose probability is at least the threshold of the calibration (`calibration`). Its most
+probable members that together have at least the probability `coverage` decide the verdict; the other members are possible,
+but improbable:
+
+| the deciding members | verdict | named effects |
+|---|---|---|
+| "no gap" is the most probable one | none | - |
+| "unknown" only | unknown | - |
+| one hypothesis, which names effects | attributed | its effects |
+| several hypotheses, which all name effects | tie | the effects of all of them |
+| anything else | inconclusive | the effects of the most probable hypothesis that names effects |
+
+With fewer than LEAST_IMAGES images, the verdict is `inconclusive` instead of `none`: no image can be held out, and a gap may
+exist although the images do not show it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from psfcore.gap.verdict.calibration import COVERAGE, Calibration
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior, without_idle
+
+Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
+
+LEAST_IMAGES = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """The verdict of a diagnosis, and the probabilities from which it follows.
+
+    answer: the effects that the verdict names; for `inconclusive`, those of the most probable hypothesis that names effects,
+    which are not certain, or empty. members: the answer set, the most probable hypothesis first. deciding: those members that
+    decide the verdict. coverage: of the set.
+    hypotheses: the probability of each hypothesis, the most probable first, after `posterior.without_idle`. effects: the
+    probability that each effect acts, alone or with another; also of "none" and "unknown". orders: `Posterior.orders`.
+    failed: the hypotheses whose full refit failed.
+    """
+
+    verdict: Verdict
+    answer: Names
+    members: tuple[Names, ...]
+    deciding: tuple[Names, ...]
+    coverage: float
+    hypotheses: Mapping[Names, float]
+    effects: Mapping[str, float]
+    orders: Mapping[Names, float]
+    failed: tuple[Names, ...] = ()
+
+    @property
+    def named(self) -> tuple[Names, ...]:
+        """The deciding members that name effects, the most probable first."""
+        return tuple(names for names in self.deciding if names not in (NONE, UNKNOWN))
+
+    @property
+    def best(self) -> Names | None:
+        """The most probable hypothesis that names effects, whether or not it is in the set; None if all of them failed."""
+        return next((names for names in self.hypotheses if names not in (NONE, UNKNOWN)), None)
+
+    @property
+    def certain(self) -> Names:
+        """For a tie, the effects that all deciding members contain; empty for other verdicts."""
+        if self.verdict != "tie":
+            return ()
+        return tuple(name for name in self.answer if all(name in names for names in self.named))
+
+    @property
+    def tied(self) -> Names:
+        """For a tie, the effects that these data cannot separate; empty for other verdicts."""
+        return (
+            () if self.verdict != "tie" else tuple(name for name in self.answer if name not in self.certain)
+        )
+
+
+def verdict_of(
+    found: Posterior,
+    calibration: Calibration,
+    *,
+    images: int,
+    coverage: float = COVERAGE,
+    failed: tuple[Names, ...] = (),
+) -> Judgement:
+    """The verdict of a posterior. images: the number of images with a disc. Raises DataError "bad-coverage"."""
+    raw = found.probabilities(calibration.temperature)
+    hypotheses = without_idle(raw)
+    members = calibration.answer(hypotheses, coverage)
+    deciding = _deciding(members, hypotheses, coverage)
+    named = [names for names in deciding if names not in (NONE, UNKNOWN)]
+    best = next((names for names in hypotheses if names not in (NONE, UNKNOWN)), NONE)
+    verdict: Verdict = "inconclusive"
+    answer = best if members[0] != NONE else NONE
+    if members[0] == NONE:
+        verdict = "none" if images >= LEAST_IMAGES else "inconclusive"
+    elif deciding == (UNKNOWN,):
+        verdict, answer = "unknown", NONE
+    elif len(named) == len(deciding):
+        verdict = "attributed" if len(deciding) == 1 else "tie"
+        answer = tuple(dict.fromkeys(name for names in named for name in names))
+    return Judgement(
+        verdict=verdict,
+        answer=answer,
+        members=members,
+        deciding=deciding,
+        coverage=coverage,
+        hypotheses=hypotheses,
+        effects=of_effects(raw),
+        orders=found.orders,
+        failed=failed,
+    )
+
+
+def _deciding(
+    members: tuple[Names, ...], hypotheses: Mapping[Names, float], coverage: float
+) -> tuple[Names, ...]:
+    """The most probable members that together have at least the probability `coverage`; all members if they have less."""
+    together = 0.0
+    for count, names in enumerate(members, 1):
+        together += hypotheses[names]
+        if together >= coverage:
+            return members[:count]
+    return members
+
+
+def of_effects(hypotheses: Mapping[Names, float]) -> dict[str, float]:
+    """The probability that each effect acts: the sum over the hypotheses that contain it. "none" and "unknown" come first."""
+    out = {"none": hypotheses.get(NONE, 0.0), "unknown": hypotheses.get(UNKNOWN, 0.0)}
+    for names, share in hypotheses.items():
+        if names not in (NONE, UNKNOWN):
+            for name in names:
+                out[name] = out.get(name, 0.0) + share
+    return out

@@ -1,0 +1,197 @@
+"""The plan of a simulated transit, from a file that states when, where and for how long images are taken.
+
+Three kinds of files are read:
+
+- a plan as JSON, as `Plan.as_json` returns it (`size_px`, `shots`, ...);
+- truth.json of a simulated transit, which contains such a plan;
+- transit.json, or a folder with it. Exposure times, gain modes, times and the size of the images come from the headers of the
+  images. If there are no images yet, transit.json states them: `size_px`, and `exposure_s`, `gain_mode` and `time_s` of each
+  image. `views` then says what each pointing shows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from psfcore.errors import DataError
+from psfcore.fits.header import FitsLimits, HeaderSummary, read_summary
+from psfcore.simulate.plan import CAMERA, DISC, HIGH, LARGEST_FINE_SIZE_PX, VIEWS, Plan, Shot, plan_from_json
+from psfcore.transit.folder import times_s
+from psfcore.transit.manifest import MANIFEST_NAME, MAX_MANIFEST_BYTES, TransitManifest, parse_manifest
+
+LARGEST_SIZE_PX = 4096
+MOST_IMAGES = 1000
+_INTERVAL_S = 60.0  # between images whose times are not stated
+
+
+@dataclass(frozen=True)
+class PlanFile:
+    """What a file states. known_psf: the file of the known part of the PSF, if there is one. instrument: its name, if stated."""
+
+    plan: Plan
+    known_psf: Path | None = None
+    instrument: str | None = None
+
+
+def read_plan(path: str | Path, limits: FitsLimits) -> PlanFile:
+    """The plan in a file, or in the transit.json of a folder.
+
+    Raises DataError "no-manifest", "bad-manifest", "bad-plan", and the errors of reading a header.
+    """
+    path = Path(path)
+    file = path / MANIFEST_NAME if path.is_dir() else path
+    if not file.is_file():
+        raise DataError(
+            "no-manifest",
+            f"expected a plan, or a folder with {MANIFEST_NAME}; {path} has no {MANIFEST_NAME}: add it, or name the file of a plan",
+        )
+    with file.open("rb") as source:
+        text = source.read(MAX_MANIFEST_BYTES + 1)
+    content = _object(text, file.name)
+    if "images" in content or str(content.get("schema", "")).startswith("transit/"):
+        manifest = parse_manifest(text)
+        plan = _checked(_of_transit(manifest, content, file.parent, limits), file.name)
+        known = None if manifest.known_psf is None else file.parent / manifest.known_psf
+        return PlanFile(plan, known if known is not None and known.is_file() else None, manifest.instrument)
+    if isinstance(content.get("plan"), dict):
+        content = content["plan"]
+    if "shots" not in content:
+        raise _bad(
+            f"{file.name}: expected a plan with `shots`, or a {MANIFEST_NAME} with `images`; got the keys "
+            f"{', '.join(sorted(content))[:120] or 'of an empty object'}"
+        )
+    return PlanFile(_checked(plan_from_json(content), file.name))
+
+
+def _checked(plan: Plan, name: str) -> Plan:
+    """The plan, if it can be simulated. A file may state any number."""
+    if not isinstance(plan.size_px, int) or plan.size_px > LARGEST_SIZE_PX:
+        raise _bad(f"{name}: expected images of at most {LARGEST_SIZE_PX} px; got {plan.size_px!r:.60} px")
+    if len(plan.shots) > MOST_IMAGES:
+        raise _bad(f"{name}: expected at most {MOST_IMAGES} images; got {len(plan.shots)}")
+    for number, shot in enumerate(plan.shots):
+        if not (math.isfinite(shot.exposure_s) and math.isfinite(shot.time_s)):
+            raise _bad(
+                f"{name}: image {number}: expected a finite exposure and time; got {shot.exposure_s} s and {shot.time_s} s"
+            )
+    return plan
+
+
+def _object(text: bytes, name: str) -> dict[str, Any]:
+    if len(text) > MAX_MANIFEST_BYTES:
+        raise _bad(f"{name}: expected at most {MAX_MANIFEST_BYTES} bytes; got more")
+    try:
+        content = json.loads(text.decode("utf-8-sig"))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise _bad(
+            f"{name}: expected a plan or a {MANIFEST_NAME}, as JSON in UTF-8; got: {error!s:.120}"
+        ) from None
+    if not isinstance(content, dict):
+        raise _bad(f"{name}: expected a JSON object; got {type(content).__name__}")
+    return content
+
+
+def _of_transit(
+    manifest: TransitManifest, content: Mapping[str, Any], folder: Path, limits: FitsLimits
+) -> Plan:
+    """The plan of a transit whose images may not be taken yet."""
+    there = [(folder / image.file).is_file() for image in manifest.images]
+    if any(there) and not all(there):
+        missing = [image.file for image, is_there in zip(manifest.images, there, strict=True) if not is_there]
+        raise _bad(
+            f"{MANIFEST_NAME}: expected all images in the folder, or none of them; missing: {', '.join(missing[:5])}"
+        )
+    if all(there):
+        headers = [read_summary(folder / image.file, limits) for image in manifest.images]
+        size_px, taken = _size_of(headers), _taken(headers, manifest)
+    else:
+        size_px, taken = _stated_size(content), _stated(content["images"])
+    numbers = {pointing: k for k, pointing in enumerate(manifest.pointings, start=1)}
+    shots = [
+        Shot(numbers[image.pointing], image.x, image.y, exposure_s, gain_mode, time_s)
+        for image, (exposure_s, gain_mode, time_s) in zip(manifest.images, taken, strict=True)
+    ]
+    radii = sorted(image.r for image in manifest.images)
+    plan = Plan(
+        size_px=size_px,
+        shots=tuple(sorted(shots, key=lambda shot: shot.time_s)),
+        views=_views(content, len(numbers)),
+        radius_px=radii[len(radii) // 2],
+        noise=CAMERA if manifest.noise is None else manifest.noise.noise(),
+    )
+    return dataclasses.replace(plan, oversampling=2 if size_px <= LARGEST_FINE_SIZE_PX else 1)
+
+
+def _size_of(headers: Sequence[HeaderSummary]) -> int:
+    shapes = {header.shape for header in headers}
+    ny, nx = headers[0].shape
+    if len(shapes) > 1 or ny != nx:
+        got = ", ".join(f"{x} x {y} px" for y, x in sorted(shapes)[:3])
+        raise _bad(f"expected square images of equal size; got {got}: cut them, or write a plan with `shots`")
+    return ny
+
+
+def _taken(headers: Sequence[HeaderSummary], manifest: TransitManifest) -> list[tuple[float, str, float]]:
+    """Exposure time, gain mode and time of each image, from its header."""
+    found = []
+    for header, image, time_s in zip(headers, manifest.images, times_s(headers), strict=True):
+        if header.exposure_s is None:
+            raise _bad(f"{image.file}: expected XPOSURE or EXPTIME in the header; got neither of them")
+        found.append((header.exposure_s, (header.gain_mode or HIGH).lower(), time_s))
+    return found
+
+
+def _stated_size(content: Mapping[str, Any]) -> int:
+    size = content.get("size_px")
+    if not isinstance(size, int) or isinstance(size, bool):
+        raise _bad(
+            f"{MANIFEST_NAME}: expected the images in the folder or, without them, `size_px` (their width and height in px); "
+            f"got {size!r:.60}"
+        )
+    return size
+
+
+def _stated(images: Sequence[Mapping[str, Any]]) -> list[tuple[float, str, float]]:
+    """Exposure time, gain mode and time of each image, from transit.json."""
+    found = []
+    for number, image in enumerate(images):
+        exposure_s: Any = image.get("exposure_s")
+        gain_mode: Any = image.get("gain_mode", HIGH)
+        time_s: Any = image.get("time_s", number * _INTERVAL_S)
+        label = f"{MANIFEST_NAME}: images[{number}]"
+        if not _is_number(exposure_s):
+            raise _bad(
+                f"{label}: expected the images in the folder or, without them, `exposure_s` of each image; got {exposure_s!r:.60}"
+            )
+        if not _is_number(time_s) or not isinstance(gain_mode, str):
+            raise _bad(
+                f"{label}: expected a number as `time_s` and a text as `gain_mode`; got {time_s!r:.60} and {gain_mode!r:.60}"
+            )
+        found.append((float(exposure_s), gain_mode.lower(), float(time_s)))
+    return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _views(content: Mapping[str, Any], count: int) -> tuple[str, ...]:
+    """What each pointing shows: as stated; else both limbs and the disc for three pointings, and the disc for other numbers."""
+    views = content.get("views")
+    if views is None:
+        return VIEWS if count == len(VIEWS) else (DISC,) * count
+    if not isinstance(views, list) or len(views) != count or not set(map(str, views)) <= set(VIEWS):
+        raise _bad(
+            f"{MANIFEST_NAME}: expected `views` with one of {', '.join(VIEWS)} for each of the {count} pointings; got {views!r:.120}"
+        )
+    return tuple(views)
+
+
+def _bad(message: str) -> DataError:
+    return DataError("bad-plan", message)

@@ -1,0 +1,126 @@
+"""Plans: an exposure ladder tells a dark offset from scatter, the limits agree with data, and the page says what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+from psfcore.errors import DataError
+from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.planning import Planned, planned_limits
+from psfcore.gap.report.limits_tables import NOT_FOUND
+from psfcore.gap.report.plan_page import lines, plan_page
+from psfcore.gap.verdict.limits import ALIKE, EffectLimits, ParameterLimits
+from psfcore.simulate.plan import HIGH, Plan, default_plan
+from tests.html_page import check_stands_alone, read_page
+from tests.transit_files import diffraction
+
+NAMES = ("dark_offset", "intensity_gradient", "gain_mismatch", "wide_halo", "scene_evolution")
+FEW = tuple(effect for effect in LIBRARY if effect.name in NAMES)
+ONE, LADDER = (1.8,), (0.6, 1.8, 5.0)
+
+
+def plan_with(exposures_s: Sequence[float], images: int = 18) -> Plan:
+    """A plan whose images have these exposure times in turn, all with one gain mode."""
+    plan = default_plan(images, 128, oversampling=1, brightness=6.0)
+    shots = (
+        replace(shot, exposure_s=exposures_s[n % len(exposures_s)], gain_mode=HIGH)
+        for n, shot in enumerate(plan.shots)
+    )
+    return replace(plan, shots=tuple(shots))
+
+
+@cache
+def planned(exposures_s: tuple[float, ...]) -> Planned:
+    return planned_limits(plan_with(exposures_s), diffraction(), library=FEW)
+
+
+def found(plan: Planned, name: str) -> float:
+    strength = plan.limits.effects[name].leading.found_90
+    assert strength is not None
+    return strength
+
+
+def test_a_ladder_of_exposures_separates_a_dark_offset_from_a_halo_and_from_a_leak() -> None:
+    one, ladder = planned(ONE), planned(LADDER)
+    assert found(ladder, "dark_offset") < found(one, "dark_offset") / 3
+    halo, leak = ("dark_offset", "wide_halo"), ("dark_offset", "intensity_gradient")
+    # The ladder separates them better although its dark offset is smaller.
+    assert ladder.limits.distances[halo] > one.limits.distances[halo]
+    alike = [one_pair.pair for one_pair in one.limits.alike]
+    assert leak in alike and one.limits.distances[leak] < 1 < ALIKE < ladder.limits.distances[leak]
+    assert "a series of exposure times at one pointing" in one.limits.alike[alike.index(leak)].would_separate
+
+
+def test_what_cannot_be_planned_is_named_with_its_reason() -> None:
+    untestable = planned(ONE).limits.untestable
+    assert "measured in the images" in untestable["scene_evolution"]
+    assert "same gain mode" in untestable["gain_mismatch"]
+
+
+def test_a_plan_as_json() -> None:
+    content = planned(LADDER).as_json()
+    assert content["schema"] == "gap-plan/1"
+    assert content["plan"]["images"] == 18
+    assert content["plan"]["pointings"][0] == {
+        "pointing": 1,
+        "view": "east_limb",
+        "images": 6,
+        "exposures_s": list(LADDER),
+    }
+    assert content["limits"]["dark_offset"] == {
+        "parameter": "offset",
+        "unit": "DN",
+        "found_90": found(planned(LADDER), "dark_offset"),
+    }
+    level = content["limits"]["intensity_gradient"]["parameters"]["level"]
+    assert level["found_90"] > 0 and "excluded_95" not in level
+    distances = [one["distance"] for one in content["distances"]]
+    assert len(distances) == 3 and distances == sorted(distances)
+    assert content["searched"] == ["wide_halo"]
+
+
+def test_a_plan_of_two_images_is_refused() -> None:
+    two = replace(plan_with(ONE), shots=plan_with(ONE).shots[:2])
+    with pytest.raises(DataError, match="at least 3 images, which the fit of a PSF needs; got 2: add images"):
+        planned_limits(two, diffraction(), library=FEW)
+
+
+def test_text_and_page_name_every_effect_and_pair() -> None:
+    plan = planned(ONE)
+    html = plan_page(plan).html()
+    check_stands_alone(html)
+    page = next(t for t in read_page(html) if t.name == "body").text
+    text = "\n".join(lines(plan))
+    for name in (*plan.limits.effects, *plan.limits.untestable):
+        assert name in text and name.replace("_", " ") in page
+    for pair in plan.limits.alike:
+        assert pair.would_separate in text and pair.would_separate in page
+    assert f"{found(plan, 'dark_offset'):.3g}" in text
+    cells = [t.text for t in read_page(html) if t.name == "td"]
+    assert all(f"{distance:.1f}" in cells for distance in plan.limits.distances.values())
+    assert "18 images of 128 x 128 px" in page
+    assert "wide_halo*" in text and "searches for its position or form" in text
+
+
+def test_a_strength_that_would_not_be_found_is_said() -> None:
+    plan = planned(LADDER)
+    hidden = EffectLimits("dark_offset", (ParameterLimits("offset", "DN", 2.0, None, None),))
+    strong = EffectLimits("wide_halo", (ParameterLimits("share", "", 0.1, 0.2, None),))
+    changed = replace(
+        plan.limits,
+        effects={"dark_offset": hidden, "wide_halo": strong},
+        alike=(),
+        untestable={},
+    )
+    plan = replace(plan, left_out={})
+    text = "\n".join(lines(replace(plan, limits=changed)))
+    assert f"offset: {NOT_FOUND}" in text and "hidden at every plausible size" in text
+    assert "share 0.2" in text and "hidden at its likely size" in text
+    assert "would show 0 of 2 effects at their likely size; all of them could be told apart" in text
+    html = plan_page(replace(plan, limits=changed)).html()
+    assert "No two effects are closer than 3 sigma" in html and "could not be tested" not in html
+    assert "could not use" not in html and "not usable" not in text
