@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -65,18 +66,29 @@ def scikit_image(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
 
 def aiapy(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
     """Its loop uses double precision and periodic convolution, so the image is padded first."""
-    import astropy.units as u
-    import sunpy.map
     from aiapy.psf import deconvolve
 
     padded = np.zeros(psf.shape)
     padded[: image.shape[0], : image.shape[1]] = image
-    header = {"ctype1": "HPLN-TAN", "ctype2": "HPLT-TAN", "cunit1": "arcsec", "cunit2": "arcsec"}
+    done = deconvolve(aia_map(padded), psf=psf, iterations=STEPS)
+    return np.asarray(done.data)[: image.shape[0], : image.shape[1]]
+
+
+def aia_map(pixels: np.ndarray) -> Any:
+    """A sunpy Map of these pixels, with the cards that aiapy needs."""
+    import astropy.units as u
+    import sunpy.map
+
+    header: dict[str, Any] = {
+        "ctype1": "HPLN-TAN",
+        "ctype2": "HPLT-TAN",
+        "cunit1": "arcsec",
+        "cunit2": "arcsec",
+    }
     header |= {"cdelt1": 0.6, "cdelt2": 0.6, "crpix1": 1, "crpix2": 1, "crval1": 0, "crval2": 0}
     header |= {"telescop": "SDO/AIA", "instrume": "AIA_3", "wavelnth": 171, "waveunit": "angstrom"}
     header |= {"date-obs": "2020-01-01T00:00:00", "hgln_obs": 0, "hglt_obs": 0, "dsun_obs": u.AU.to(u.m)}
-    done = deconvolve(sunpy.map.Map(padded, header), psf=psf, iterations=STEPS)
-    return np.asarray(done.data)[: image.shape[0], : image.shape[1]]
+    return sunpy.map.Map(pixels, header)
 
 
 CONTENDERS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {

@@ -1,55 +1,73 @@
 """heliopsf for Python programs: point-spread functions (PSFs) of solar EUV telescopes, and deconvolution.
 
-    >>> import heliopsf
-    >>> psf = heliopsf.build_psf("hri_euv")                          # in this process
-    >>> result = heliopsf.deconvolve("image.fits", psf)
+    >>> import heliopsf, sunpy.map
+    >>> image = sunpy.map.Map("image.fits")
+    >>> sharp = heliopsf.deconvolve(image)                           # a Map; the PSF is that of the telescope
+    >>> psf = heliopsf.psf_for(image)                                # the PSF itself
     >>> with heliopsf.Client("http://127.0.0.1:8765") as client:     # on a service
     ...     client.deconvolve("image.fits", "deconvolved.fits")
 
 The functions compute in this process. ``Client`` sends requests to a service. The service keeps products, versions and
-lineage. ``import heliopsf`` is fast, because each name is imported when it is first used.
+lineage. ``import heliopsf`` is fast, because each name is imported when it is first used. A name that needs packages of an
+extra (``pip install 'heliopsf[service]'``) raises ``MissingExtra``, which names the extra.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from heliopsf.images import deconvolve
-    from heliopsf.psfs import build_psf, read_psf
-    from heliopsf.transits import diagnose_gap, fit_scatter
-    from psfcore.errors import DataError
+    from heliopsf.images import deconvolve, psf_for
+    from heliopsf.outputs import Deconvolution
+    from heliopsf.psfs import Psf, build_psf, read_psf
+    from heliopsf.transits import GapDiagnosis, ScatterFit, diagnose_gap, fit_scatter
+    from psfcore.errors import DataError, MissingExtra
     from service.client.errors import ServiceError
     from service.client.http import Client
 
 __all__ = [
     "Client",
     "DataError",
+    "Deconvolution",
+    "GapDiagnosis",
+    "MissingExtra",
+    "Psf",
+    "ScatterFit",
     "ServiceError",
     "build_psf",
     "deconvolve",
     "diagnose_gap",
     "fit_scatter",
+    "psf_for",
     "read_psf",
 ]
 
+# The module of each name, and the extra with the packages that the module needs.
 _MODULES = {
-    "Client": "service.client.http",
-    "DataError": "psfcore.errors",
-    "ServiceError": "service.client.errors",
-    "build_psf": "heliopsf.psfs",
-    "deconvolve": "heliopsf.images",
-    "diagnose_gap": "heliopsf.transits",
-    "fit_scatter": "heliopsf.transits",
-    "read_psf": "heliopsf.psfs",
+    "Client": ("service.client.http", "service"),
+    "DataError": ("psfcore.errors", ""),
+    "Deconvolution": ("heliopsf.outputs", ""),
+    "GapDiagnosis": ("heliopsf.transits", "fit"),
+    "MissingExtra": ("psfcore.errors", ""),
+    "Psf": ("heliopsf.psfs", ""),
+    "ScatterFit": ("heliopsf.transits", "fit"),
+    "ServiceError": ("service.client.errors", "service"),
+    "build_psf": ("heliopsf.psfs", ""),
+    "deconvolve": ("heliopsf.images", ""),
+    "diagnose_gap": ("heliopsf.transits", "fit"),
+    "fit_scatter": ("heliopsf.transits", "fit"),
+    "psf_for": ("heliopsf.images", ""),
+    "read_psf": ("heliopsf.psfs", ""),
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module 'heliopsf' has no attribute {name!r}")
-    found = getattr(import_module(_MODULES[name]), name)
+    from psfcore.errors import module_of_extra
+
+    module, extra = _MODULES[name]
+    found = getattr(module_of_extra(extra, module), name)
     globals()[name] = found
     return found
 

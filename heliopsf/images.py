@@ -1,72 +1,292 @@
-"""Deconvolve an image in this process."""
+"""Deconvolve images in this process, and find their PSFs."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
 
-from heliopsf.psfs import LIMITS, read_psf
-from psfcore.deconvolve.conditions import Conditions
+import numpy as np
+from astropy.io.fits import Header
+from numpy.typing import NDArray
+
+from heliopsf.inputs import header_of, image_of, is_many
+from heliopsf.machine import cores
+from heliopsf.outputs import Deconvolution, in_form_of
+from heliopsf.progress import Told, told
+from heliopsf.psfs import Psf, build_psf, read_psf
+from psfcore.deconvolve.conditions import Conditions, EngineCache
 from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.methods.registry import method_named
+from psfcore.deconvolve.methods.registry import may_be_negative
 from psfcore.deconvolve.result import Deconvolved
-from psfcore.fits.channel import check_channel
-from psfcore.fits.header import check_not_deconvolved, content_of
-from psfcore.fits.observation import read_observation
+from psfcore.deconvolve.whole import Work, input_warnings, known_noise
+from psfcore.errors import DataError
+from psfcore.fits.header import check_not_deconvolved, content_of, plate_scale_arcsec, seen_by
 from psfcore.image import Image
+from psfcore.instruments.unknown import unknown_instrument
 from psfcore.noise import Noise
-from psfcore.psf import Psf
+from psfcore.psf import Psf as CorePsf
 from psfcore.psf_sampling import psf_for_image
+from psfcore.scatter.samples import possible_psfs
+
+if TYPE_CHECKING:
+    from astropy.nddata import NDData
+
+    Like = TypeVar("Like", NDData, NDArray[Any])
+else:
+    Like = TypeVar("Like")
+
+AnyPsf = str | Path | CorePsf | NDArray[np.floating]
 
 
+@overload
+def deconvolve(smap: str | Path | Image, psf: AnyPsf | None = ..., **options: Any) -> Deconvolution: ...
+@overload
+def deconvolve(smap: Like, psf: AnyPsf | None = ..., **options: Any) -> Like: ...
+@overload
+def deconvolve(smap: Sequence[Any], psf: AnyPsf | None = ..., **options: Any) -> list[Any]: ...
 def deconvolve(
-    image: str | Path | Image,
-    psf: str | Path | Psf,
+    smap: Any,
+    psf: AnyPsf | None = None,
+    iterations: int | None = None,
+    clip_negative: bool | None = None,
+    use_gpu: bool = False,
     *,
     method: str = "richardson-lucy",
     noise: tuple[float, float] | None = None,
+    error_draws: int = 0,
     saturation_dn: float | None = None,
     edges: Edges | None = None,
     other_channel: bool = False,
     again: bool = False,
-    threads: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    full: bool = False,
+    threads: int | None = None,
+    progress: Told = None,
     **parameters: Any,
-) -> Deconvolved:
-    """Deconvolve an image with a PSF. The result's ``pixels`` [y, x] have the shape and the unit of the image.
+) -> Any:
+    """Deconvolve an image with the PSF of its telescope. The result has the form of the image.
 
-    image: a FITS file, or an ``Image`` (pixels [y, x] with their unit, and a mask).
-    psf: a FITS file, or a ``Psf``. The PSF is rebinned if the image is binned.
-    noise: photon gain (DN per photon) and read noise (DN rms).
+        >>> import heliopsf, sunpy.map
+        >>> image = sunpy.map.Map("aia.fits")
+        >>> sharp = heliopsf.deconvolve(image)
+
+    The first parameters are those of ``aiapy.psf.deconvolve``; calls of it work unchanged.
+
+    smap: a sunpy Map (the result is a Map of the same class), an NDData or CCDData (the same), an array (an array; ``psf``
+    is then needed), a path of a FITS file or an ``Image`` (a ``Deconvolution``), or a list of these (a list). Cut-outs work
+    like whole images. Pixels with NaN or a mask are not used, and stay without a value.
+    psf: a ``Psf``, a path of a FITS file, or an array whose centre is [ny // 2, nx // 2]; default: the PSF that is built for
+    the telescope in the header, see ``psf_for``. The PSF is rebinned if the image is binned.
+    iterations: number of steps; default: that of the method (Richardson-Lucy: 20; aiapy: 25).
+    clip_negative: whether pixels below 0 count as 0; default: the rule of the method. The Richardson-Lucy methods always
+    count them as 0. For ``linear`` and ``basic-iterative`` the default is False.
+    use_gpu: without effect, because heliopsf computes on the processor; ``threads`` is the number of threads.
+    method: "richardson-lucy", "linear" or another method.
+    noise: photon gain (DN per photon) and read noise (DN rms); default: those of the instrument, if known.
+    error_draws: number of noise realisations (2 to 64) for the standard deviation of each pixel: ``uncertainty`` of the
+    result. Each realisation takes as long as one deconvolution. 0: no uncertainty.
     saturation_dn: pixels at or above this level (DN) are ignored; default: the level that the header or the instrument
-    file gives, or that the pixels show. The level is used only if ``image`` is a file.
+    file gives, or that the pixels show.
     edges: "zero", "symmetric" or "extended"; default: the assumption that suits the method best.
     other_channel: whether the PSF may be of another telescope, channel or filter than the image.
     again: deconvolve the image even if its header says that it is a product or a PSF.
-    progress(step, steps) is called after each step.
-    parameters: parameters of the method, such as ``steps=20``.
+    full: return a ``Deconvolution`` for every form of image: pixels, QUALITY, errors, changes and plots.
+    threads: default: all cores. The number does not change the result.
+    progress: True, or a function that is called with (step, steps) after each step of the deconvolution.
+    parameters: further parameters of the method, such as ``stop="discrepancy"``.
 
-    Raises ``DataError``; its ``code`` is the reason, such as "not-fits", "already-deconvolved", "plate-scale-mismatch",
-    "channel-mismatch" or "unknown-method". Gives a ``UserWarning`` if saturated pixels may be missed, or if the channels
-    cannot be compared.
+    A Map or NDData keeps its metadata. Added are the cards of products (PSFID, PSFVERS, ...), HISTORY, and a mask of the
+    pixels without a measurement (QUALITY 1 or 2: not finite, masked or saturated).
+
+    Raises ``DataError``; its ``code`` is the reason, such as "no-psf-for-instrument", "not-fits", "already-deconvolved",
+    "plate-scale-mismatch", "channel-mismatch" or "unknown-method". Gives a ``UserWarning`` if saturated pixels may be
+    missed, or if channels or plate scales cannot be compared.
     """
-    if not isinstance(image, Image):
-        image = read_observation(image, LIMITS, saturation_dn=saturation_dn)
+    options: dict[str, Any] = {
+        "iterations": iterations,
+        "clip_negative": clip_negative,
+        "method": method,
+        "noise": noise,
+        "error_draws": error_draws,
+        "saturation_dn": saturation_dn,
+        "edges": edges,
+        "other_channel": other_channel,
+        "again": again,
+        "threads": threads or cores(),
+        "progress": progress,
+        "parameters": parameters,
+    }
+    options["engines"] = EngineCache()
+    if not is_many(smap):
+        result = _deconvolved(smap, psf, **options)
+        return result if full else in_form_of(smap, result)
+    images = list(smap)
+    given = None if psf is None else _given(psf)
+    results = []
+    for number, image in enumerate(images, start=1):
+        try:
+            result = _deconvolved(image, given, **options)
+        except DataError as error:
+            told_which = f"image {number} of {len(images)}: {error.message}"
+            raise type(error)(error.code, told_which, error.fields) from error
+        results.append(result if full else in_form_of(image, result))
+    return results
+
+
+def psf_for(
+    image: Any,
+    *,
+    threads: int | None = None,
+    progress: Told = None,
+) -> Psf:
+    """The PSF for an image, on the pixels of the image. It is the PSF that a service without certified PSFs takes.
+
+    image: as for ``deconvolve``, or a header (a ``Header`` of astropy, or a table of cards such as ``Map.meta``).
+    The first call for a telescope takes up to a minute; the PSF is then kept (``heliopsf cache``).
+
+    Raises ``DataError`` "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch".
+    """
+    header = header_of(image)
+    psf = _built_for(header, threads or cores(), progress)
+    for message in input_warnings(psf, _header_only(header), other_channel=False).values():
+        warnings.warn(message, stacklevel=2)
+    return _on_pixels(psf, header)
+
+
+def _deconvolved(
+    image: Any,
+    psf: AnyPsf | None,
+    *,
+    iterations: int | None,
+    clip_negative: bool | None,
+    method: str,
+    noise: tuple[float, float] | None,
+    error_draws: int,
+    saturation_dn: float | None,
+    edges: Edges | None,
+    other_channel: bool,
+    again: bool,
+    threads: int,
+    progress: Told,
+    engines: EngineCache,
+    parameters: Mapping[str, Any],
+) -> Deconvolution:
+    observed = image_of(image, saturation_dn=saturation_dn)
     if not again:
-        check_not_deconvolved(content_of(image.header))
-    if not isinstance(psf, Psf):
-        psf = read_psf(psf)
-    said = [check_channel(psf, image.header, other_channel=other_channel)]
-    said += [None if image.saturation is None else image.saturation.warning]
-    for warning in said:
-        if warning is not None:
-            warnings.warn(warning, stacklevel=2)
-    conditions = Conditions(
-        edges=edges,
-        noise=None if noise is None else Noise(*noise),
-        threads=threads,
-        progress=progress,
+        check_not_deconvolved(content_of(observed.header))
+    found = _built_for(observed.header, threads, progress) if psf is None else _given(psf)
+    said = input_warnings(found, observed, other_channel=other_channel)
+    for message in [*said.values(), *_plate_scale_warning(found, observed.header)]:
+        warnings.warn(message, stacklevel=3)
+    fitted = _on_pixels(found, observed.header)
+    known = found.instrument if psf is None else None
+    work = Work(
+        _clipped(observed, clip_negative, method),
+        fitted,
+        method,
+        Conditions(
+            edges=edges,
+            noise=known_noise(known, observed.header) if noise is None else Noise(*noise),
+            threads=threads,
+            engine_for=engines,
+        ),
+        _with_steps(parameters, iterations),
     )
-    return method_named(method)(image, psf_for_image(psf, image.header), conditions, **parameters)
+    result = work.run(progress=told(progress, "deconvolving"))
+    _check_draws(error_draws)
+    errors = work.errors(
+        result,
+        error_draws,
+        possible_psfs=lambda: _possible(found, observed.header, threads),
+        begin=lambda stage, _: told(progress is True, stage),
+    )
+    return Deconvolution(
+        **{one.name: getattr(result, one.name) for one in fields(Deconvolved)},
+        image=observed,
+        psf=fitted,
+        errors=errors,
+        warnings=said,
+        work=work,
+    )
+
+
+def _built_for(header: Header, threads: int, progress: Told) -> Psf:
+    """The PSF of the shipped instrument file that the header names. Raises ``DataError`` "no-psf-for-instrument"."""
+    summary = seen_by(header)
+    if summary["instrument"] is None:
+        raise unknown_instrument(summary)
+    return build_psf(summary["instrument"], threads=threads, progress=progress is True)
+
+
+def _given(psf: AnyPsf) -> Psf:
+    if isinstance(psf, CorePsf):
+        return psf if isinstance(psf, Psf) else Psf.of(psf)
+    if isinstance(psf, str | Path):
+        return read_psf(psf)
+    if isinstance(psf, np.ndarray):
+        return Psf(
+            kernel=np.asarray(psf, np.float64),
+            name="array",
+            version="unversioned",
+            instrument=None,
+            status="user",
+        )
+    raise DataError(
+        "bad-input", f"psf: expected a Psf, a path of a FITS file or an array; got {type(psf).__name__}"
+    )
+
+
+def _on_pixels(psf: Psf, header: Header) -> Psf:
+    return cast(Psf, psf_for_image(psf, header))  # a changed copy has the class of the original
+
+
+def _possible(psf: Psf, header: Header, threads: int) -> list[CorePsf]:
+    if psf.fitted is None:
+        return []
+    return [psf_for_image(one, header) for one in possible_psfs(psf, threads=threads)]
+
+
+def _clipped(image: Image, clip_negative: bool | None, method: str) -> Image:
+    """The image with pixels below 0 set to 0, if this was asked for. Raises ``DataError`` "negative-pixels"."""
+    negative = image.valid & (image.pixels < 0)
+    if clip_negative is None or not negative.any():
+        return image
+    if clip_negative:
+        return replace(image, pixels=np.where(negative, 0.0, image.pixels))
+    if not may_be_negative(method):
+        raise DataError(
+            "negative-pixels",
+            f"clip_negative=False: expected an image without negative pixels, or a method whose results may be negative "
+            f'("linear", "basic-iterative"); got {np.count_nonzero(negative)} negative pixels and {method!r}',
+        )
+    return image
+
+
+def _with_steps(parameters: Mapping[str, Any], iterations: int | None) -> dict[str, Any]:
+    if iterations is None:
+        return dict(parameters)
+    if "steps" in parameters:
+        raise DataError("bad-steps", "expected iterations or steps; got both: they mean the same")
+    return {**parameters, "steps": iterations}
+
+
+def _check_draws(draws: int) -> None:
+    if draws and not 2 <= draws <= 64:
+        raise DataError("bad-draws", f"error_draws: expected 0, or 2 to 64; got {draws}")
+
+
+def _plate_scale_warning(psf: Psf, header: Header) -> list[str]:
+    if psf.plate_scale_arcsec is None or plate_scale_arcsec(header) is not None:
+        return []
+    return [
+        f"the header gives no plate scale (CDELT1 with a unit of angle); the image is taken to have "
+        f"{psf.plate_scale_arcsec:g} arcsec/px, the plate scale of PSF {psf.name}"
+    ]
+
+
+def _header_only(header: Header) -> Image:
+    """An image with this header, to compare channels when only the header is known."""
+    pixels = np.ones((16, 16))
+    return Image(pixels, np.zeros(pixels.shape, np.uint8), header, None, None)

@@ -1,18 +1,74 @@
-"""Build and read PSFs in this process."""
+"""Build, read and find PSFs in this process."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from psfcore import build
+from heliopsf.kept import kept_psf
+from heliopsf.machine import cores
+from heliopsf.progress import Told, told
+from psfcore.built.cache import sha256_of_file
+from psfcore.built.recipe import Recipe
+from psfcore.errors import module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.mask_file import read_mask_image
-from psfcore.instruments.model import load_instrument
-from psfcore.psf import Psf
+from psfcore.instruments.files import instrument_path
+from psfcore.instruments.model import load_instrument, read_instrument_text
+from psfcore.psf import Psf as CorePsf
+from psfcore.psf import cumulative_curve
+from psfcore.psf_sampling import rebinned
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike, NDArray
 
 LIMITS = FitsLimits(max_pixels=2**26)
+
+
+class Psf(CorePsf):
+    """The weights ``kernel`` [y, x] of a PSF, and how they were obtained.
+
+    A weight is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx // 2]. Further
+    fields: ``components``, ``name``, ``version``, ``instrument``, ``plate_scale_arcsec``, ``wavelength_angstrom``,
+    ``provenance``.
+    """
+
+    def light_beyond(self, radii_px: ArrayLike) -> NDArray[Any]:
+        """1 - encircled energy: the light beyond each radius (px), in percent."""
+        return cumulative_curve(self.kernel, radii_px)
+
+    def rebinned(self, factor: int) -> Psf:
+        """The PSF for pixels that are means of factor x factor pixels. Raises ``DataError`` "bad-binning"."""
+        return Psf.of(rebinned(self, factor))
+
+    def write(self, path: str | Path) -> None:
+        """Write the PSF and its components to a FITS file, which every function and command reads."""
+        toml = self.provenance.get("instrument_toml")
+        psfs.write_psf(path, self, instrument_file=None if toml is None else str(toml).encode())
+
+    def plot(self, axes: Axes | None = None, *, size: int = 129) -> Axes:
+        """Draw the central ``size`` px on a logarithmic scale. Needs the extra "plot". axes None: new axes."""
+        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_psf(self, axes, size=size)
+        return drawn
+
+    def plot_curve(self, axes: Axes | None = None) -> Axes:
+        """Draw 1 - encircled energy by radius, also of the components. Needs the extra "plot"."""
+        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_curves(self, axes)
+        return drawn
+
+    def quicklook(self) -> Figure:
+        """A figure with the centre, the mean weight by radius and the light beyond a radius. Needs the extra "plot"."""
+        figure: Figure = module_of_extra("plot", "psfcore.drawing.plots").psf_figure(self)
+        return figure
+
+    @classmethod
+    def of(cls, psf: CorePsf) -> Psf:
+        """A PSF of ``psfcore`` with the methods of this class."""
+        return cls(**{field.name: getattr(psf, field.name) for field in fields(CorePsf)})
 
 
 def build_psf(
@@ -20,26 +76,44 @@ def build_psf(
     *,
     size: int = 2048,
     component: str | None = None,
-    threads: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    threads: int | None = None,
+    progress: Told = None,
 ) -> Psf:
     """Compute the PSF of an instrument: a ``kernel`` [y, x] of (size, size) px, and its ``components``.
+
+    The PSF is kept in the user's cache folder (``heliopsf cache``); the next call reads it there.
 
     instrument: the name of a known instrument, such as "hri_euv", or the path of an instrument file (TOML). If the file
     names a mask image of the mount, that image is read too.
     size: an even number from 64 to 4096 (px).
     component: compute only this component, such as "DIFFRACTION".
-    progress(step, steps) is called after each step.
+    threads: default: all cores.
+    progress: True, or a function that is called with (step, steps).
 
     Raises ``DataError`` "bad-size", "unknown-component" or "bad-mount", and the errors of
     ``psfcore.instruments.model.load_instrument``.
     """
     known = load_instrument(instrument)
-    mask = None
+    own = isinstance(instrument, Path) or instrument.endswith(".toml")
+    mask, mask_id = None, None
     if known.mount is not None and known.mount.mask_image is not None:
-        mask = read_mask_image(Path(instrument).parent / known.mount.mask_image.file)
-    return build.build_psf(
-        known, size=size, component=component, mount_image=mask, threads=threads, progress=progress
+        file = Path(instrument).parent / known.mount.mask_image.file
+        mask, mask_id = read_mask_image(file), sha256_of_file(file)
+    recipe = Recipe(
+        text=read_instrument_text(Path(instrument) if own else instrument_path(str(instrument))),
+        name=None if own else str(instrument),
+        mask_id=mask_id,
+        size=size,
+        component=None if component is None else component.lower(),
+    )
+    return Psf.of(
+        kept_psf(
+            recipe,
+            LIMITS,
+            mount_image=mask,
+            threads=threads or cores(),
+            progress=told(progress, f"building the PSF of {known.name}"),
+        )
     )
 
 
@@ -49,4 +123,7 @@ def read_psf(path: str | Path) -> Psf:
     The weights of the kernel sum to 1 over the reach, and to less on a smaller array.
     Raises ``DataError``, for example "not-fits".
     """
-    return psfs.read_psf(path, LIMITS)
+    psf = Psf.of(psfs.read_psf(path, LIMITS))
+    # The id is that of a service to which the file is uploaded: the file of a built PSF keeps its id.
+    identity = psfs.stated_id(path, LIMITS) or sha256_of_file(Path(path))
+    return replace(psf, provenance={**psf.provenance, "psf_id": identity})

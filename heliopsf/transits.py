@@ -2,18 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from heliopsf.psfs import LIMITS
+from heliopsf.machine import cores
+from heliopsf.progress import Stages, told_stages
+from heliopsf.psfs import LIMITS, build_psf
+from psfcore.errors import module_of_extra
 from psfcore.gap import diagnose
-from psfcore.known_diffraction import known_diffraction
+from psfcore.gap.report.report import gap_report
+from psfcore.gap.verdict.calibration import COVERAGE
+from psfcore.known_diffraction import check_known
 from psfcore.noise import Noise
+from psfcore.psf import Kernel
 from psfcore.scatter.fit import TransitFit, fit_transit
 from psfcore.transit.folder import read_transit
 from psfcore.transit.transit import Transit
 
-Progress = Callable[[str, int, int], None]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+class ScatterFit(TransitFit):
+    """The fit of a transit: total PSF (``kernel``), ``scatter`` kernel, curves with errors, and limits of the fit."""
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the light beyond each radius with its error. Needs the extra "plot". axes None: new axes."""
+        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_fit(self, axes)
+        return drawn
+
+    def quicklook(self) -> Figure:
+        """A figure with curves, residuals and convergence. Needs the extra "plot"."""
+        figure: Figure = module_of_extra("plot", "psfcore.scatter.fit_plot").fit_figure(self)
+        return figure
+
+
+class GapDiagnosis(diagnose.Diagnosis):
+    """The diagnosis of a transit: which effect explains the residuals of the fit."""
+
+    def report(self) -> dict[str, Any]:
+        """The report (JSON): verdict, probabilities, limits, cautions (docs/gap.md)."""
+        return gap_report(self)
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the probabilities of the effects. Needs the extra "plot". axes None: new axes."""
+        axes = module_of_extra("plot", "matplotlib.pyplot").subplots()[1] if axes is None else axes
+        module_of_extra("plot", "psfcore.gap.report.plot").draw_effects(axes, self.report())
+        return axes
+
+    def quicklook(self) -> Figure:
+        """A figure with residuals, maps and effects. Needs the extra "plot"."""
+        figure: Figure = module_of_extra("plot", "psfcore.gap.report.plot").gap_figure(self, self.report())
+        return figure
 
 
 def fit_scatter(
@@ -23,9 +65,9 @@ def fit_scatter(
     noise: tuple[float, float] | None = None,
     saturation_dn: float | None = None,
     seed: int = 1,
-    threads: int = 1,
-    progress: Progress = lambda stage, step, steps: None,
-) -> TransitFit:
+    threads: int | None = None,
+    progress: Stages | bool | None = None,
+) -> ScatterFit:
     """Fit the scatter kernel to the stray light that a transit's images show inside the occulter's disc.
 
     transit: a folder with a transit.json.
@@ -34,14 +76,17 @@ def fit_scatter(
     saturation_dn: pixels at or above this level (DN) are ignored; default: the level that the instrument description
     gives for the image's gain mode.
     seed: seed of the random numbers.
-    progress(stage, step, steps) is called after each step.
+    threads: default: all cores.
+    progress: True, or a function that is called with (stage, step, steps) after each step.
 
     The result holds the total PSF (``kernel`` [y, x], 2048 px) and its scatter kernel. It also holds the curve of
     1 - encircled energy (radius in px, light in percent), the parameters with their errors, and the limits of the fit.
     Raises ``DataError``, for example "no-manifest" or "too-few-frames".
     """
+    threads = threads or cores()
     fitted = _read(transit, noise, saturation_dn, threads)
-    return fit_transit(fitted, shape=shape, seed=seed, threads=threads, progress=progress)
+    found = fit_transit(fitted, shape=shape, seed=seed, threads=threads, progress=told_stages(progress))
+    return ScatterFit(**{one.name: getattr(found, one.name) for one in fields(TransitFit)})
 
 
 def diagnose_gap(
@@ -49,27 +94,37 @@ def diagnose_gap(
     *,
     noise: tuple[float, float] | None = None,
     saturation_dn: float | None = None,
+    coverage: float = COVERAGE,
     seed: int = 1,
-    threads: int = 1,
-    progress: Progress = lambda stage, step, steps: None,
-) -> diagnose.Diagnosis:
+    threads: int | None = None,
+    progress: Stages | bool | None = None,
+) -> GapDiagnosis:
     """Fit a transit and find out which effect explains the residuals of the fit.
 
-    The parameters are those of ``fit_scatter``. ``psfcore.gap.report.report.gap_report`` turns the result into the report
-    (JSON). Raises the same errors as ``fit_scatter``.
+    coverage: the probability with which the answer set contains the true cause. The other parameters are those of
+    ``fit_scatter``. ``report()`` of the result is the report (JSON). Raises the same errors as ``fit_scatter``.
     """
-    return diagnose.diagnose(
-        _read(transit, noise, saturation_dn, threads), seed=seed, threads=threads, progress=progress
+    threads = threads or cores()
+    found = diagnose.diagnose(
+        _read(transit, noise, saturation_dn, threads),
+        coverage=coverage,
+        seed=seed,
+        threads=threads,
+        progress=told_stages(progress),
     )
+    return GapDiagnosis(**{one.name: getattr(found, one.name) for one in fields(diagnose.Diagnosis)})
 
 
 def _read(
     transit: str | Path, noise: tuple[float, float] | None, saturation_dn: float | None, threads: int
 ) -> Transit:
+    def diffraction(instrument: str | None, _shape: tuple[int, int]) -> Kernel:
+        return build_psf(check_known(instrument), component="DIFFRACTION", threads=threads).kernel
+
     return read_transit(
         transit,
         LIMITS,
-        diffraction=lambda instrument, _shape: known_diffraction(instrument, threads=threads),
+        diffraction=diffraction,
         noise=None if noise is None else Noise(*noise),
         saturation_dn=saturation_dn,
     )

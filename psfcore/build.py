@@ -14,15 +14,18 @@ also moves light from beyond the reach into the reach. For the diffraction of HR
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.built.recipe import Recipe
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.combined import DIFFRACTION, available_parts, diffraction_patterns
 from psfcore.errors import DataError
-from psfcore.instruments.model import Instrument
+from psfcore.fits.product.version import software_version
+from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.instruments.workload import LARGEST_SIZE_PX, check_workload
 from psfcore.psf import REACH_GRID_PX, Psf, crop_centred
 from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel
@@ -92,6 +95,39 @@ def build_psf(
         wavelength_angstrom=instrument.wavelength_angstrom,
         components={name: crop_centred(part, shape) for name, part in kernels.items()},
         provenance=provenance,
+    )
+
+
+def build_recipe(
+    recipe: Recipe,
+    *,
+    mount_image: NDArray[np.floating] | None = None,
+    progress: Progress | None = None,
+    threads: int = 1,
+) -> Psf:
+    """Compute the PSF of a recipe. Its version and its provenance name the recipe.
+
+    Raises the errors of `build_psf` and of `parse_instrument`.
+    """
+    psf = build_psf(
+        parse_instrument(recipe.text, recipe.name or "instrument_file"),
+        size=recipe.size,
+        component=recipe.component and recipe.component.upper(),
+        mount_image=mount_image,
+        threads=threads,
+        progress=progress,
+    )
+    return replace(
+        psf,
+        version=f"{psf.version}+{recipe.identity[:8]}",
+        provenance={
+            **psf.provenance,
+            "psf_id": recipe.identity,
+            "instrument_file_sha256": recipe.file_sha256,
+            "parameters": recipe.parameters,
+            "algorithm_version": recipe.algorithm_version,
+            "software_version": software_version(),
+        },
     )
 
 

@@ -21,8 +21,9 @@ import hashlib
 import logging
 import os
 import stat
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,8 @@ from numba import njit
 from numba.core.caching import IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
+# Called when a thread compiles a kernel. A new thread has none: a kernel that another thread of a job compiles is not told.
+_LISTENER: ContextVar[Callable[[bool], None] | None] = ContextVar("listener", default=None)
 SEAL_BYTES = 2 * hashlib.sha256().digest_size
 MARK = b"@compiled("
 SOURCE = Path(__file__)
@@ -63,6 +66,25 @@ def compiled(
         return kernel
 
     return decorate
+
+
+@contextmanager
+def listening(listener: Callable[[bool], None]) -> Iterator[None]:
+    """Call listener(False) when this thread begins to compile a kernel in the block, and listener(True) when it is compiled.
+
+    Compilation takes some seconds, once per installation. An exception of the listener stops the call of the kernel.
+    """
+    token = _LISTENER.set(listener)
+    try:
+        yield
+    finally:
+        _LISTENER.reset(token)
+
+
+def _tell(*, done: bool) -> None:
+    listener = _LISTENER.get()
+    if listener is not None:
+        listener(done)
 
 
 @cache
@@ -124,6 +146,7 @@ class KernelFiles(IndexDataCacheFile):
 
     def save(self, key: Any, data: Any) -> None:
         """Write a kernel to disk in one step. If this fails, log a warning; the kernel can still be used."""
+        _tell(done=True)
         if not trusted(Path(self._cache_path)):
             log.warning(
                 "expected a folder for compiled kernels to which nobody else can write; got %s: each process will compile "
@@ -141,8 +164,13 @@ class KernelFiles(IndexDataCacheFile):
             )
 
     def load(self, key: Any) -> Any:
-        """The kernel for this key, compiled from the present sources; None if it is not on disk yet."""
-        name = self._name(key)
+        """The kernel for this key, compiled from the present sources; None if it is not on disk yet, and must be compiled."""
+        data = self._found(self._name(key))
+        if data is None:
+            _tell(done=False)
+        return data
+
+    def _found(self, name: str) -> Any:
         if not (self._is_good(name) and self._is_ours(name)):
             return None
         data = self._load_data(name)

@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from typing import Any
 
+_OWN = {
+    "heliopsf",
+    "psfcore",
+    "workers",
+    "service",
+}  # a missing module of ours is a fault of the installation
 MOST_TOLD = 20  # errors of which the text is given, if one request has many
 
 
@@ -27,6 +34,25 @@ class DataError(ValueError):
 
 class HeaderError(DataError):
     """The headers of a file show that the file cannot be used. No pixel was read."""
+
+
+class MissingExtra(ImportError):
+    """A function needs packages that an extra of heliopsf installs, and they are not installed."""
+
+
+def module_of_extra(extra: str, module: str) -> Any:
+    """Import a module that needs packages of an extra, such as "plot"; "": of none. Raises MissingExtra, which names the extra."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in _OWN or not extra:
+            raise
+        raise MissingExtra(
+            f"expected the package {package}, which is not installed: install heliopsf with the extra {extra!r}, "
+            f"pip install 'heliopsf[{extra}]'",
+            name=error.name,
+        ) from error
 
 
 def together(errors: Sequence[DataError]) -> DataError:

@@ -13,6 +13,12 @@ def known_diffraction(instrument: str | None, *, threads: int = 1) -> Kernel:
 
     Raises DataError "no-known-psf" if the instrument is not known.
     """
+    known = load_instrument(check_known(instrument))
+    return build_psf(known, component="DIFFRACTION", threads=threads).kernel
+
+
+def check_known(instrument: str | None) -> str:
+    """The name of a known instrument. Raises DataError "no-known-psf" if the instrument is not known."""
     if instrument not in instrument_names():
         known = ", ".join(instrument_names())
         raise DataError(
@@ -20,4 +26,4 @@ def known_diffraction(instrument: str | None, *, threads: int = 1) -> Kernel:
             f'expected "known_psf" in transit.json, or an instrument with a known diffraction PSF ({known}); '
             f"got {instrument or 'neither'}",
         )
-    return build_psf(load_instrument(instrument), component="DIFFRACTION", threads=threads).kernel
+    return instrument

@@ -30,9 +30,9 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.header import optional_text, plate_scale_arcsec
+from psfcore.fits.binning import binning_factor
+from psfcore.fits.header import plate_scale_arcsec
 from psfcore.image import Image
-from psfcore.instruments.files import match_instrument
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred
 
 LARGEST_FACTOR = 64
@@ -57,32 +57,6 @@ def check_compatible(image: Image, psf: Psf) -> None:
             raise DataError(
                 "plate-scale-mismatch", f"expected {wanted}; got CDELT{axis} = {scale:g} arcsec/px"
             )
-
-
-def binning_factor(psf: Psf, header: Header) -> int:
-    """Number of the PSF's pixels per image pixel, along each axis.
-
-    The factor is 1 if the plate scales agree to 1 %, or if one of them is not known. If the image's plate scale is the
-    same whole multiple of the PSF's on both axes, the factor is that multiple. This requires that the image is from the
-    PSF's instrument, or that the PSF names no instrument. Otherwise the multiple may be a coincidence: a pixel of FSI,
-    for example, is as wide as nine pixels of HRI_EUV. Raises DataError "plate-scale-mismatch".
-    """
-    if psf.plate_scale_arcsec is None:
-        return 1
-    scales = [plate_scale_arcsec(header, axis) for axis in (1, 2)]
-    factors = {_factor(scale / psf.plate_scale_arcsec) for scale in scales if scale is not None}
-    if factors <= {1}:
-        return 1
-    if len(factors) > 1 or None in factors or not _same_instrument(psf, header):
-        found = " x ".join("unknown" if scale is None else f"{scale:g}" for scale in scales)
-        wanted = f"{psf.plate_scale_arcsec:g} arcsec/px, the plate scale of PSF {psf.name}, or binned images of its instrument"
-        raise DataError("plate-scale-mismatch", f"expected {wanted}; got CDELT1 x CDELT2 = {found} arcsec/px")
-    return factors.pop() or 1
-
-
-def _same_instrument(psf: Psf, header: Header) -> bool:
-    cards = {key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")}
-    return psf.instrument is None or match_instrument(cards) == psf.instrument
 
 
 def rebinned(psf: Psf, factor: int) -> Psf:
@@ -126,9 +100,3 @@ def _rebin_axis(kernel: Kernel, factor: int) -> Kernel:
     np.add.at(out, low + half, (1 - upper) * kernel)
     np.add.at(out, low + half + 1, upper * kernel)
     return out
-
-
-def _factor(ratio: float) -> int | None:
-    """The whole number that agrees with the ratio of two plate scales to 1 %; None if there is no such number."""
-    whole = round(ratio)
-    return whole if whole >= 1 and abs(ratio / whole - 1) <= PLATE_SCALE_TOLERANCE else None

@@ -71,6 +71,11 @@ def _plain_texts(artist: Artist) -> Iterator[Text]:
 
 
 def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, unit: str) -> None:
+    """Write the figure of `preview_figure` as PNG."""
+    write_png(preview_figure(before, after, title=title, unit=unit), path, pil_kwargs={"compress_level": 3})
+
+
+def preview_figure(before: Plane, after: Plane, *, title: str, unit: str) -> Figure:
     """Draw three panels [y, x], first row at the bottom: before, after (same stretch), change in percent.
 
     unit: unit of the pixels, see `psfcore.drawing.units`.
@@ -99,10 +104,15 @@ def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, un
         else:
             axes.set_yticks([])
         colourbar(figure, axes, drawn, beyond="both" if name == "Change" else "max")
-    write_png(figure, path, pil_kwargs={"compress_level": 3})
+    return figure
 
 
 def psf_png(psf: Psf, path: str | Path) -> None:
+    """Write the figure of `psf_figure` as PNG."""
+    write_png(psf_figure(psf), path)
+
+
+def psf_figure(psf: Psf) -> Figure:
     """Draw three panels: the centre on a logarithmic scale, mean weight by radius, 1 - encircled energy by radius.
 
     There is a curve for the total PSF and one for each component. The Airy pattern of the open aperture is a reference.
@@ -141,7 +151,7 @@ def psf_png(psf: Psf, path: str | Path) -> None:
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
     figure.legend(loc="outside lower center", ncols=len(kernels), frameon=False, reverse=True)
-    write_png(figure, path)
+    return figure
 
 
 def _smoothed_profile(kernel: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -101,7 +101,7 @@ class ShapesByErrors:
 
 
 def _cell(figure: tuple[float, float], sign: str = "") -> str:
-    return f"{f'{figure[0]:{sign}.2f} +- {figure[1]:.2f}':>16}"
+    return f"{f'{figure[0]:{sign}.2f} ± {figure[1]:.2f}':>16}"
 
 
 def _named(figures: dict[str, tuple[float, float]]) -> dict[str, dict[str, float]]:

@@ -45,8 +45,8 @@ def _pointing(of: Json) -> str:
 def _trend(trend: Json) -> str:
     relative, absolute = trend["relative_pct"], trend["absolute_dn_s"]
     return (
-        f"pointing {trend['fov']} along {trend['against']}: {relative['per_100_px']:+.2f} +- {relative['sigma']:.2f} %, "
-        f"{absolute['per_100_px']:+.3g} +- {absolute['sigma']:.2g} DN/s per {TREND_PX} px"
+        f"pointing {trend['fov']} along {trend['against']}: {relative['per_100_px']:+.2f} ± {relative['sigma']:.2f} %, "
+        f"{absolute['per_100_px']:+.3g} ± {absolute['sigma']:.2g} DN/s per {TREND_PX} px"
     )
 
 
@@ -70,7 +70,7 @@ def _shapes(shapes: list[Json]) -> list[str]:
 
 
 def _figures(figures: Json, sign: str = "") -> str:
-    texts = (f"{figures[name]['value']:{sign}.2f} +- {figures[name]['sigma']:.2f}" for name in SHAPE_FIGURES)
+    texts = (f"{figures[name]['value']:{sign}.2f} ± {figures[name]['sigma']:.2f}" for name in SHAPE_FIGURES)
     return "".join(f"{text:>16}" for text in texts)
 
 

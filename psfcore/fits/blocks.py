@@ -35,6 +35,7 @@ BLOCK_BYTES = 2880
 CARD_BYTES = 80
 _BITPIX = (8, 16, 32, 64, -32, -64)
 _SKIP_BYTES = 1 << 20
+_MANY_AXES = 10  # of so many, a message does not write the indices
 END_CARD = b"END" + b" " * 77
 # astropy ends a header at a card such as "END x" too, and would then see another file than this module.
 _DAMAGED_END = re.compile(rb"END[^A-Z0-9_-]")
@@ -187,19 +188,26 @@ def walk(source: Source, limits: FitsLimits, *, to_the_end: bool) -> Iterator[tu
         raise HeaderError("too-many-hdus", message)
 
 
+def _counted(kinds: list[str]) -> str:
+    return "1 HDU" if len(kinds) == 1 else f"{len(kinds)} HDUs"
+
+
 def _no_image(kinds: list[str]) -> HeaderError:
     wanted = "expected a two-dimensional image"
     if any(kind.startswith("cube") for kind in kinds):
-        axes = next(kind for kind in kinds if kind.startswith("cube")).split()[1]
-        code = "three-axes" if axes == "3" else "not-2d"
-        return HeaderError(code, f"{wanted}; got an image of {axes} axes")
+        hdu, kind = next((n, kind) for n, kind in enumerate(kinds) if kind.startswith("cube"))
+        axes = int(kind.split()[1])
+        first = ", ".join("0" * (axes - 2)) if axes < _MANY_AXES else "..."
+        return HeaderError(
+            "three-axes" if axes == 3 else "not-2d",
+            f"{wanted}; got an image of {axes} axes: write one plane of it, for example the first one with astropy: "
+            f"hdus = fits.open('FILE'); hdus[{hdu}].data = hdus[{hdu}].data[{first}]; hdus.writeto('NEW')",
+        )
     if "line" in kinds:
         return HeaderError("not-2d", f"{wanted}; got an image of one axis")
     if "table" in kinds:
-        return HeaderError("table-only", f"{wanted}; got only tables ({len(kinds)} HDUs)")
-    return HeaderError(
-        "no-image", f"{wanted}; got {len(kinds)} HDUs, and the data of none of them have two axes"
-    )
+        return HeaderError("table-only", f"{wanted}; got only tables ({_counted(kinds)})")
+    return HeaderError("no-image", f"{wanted}; got {_counted(kinds)}, and none has data with two axes")
 
 
 def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:

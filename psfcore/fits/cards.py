@@ -7,7 +7,7 @@ IAU FITS working group 2018), section 4.4.
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 from psfcore.errors import HeaderError
 
@@ -15,6 +15,14 @@ if TYPE_CHECKING:
     from astropy.io.fits import Header
 
 LARGEST_COUNT = 2**63 - 1
+
+
+class Cards(Protocol):
+    """Header cards by their keywords: the header of a file, or the cards that the catalogue keeps of it."""
+
+    def __getitem__(self, key: str, /) -> Any:
+        """The value of a card. Raises KeyError if there is no such card."""
+        ...
 
 
 @cache

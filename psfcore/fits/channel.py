@@ -9,20 +9,32 @@ the channels of AIA, EUI and similar telescopes differ by more, and headers roun
 from __future__ import annotations
 
 import re
-
-from astropy.io.fits import Header
+from collections.abc import Mapping
+from typing import Protocol
 
 from psfcore.errors import DataError
-from psfcore.fits.header import optional_text, wavelength_angstrom
-from psfcore.instruments.files import instrument_names, match_instrument, match_table
+from psfcore.fits.cards import Cards
+from psfcore.fits.header import known_instrument, optional_text, wavelength_angstrom
+from psfcore.instruments.files import WAVELENGTH_TOLERANCE, instrument_names, match_table
 from psfcore.instruments.model import load_instrument
-from psfcore.psf import Psf
 
-WAVELENGTH_TOLERANCE = 0.01  # largest deviation from 1 of the ratio of two wavelengths
 _TO_ALLOW = "set other_channel (--other-channel)"
 
 
-def check_channel(psf: Psf, header: Header, *, other_channel: bool = False) -> str | None:
+class Origin(Protocol):
+    """The properties of a PSF that say which images it is for. `psfcore.psf.Psf` has them."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def instrument(self) -> str | None: ...
+    @property
+    def wavelength_angstrom(self) -> float | None: ...
+    @property
+    def cards(self) -> Mapping[str, str]: ...
+
+
+def check_channel(psf: Origin, header: Cards, *, other_channel: bool = False) -> str | None:
     """Compare a PSF with an image of this header. Returns a warning, or None if they are of one channel.
 
     The warning does not name the PSF: it becomes a part of the product, which must not depend on the name of a file.
@@ -36,6 +48,7 @@ def check_channel(psf: Psf, header: Header, *, other_channel: bool = False) -> s
             "channel-mismatch",
             f"expected an image of the telescope, channel and filter of PSF {psf.name}; {'; '.join(differences)}: name "
             f"a PSF of the image's channel, or {_TO_ALLOW} to use this PSF",
+            {"psf": psf.name, "differences": differences},
         )
     if differences:
         return f"the PSF is of another channel than the image: {'; '.join(differences)}"
@@ -49,7 +62,7 @@ def check_channel(psf: Psf, header: Header, *, other_channel: bool = False) -> s
     return None
 
 
-def channel_differences(psf: Psf, header: Header) -> list[str]:
+def channel_differences(psf: Origin, header: Cards) -> list[str]:
     """In what the PSF and an image of this header differ, one text for each difference."""
     differences = []
     instrument = _other_instrument(psf, header)
@@ -67,28 +80,30 @@ def channel_differences(psf: Psf, header: Header) -> list[str]:
     return differences
 
 
-def _other_instrument(psf: Psf, header: Header) -> str | None:
+def _other_instrument(psf: Origin, header: Cards) -> str | None:
     """The image's instrument, if it is known not to be that of the PSF; otherwise None."""
     if psf.instrument not in instrument_names():
         return None
-    cards = {key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")}
-    known = match_instrument(cards)
+    known = known_instrument(header)
     if known is not None:
         return None if known == psf.instrument else known
-    # An instrument file without [match] cannot say which images are of its instrument.
+    # The wavelength is compared separately. An instrument file without [match] cannot say which images are of its
+    # instrument.
+    wanted = {key: text for key, text in match_table(psf.instrument).items() if isinstance(text, str)}
+    cards = {key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")}
     named = " ".join(text for text in cards.values() if text)
-    return named or None if match_table(psf.instrument) else None
+    compared = [_same_words(text, wanted[key]) for key, text in cards.items() if text and key in wanted]
+    return named or None if wanted and not (compared and all(compared)) else None
 
 
-def _image_wavelength(header: Header) -> float | None:
+def _image_wavelength(header: Cards) -> float | None:
     """Wavelength in angstrom from the header, else from the file of the known instrument; None if there is neither."""
     found = wavelength_angstrom(header)
-    cards = {key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")}
-    known = match_instrument(cards)
+    known = known_instrument(header)
     return load_instrument(known).wavelength_angstrom if found is None and known is not None else found
 
 
-def _psf_wavelength(psf: Psf) -> float | None:
+def _psf_wavelength(psf: Origin) -> float | None:
     if psf.wavelength_angstrom is None and psf.instrument in instrument_names():
         return load_instrument(psf.instrument).wavelength_angstrom
     return psf.wavelength_angstrom

@@ -7,14 +7,18 @@ mode, which the card GAINCOMB names (`combined`, `high-only`, `low-only`). The v
 
 from __future__ import annotations
 
-from astropy.io.fits import Header
+from typing import TYPE_CHECKING
 
+from psfcore.errors import DataError
+from psfcore.fits.cards import Cards
 from psfcore.fits.header import optional_text
 from psfcore.instruments.model import GainMode, Instrument
-from psfcore.noise import Noise
+
+if TYPE_CHECKING:
+    from psfcore.noise import Noise
 
 
-def gain_mode(instrument: Instrument, header: Header) -> GainMode | None:
+def gain_mode(instrument: Instrument, header: Cards) -> GainMode | None:
     """The mode that GAINCOMB names, in upper or lower case.
 
     None if the card is missing, or if the instrument description does not have this mode.
@@ -24,15 +28,35 @@ def gain_mode(instrument: Instrument, header: Header) -> GainMode | None:
     return modes.get(named)
 
 
-def saturation_for(instrument: Instrument, header: Header) -> float | None:
+def saturation_for(instrument: Instrument, header: Cards) -> float | None:
     """Level (DN in one exposure) from which a pixel is saturated; None if it is not known."""
     mode = gain_mode(instrument, header)
     return None if mode is None else mode.saturation_dn
 
 
-def noise_for(instrument: Instrument, header: Header) -> Noise | None:
-    """Photon gain and read noise of the image's gain mode; None if one of the two is not known."""
+def noise_figures_for(instrument: Instrument, header: Cards) -> tuple[float, float] | None:
+    """Photon gain (DN per photon) and read noise (DN rms) of the image's gain mode; None if one of the two is not known."""
     mode = gain_mode(instrument, header)
     if mode is None or mode.photon_gain_dn is None or mode.read_noise_dn is None:
         return None
-    return Noise(photon_gain_dn=mode.photon_gain_dn, read_noise_dn=mode.read_noise_dn)
+    return mode.photon_gain_dn, mode.read_noise_dn
+
+
+def noise_for(instrument: Instrument, header: Cards) -> Noise | None:
+    """The noise model with the figures of `noise_figures_for`; None if there are none."""
+    figures = noise_figures_for(instrument, header)
+    if figures is None:
+        return None
+    from psfcore.noise import Noise
+
+    return Noise(*figures)
+
+
+def no_noise_figures() -> DataError:
+    """The error for noise realisations of a camera whose noise is not known."""
+    return DataError(
+        "no-noise-figures",
+        "expected noise (photon_gain_dn and read_noise_dn) to simulate noise realisations; got none, and the instrument's "
+        "figures are unknown: give them (noise=(GAIN, READ) in Python, --noise GAIN READ on the command line, noise in a "
+        "request), or ask for 0 noise realisations",
+    )

@@ -24,8 +24,10 @@ from psfcore.errors import DataError
 from psfcore.fits.header import HeaderSummary
 from psfcore.fits.tiled.compression import compression_of
 from psfcore.fits.tiled.tiles import check_tiles
+from psfcore.whole_files import probe
 
 _CHECKSUM_COMMENT = "computed when the file was written"
+_RIGHT = 1  # answer of astropy: the card is there, and its value is right
 # Exceptions that astropy raises for a damaged data unit. The position of the damage decides which one it raises.
 PIXEL_TROUBLE = (
     CfitsioException,  # raised when RICE decoding fails; astropy has no public name for it
@@ -126,12 +128,26 @@ def ascii_text(text: str) -> str:
     return "".join(c if " " <= c <= "~" else " " if c.isspace() else "?" for c in text)
 
 
+def as_written(hdu: Any) -> bool:
+    """Whether an HDU is as `write_hdus` wrote it: its checksums are right, and no other program computed them again."""
+    sums = ("CHECKSUM", "DATASUM")
+    ours = all(key in hdu.header and hdu.header.comments[key] == _CHECKSUM_COMMENT for key in sums)
+    return ours and hdu.verify_datasum() == hdu.verify_checksum() == _RIGHT
+
+
 def write_hdus(path: str | Path, hdus: list[Any]) -> None:
-    """Write HDUs with checksums, but without a date of writing."""
+    """Write HDUs with checksums, but without a date of writing. Raises OSError, with the number of the system's error if there is
+    one now."""
     hdus[0].header["EXTEND"] = True
     for hdu in hdus:
         hdu.verify("silentfix")
         hdu.add_checksum(when=_CHECKSUM_COMMENT)
     # Pass an open file. If astropy gets a name such as x.fits.gz, it compresses the file because of the ending.
     with Path(path).open("wb") as file:
-        fits.HDUList(hdus).writeto(file, output_verify="silentfix")
+        try:
+            fits.HDUList(hdus).writeto(file, output_verify="silentfix")
+        except OSError as error:
+            if error.errno is None:
+                # numpy and astropy say how many bytes were written, not why no more were. A full disk is still full.
+                probe(Path(path))
+            raise

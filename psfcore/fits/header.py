@@ -6,14 +6,15 @@ of the file must be correct (see `psfcore.fits.blocks`). This module reads no pi
 
 from __future__ import annotations
 
+import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits, first_image, open_source, walk
-from psfcore.fits.cards import card_count, card_flag, card_text, card_trouble
+from psfcore.fits.cards import Cards, card_count, card_flag, card_text, card_trouble
 from psfcore.instruments.files import match_instrument
 
 if TYPE_CHECKING:
@@ -27,12 +28,14 @@ __all__ = [
     "check_not_deconvolved",
     "content_of",
     "first_image_header",
+    "known_instrument",
     "optional_exposure_s",
     "optional_number",
     "optional_text",
     "optional_value",
     "plate_scale_arcsec",
     "read_summary",
+    "seen_by",
     "wavelength_angstrom",
 ]
 
@@ -49,6 +52,13 @@ _ANGSTROM_PER_UNIT = {
 }
 # The content of a file, see `content_of`.
 IMAGE, PRODUCT, PSF = "image", "product", "psf"
+# The cards that say which PSF and which image fit together.
+ORIGIN_CARDS = ("TELESCOP", "INSTRUME", "DETECTOR", "FILTER")
+_FIT_CARDS = (
+    *ORIGIN_CARDS,
+    *("WAVELNTH", "WAVEUNIT", "CDELT1", "CDELT2", "CUNIT1", "CUNIT2", "CD1_1", "CD1_2", "CD2_1", "CD2_2"),
+    *("GAINCOMB", "PSFNAME"),
+)
 _ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600.0}
 
 
@@ -56,7 +66,8 @@ _ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600
 class HeaderSummary:
     """The first 2-D image of a file: its HDU, its shape (ny, nx) and values of its header.
 
-    A value is None if its card is missing or unusable. content: IMAGE, PRODUCT or PSF, see `content_of`.
+    A value is None if its card is missing or unusable. content: IMAGE, PRODUCT or PSF, see `content_of`. cards: the usable
+    cards that say which PSF and which image fit together.
     """
 
     hdu: int
@@ -80,6 +91,7 @@ class HeaderSummary:
     psf_name: str | None
     psf_version: str | None
     content: str = IMAGE
+    cards: dict[str, str | float | bool] = field(default_factory=dict)
 
 
 def read_summary(path: str | os.PathLike[str], limits: FitsLimits) -> HeaderSummary:
@@ -134,7 +146,20 @@ def check_not_deconvolved(content: str) -> None:
         )
 
 
-def optional_text(header: Header, *keys: str) -> str | None:
+def origin_of(header: Cards) -> tuple[str | None, dict[str, str]]:
+    """The instrument of a PSF, and the cards that say which images it is for. header: of the file of the PSF.
+
+    INSTRUME of a file of `psfcore.fits.psfs.write_psf`, which has the card PSFNAME, is the name of an instrument file.
+    """
+    own = optional_text(header, "PSFNAME") is not None
+    texts = {key: optional_text(header, key) for key in ORIGIN_CARDS}
+    named = texts["INSTRUME"] if own else known_instrument(header)
+    return named, {
+        key: text for key, text in texts.items() if text is not None and not (own and key == "INSTRUME")
+    }
+
+
+def optional_text(header: Cards, *keys: str) -> str | None:
     """Text of the first of the cards `keys` that holds a non-empty string; None if no card does.
 
     Surrounding spaces are removed.
@@ -146,7 +171,7 @@ def optional_text(header: Header, *keys: str) -> str | None:
     return None
 
 
-def optional_number(header: Header, *keys: str) -> float | None:
+def optional_number(header: Cards, *keys: str) -> float | None:
     """Value of the first of the cards `keys` that holds a finite number; None if no card does."""
     for key in keys:
         value = _lenient(header, key)
@@ -155,7 +180,7 @@ def optional_number(header: Header, *keys: str) -> float | None:
     return None
 
 
-def optional_value(header: Header, key: str) -> str | float | bool | None:
+def optional_value(header: Cards, key: str) -> str | float | bool | None:
     """Value of a card: True or False, a finite number, or a text without surrounding spaces; otherwise None."""
     value = _lenient(header, key)
     if isinstance(value, bool):
@@ -164,30 +189,43 @@ def optional_value(header: Header, key: str) -> str | float | bool | None:
     return optional_text(header, key) if number is None else number
 
 
-def plate_scale_arcsec(header: Header, axis: int = 1) -> float | None:
-    """Plate scale of an axis, |CDELT| in arcsec/px.
+def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
+    """Plate scale of an axis in arcsec/px: |CDELT|, or the length of a column of the matrix CDi_j.
 
-    If CUNIT is missing, the unit is arcsec. Returns None if CDELT is missing or 0, or if CUNIT is not an angle.
+    If CUNIT is missing, the unit is arcsec. Returns None if CDELT and the matrix are missing or 0, or if CUNIT is not an angle.
     """
     step = optional_number(header, f"CDELT{axis}")
+    if step is None:
+        step = math.hypot(*(optional_number(header, f"CD{row}_{axis}") or 0.0 for row in (1, 2)))
     factor = _ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{axis}") or "arcsec").lower())
     return None if not step or factor is None else abs(step) * factor
 
 
-def wavelength_angstrom(header: Header) -> float | None:
-    """Wavelength of an image in angstrom: WAVELNTH in the unit WAVEUNIT.
+def wavelength_angstrom(header: Cards) -> float | None:
+    """Wavelength of an image in angstrom: WAVELNTH in the unit WAVEUNIT; without WAVELNTH, the text WAVE_LEN of TRACE.
 
     If WAVEUNIT is missing, the unit is angstrom. Returns None if WAVELNTH is missing or not above 0, or if the unit is
     unknown.
     """
     value = optional_number(header, "WAVELNTH")
+    of_trace = optional_text(header, "WAVE_LEN")
+    if value is None and of_trace is not None and of_trace.isdecimal():
+        value = float(of_trace)
     power = optional_number(header, "WAVEUNIT")
     unit = optional_text(header, "WAVEUNIT") or ("angstrom" if power is None else f"{power:g}")
     factor = _ANGSTROM_PER_UNIT.get(unit.replace(" ", "").lower())
     return None if value is None or value <= 0 or factor is None else value * factor
 
 
-def optional_exposure_s(header: Header) -> float | None:
+def known_instrument(header: Cards) -> str | None:
+    """Name of the shipped instrument whose table [match] agrees with this header; None if there is none."""
+    cards: dict[str, object] = {
+        key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")
+    }
+    return match_instrument({**cards, "WAVELNTH": wavelength_angstrom(header)})
+
+
+def optional_exposure_s(header: Cards) -> float | None:
     """Exposure time in s: the value of XPOSURE, or else of EXPTIME. None if neither card holds a number above zero."""
     for key in ("XPOSURE", "EXPTIME"):
         exposure = optional_number(header, key)
@@ -196,7 +234,24 @@ def optional_exposure_s(header: Header) -> float | None:
     return None
 
 
-def _lenient(header: Header, key: str) -> object:
+def seen_by(header: Cards) -> dict[str, Any]:
+    """What a header says about the observation: the fields of `HeaderSummary` from instrument to gain_mode, by name."""
+    return {
+        "instrument": known_instrument(header),
+        "telescop": optional_text(header, "TELESCOP"),
+        "instrume": optional_text(header, "INSTRUME"),
+        "detector": optional_text(header, "DETECTOR"),
+        "wavelnth": wavelength_angstrom(header),
+        "date_obs": optional_text(header, "DATE-BEG", "DATE-OBS", "DATE_OBS"),
+        "exposure_s": optional_exposure_s(header),
+        "unit": optional_text(header, "BUNIT"),
+        "cdelt1": optional_number(header, "CDELT1"),
+        "cdelt2": optional_number(header, "CDELT2"),
+        "gain_mode": optional_text(header, "GAINCOMB"),
+    }
+
+
+def _lenient(header: Cards, key: str) -> object:
     """Value of a card that only describes the image; None if it is missing or damaged."""
     try:
         return header[key]
@@ -216,27 +271,17 @@ def _pair(header: Header, stem: str) -> tuple[int, int] | None:
 def _summary(header: Header, hdu: int, gzipped: bool) -> HeaderSummary:
     compressed = card_flag(header, "ZIMAGE")
     z = "Z" if compressed else ""
-    cards = {key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")}
     return HeaderSummary(
         hdu=hdu,
         shape=(card_count(header, f"{z}NAXIS2"), card_count(header, f"{z}NAXIS1")),
         bitpix=card_count(header, f"{z}BITPIX", smallest=-64, largest=64),
         codec=card_text(header, "ZCMPTYPE") if compressed else None,
         gzipped=gzipped,
-        instrument=match_instrument(cards),
-        telescop=cards["TELESCOP"],
-        instrume=cards["INSTRUME"],
-        detector=cards["DETECTOR"],
-        wavelnth=optional_number(header, "WAVELNTH"),
-        date_obs=optional_text(header, "DATE-BEG", "DATE-OBS"),
-        exposure_s=optional_exposure_s(header),
-        unit=optional_text(header, "BUNIT"),
-        cdelt1=optional_number(header, "CDELT1"),
-        cdelt2=optional_number(header, "CDELT2"),
-        gain_mode=optional_text(header, "GAINCOMB"),
+        **seen_by(header),
         pxbeg=_pair(header, "PXBEG"),
         pxend=_pair(header, "PXEND"),
         psf_name=optional_text(header, "PSFNAME"),
         psf_version=optional_text(header, "PSFVERS"),
         content=content_of(header),
+        cards={key: value for key in _FIT_CARDS if (value := optional_value(header, key)) is not None},
     )

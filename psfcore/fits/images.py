@@ -21,7 +21,7 @@ from psfcore.fits.cards import card_trouble
 from psfcore.fits.hdus import ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import FitsLimits, optional_exposure_s, optional_text, read_summary
 from psfcore.fits.product.planes import Meanings, check_plane, plane_hdu
-from psfcore.fits.saturation import card_levels, per_second
+from psfcore.fits.saturation import card_levels, in_other_unit, per_second
 from psfcore.image import Image, MaskBit
 
 CardValue = str | int | float | bool
@@ -49,13 +49,28 @@ def read_image(path: str | Path, limits: FitsLimits, *, saturation_dn: float | N
     """
     summary = read_summary(path, limits)
     pixels, header = read_pixels(path, summary)
+    return image_of(pixels, header, saturation_dn=saturation_dn, stored_as_integer=summary.bitpix > 0)
+
+
+def image_of(
+    pixels: NDArray[np.float64],
+    header: fits.Header,
+    *,
+    saturation_dn: float | None = None,
+    stored_as_integer: bool = False,
+) -> Image:
+    """The image of pixels [y, x] and a header, with its unusable pixels masked as in `read_image`.
+
+    stored_as_integer: whether the numbers come from a converter, without a calibration. Raises DataError "no-exposure",
+    "all-nan", "all-saturated", "no-signal", "too-small", "not-2d".
+    """
     unit, exposure_s = optional_text(header, "BUNIT"), optional_exposure_s(header)
     level = _saturation_level(header, unit, exposure_s, saturation_dn)
     mask = np.where(np.isfinite(pixels), 0, int(MaskBit.NONFINITE)).astype(np.uint8)
     if level is not None:
         mask[pixels >= level] |= int(MaskBit.SATURATED)  # False for NaN
     image = Image(pixels=pixels, mask=mask, header=header, unit=unit, exposure_s=exposure_s)
-    _check_signal(image, stored_as_integer=summary.bitpix > 0)
+    _check_signal(image, stored_as_integer=stored_as_integer)
     return image
 
 
@@ -72,7 +87,7 @@ def _saturation_level(
 ) -> float | None:
     """Lowest saturated value in the unit of the image; None if no level is known."""
     levels = list(card_levels(header).values())
-    if saturation_dn is not None:
+    if saturation_dn is not None and not in_other_unit(unit):
         if not per_second(unit):
             levels.append(saturation_dn)
         elif exposure_s is not None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.image import imread
 from numpy.typing import NDArray
 
-from psfcore.errors import DataError
+from psfcore.errors import DataError, module_of_extra
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_plane
 
@@ -32,6 +31,7 @@ def read_mask_image(path: Path) -> NDArray[np.float64]:
 
 
 def _png(path: Path) -> NDArray[np.float64]:
+    imread = module_of_extra("plot", "matplotlib.image").imread
     try:
         picture = np.asarray(imread(path, format="png"), dtype=np.float64)
     except (OSError, ValueError, SyntaxError) as error:  # Pillow raises SyntaxError for a broken PNG

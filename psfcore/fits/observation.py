@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 from astropy.io.fits import Header
+from numpy.typing import NDArray
 
 from psfcore.fits.gain import saturation_for
-from psfcore.fits.header import FitsLimits, first_image_header, optional_text
-from psfcore.fits.images import read_image
+from psfcore.fits.header import FitsLimits, first_image_header, known_instrument
+from psfcore.fits.images import image_of, read_image
 from psfcore.fits.saturation import with_saturation
 from psfcore.image import Image
-from psfcore.instruments.files import match_instrument
 from psfcore.instruments.model import load_instrument
 
 
@@ -26,7 +27,25 @@ def read_observation(path: str | Path, limits: FitsLimits, *, saturation_dn: flo
     return with_saturation(image, requested_dn=saturation_dn, instrument_dn=known)
 
 
+def observation_of(
+    pixels: NDArray[np.float64],
+    header: Header,
+    *,
+    saturation_dn: float | None = None,
+    stored_as_integer: bool = False,
+) -> Image:
+    """The image of pixels [y, x] and a header that are in memory, with its saturated pixels masked as in `read_observation`.
+
+    Raises the errors of `psfcore.fits.images.image_of`.
+    """
+    known = _instrument_level_dn(header)
+    image = image_of(
+        pixels, header, saturation_dn=saturation_dn or known, stored_as_integer=stored_as_integer
+    )
+    return with_saturation(image, requested_dn=saturation_dn, instrument_dn=known)
+
+
 def _instrument_level_dn(header: Header) -> float | None:
     """The level that the instrument file gives for the image's gain mode, in DN of one exposure; None if unknown."""
-    name = match_instrument({key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")})
+    name = known_instrument(header)
     return None if name is None else saturation_for(load_instrument(name), header)

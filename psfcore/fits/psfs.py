@@ -5,6 +5,7 @@ In memory, weights are float64 [y, x]. Files that this module writes hold float3
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,12 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.columns import read_columns
-from psfcore.fits.hdus import PIXEL_TROUBLE, ascii_text, read_pixels, write_hdus
+from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import (
     FitsLimits,
     check_all_headers,
     optional_text,
+    origin_of,
     plate_scale_arcsec,
     read_summary,
     wavelength_angstrom,
@@ -31,7 +33,7 @@ from psfcore.psf import (
     radial_profile,
 )
 
-ORIGIN_CARDS = ("TELESCOP", "INSTRUME", "DETECTOR", "FILTER")
+_STATED = re.compile(r"psf_id: ([0-9a-f]{64})")
 
 
 def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = None) -> None:
@@ -141,25 +143,41 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     components, provenance, fitted = (
         _read_extras(path, limits, kernel.shape) if own and parts else ({}, {}, None)
     )
+    instrument, cards = origin_of(header)
     return Psf(
         kernel=kernel,
         name=optional_text(header, "PSFNAME") or Path(path).name.split(".")[0],
         version=optional_text(header, "PSFVERS") or "unversioned",
-        instrument=optional_text(header, "INSTRUME") if own else summary.instrument,
+        instrument=instrument,
         status=optional_text(header, "PSFSTAT") or "user",
         plate_scale_arcsec=plate_scale_arcsec(header),
         wavelength_angstrom=wavelength_angstrom(header),
         components=components,
         provenance={"file": Path(path).name, **provenance},
         fitted=fitted,
-        cards=_origin_cards(header, own=own),
+        cards=cards,
     )
 
 
-def _origin_cards(header: fits.Header, *, own: bool) -> dict[str, str]:
-    """The cards that say which images a PSF is for. INSTRUME of a file of `write_psf` is the name of an instrument file."""
-    cards = {key: optional_text(header, key) for key in ORIGIN_CARDS if not (own and key == "INSTRUME")}
-    return {key: text for key, text in cards.items() if text is not None}
+def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
+    """The id that heliopsf gave to the PSF in a file, as its HISTORY states it; None if the file states none.
+
+    None also if the file was changed since `write_psf` wrote it (CHECKSUM and DATASUM of every HDU), or if it was derived
+    from the file of another PSF. Raises HeaderError.
+    """
+    check_all_headers(path, limits)
+    try:
+        with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+            lines = [str(line) for line in hdus[0].header.get("HISTORY", [])]
+            stated = [found[1] for line in lines if (found := _STATED.fullmatch(line))]
+            # `read_psf` keeps the history of a file under this name, and `write_psf` then writes it into the derived file.
+            derived = any(line.startswith("history:") for line in lines)
+            if len(stated) != 1 or derived:
+                return None
+            same = all(as_written(hdu) for hdu in hdus)
+    except PIXEL_TROUBLE:  # the file cannot be read as one of write_psf; the job that uses it says why
+        return None
+    return stated[0] if same else None
 
 
 def _read_extras(

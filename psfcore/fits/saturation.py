@@ -24,6 +24,7 @@ equal. It cannot find saturated pixels that a flat field or an interpolation mad
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -32,6 +33,7 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 from scipy.special import pdtrc
 
+from psfcore.errors import DataError
 from psfcore.fits.header import optional_number, optional_text
 from psfcore.image import Image, MaskBit, Saturation
 
@@ -50,6 +52,15 @@ def per_second(unit: str | None) -> bool:
     return (unit or "").replace(" ", "").lower() in ("dn/s", "dn/s/pixel", "dn/s/pix")
 
 
+# Counts and rates of counts; a level in DN cannot be compared with pixels in another unit, such as photons or kelvin.
+_COUNTS = re.compile(r"(dn|adu|ct|counts?)(/?pix(el)?)?(/s(/pix(el)?)?)?", re.IGNORECASE)
+
+
+def in_other_unit(unit: str | None) -> bool:
+    """Whether a unit is known, and is neither DN nor DN/s (also written as adu or counts, or per pixel)."""
+    return bool(unit and unit.strip()) and _COUNTS.fullmatch((unit or "").replace(" ", "")) is None
+
+
 def card_levels(header: Header) -> dict[str, float]:
     """Levels in the unit of the image, by the cards that give them."""
     levels = {key: optional_number(header, key) for key in _LEVEL_CARDS}
@@ -63,7 +74,8 @@ def with_saturation(
 
     requested_dn, instrument_dn: the level in DN of one exposure that the request and the instrument file give. As in
     `psfcore.fits.images.read_image`, the level of the request replaces that of the instrument file, and the lowest
-    level of all is used. Unless the request gives a level, the pixels are tested too, see Eq. (1).
+    level of all is used. Unless the request gives a level, the pixels are tested too, see Eq. (1). For an image in another unit
+    than DN or DN/s, levels in DN are not used. Raises DataError "saturation-unit" if the request gives one.
     """
     known = _levels(image, requested_dn, instrument_dn)
     found = min(known, key=lambda key: known[key], default=None)
@@ -124,6 +136,14 @@ def _levels(image: Image, requested_dn: float | None, instrument_dn: float | Non
     if requested_dn is None:
         in_dn = {INSTRUMENT: instrument_dn, "NSATPIX": _aia_level_dn(image.header)}
     rate = per_second(image.unit)
+    if in_other_unit(image.unit):
+        if requested_dn is not None:
+            raise DataError(
+                "saturation-unit",
+                f"expected an image in DN or DN/s, because the saturation level is in DN; got an image in {image.unit:.30}: "
+                "leave the level out, or use the image in DN",
+            )
+        return levels
     for source, level_dn in in_dn.items():
         if level_dn is not None and not (rate and image.exposure_s is None):
             levels[source] = level_dn / image.exposure_s if rate and image.exposure_s else level_dn

@@ -22,7 +22,7 @@ def arms_png(image: NDArray[np.float64], found: ArmMeasurement, path: str | Path
     """Plot the image [y, x] in `unit`, the fitted orders, and cuts along each arm."""
     layout = ConstrainedLayoutEngine(w_pad=0.08)
     figure = Figure(figsize=(15.6, 6.2), dpi=100, facecolor="white", layout=layout)
-    spacing = f"{found.spacing_px:.4f} +- {found.spacing_sigma_px:.4f} px"
+    spacing = f"{found.spacing_px:.4f} ± {found.spacing_sigma_px:.4f} px"
     figure.suptitle(
         f"Order spacing {spacing}, {len(found.peaks)} orders fitted, reduced chi2 {found.reduced_chi2:.2f}",
         x=0.01,
@@ -45,7 +45,7 @@ def _draw_image(
     for arm, angle in enumerate(found.angles_deg):
         x = [peak.x_px for peak in found.peaks if peak.arm == arm]
         y = [peak.y_px for peak in found.peaks if peak.arm == arm]
-        name = f"{angle:.3f} +- {found.angles_sigma_deg[arm]:.3f} deg"
+        name = f"{angle:.3f} ± {found.angles_sigma_deg[arm]:.3f} deg"
         colour = _COLOURS[arm % len(_COLOURS)]
         axes.plot(x, y, "o", markersize=6, markerfacecolor="none", color=colour, label=name)
     axes.set(xlabel="x (px)", ylabel="y (px)")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from psfcore.errors import DataError
 
+WAVELENGTH_TOLERANCE = 0.01  # largest deviation from 1 of the ratio of two wavelengths of one channel
 _FOLDER = Path(__file__).parent
 
 
@@ -29,7 +30,11 @@ def instrument_path(name: str) -> Path:
 
 
 def match_instrument(cards: Mapping[str, object]) -> str | None:
-    """Name of the first instrument whose cards in the table [match] all equal the given header cards, or None."""
+    """Name of the first instrument whose cards in the table [match] all equal the given header cards, or None.
+
+    cards: TELESCOP, INSTRUME and DETECTOR as texts, and WAVELNTH in angstrom. `psfcore.fits.header.known_instrument`
+    reads them from a header.
+    """
     for name in instrument_names():
         wanted = match_table(name)
         if wanted and all(_same(cards.get(key), value) for key, value in wanted.items()):
@@ -38,10 +43,14 @@ def match_instrument(cards: Mapping[str, object]) -> str | None:
 
 
 @cache
-def match_table(name: str) -> dict[str, str]:
+def match_table(name: str) -> dict[str, str | float]:
     """The table [match] of the file of instrument `name`: header cards and their values; empty if there is none."""
     return dict(tomllib.loads(instrument_path(name).read_text("utf-8")).get("match", {}))
 
 
-def _same(found: object, wanted: str) -> bool:
-    return isinstance(found, str) and found.strip().upper() == wanted.upper()
+def _same(found: object, wanted: str | float) -> bool:
+    if isinstance(wanted, str):
+        return isinstance(found, str) and found.strip().upper() == wanted.upper()
+    if not isinstance(found, (int, float)) or isinstance(found, bool):
+        return False
+    return abs(found / wanted - 1) <= WAVELENGTH_TOLERANCE

@@ -7,41 +7,38 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-
 from psfcore.errors import DataError
+from psfcore.instruments.checked import BadValues, Checked, Fault, Limit
 from psfcore.instruments.files import instrument_path
 
 _MOST_DOTS = 64  # largest number of dots in a part of the file without brackets, commas or line ends
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Positive = Annotated[float, Limit(gt=0)]
 # The software multiplies lengths and divides them by each other. Within these limits no result overflows or becomes 0.
 # In the units of the keys, all telescopes from X-rays to the far infrared are far inside these limits.
 _LEAST, _MOST = 1e-9, 1e9
-Size = Annotated[float, Field(ge=_LEAST, le=_MOST, allow_inf_nan=False)]
-SizeOrNone = Annotated[float, Field(ge=0, le=_MOST, allow_inf_nan=False)]
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Place = Annotated[float, Field(ge=-_MOST, le=_MOST, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1, le=100_000)]
+Size = Annotated[float, Limit(ge=_LEAST, le=_MOST)]
+SizeOrNone = Annotated[float, Limit(ge=0, le=_MOST)]
+Number = float
+Place = Annotated[float, Limit(ge=-_MOST, le=_MOST)]
+Count = Annotated[int, Limit(ge=1, le=100_000)]
 # The numbers of parts of an instrument. Memory and time of a PSF grow with them; the shipped instruments have at most 3
 # meshes of 551 windows, 8 rays, 2 rings and 1 spectral line.
 MOST_BYTES = 65_536
 MOST_LINES, MOST_MIRRORS, MOST_MESHES, MOST_WINDOWS = 64, 16, 16, 10_000
 MOST_RAYS, MOST_RINGS, MOST_POLYGONS, MOST_CORNERS = 256, 64, 64, 1024
 MOST_KEYS = 64
-Windows = Annotated[int, Field(ge=1, le=MOST_WINDOWS)]
-Name = Annotated[str, Field(max_length=80)]
-Share = Annotated[float, Field(gt=0, lt=1)]
+Windows = Annotated[int, Limit(ge=1, le=MOST_WINDOWS)]
+Name = Annotated[str, Limit(max_length=80)]
+Share = Annotated[float, Limit(gt=0, lt=1)]
+MatchKey = Literal["TELESCOP", "INSTRUME", "DETECTOR", "WAVELNTH"]
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class GainMode(_Frozen):
+class GainMode(Checked):
     """Saturation and noise of one readout mode. ``basis``: the origin of the numbers."""
 
     saturation_dn: Positive | None = None
@@ -50,39 +47,40 @@ class GainMode(_Frozen):
     basis: Literal["published", "measured", "assumed"]
 
 
-class Detector(_Frozen):
+class Detector(Checked):
     """The sensor. The keys of ``gain_modes`` are the values of the header keyword GAINCOMB."""
 
     pixel_pitch_um: Size
     pixels: Count
     readout_pixels: Count
     plate_scale_arcsec: Size
-    gain_modes: Annotated[dict[Name, GainMode], Field(max_length=MOST_KEYS)] = {}
+    gain_modes: Annotated[dict[Name, GainMode], Limit(max_length=MOST_KEYS)] = field(default_factory=dict)
 
 
-class Aperture(_Frozen):
+class Aperture(Checked):
     """The entrance pupil: a disc, or a ring where the centre is obscured."""
 
     diameter_mm: Size
     obscuration_diameter_mm: SizeOrNone = 0.0
 
-    @model_validator(mode="after")
-    def _ring(self) -> Aperture:
-        if self.obscuration_diameter_mm >= self.diameter_mm:
-            raise ValueError(
-                f"obscuration_diameter_mm ({self.obscuration_diameter_mm}) must be less than diameter_mm ({self.diameter_mm})"
-            )
-        return self
+    def check(self) -> str | None:
+        """The obscuration must be smaller than the aperture."""
+        if self.obscuration_diameter_mm < self.diameter_mm:
+            return None
+        return (
+            f"expected obscuration_diameter_mm less than diameter_mm ({self.diameter_mm}); "
+            f"got {self.obscuration_diameter_mm}"
+        )
 
 
-class SpectralLine(_Frozen):
+class SpectralLine(Checked):
     """A spectral line of the bandpass and its share of the light; the shares are normalised to sum 1."""
 
     wavelength_angstrom: Size
     weight: Size
 
 
-class Mirror(_Frozen):
+class Mirror(Checked):
     """A conic mirror. Its sag is r^2 / (R (1 + sqrt(1 - (1 + K) r^2 / R^2)))."""
 
     name: Name
@@ -92,7 +90,7 @@ class Mirror(_Frozen):
     figure: Literal["concave", "convex"]
 
 
-class Distances(_Frozen):
+class Distances(Checked):
     """Distances along the optical path, as the drawings give them."""
 
     aperture_to_primary_mm: Size
@@ -101,7 +99,7 @@ class Distances(_Frozen):
     filter_wheel_to_detector_mm: Size
 
 
-class Mesh(_Frozen):
+class Mesh(Checked):
     """A square mesh that supports a filter.
 
     ``windows``: number of windows of the diffraction series in each direction. At the entrance, this is the diameter of
@@ -115,65 +113,65 @@ class Mesh(_Frozen):
     wire_um: Size
     windows: Windows
     angle_deg: Number = 0.0
-    share: Annotated[float, Field(gt=0, le=1)] = 1.0
+    share: Annotated[float, Limit(gt=0, le=1)] = 1.0
 
-    @model_validator(mode="after")
-    def _wire_fits(self) -> Mesh:
-        if self.wire_um >= self.pitch_um:
-            raise ValueError(f"wire_um ({self.wire_um}) must be less than pitch_um ({self.pitch_um})")
-        return self
+    def check(self) -> str | None:
+        """The wires must be thinner than the pitch."""
+        if self.wire_um < self.pitch_um:
+            return None
+        return f"expected wire_um less than pitch_um ({self.pitch_um}); got {self.wire_um}"
 
 
-class Rays(_Frozen):
+class Rays(Checked):
     """Straight bars from the hub (or the centre) to the rim, at equal angles."""
 
-    count: Annotated[int, Field(ge=1, le=MOST_RAYS)]
+    count: Annotated[int, Limit(ge=1, le=MOST_RAYS)]
     width_mm: Size
     first_angle_deg: Number = 0.0
 
 
-class Ring(_Frozen):
+class Ring(Checked):
     """A circular bar; ``radius_mm`` is the radius of its centre line."""
 
     radius_mm: Size
     width_mm: Size
 
 
-class Polygon(_Frozen):
+class Polygon(Checked):
     """An opaque polygon with corners (x, y) in mm from the centre of the aperture."""
 
-    corners_mm: Annotated[tuple[tuple[Place, Place], ...], Field(min_length=3, max_length=MOST_CORNERS)]
+    corners_mm: Annotated[tuple[tuple[Place, Place], ...], Limit(min_length=3, max_length=MOST_CORNERS)]
 
 
-class MaskImage(_Frozen):
+class MaskImage(Checked):
     """A mask as a FITS or PNG image centred on the aperture: 0 is opaque, the largest value is open.
 
     ``file`` is the name of a file in the folder of the instrument file.
     """
 
-    file: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*\.(png|fits|fits\.gz)$")]
+    file: Annotated[str, Limit(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*\.(png|fits|fits\.gz)$")]
     width_mm: Size
 
 
-class Mount(_Frozen):
+class Mount(Checked):
     """The mount of the entrance filter. ``basis``: the origin of its description."""
 
     basis: Literal["drawing", "assumed"]
-    rays: Annotated[tuple[Rays, ...], Field(max_length=MOST_RAYS)] = ()
-    rings: Annotated[tuple[Ring, ...], Field(max_length=MOST_RINGS)] = ()
+    rays: Annotated[tuple[Rays, ...], Limit(max_length=MOST_RAYS)] = ()
+    rings: Annotated[tuple[Ring, ...], Limit(max_length=MOST_RINGS)] = ()
     hub_diameter_mm: SizeOrNone = 0.0
-    polygons: Annotated[tuple[Polygon, ...], Field(max_length=MOST_POLYGONS)] = ()
+    polygons: Annotated[tuple[Polygon, ...], Limit(max_length=MOST_POLYGONS)] = ()
     mask_image: MaskImage | None = None
 
-    @model_validator(mode="after")
-    def _few_outlines(self) -> Mount:
+    def check(self) -> str | None:
+        """All groups together must be few."""
         for most, got, parts in (
             (MOST_RAYS, self.ray_count, "rays"),
             (MOST_CORNERS, self.corner_count, "corners of polygons"),
         ):
             if got > most:
-                raise ValueError(f"expected at most {most} {parts} in all; got {got}")
-        return self
+                return f"expected at most {most} {parts} in all; got {got}"
+        return None
 
     @property
     def ray_count(self) -> int:
@@ -186,7 +184,7 @@ class Mount(_Frozen):
         return sum(len(polygon.corners_mm) for polygon in self.polygons)
 
 
-class Scatter(_Frozen):
+class Scatter(Checked):
     """The softened power law a / (b + r)^c; ``total`` is its sum over r > 0 on the full reach."""
 
     b_px: Positive
@@ -195,30 +193,40 @@ class Scatter(_Frozen):
     basis: Literal["published", "fitted", "inferred"]
 
 
-class Instrument(_Frozen):
+class Instrument(Checked):
     """An instrument: all quantities from which a PSF is computed."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
-    version: Annotated[str, Field(pattern=r"^\d+\.\d+\.\d+$")]
+    name: Annotated[str, Limit(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
+    version: Annotated[str, Limit(pattern=r"^\d+\.\d+\.\d+$")]
     status: Literal["draft", "released"]
     wavelength_angstrom: Size
-    bandpass: Annotated[tuple[SpectralLine, ...], Field(max_length=MOST_LINES)] = ()
+    bandpass: Annotated[tuple[SpectralLine, ...], Limit(max_length=MOST_LINES)] = ()
     focal_length_mm: Size
-    match: Annotated[dict[Name, Name], Field(max_length=MOST_KEYS)] = {}
+    match: dict[MatchKey, Name | Size] = field(default_factory=dict)
     aperture: Aperture
-    mirrors: Annotated[tuple[Mirror, ...], Field(max_length=MOST_MIRRORS)] = ()
+    mirrors: Annotated[tuple[Mirror, ...], Limit(max_length=MOST_MIRRORS)] = ()
     distances: Distances | None = None
-    meshes: Annotated[tuple[Mesh, ...], Field(max_length=MOST_MESHES)] = ()
+    meshes: Annotated[tuple[Mesh, ...], Limit(max_length=MOST_MESHES)] = ()
     mount: Mount | None = None
     detector: Detector
     scatter: Scatter | None = None
+
+    def check(self) -> None:
+        """WAVELNTH of the table [match] is a number, its other keys are texts."""
+        wrong = [
+            Fault(("match", key), f"expected {'a number' if key == 'WAVELNTH' else 'a text'}", value)
+            for key, value in self.match.items()
+            if isinstance(value, str) == (key == "WAVELNTH")
+        ]
+        if wrong:
+            raise BadValues(wrong)
 
     @property
     def spectral_lines(self) -> tuple[SpectralLine, ...]:
         """The bandpass, or the one wavelength; the weights sum to 1."""
         lines = self.bandpass or (SpectralLine(wavelength_angstrom=self.wavelength_angstrom, weight=1.0),)
         total = sum(line.weight for line in lines)
-        return tuple(line.model_copy(update={"weight": line.weight / total}) for line in lines)
+        return tuple(replace(line, weight=line.weight / total) for line in lines)
 
     def mesh_distance_mm(self, mesh: Mesh) -> float:
         """Diffraction distance of a mesh: the focal length at the entrance, otherwise the distance to the detector.
@@ -242,13 +250,17 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     """
     is_file = isinstance(name_or_path, Path) or name_or_path.endswith(".toml")
     path = Path(name_or_path) if is_file else instrument_path(str(name_or_path))
+    return parse_instrument(read_instrument_text(path), path.name)
+
+
+def read_instrument_text(path: Path) -> str:
+    """The text of an instrument file, at most one character more than is allowed. Raises DataError "bad-instrument-file"."""
     try:
         with path.open("rb") as file:
-            text = file.read(MOST_BYTES + 1).decode("utf-8")
+            return file.read(MOST_BYTES + 1).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
         raise DataError("bad-instrument-file", f"{path.name}: expected TOML in UTF-8; {reason}") from None
-    return parse_instrument(text, path.name)
 
 
 def parse_instrument(text: str, label: str) -> Instrument:
@@ -259,18 +271,28 @@ def parse_instrument(text: str, label: str) -> Instrument:
     if len(text) > MOST_BYTES:
         raise DataError("bad-instrument-file", f"{label}: expected at most {MOST_BYTES} characters; got more")
     try:
-        return Instrument.model_validate(_parse_toml(text))
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"]) or "file"
-        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        problem = f"{label}: {key}: {first['msg']}; got {first['input']!r:.80}{more}"
-        raise DataError("bad-instrument-file", problem) from None
+        return Instrument.read(_parse_toml(text))
+    except BadValues as error:
+        raise DataError("bad-instrument-file", f"{label}: {_said(error)}") from None
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
         # An integer of thousands of digits raises ValueError; deeply nested lists raise RecursionError.
         deep = isinstance(error, RecursionError)
         reason = "too many levels of nesting" if deep else " ".join(str(error).split())
         raise DataError("bad-instrument-file", f"{label}: expected TOML; {reason:.200}") from None
+
+
+def _said(error: BadValues) -> str:
+    """The first fault in one line, and the number of the others."""
+    first, more = error.faults[0], len(error.faults) - 1
+    key = ".".join(map(str, first.key)) or "file"
+    # The fault of a table as a whole says itself what it got; a missing key has no value.
+    if "; got " in first.expected:
+        got = ""
+    elif first.got is None:
+        got = "; got none"
+    else:
+        got = f"; got {first.got!r:.80}"
+    return f"{key}: {first.expected}{got}" + (f" (and {more} more)" if more else "")
 
 
 def _parse_toml(text: str) -> dict[str, Any]:

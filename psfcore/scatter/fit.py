@@ -304,7 +304,7 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
     if inversion.left_out:
         out.append(
             f"the fit did not use {len(inversion.left_out)} image{'s' if len(inversion.left_out) > 1 else ''}: "
-            + "; ".join(sorted(inversion.left_out)[:5])
+            + "; ".join(f"{file} ({why})" for file, why in sorted(inversion.left_out.items())[:5])
         )
     if len(pointings) < 3:
         out.append(

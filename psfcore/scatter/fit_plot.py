@@ -33,7 +33,12 @@ _TITLE_LETTERS = 175
 
 
 def fit_png(fit: TransitFit, path: str | Path) -> None:
-    """Write a PNG with six panels.
+    """Write the figure of `fit_figure` as PNG."""
+    write_png(fit_figure(fit), path)
+
+
+def fit_figure(fit: TransitFit) -> Figure:
+    """Draw six panels.
 
     They show the diffuse weight and the light beyond each distance, the first guess, the residuals by time and by
     position, and the convergence.
@@ -62,7 +67,7 @@ def fit_png(fit: TransitFit, path: str | Path) -> None:
         axes.grid(which="major", color="#e2e2e2", linewidth=0.7)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
-    write_png(figure, path)
+    return figure
 
 
 def _draw_weights(axes: Any, fit: TransitFit) -> None:

@@ -10,10 +10,16 @@ import re
 from dataclasses import dataclass
 
 from psfcore.errors import DataError
-from psfcore.transit.manifest import is_plain_name
+from psfcore.transit.manifest import MANIFEST_NAME, is_plain_name
 
 RATIO_FLOOR_BYTES = 64 * 2**20  # an archive may always unpack to this number of bytes, whatever its ratio
 _HIDDEN = ("__MACOSX", "PaxHeader", "PaxHeaders", "Thumbs.db", "desktop.ini")
+
+
+_DEEPEST = 3  # parts of the longest name: the folder of the transit, a folder beside its files, a file
+_WHERE = (
+    "expected files at the top level or in one folder, and beside them at most one level of other folders"
+)
 
 
 @dataclass(frozen=True)
@@ -35,15 +41,27 @@ class ArchiveLimits:
         return min(self.max_bytes, max(RATIO_FLOOR_BYTES, int(self.max_ratio * archive_bytes)))
 
 
+@dataclass(frozen=True)
+class Admitted:
+    """An accepted file: its folder in the archive ("": the top level), and its plain name."""
+
+    folder: str
+    name: str
+
+
 class Gate:
-    """Checks every member of one archive: its name, its number, its size, and the bytes unpacked so far."""
+    """Checks every member of one archive: its name, its number, its size, and the bytes unpacked so far.
+
+    The files of a transit are at the top level or in one folder. Files in the folders beside them (one level) are ignored, but
+    they are checked and counted as the others are.
+    """
 
     def __init__(self, limits: ArchiveLimits, archive_bytes: int) -> None:
         self.limits = limits
         self._budget = limits.budget_bytes(archive_bytes)
         self._declared = self._unpacked = self._members = 0
-        self._top: str | None = None
-        self._names: set[str] = set()
+        self._files: dict[Admitted, str] = {}  # accepted files and their names in the archive
+        self._folders: list[str] = []  # names of folders that have entries of their own
 
     def count_members(self, count: int = 1) -> None:
         """Add members of any kind to the count. Raises DataError "archive-too-large"."""
@@ -57,8 +75,8 @@ class Gate:
         self._unpacked += count
         self._check(self._unpacked)
 
-    def admit(self, raw_name: str, size: int) -> str | None:
-        """Check a file; return its plain name, or None if the file is hidden and must be skipped.
+    def admit(self, raw_name: str, size: int) -> Admitted | None:
+        """Check a file; return its folder and its plain name, or None if the file is hidden and must be skipped.
 
         Raises DataError "archive-climbs", "archive-not-plain", "archive-too-large".
         """
@@ -67,31 +85,54 @@ class Gate:
             raise not_plain(raw_name, "expected the name of a file")
         if _is_hidden(parts):
             return None
-        if len(parts) > 2:
-            raise not_plain(raw_name, "expected files at the top level or in one folder")
-        top = parts[0] if len(parts) == 2 else ""
-        if self._top is not None and top != self._top:
-            raise not_plain(raw_name, "expected all files in the same folder")
-        self._top = top
-        name = parts[-1]
-        if not is_plain_name(name):
+        if len(parts) > _DEEPEST:
+            raise not_plain(raw_name, _WHERE)
+        if not is_plain_name(parts[-1]):
             raise not_plain(raw_name, "expected a plain file name")
-        if name in self._names:
+        file = Admitted("/".join(parts[:-1]), parts[-1])
+        if file in self._files:
             raise not_plain(raw_name, "expected each file name only once")
-        self._names.add(name)
+        if file.name == MANIFEST_NAME and any(other.name == MANIFEST_NAME for other in self._files):
+            raise not_plain(raw_name, f"expected {MANIFEST_NAME} only once")
+        self._files[file] = raw_name
         if size > self.limits.max_member_bytes:
             most = self.limits.max_member_bytes
             message = f"{shown(raw_name)}: expected at most {most} bytes; got {size}"
             raise DataError("archive-too-large", message)
         self._declared += size
         self._check(self._declared)
-        return name
+        return file
 
     def check_folder(self, raw_name: str) -> None:
         """Check the entry of a folder; the folder is not created. Raises DataError "archive-climbs", "archive-not-plain"."""
         parts = _parts(raw_name)
-        if len(parts) > 1 and not _is_hidden(parts):
-            raise not_plain(raw_name, "expected files at the top level or in one folder")
+        if _is_hidden(parts):
+            return
+        if len(parts) >= _DEEPEST:
+            raise not_plain(raw_name, _WHERE)
+        if len(parts) > 1:
+            self._folders.append("/".join(parts))
+
+    def main_folder(self) -> str:
+        """The folder of the transit's files, after all members were checked: the top level if it has files, otherwise the one
+        folder there.
+
+        Raises DataError "archive-not-plain" if files are elsewhere than in this folder and in the folders beside them, or if
+        transit.json is not in it.
+        """
+        folders = dict.fromkeys(file.folder for file in self._files)
+        main = "" if "" in folders else next((one for one in folders if "/" not in one), "")
+        for file, raw_name in self._files.items():
+            if file.folder not in ("", main) and _above(file.folder) != main:
+                raise not_plain(raw_name, _WHERE)
+        for folder in self._folders:
+            if _above(folder) != main:
+                raise not_plain(folder, _WHERE)
+        described = [file for file in self._files if file.name == MANIFEST_NAME]
+        if described and Admitted(main, MANIFEST_NAME) not in described:
+            message = f"expected {MANIFEST_NAME} in the same folder as the other files"
+            raise not_plain(self._files[described[0]], message)
+        return main
 
     def _check(self, count: int) -> None:
         if count > self._budget:
@@ -107,6 +148,11 @@ def not_plain(raw_name: str, message: str) -> DataError:
 def shown(raw_name: str) -> str:
     """A member's name for a message: in ASCII, at most 80 characters of the name."""
     return ascii(raw_name[:80])
+
+
+def _above(folder: str) -> str:
+    """The folder that contains a folder."""
+    return folder.rpartition("/")[0]
 
 
 def _parts(raw_name: str) -> list[str]:

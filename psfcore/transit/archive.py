@@ -10,6 +10,7 @@ This module imports no numerical library, so that the web process can list an up
 from __future__ import annotations
 
 import io
+import shutil
 import tarfile
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -49,50 +50,71 @@ def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
     Raises the DataErrors of ``unpack``; also "no-manifest", "bad-manifest", "missing-file" if transit.json names a file
     that the archive does not contain, and "not-fits" if a named file cannot be FITS. The message names all such files.
     """
-    files: dict[str, int] = {}
-    starts: dict[str, bytes] = {}
-    content: bytes | None = None
+    sizes: dict[str, dict[str, int]] = {}  # by folder of the archive
+    starts: dict[str, dict[str, bytes]] = {}
     with opened(Path(path), limits) as archive:
         for member in archive.members():
-            files[member.name] = member.size_bytes
-            if member.name == MANIFEST_NAME:
-                content = member.read(MAX_MANIFEST_BYTES + 1)
-            else:
-                starts[member.name] = member.read(len(_FITS_STARTS[0]))
-        kind = archive.kind
+            count = MAX_MANIFEST_BYTES + 1 if member.name == MANIFEST_NAME else len(_FITS_STARTS[0])
+            sizes.setdefault(member.folder, {})[member.name] = member.size_bytes
+            starts.setdefault(member.folder, {})[member.name] = member.read(count)
+        main, kind = archive.main_folder(), archive.kind
+    files, first = sizes.get(main, {}), starts.get(main, {})
+    content = first.pop(MANIFEST_NAME, None)
     if content is None:
         raise DataError("no-manifest", f"expected a file {MANIFEST_NAME} in the archive; add it")
     manifest = parse_manifest(content)
-    _check_files(manifest, starts, "the archive")
+    _check_files(manifest, first, "the archive")
     return ArchiveContents(kind, manifest, files)
 
 
 def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple[str, ...]:
     """Write the files of an archive into a folder; returns their names. The folder is created if needed.
 
-    If all files are in one folder of the archive, that folder's name is dropped. Hidden files and files that operating
-    systems add are skipped.
+    If all files are in one folder of the archive, that folder's name is dropped. Hidden files, files that operating
+    systems add, and files of folders beside the transit's files are skipped.
     Raises one of these DataErrors, and then removes all files that it wrote: "not-an-archive"; "archive-climbs" for a name that leads
-    out of the folder; "archive-not-plain" for links, devices, sparse or encrypted files, nested folders, a name that
+    out of the folder; "archive-not-plain" for links, devices, sparse or encrypted files, deeper folders, a name that
     occurs twice, and a name that is not a plain file name; "archive-too-large" if there are more bytes or members than
     the limits allow; "archive-broken". An OSError of the disk is raised unchanged.
     """
     folder = Path(folder)
-    names: list[str] = []
+    written: list[tuple[str, Path]] = []  # folder of the archive, and path
+    staged = {
+        "": folder
+    }  # by folder of the archive. A name cannot begin with a full stop, so no file is called like these.
     with ExitStack() as undo:
         if not folder.exists():
             folder.mkdir(parents=True)
             undo.callback(folder.rmdir)
         with opened(Path(path), limits) as archive:
             for member in archive.members():
-                target = folder / member.name
+                if member.folder not in staged:
+                    staged[member.folder] = folder / f".{len(staged)}"
+                    staged[member.folder].mkdir()
+                    undo.callback(_remove_folder, staged[member.folder])
+                target = staged[member.folder] / member.name
                 with target.open("xb") as file:
-                    undo.callback(target.unlink)
+                    undo.callback(target.unlink, missing_ok=True)
                     while chunk := member.read(_CHUNK):
                         file.write(chunk)
-                names.append(member.name)
+                written.append((member.folder, target))
+            main = archive.main_folder()
+        kept = [target for beside, target in written if beside == main]
+        for target in kept:
+            if target.parent != folder:
+                undo.callback((folder / target.name).unlink, missing_ok=True)
+                target.rename(folder / target.name)
+        for beside, there in staged.items():
+            if beside:
+                shutil.rmtree(there)
         undo.pop_all()  # success: keep the files
-    return tuple(names)
+    return tuple(target.name for target in kept)
+
+
+def _remove_folder(folder: Path) -> None:
+    """Remove a folder that is empty, if it is still there."""
+    if folder.is_dir():
+        folder.rmdir()
 
 
 def pack(folder: str | Path, path: str | Path) -> TransitManifest:

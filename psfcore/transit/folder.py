@@ -89,7 +89,7 @@ def read_prepared(
     known = _known_psf(folder, manifest, limits, diffraction, instrument, headers[0].shape)
     looks = [
         _Look(entry, time_s, header, _level_dn(header, saturation_dn))
-        for entry, time_s, header in zip(manifest.images, _times_s(headers), headers, strict=True)
+        for entry, time_s, header in zip(manifest.images, times_s(headers), headers, strict=True)
     ]
     looks.sort(key=lambda look: look.time_s)  # stable: equal times stay in the order of transit.json
     exposures: list[Exposure] = []
@@ -207,7 +207,7 @@ def _check_frame(
     check_reaches_in(Place(image.x, image.y, image.r), header.shape, label)
 
 
-def _times_s(headers: Sequence[HeaderSummary]) -> list[float]:
+def times_s(headers: Sequence[HeaderSummary]) -> list[float]:
     """Start of each image in seconds after the first image; if one image has no readable date, the index of each image."""
     starts = [_instant(header.date_obs) for header in headers]
     known = [start for start in starts if start is not None]

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import IO, BinaryIO, Literal, Protocol, Self, cast
 
 from psfcore.errors import DataError
-from psfcore.transit.admission import ArchiveLimits, Gate, not_plain, shown
+from psfcore.transit.admission import Admitted, ArchiveLimits, Gate, not_plain, shown
 
 Kind = Literal["zip", "tar", "tar.gz"]
 START_BYTES = 262  # number of bytes at the start of a file that identify its kind
@@ -82,10 +82,11 @@ def _starts_like(start: bytes, known: bytes) -> bool:
 
 
 class Member:
-    """A file in an archive. gate: counts the unpacked bytes; None if the input of the archive counts them already."""
+    """A file in an archive, with its folder there. gate: counts the unpacked bytes; None if the input of the archive counts them
+    already."""
 
-    def __init__(self, name: str, size_bytes: int, stream: IO[bytes], gate: Gate | None = None) -> None:
-        self.name, self.size_bytes = name, size_bytes
+    def __init__(self, file: Admitted, size_bytes: int, stream: IO[bytes], gate: Gate | None = None) -> None:
+        self.folder, self.name, self.size_bytes = file.folder, file.name, size_bytes
         self._stream, self._gate, self._read = stream, gate, 0
 
     def read(self, count: int) -> bytes:
@@ -106,7 +107,12 @@ class OpenArchive(Protocol):
     kind: Kind
 
     def members(self) -> Iterator[Member]:
-        """The accepted members. Each member must be read before the next member is requested."""
+        """The accepted members, which may include files that are not in ``main_folder``. Each member must be read before the next
+        member is requested."""
+        ...
+
+    def main_folder(self) -> str:
+        """The folder of the transit's files, after all members were read. Files elsewhere are ignored. Raises DataError."""
         ...
 
 
@@ -195,18 +201,24 @@ class _Zip:
         """Yield the accepted members; all entries are checked before the first member is read."""
         entries = self._archive.infolist()
         self._gate.count_members(len(entries))
-        admitted = [(info, name) for info in entries if (name := self._admit(info)) is not None]
-        for info, name in admitted:
-            with self._archive.open(info) as stream:
-                yield Member(name, info.file_size, stream, self._gate)
+        admitted = [(info, file) for info in entries if (file := self._admit(info)) is not None]
+        main = self._gate.main_folder()
+        for info, file in admitted:
+            if file.folder == main:
+                with self._archive.open(info) as stream:
+                    yield Member(file, info.file_size, stream, self._gate)
 
-    def _admit(self, info: zipfile.ZipInfo) -> str | None:
+    def main_folder(self) -> str:
+        """The folder of the transit's files."""
+        return self._gate.main_folder()
+
+    def _admit(self, info: zipfile.ZipInfo) -> Admitted | None:
         kind = stat.S_IFMT(info.external_attr >> 16) if info.create_system != 0 else 0
         if info.orig_filename.endswith("/") and kind in (0, stat.S_IFDIR):
             self._gate.check_folder(info.orig_filename)
             return None
-        name = self._gate.admit(info.orig_filename, info.file_size)
-        if name is None:
+        file = self._gate.admit(info.orig_filename, info.file_size)
+        if file is None:
             return None
         if kind not in (0, stat.S_IFREG):
             raise not_plain(info.orig_filename, "expected only plain files, no links or devices")
@@ -222,7 +234,7 @@ class _Zip:
             got = f"{info.compress_size} compressed bytes for a declared size of {info.file_size} bytes"
             message = f"{shown(info.orig_filename)}: expected sizes that agree; got {got}"
             raise DataError("archive-broken", message)
-        return name
+        return file
 
 
 # --- tar --------------------------------------------------------------------------------------------------
@@ -350,14 +362,18 @@ class _Tar:
                 if len(archive.pax_headers) > _MAX_GLOBAL_RECORDS:
                     message = f"expected at most {_MAX_GLOBAL_RECORDS} global pax records; got more"
                     raise DataError("archive-broken", message)
-                name = self._admit(info)
+                file = self._admit(info)
                 info.pax_headers = {}  # to save memory, because tarfile keeps each TarInfo
-                stream = None if name is None else archive.extractfile(info)
-                if name is not None and stream is not None:
+                stream = None if file is None else archive.extractfile(info)
+                if file is not None and stream is not None:
                     with stream:
-                        yield Member(name, info.size, stream)
+                        yield Member(file, info.size, stream)
 
-    def _admit(self, info: tarfile.TarInfo) -> str | None:
+    def main_folder(self) -> str:
+        """The folder of the transit's files."""
+        return self._gate.main_folder()
+
+    def _admit(self, info: tarfile.TarInfo) -> Admitted | None:
         if any(key.startswith("GNU.sparse") for key in info.pax_headers):
             raise not_plain(info.name, "expected only plain files, no sparse ones")
         if info.isdir():

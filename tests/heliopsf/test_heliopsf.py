@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from heliopsf.psfs import LIMITS
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.fits.images import read_image
+from psfcore.gap import diagnose
 from psfcore.known_diffraction import known_diffraction
 from psfcore.simulate.transit_files import write
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
@@ -57,7 +60,14 @@ def test_the_client_loads_no_numerics_and_no_server() -> None:
 def test_the_functions_load_no_server() -> None:
     loaded = loaded_by("from heliopsf import deconvolve, build_psf, read_psf, fit_scatter, diagnose_gap")
     assert "psfcore.scatter.fit" in loaded
-    assert loaded & {"fastapi", "sqlalchemy", "celery", "httpx", "service", "workers"} == set()
+    assert loaded & {"fastapi", "sqlalchemy", "celery", "httpx", "service", "sunpy", "matplotlib"} == set()
+    assert {name for name in loaded if name.startswith("workers.")} == {"workers.cache_folder"}
+
+
+def test_the_core_needs_no_extra() -> None:
+    loaded = loaded_by("from heliopsf import deconvolve, build_psf, psf_for, Psf, Deconvolution")
+    assert "psfcore.build" in loaded
+    assert loaded & {"pydantic", "threadpoolctl", "matplotlib", "sunpy", "jinja2", "click"} == set()
 
 
 def test_every_name_is_there_with_a_docstring_and_no_other() -> None:
@@ -124,6 +134,18 @@ def test_a_transit_is_fitted(tmp_path: Path) -> None:
     assert abs(fit.inversion.values["total"] - SCATTER.total) < 0.03
     with pytest.raises(heliopsf.DataError, match="transit"):
         heliopsf.diagnose_gap(tmp_path)
+
+
+def test_a_gap_is_diagnosed_with_the_coverage_that_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(observed(sky()), tmp_path / "transit")
+    asked: list[dict[str, object]] = []
+    found = SimpleNamespace(**dict.fromkeys(one.name for one in fields(diagnose.Diagnosis)))
+    monkeypatch.setattr(diagnose, "diagnose", lambda transit, **how: asked.append(how) or found)
+    heliopsf.diagnose_gap(tmp_path / "transit", coverage=0.7, seed=4)
+    heliopsf.diagnose_gap(tmp_path / "transit")
+    assert [(how["coverage"], how["seed"]) for how in asked] == [(0.7, 4), (0.9, 1)]
 
 
 def test_a_diffraction_that_is_not_known_is_refused() -> None:

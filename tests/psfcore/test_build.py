@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -178,14 +180,12 @@ def test_assumptions_are_in_the_provenance(hri_psf: Psf) -> None:
 
 # --- an instrument with a small pupil, for which every route is quick ---------------------------------------
 
-SMALL = HRI.model_copy(
-    update={"aperture": Aperture(diameter_mm=4.0), "meshes": (WHEEL,), "mount": None, "scatter": None}
-)
-FINE_MESH = ENTRANCE.model_copy(update={"pitch_um": 400.0, "wire_um": 30.0, "windows": 10})
+SMALL = replace(HRI, aperture=Aperture(diameter_mm=4.0), meshes=(WHEEL,), mount=None, scatter=None)
+FINE_MESH = replace(ENTRANCE, pitch_um=400.0, wire_um=30.0, windows=10)
 
 
-def changed(**changes: object) -> Instrument:
-    return SMALL.model_copy(update=changes)
+def changed(**changes: Any) -> Instrument:
+    return replace(SMALL, **changes)
 
 
 def test_without_scatter_the_total_is_diffraction() -> None:
@@ -226,7 +226,7 @@ def test_a_larger_array_holds_the_full_reach_in_its_middle() -> None:
 
 
 def test_tilted_and_shared_meshes_use_the_series() -> None:
-    turned = changed(meshes=(FINE_MESH.model_copy(update={"angle_deg": 30.0}),))
+    turned = changed(meshes=(replace(FINE_MESH, angle_deg=30.0),))
     psf = build_psf(turned, size=128, threads=2)
     assert "meshes as series" in psf.provenance["entrance_route"]
     straight = build_psf(changed(meshes=(FINE_MESH,)), size=128, threads=2)
@@ -237,9 +237,9 @@ def test_tilted_and_shared_meshes_use_the_series() -> None:
         cumulative_curve(straight.kernel, between_orders),
         rtol=0.05,
     )
-    halves = [FINE_MESH.model_copy(update={"angle_deg": a, "share": 0.5}) for a in (30.0, -30.0)]
+    halves = [replace(FINE_MESH, angle_deg=a, share=0.5) for a in (30.0, -30.0)]
     shared = build_psf(changed(meshes=tuple(halves)), size=128, threads=2).components["ENTRANCE_MESH"]
-    other = build_psf(changed(meshes=(halves[1].model_copy(update={"share": 1.0}),)), size=128, threads=2)
+    other = build_psf(changed(meshes=(replace(halves[1], share=1.0),)), size=128, threads=2)
     np.testing.assert_allclose(shared, (psf.kernel + other.kernel) / 2, rtol=0.02, atol=1e-6)
 
 

@@ -56,7 +56,7 @@ def described(source: Header, *, filename: str, creator: str, sha256: str) -> De
         cards["PARENT"] = (parent, "")
     if "LEVEL" in source:
         cards["LEVEL"] = (_LEVEL, "derived from calibrated data")
-    passes = _passes(source) + 1
+    passes = passes_of(source) + 1
     cards[CARD_OF_PASS] = (passes, "deconvolutions of this image, with this one")
     kept = source.copy()
     for key in _OF_FILE:
@@ -73,7 +73,7 @@ def described(source: Header, *, filename: str, creator: str, sha256: str) -> De
     return Described(kept, cards, history)
 
 
-def _passes(source: Header) -> int:
+def passes_of(source: Header) -> int:
     """How often the input was deconvolved. A product without the card was deconvolved once."""
     if content_of(source) != PRODUCT:
         return 0

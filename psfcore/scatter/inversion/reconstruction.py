@@ -110,7 +110,7 @@ class TransitScenes:
             elif not found.seen:
                 reasons[frame.file] = (
                     f"expected an occulter at ({frame.place.x_px:g}, {frame.place.y_px:g}) px; "
-                    f"got a depth of {100 * found.depth:.0f} +- {100 * found.depth_sigma:.0f} % of the light that "
+                    f"got a depth of {100 * found.depth:.0f} ± {100 * found.depth_sigma:.0f} % of the light that "
                     "an occulter would block"
                 )
             elif dark[0].size < LEAST_DARK_PIXELS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -63,7 +64,7 @@ def test_orders_of_a_flare_as_wide_as_their_spacing_overlap() -> None:
 
 
 def test_without_scatter_there_is_no_ratio_to_it() -> None:
-    hri = load_instrument("hri_euv").model_copy(update={"scatter": None})
+    hri = replace(load_instrument("hri_euv"), scatter=None)
     assert design_study(hri, [1270.0], [40.0]).rows[0].peak_over_scatter is None
 
 

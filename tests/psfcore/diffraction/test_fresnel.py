@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
@@ -164,7 +165,7 @@ def test_a_parabola_focuses_at_half_its_radius() -> None:
 def test_a_convex_mirror_cancels_a_concave_one() -> None:
     grid = Grid("mirror", 4001, 0.001)
     concave = Mirror(name="m", radius_mm=257.0, conic=-2.04, diameter_mm=3.001, figure="concave")
-    convex = concave.model_copy(update={"figure": "convex"})
+    convex = replace(concave, figure="convex")
     product = mirror_transmission(concave, grid, LAMBDA_MM) * mirror_transmission(convex, grid, LAMBDA_MM)
     np.testing.assert_allclose(product, np.abs(grid.x_mm) < 1.5005, atol=1e-9)
 
@@ -228,7 +229,7 @@ def collins(path: LightPath, separation_mm: float, behind_mm: float, x_mm: NDArr
 
 def test_a_telescope_of_parabolas_matches_the_closed_form(path: LightPath) -> None:
     """At every plane and with both meshes, the transforms agree with Fresnel integrals and with a plain sum."""
-    secondary = path.secondary.model_copy(update={"conic": -1.0})
+    secondary = replace(path.secondary, conic=-1.0)
     path = dataclasses.replace(path, secondary=secondary)
     separation = paraxial_separation_mm(path)
     behind, distance = path.secondary_to_detector_mm - 273.0, 273.0
@@ -346,7 +347,7 @@ def test_a_study_is_plain_json_and_reports_its_progress() -> None:
 
 
 def without(**changes: object) -> Instrument:
-    return HRI.model_copy(update=changes)
+    return replace(HRI, **changes)
 
 
 @pytest.mark.parametrize(
@@ -356,7 +357,7 @@ def without(**changes: object) -> Instrument:
         (without(mirrors=HRI.mirrors[:1]), "mirrors"),
         (without(distances=None), "distances"),
         (without(meshes=HRI.meshes[:1]), "meshes: expected one mesh at place 'filter_wheel'; got 0"),
-        (without(meshes=(HRI.meshes[0].model_copy(update={"angle_deg": 45.0}), HRI.meshes[1])), "angle_deg"),
+        (without(meshes=(replace(HRI.meshes[0], angle_deg=45.0), HRI.meshes[1])), "angle_deg"),
     ],
 )
 def test_the_error_names_the_key_that_an_instrument_lacks(instrument: Instrument, key: str) -> None:
@@ -390,7 +391,7 @@ def test_a_wheel_too_close_to_another_plane_is_refused_before_the_work(distance_
 
 
 def test_mirrors_without_a_focus_are_refused(path: LightPath) -> None:
-    concave = path.secondary.model_copy(update={"figure": "concave"})
+    concave = replace(path.secondary, figure="concave")
     blind = dataclasses.replace(path, secondary=concave, secondary_to_detector_mm=128.5)
     with pytest.raises(DataError, match="no-focus"):
         paraxial_separation_mm(blind)

@@ -45,7 +45,7 @@ def test_every_pointing_has_a_line_and_all_together() -> None:
     )
     assert lines[2].startswith("pointing 2: 4 images, mean -1.25 %") and "centre" not in lines[2]
     assert lines[3].startswith("all pointings: 8 images")
-    assert lines[5] == "pointing 1 along x: +0.25 +- 0.12 %, -0.5 +- 0.25 DN/s per 100 px"
+    assert lines[5] == "pointing 1 along x: +0.25 ± 0.12 %, -0.5 ± 0.25 DN/s per 100 px"
     assert len(lines) == 6
 
 
@@ -78,7 +78,7 @@ def test_shapes_are_a_table_with_differences_from_the_first() -> None:
     told = json.loads(json.dumps(shapes.to_json()))
     lines = summary_lines(evaluation(), told)[6:]
     assert "errors of shapes, held out (%)" in lines[0] and "MAPE mean" in lines[0]
-    assert lines[1].split()[:4] == ["softened-power-law", "2.00", "+-", "0.50"]
+    assert lines[1].split()[:4] == ["softened-power-law", "2.00", "±", "0.50"]
     assert lines[3] == "differences from softened-power-law"
-    assert lines[4].split()[:4] == ["stretched", "-0.25", "+-", f"{0.125:.2f}"]
+    assert lines[4].split()[:4] == ["stretched", "-0.25", "±", f"{0.125:.2f}"]
     assert len(lines) == 5

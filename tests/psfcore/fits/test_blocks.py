@@ -91,6 +91,22 @@ def test_a_bad_file_raises_its_error_code(tmp_path: Path, name: str) -> None:
     assert len(caught.value.message) < 300
 
 
+@pytest.mark.parametrize("shape", [(1, 5, 6), (1, 2, 5, 6)])
+@pytest.mark.parametrize("hdu", [0, 1])
+def test_the_error_about_a_cube_says_how_to_write_one_plane(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, ...], hdu: int
+) -> None:
+    cube = np.arange(np.prod(shape), dtype="f4").reshape(shape)
+    image = fits.PrimaryHDU(cube) if hdu == 0 else fits.ImageHDU(cube)
+    fits.HDUList([*[fits.PrimaryHDU()] * hdu, image]).writeto(tmp_path / "FILE")
+    with pytest.raises(HeaderError) as caught:
+        read_summary(tmp_path / "FILE", SMALL)
+    monkeypatch.chdir(tmp_path)
+    exec(caught.value.message.partition("astropy: ")[2], {"fits": fits})
+    assert read_summary(tmp_path / "NEW", SMALL).shape == (5, 6)
+    np.testing.assert_array_equal(fits.getdata(tmp_path / "NEW", hdu), cube.reshape(-1, 5, 6)[0])
+
+
 def test_a_gzip_bomb_is_refused_before_it_is_inflated(tmp_path: Path) -> None:
     """A file of a few kilobytes declares a table of 300 GB before the image."""
     rows = 3 * 10**11 // 8

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from astropy.io.fits import Header
 
@@ -15,8 +17,8 @@ def instrument() -> Instrument:
         "combined": GainMode(saturation_dn=48000, photon_gain_dn=6.0, read_noise_dn=2.0, basis="assumed"),
         "high-only": GainMode(saturation_dn=3500, basis="assumed"),
     }
-    detector = hri.detector.model_copy(update={"gain_modes": modes})
-    return hri.model_copy(update={"detector": detector})
+    detector = replace(hri.detector, gain_modes=modes)
+    return replace(hri, detector=detector)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.header import FitsLimits, known_instrument, read_summary, wavelength_angstrom
 from tests.psfcore.fits.raw_files import block, image_cards
 
 SMALL = FitsLimits(max_pixels=4096 * 4096, max_header_bytes=64 * 1024, max_hdus=8)
@@ -64,6 +65,13 @@ def test_unusable_descriptive_cards_count_as_missing(tmp_path: Path) -> None:
     assert (summary.detector, summary.date_obs, summary.instrument) == (None, None, None)
 
 
+def test_the_date_of_xrt_and_trace_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "xrt.fits"
+    cards = image_cards(32, 16, 16, "DATE_OBS= '2012-06-05T22:00:00.123'")
+    path.write_bytes(block(*cards, data=bytes(1024)))
+    assert read_summary(path, SMALL).date_obs == "2012-06-05T22:00:00.123"
+
+
 def test_the_header_reader_imports_no_numerical_library() -> None:
     code = "import sys, psfcore.fits.header; print([m for m in ('scipy', 'numba', 'matplotlib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -75,8 +83,13 @@ def test_the_header_reader_imports_no_numerical_library() -> None:
     [
         ("eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits", (2048, 2048), "GZIP_2", "hri_euv"),
         ("eui/solo_L2_eui-fsi174-image_20240109T200055237_V01.fits", (3072, 3040), "RICE_1", None),
-        ("aia/aia_171_cutout_20130310.fits", (705, 769), "RICE_1", None),
-        ("aia/AIA20110319_105400_0171.fits.gz", (1024, 1024), None, None),
+        ("aia/aia_171_cutout_20130310.fits", (705, 769), "RICE_1", "aia_171"),
+        ("aia/AIA20110319_105400_0171.fits.gz", (1024, 1024), None, "aia_171"),
+        ("aia/aia.lev1_euv_12s.2022-04-02T132423Z.304.image.fits", (400, 450), "RICE_1", "aia_304"),
+        ("aia/derived_aia193_coronalhole_20161123_map.fits.gz", (667, 667), None, "aia_193"),
+        ("occultation/AIA1600_venus_20120606_040731_UTC.0041.fits", (480, 854), "RICE_1", None),
+        ("other/swap_lv1_20110607_063329.fits.gz", (1024, 1024), None, None),
+        ("other/trace_19980519_222143_171.fits.gz", (1024, 1024), None, None),
         ("occultation/L1_XRT20120605_215839.9.fits", (384, 384), None, None),
     ],
 )
@@ -86,3 +99,24 @@ def test_real_headers(
     summary = read_summary(real(name), SMALL)
     assert (summary.shape, summary.codec, summary.instrument) == (shape, codec, instrument)
     assert summary.gzipped is name.endswith(".gz")
+
+
+@pytest.mark.parametrize(
+    ("name", "instrument", "angstrom"),
+    [
+        ("aia_171_level1.fits", "aia_171", 171.0),
+        ("swap_lv1_20140606_000113.header", None, 174.0),
+        ("euvi_20090615_000900_n4euA_s.header", None, 171.0),
+        ("solo_L1_eui-fsi304-image_20201021T145510206_V03.header", None, 304.0),
+        ("tsi20010130_025823_a2.header", None, 171.0),
+        ("HinodeXRT.header", None, None),
+    ],
+)
+def test_headers_of_sunpy_are_recognised(name: str, instrument: str | None, angstrom: float | None) -> None:
+    """Its test files; sunpy itself is not imported, which is slow."""
+    sunpy = importlib.util.find_spec("sunpy")
+    if sunpy is None or sunpy.origin is None:
+        pytest.skip("sunpy is not installed")
+    path = Path(sunpy.origin).parent / "data" / "test" / name
+    header = fits.getheader(path) if path.suffix == ".fits" else fits.Header.fromtextfile(path)
+    assert (known_instrument(header), wavelength_angstrom(header)) == (instrument, angstrom)

@@ -6,14 +6,13 @@ import re
 import types
 import typing
 from collections.abc import Iterator
+from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import pytest
-from annotated_types import Ge, Gt, Le, Lt
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
+from psfcore.instruments.checked import Checked, Limit, annotations_of
 from psfcore.instruments.model import Instrument, parse_instrument
 
 REFERENCE = (Path(__file__).parents[3] / "docs" / "instruments.md").read_text("utf-8")
@@ -37,26 +36,42 @@ def documented() -> dict[str, dict[str, str]]:
     return rows
 
 
-def models(annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
+class Key(NamedTuple):
+    """What the model says of a key."""
+
+    annotation: Any
+    default: Any  # MISSING: the key is required
+
+
+def inner(annotation: Any) -> Any:
+    """The annotation without its limits and without None."""
+    if typing.get_origin(annotation) is Annotated:
+        return inner(typing.get_args(annotation)[0])
+    if typing.get_origin(annotation) in (types.UnionType, typing.Union):
+        return inner(next(one for one in typing.get_args(annotation) if one is not types.NoneType))
+    return annotation
+
+
+def models(annotation: Any) -> Iterator[tuple[str, type[Checked]]]:
     """The models inside an annotation, with how a key below them is written."""
+    annotation = inner(annotation)
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    if isinstance(annotation, type) and issubclass(annotation, Checked):
         yield ".", annotation
-    elif origin is tuple and isinstance(arguments[0], type) and issubclass(arguments[0], BaseModel):
+    elif origin is tuple and isinstance(arguments[0], type) and issubclass(arguments[0], Checked):
         yield "[].", arguments[0]
-    elif origin is dict and isinstance(arguments[1], type) and issubclass(arguments[1], BaseModel):
+    elif origin is dict and isinstance(arguments[1], type) and issubclass(arguments[1], Checked):
         yield ".MODE.", arguments[1]
-    elif origin in (types.UnionType, typing.Union):
-        for argument in arguments:
-            yield from models(argument)
 
 
-def accepted(model: type[BaseModel] = Instrument, before: str = "") -> Iterator[tuple[str, FieldInfo]]:
+def accepted(model: type[Checked] = Instrument, before: str = "") -> Iterator[tuple[str, Key]]:
     """Every key that the model accepts, as the reference writes it."""
-    for name, field in model.model_fields.items():
-        key = before + name
-        yield key, field
-        for join, below in models(field.annotation):
+    annotations = annotations_of(model)
+    for field in fields(model):  # type: ignore[arg-type]
+        key, annotation = before + field.name, annotations[field.name]
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        yield key, Key(annotation, default)
+        for join, below in models(annotation):
             yield from accepted(below, key + join)
 
 
@@ -71,7 +86,7 @@ def test_the_reference_lists_every_key_and_no_other() -> None:
 @pytest.mark.parametrize("key", sorted(KEYS))
 def test_the_reference_states_the_default_of_a_key(key: str) -> None:
     stated, field = documented()[key]["default"], KEYS[key]
-    if field.is_required():
+    if field.default is MISSING:
         assert stated == "required"
     elif field.default is None:
         assert stated in UNSET.values()
@@ -85,29 +100,24 @@ def test_the_reference_states_the_default_of_a_key(key: str) -> None:
 def test_the_reference_states_the_limits_of_a_key(key: str) -> None:
     stated, field = documented()[key]["limits"], KEYS[key]
     low, high = "", ""
-    for limit in limits_of(field):
-        if isinstance(limit, Ge):
-            low = f"{limit.ge:g}"
-        elif isinstance(limit, Gt):
-            low = f"> {limit.gt:g}"
-        elif isinstance(limit, Le):
-            high = f"<= {limit.le:g}"
-        elif isinstance(limit, Lt):
-            high = f"< {limit.lt:g}"
+    for limit in limits_of(field.annotation):
+        low = low if limit.ge is None else f"{limit.ge:g}"
+        low = low if limit.gt is None else f"> {limit.gt:g}"
+        high = high if limit.le is None else f"<= {limit.le:g}"
+        high = high if limit.lt is None else f"< {limit.lt:g}"
     if low and not low.startswith(">"):
         assert stated.startswith(plain(low) + " to " + plain(high.removeprefix("<= ")))
     elif low:
         assert stated == ", ".join(part for part in (low, high) if part)
-    for choice in choices_of(field.annotation):
+    for choice in choices_of(inner(field.annotation)):
         assert f"`{choice}`" in stated
 
 
-def limits_of(field: FieldInfo) -> list[Any]:
-    """The limits of a field's value, also where the field may be left out."""
-    found = list(field.metadata)
-    for argument in typing.get_args(field.annotation):
-        for extra in getattr(argument, "__metadata__", ()):
-            found += getattr(extra, "metadata", [])
+def limits_of(annotation: Any) -> list[Limit]:
+    """The limits of a value, also where the key may be left out."""
+    found = [one for one in getattr(annotation, "__metadata__", ()) if isinstance(one, Limit)]
+    for argument in typing.get_args(annotation) if typing.get_origin(annotation) is types.UnionType else ():
+        found += limits_of(argument)
     return found
 
 

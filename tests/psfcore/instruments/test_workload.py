@@ -16,7 +16,7 @@ from psfcore.diffraction.pupil import MaskGrid, entrance_pupil
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import MOST_BYTES, load_instrument, parse_instrument
-from psfcore.instruments.workload import MOST_CELLS, PERIOD_PX, check_workload, workload
+from psfcore.instruments.workload import MOST_CELLS, MOST_SAMPLES, PERIOD_PX, check_workload, workload
 from tests.conftest import REPOSITORY, SMALL_INSTRUMENT
 from workers.intake.cost_model import COSTS
 from workers.intake.estimates import _build
@@ -83,7 +83,7 @@ def test_shipped_instruments_are_far_from_the_limits(name: str) -> None:
     instrument = load_instrument(name)
     check_workload(instrument, name)
     work = workload(instrument, 4096)
-    assert max(work.cells, default=0) < MOST_CELLS / 5 and work.samples < 100
+    assert max(work.cells, default=0) < MOST_CELLS / 5 and work.samples < MOST_SAMPLES / 2
 
 
 def test_the_sizes_are_those_of_the_arrays(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -141,11 +141,13 @@ def test_limits_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         dataclasses.replace(solved(), transit=one_pointing),
         converged=False,
         covariance=200 * inversion.covariance,
+        left_out={"007.fits": "found no occulter", "000.fits": "too dark"},
         frames=tuple(dataclasses.replace(f, chi2=3 * f.chi2) for f in frames),
     )
     words = "; ".join(fit_of(monkeypatch, unsure).limits)
     for told in (
         f"did not converge in {len(inversion.rounds)} rounds",
+        "did not use 2 images: 000.fits (too dark); 007.fits (found no occulter)",
         "with 1 pointing, the data hardly distinguish",
         "px has a standard error of more than 3 percentage points",
         "does not describe the occulted pixels",

@@ -131,6 +131,62 @@ def test_files_that_operating_systems_add_are_skipped(folder: Path, tmp_path: Pa
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(names)
 
 
+@pytest.mark.parametrize("make", KINDS)
+@pytest.mark.parametrize("top", ["", "p1/"])
+@pytest.mark.parametrize("first", [True, False])
+def test_files_of_folders_beside_the_transit_are_ignored(
+    folder: Path, tmp_path: Path, make: Maker, top: str, first: bool
+) -> None:
+    """As in a simulated transit. Members may have any order, and files of other folders may have equal names."""
+    others = [(f"{top}noise_free/", b""), (f"{top}noise_free/000.fits", b"other"), (f"{top}scenes/x", b"x")]
+    members = members_of(folder, top)
+    path = make(tmp_path / "a", others + members if first else members + others)
+    contents = list_archive(path, LIMITS)
+    assert contents.files == {p.name: p.stat().st_size for p in folder.iterdir()}
+    out = tmp_path / "out"
+    assert sorted(unpack(path, out, LIMITS)) == sorted(contents.files)
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == {
+        p.name: p.read_bytes() for p in folder.iterdir()
+    }
+
+
+@pytest.mark.parametrize("make", KINDS)
+@pytest.mark.parametrize("beside", ["", "p1/"])
+@pytest.mark.parametrize("first", [True, False])
+def test_a_second_description_is_refused(
+    folder: Path, tmp_path: Path, make: Maker, beside: str, first: bool
+) -> None:
+    members, other = members_of(folder, beside), [(f"{beside}old/transit.json", b"{}")]
+    path = make(tmp_path / "a", other + members if first else members + other)
+    assert "only once" in refused(path, tmp_path / "out", "archive-not-plain")
+
+
+@pytest.mark.parametrize("make", KINDS)
+def test_a_description_beside_other_files_is_refused(folder: Path, tmp_path: Path, make: Maker) -> None:
+    members = [(f"p1/{name}" if name == "transit.json" else name, text) for name, text in members_of(folder)]
+    told = refused(make(tmp_path / "a", members), tmp_path / "out", "archive-not-plain")
+    assert "expected transit.json in the same folder as the other files" in told
+
+
+@pytest.mark.parametrize("make", KINDS)
+def test_ignored_files_count_as_the_others(folder: Path, tmp_path: Path, make: Maker) -> None:
+    large = make(tmp_path / "a", [*members_of(folder), ("beside/x.fits", bytes(600_000))])
+    refused(large, tmp_path / "out", "archive-too-large", SMALL)
+    several = [(f"beside/{i}.x", bytes(400_000)) for i in range(3)]
+    refused(
+        make(tmp_path / "b", [*members_of(folder), *several]), tmp_path / "out", "archive-too-large", SMALL
+    )
+
+
+def test_an_ignored_link_is_refused(folder: Path, tmp_path: Path) -> None:
+    as_zip(tmp_path / "a.zip", members_of(folder))
+    with zipfile.ZipFile(tmp_path / "a.zip", "a") as out:
+        info = zipfile.ZipInfo("beside/x.fits")
+        info.external_attr, info.create_system = (stat.S_IFLNK | 0o777) << 16, 3
+        out.writestr(info, "/etc/passwd")
+    refused(tmp_path / "a.zip", tmp_path / "out", "archive-not-plain")
+
+
 @pytest.mark.parametrize("form", [tarfile.PAX_FORMAT, tarfile.GNU_FORMAT, tarfile.USTAR_FORMAT])
 def test_long_and_foreign_names_in_a_tar(tmp_path: Path, form: int) -> None:
     names = ["a" * 90 + ".fits"] if form == tarfile.USTAR_FORMAT else ["a" * 200 + ".fits", "Ü.fits"]
@@ -196,7 +252,6 @@ def test_names_that_lead_out_of_the_folder_are_refused(
     "extra",
     [
         ["a/b/x.fits"],
-        ["other/x.fits"],
         ["a/b/"],
         ["000.fits"],
         ["bell\x07.fits"],

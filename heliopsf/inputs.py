@@ -1,0 +1,162 @@
+"""Images as users have them: files, sunpy Maps, NDData and CCDData, arrays. Each becomes an ``Image`` of the core.
+
+``sunpy`` and ``astropy.nddata`` are looked up among the loaded modules: an object of their classes exists only if they are loaded.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units
+from astropy.io.fits import Header
+from numpy.typing import NDArray
+
+from heliopsf.psfs import LIMITS
+from psfcore.errors import DataError
+from psfcore.fits.cards import card_trouble
+from psfcore.fits.header import first_image_header
+from psfcore.fits.observation import observation_of, read_observation
+from psfcore.image import Image
+
+_EXPECTED = "a sunpy Map, an NDData or CCDData, an array, a path of a FITS file, or a list of these"
+_RATE, _COUNT = "DN/s", "DN"
+
+
+def is_map(image: Any) -> bool:
+    """Whether an object is a sunpy Map."""
+    return _is_of(image, "sunpy.map", "GenericMap")
+
+
+def is_nddata(image: Any) -> bool:
+    """Whether an object is an NDData, such as a CCDData. A sunpy Map is one too."""
+    return _is_of(image, "astropy.nddata", "NDData")
+
+
+def is_many(image: Any) -> bool:
+    """Whether an object is a list of images: a list, a tuple or a MapSequence."""
+    return isinstance(image, list | tuple) or _is_of(image, "sunpy.map", "MapSequence")
+
+
+def _is_of(image: Any, module: str, name: str) -> bool:
+    loaded = sys.modules.get(module)
+    # While a module is imported, it has no classes yet.
+    return loaded is not None and isinstance(image, getattr(loaded, name, ()))
+
+
+def image_of(image: Any, *, saturation_dn: float | None) -> Image:
+    """The image of the core for an image of the user.
+
+    Pixels that the mask of a Map or NDData excludes are pixels without a value. Raises ``DataError`` "bad-input" for another
+    kind of object, "bad-unit" for a logarithmic unit, and the errors of reading an image.
+    """
+    if isinstance(image, Image):
+        return image
+    if isinstance(image, str | Path):
+        return read_observation(image, LIMITS, saturation_dn=saturation_dn)
+    if is_nddata(image) or isinstance(image, np.ndarray):
+        data = np.asarray(image.value if isinstance(image, units.Quantity) else _data(image))
+        pixels = _pixels(data)
+        mask = getattr(image, "mask", None)
+        if mask is not None and np.any(mask):
+            pixels = np.where(np.asarray(mask, dtype=bool), np.nan, pixels)
+        return observation_of(
+            pixels,
+            header_of(image),
+            saturation_dn=saturation_dn,
+            stored_as_integer=data.dtype.kind in "iu",
+        )
+    raise _not_an_image(image)
+
+
+def header_of(image: Any) -> Header:
+    """The header of an image of the user, or of its header alone (a ``Header`` or a table of cards).
+
+    Raises ``DataError`` "bad-input", "bad-unit", and the errors of reading a header.
+    """
+    if isinstance(image, Image):
+        return image.header
+    if isinstance(image, str | Path):
+        return first_image_header(image, LIMITS)
+    if isinstance(image, Header):
+        return image
+    if is_nddata(image):
+        header = _header(image.meta)
+        if not is_map(image):
+            _add_coordinates(header, image.wcs)
+    elif isinstance(image, np.ndarray):
+        header = Header()
+    elif isinstance(image, Mapping):
+        return _header(image)
+    else:
+        raise _not_an_image(image)
+    if "BUNIT" not in header:
+        text = unit_text(getattr(image, "unit", None))
+        if text is not None:
+            header["BUNIT"] = text
+    elif not is_map(image):
+        unit_text(getattr(image, "unit", None))  # refuses logarithmic units
+    return header
+
+
+def unit_text(unit: Any) -> str | None:
+    """A unit as the card BUNIT: "DN" and "DN/s" also for adu and counts. Raises ``DataError`` "bad-unit"."""
+    if unit is None:
+        return None
+    logarithmic = {units.mag, units.dex, units.dB}
+    if isinstance(unit, units.function.FunctionUnitBase) or logarithmic & set(getattr(unit, "bases", ())):
+        raise DataError(
+            "bad-unit",
+            f"expected pixels that are proportional to the light, such as DN or DN/s; got the logarithmic unit {unit}: convert "
+            "them first",
+        )
+    pixel_free = unit * units.pix if units.pix in getattr(unit, "bases", ()) else unit
+    for count in (units.DN, units.adu, units.ct):
+        if pixel_free == count:
+            return _COUNT
+        if pixel_free == count / units.s:
+            return _RATE
+    return str(unit) or None
+
+
+def _data(image: Any) -> Any:
+    return image.data if is_nddata(image) else image
+
+
+def _pixels(data: NDArray[Any]) -> NDArray[np.float64]:
+    if data.dtype.kind not in "iufb":
+        raise DataError("bad-input", f"expected pixels that are real numbers; got the type {data.dtype}")
+    if data.ndim != 2:
+        raise DataError("not-2d", f"expected an image with two axes; got {data.ndim}")
+    return np.asarray(data, dtype=np.float64)
+
+
+def _header(meta: Mapping[str, Any]) -> Header:
+    """The cards of a table. Values that no card can hold are left out: they do not describe the observation."""
+    if isinstance(meta, Header):
+        return meta.copy()
+    header = Header()
+    for key, value in meta.items():
+        name = str(key).upper()
+        if name in ("KEYCOMMENTS", "HISTORY", "COMMENT", "SIMPLE", "END", ""):
+            continue
+        try:
+            header[name] = value
+        except card_trouble():
+            continue
+    return header
+
+
+def _add_coordinates(header: Header, wcs: Any) -> None:
+    """Add the cards of a WCS, which ``CCDData.read`` takes out of the header."""
+    if hasattr(wcs, "to_header"):
+        for card in wcs.to_header().cards:
+            if card.keyword not in header:
+                header.append(card, end=True)
+
+
+def _not_an_image(image: Any) -> DataError:
+    return DataError("bad-input", f"expected {_EXPECTED}; got {type(image).__name__}")

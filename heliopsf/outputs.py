@@ -1,0 +1,177 @@
+"""Results of a deconvolution: as an object of its own, or in the form of the user's image."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import re
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy import units
+from astropy.io.fits import Header
+from numpy.typing import NDArray
+
+from heliopsf.inputs import is_map, is_nddata
+from heliopsf.psfs import Psf
+from psfcore.deconvolve.assess.error_planes import ErrorPlanes
+from psfcore.deconvolve.cards import UsedPsf, deconvolution_cards, deconvolution_history
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.whole import Assessed, Work
+from psfcore.errors import module_of_extra
+from psfcore.fits.header import optional_text
+from psfcore.fits.product.cards import CARD_OF_PASS, passes_of
+from psfcore.image import Image
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Statistics of the input's pixels, which are wrong for the result.
+_STATISTICS = re.compile(r"data(min|max|mean|medn|rms|std|skew|kurt|cent|p\d\d)", re.IGNORECASE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deconvolution(Deconvolved):
+    """A deconvolved image: ``pixels`` [y, x] in the unit of the image, how they were made, and what is known about them.
+
+    image: the input, with its mask. psf: the PSF on the pixels of the image. errors: planes with the standard deviation of
+    each pixel, if they were asked for. warnings: sentences by their codes.
+    """
+
+    image: Image
+    psf: Psf
+    errors: ErrorPlanes | None
+    warnings: dict[str, str]
+    work: Work = field(repr=False)
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """True for pixels without a measurement: QUALITY 1 or 2 (not finite or masked; saturated), [y, x]."""
+        return np.asarray(self.image.mask != 0)
+
+    @property
+    def error(self) -> NDArray[np.float64] | None:
+        """Standard deviation of each pixel from noise, and from the PSF if its errors are known; None if not asked for."""
+        if self.errors is None or self.errors.psf_error is None:
+            return None if self.errors is None else self.errors.error
+        return np.hypot(self.errors.error, self.errors.psf_error)
+
+    @property
+    def quality(self) -> NDArray[np.uint8]:
+        """The plane QUALITY of products (docs/products.md): 0 for a good pixel, [y, x]."""
+        return self._assessed.quality
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """What the deconvolution changed: flux, bright and dark structures, signs of artefacts."""
+        return self._assessed.found.as_json()
+
+    @cached_property
+    def _assessed(self) -> Assessed:
+        return self.work.assess(self, self.errors)
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the deconvolved image. Needs the extra "plot". axes None: new axes."""
+        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_image(self, axes)
+        return drawn
+
+    def plot_change(self, axes: Axes | None = None) -> Axes:
+        """Draw the change in percent of the input. Needs the extra "plot"."""
+        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_change(self, axes)
+        return drawn
+
+    def quicklook(self) -> Figure:
+        """A figure with the image before and after, and the change. Needs the extra "plot"."""
+        figure: Figure = module_of_extra("plot", "heliopsf.plots").before_and_after(self)
+        return figure
+
+
+def in_form_of(image: Any, result: Deconvolution) -> Any:
+    """The result in the form of the user's image: a Map for a Map, an NDData for an NDData, an array for an array."""
+    if is_map(image):
+        return _as_map(image, result)
+    if is_nddata(image):
+        return _as_nddata(image, result)
+    if isinstance(image, units.Quantity):
+        return result.pixels * image.unit
+    return result.pixels if isinstance(image, np.ndarray) else result
+
+
+def used_psf(psf: Psf) -> UsedPsf:
+    """The PSF as the cards of a result name it. The id is that of a service: of the recipe, or of the file."""
+    identity = psf.provenance.get("psf_id")
+    if identity is None:  # weights in memory
+        identity = hashlib.sha256(f"{psf.kernel.shape}".encode() + psf.kernel.tobytes()).hexdigest()
+    return UsedPsf(str(identity), psf.name, psf.version, psf.status)
+
+
+def _as_map(image: Any, result: Deconvolution) -> Any:
+    meta = copy.deepcopy(image.meta)
+    _describe(meta, result)
+    made = type(image)(result.pixels, meta, mask=_mask(result), uncertainty=_uncertainty(result))
+    # Set afterwards: the class of a Map may choose other settings when it is made.
+    made.plot_settings.update(copy.deepcopy(image.plot_settings))
+    return made
+
+
+def _as_nddata(image: Any, result: Deconvolution) -> Any:
+    meta = copy.deepcopy(image.meta)
+    _describe(meta, result)
+    return type(image)(
+        result.pixels,
+        mask=_mask(result),
+        uncertainty=_uncertainty(result),
+        meta=meta,
+        wcs=image.wcs,
+        unit=image.unit,
+    )
+
+
+def _mask(result: Deconvolution) -> NDArray[np.bool_] | None:
+    return result.mask if result.mask.any() else None
+
+
+def _uncertainty(result: Deconvolution) -> Any:
+    if result.error is None:
+        return None
+    from astropy.nddata import StdDevUncertainty
+
+    return StdDevUncertainty(result.error)
+
+
+def _describe(meta: Any, result: Deconvolution) -> None:
+    """Add the cards and the history of a product to the metadata of the image."""
+    used = used_psf(result.psf)
+    is_header = isinstance(meta, Header)
+    for key in [key for key in meta if _STATISTICS.fullmatch(str(key))]:
+        del meta[key]
+    cards: dict[str, tuple[Any, str]] = dict(
+        deconvolution_cards(
+            used,
+            result,
+            saturation=result.image.saturation,
+            amplification=None if result.errors is None else result.errors.amplification,
+        )
+    )
+    cards[CARD_OF_PASS] = (passes_of(result.image.header) + 1, "deconvolutions of this image, with this one")
+    for key, (value, comment) in cards.items():
+        meta[key] = (value, comment) if is_header else value
+    lines = deconvolution_history(used, result, result.warnings)
+    if is_header:
+        for line in lines:
+            meta.add_history(line)
+    else:
+        # sunpy keeps HISTORY as one text with a line for each card.
+        before = [str(meta[key]) for key in ("history",) if key in meta]
+        meta["history"] = "\n".join([*before, *lines])
+
+
+def title_of(result: Deconvolution) -> str:
+    """The telescope, the time and the PSF, for the title of a figure."""
+    header = result.image.header
+    seen_by = optional_text(header, "DETECTOR", "INSTRUME") or "image"
+    date = optional_text(header, "DATE-BEG", "DATE-OBS")
+    return f"{seen_by}{f' {date}' if date else ''}   PSF {result.psf.name} {result.psf.version}"

@@ -1,0 +1,176 @@
+"""A folder of built PSFs, so that a PSF is built only once.
+
+A file is named IDENTITY.SHA256.PART: the identity of the PSF (`psfcore.built.recipe`), the hash of the file, and what the file
+holds, such as "fits". A file is written under a temporary name and renamed, and its hash is checked when it is read. If the
+files need more space than allowed, the files of the PSF that was not used for the longest time are removed.
+
+The folder is closed to other users: files in it are used without a further question.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import time
+import uuid
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from psfcore.errors import DataError
+from psfcore.whole_files import PARTIAL
+
+FITS, PROVENANCE = "fits", "provenance.json"  # parts that every builder keeps
+_NAME = re.compile(r"([0-9a-f]{64})\.([0-9a-f]{64})\.([a-z.]+)")
+_OTHERS = 0o077  # permissions of the group and of all other users
+_ABANDONED_S = 86_400.0  # a temporary file of this age belongs to no running process
+
+
+@dataclass(frozen=True)
+class CachedFile:
+    """A file of the cache, whose content was checked."""
+
+    path: Path
+    sha256: str
+
+
+@dataclass(frozen=True)
+class CachedPsf:
+    """All files of one PSF. used_at: when the PSF was used last, in seconds since 1970."""
+
+    identity: str
+    files: tuple[Path, ...]
+    bytes: int
+    used_at: float
+
+
+class PsfCache:
+    """Keeps the files of PSFs by identity. max_bytes: the largest size of all files; 0: nothing is kept.
+
+    Files in a folder that belongs to another user are not used, because that user could change them.
+    """
+
+    def __init__(self, folder: Path, max_bytes: int) -> None:
+        self.folder = folder
+        self.max_bytes = max_bytes
+
+    def find(self, identity: str, part: str) -> CachedFile | None:
+        """A file of a PSF, after its content was checked; None if there is none. A damaged file is removed."""
+        for path in self._files():
+            of, sha256, found_part = path.name.split(".", 2)
+            if (of, found_part) != (identity, part):
+                continue
+            try:
+                if sha256_of_file(path) == sha256:
+                    # The time of access is the time of the last use. The time of change stays: commands that run now
+                    # notice by it whether a file was replaced.
+                    os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
+                    return CachedFile(path, sha256)
+                path.unlink()
+            except FileNotFoundError:  # another process removed it
+                continue
+        return None
+
+    def keep(self, identity: str, part: str, write: Callable[[Path], object]) -> CachedFile | None:
+        """Keep a file, which ``write`` writes to the path that it gets; None if it is larger than the cache may be.
+
+        Raises DataError "cache-of-another-user", and OSError if the file cannot be written.
+        """
+        if self.max_bytes == 0:
+            return None
+        self._make_private()
+        partial = self.folder / f".{uuid.uuid4().hex}{PARTIAL}"
+        try:
+            partial.touch(mode=0o600)
+            write(partial)
+            partial.chmod(0o600)
+            with partial.open("rb") as written:
+                os.fsync(written.fileno())
+            if partial.stat().st_size > self.max_bytes:
+                return None
+            sha256 = sha256_of_file(partial)
+            kept = self.folder / f"{identity}.{sha256}.{part}"
+            partial.replace(kept)
+        finally:
+            partial.unlink(missing_ok=True)
+        self._shrink(identity)
+        return CachedFile(kept, sha256)
+
+    def psfs(self) -> list[CachedPsf]:
+        """The PSFs in the cache, the last used first."""
+        files: dict[str, list[tuple[Path, os.stat_result]]] = {}
+        for path in self._files():
+            with suppress(FileNotFoundError):  # another process removed it
+                files.setdefault(path.name.split(".")[0], []).append((path, path.stat()))
+        found = [
+            CachedPsf(
+                identity=identity,
+                files=tuple(path for path, _ in of),
+                bytes=sum(state.st_size for _, state in of),
+                used_at=max(state.st_atime for _, state in of),
+            )
+            for identity, of in files.items()
+        ]
+        return sorted(found, key=lambda psf: psf.used_at, reverse=True)
+
+    def clear(self) -> int:
+        """Remove all files; returns the size of the PSFs in bytes. Other files in the folder stay."""
+        removed = self.psfs()
+        for psf in removed:
+            _remove(psf)
+        for partial in self._partials():
+            partial.unlink(missing_ok=True)
+        return sum(psf.bytes for psf in removed)
+
+    def _files(self) -> list[Path]:
+        """The files of PSFs; none if the folder does not exist or belongs to another user."""
+        if not self.folder.is_dir() or self._of_another_user():
+            return []
+        return sorted(path for path in self.folder.iterdir() if _NAME.fullmatch(path.name))
+
+    def _partials(self) -> list[Path]:
+        if not self.folder.is_dir() or self._of_another_user():
+            return []
+        return list(self.folder.glob(f".*{PARTIAL}"))
+
+    def _shrink(self, last: str) -> None:
+        """Remove PSFs until the rest fits, those that were not used for the longest time first; never the last one."""
+        psfs = self.psfs()
+        total = sum(psf.bytes for psf in psfs)
+        for psf in reversed(psfs):
+            if total <= self.max_bytes:
+                break
+            if psf.identity != last:
+                _remove(psf)
+                total -= psf.bytes
+        for partial in self._partials():  # killed processes leave such files
+            with suppress(FileNotFoundError):
+                if time.time() - partial.stat().st_mtime > _ABANDONED_S:
+                    partial.unlink()
+
+    def _of_another_user(self) -> bool:
+        return self.folder.stat().st_uid != os.geteuid()
+
+    def _make_private(self) -> None:
+        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if self._of_another_user():
+            raise DataError(
+                "cache-of-another-user",
+                f"expected the folder {self.folder} to belong to you; it belongs to another user: name another folder with "
+                "HELIOPSF_CACHE_DIR",
+            )
+        if self.folder.stat().st_mode & _OTHERS:
+            self.folder.chmod(0o700)
+
+
+def _remove(psf: CachedPsf) -> None:
+    for path in psf.files:
+        path.unlink(missing_ok=True)
+
+
+def sha256_of_file(path: Path) -> str:
+    """SHA-256 of a file. Raises OSError."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,54 @@
+"""The cards and the lines of HISTORY that say how an image was deconvolved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.fits.product.version import software_version
+from psfcore.image import Saturation
+
+
+@dataclass(frozen=True)
+class UsedPsf:
+    """The PSF of a deconvolution, as cards name it."""
+
+    id: str
+    name: str
+    version: str
+    status: str
+
+
+def deconvolution_cards(
+    psf: UsedPsf, result: Deconvolved, *, saturation: Saturation | None, amplification: float | None
+) -> dict[str, tuple[str | int | float, str]]:
+    """The cards that say how an image was deconvolved. saturation: of the input. amplification: of the noise, if known."""
+    # A hash fills its card, so cards with a hash have no comment.
+    cards: dict[str, tuple[str | int | float, str]] = {
+        "PSFID": (psf.id, ""),
+        "PSFVERS": (psf.version, "PSF version"),
+        "PSFNAME": (psf.name, "PSF name"),
+        "PSFSTAT": (psf.status, "PSF status"),
+        "DCNVMETH": (result.method, "deconvolution method"),
+        "DCNVITER": (result.steps_done, "deconvolution steps done"),
+        "DCNVSTOP": (result.stopped_because, "why the iteration stopped"),
+        "DCNVEDGE": (result.edges, "assumed scene beyond the edges"),
+        "DCNVBAND": (result.edge_band_px, "[px] width of band affected by DCNVEDGE"),
+        "SWHELIO": (software_version(), "heliopsf version"),
+    }
+    if saturation is not None and saturation.found is not None and saturation.level is not None:
+        cards["DCNVSATL"] = (saturation.level, "saturation level, in the unit of the image")
+        cards["DCNVSATF"] = (saturation.found, "where the saturation level was found")
+    if amplification is not None:
+        cards["DCNVAMPL"] = (amplification, "noise of result / noise of input")
+    return cards
+
+
+def deconvolution_history(psf: UsedPsf, result: Deconvolved, warnings: Mapping[str, str]) -> list[str]:
+    """The lines of HISTORY that say how an image was deconvolved. warnings: sentences by their codes."""
+    return [
+        f"heliopsf {software_version()}: {result.method}, {result.steps_done} steps, "
+        f"edges {result.edges}, PSF {psf.name} {psf.version} ({psf.status})",
+        *(f"WARNING ({code}): {message}" for code, message in warnings.items()),
+    ]

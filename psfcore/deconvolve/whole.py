@@ -1,0 +1,136 @@
+"""A whole deconvolution: the estimate, its errors, what changed, and the quality plane.
+
+The service and the Python functions both run `Work`, so that they give the same result for the same image and PSF.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from astropy.io.fits import Header
+from numpy.typing import NDArray
+
+from psfcore.deconvolve.assess.changes import Changes, measure_changes
+from psfcore.deconvolve.assess.error_planes import ErrorPlanes, error_planes, psf_error_plane, with_psf_error
+from psfcore.deconvolve.assess.quality import quality_plane
+from psfcore.deconvolve.conditions import Conditions, Progress
+from psfcore.deconvolve.methods.registry import method_named
+from psfcore.deconvolve.result import Deconvolved
+from psfcore.fits.channel import check_channel
+from psfcore.fits.gain import no_noise_figures, noise_for
+from psfcore.image import Image
+from psfcore.instruments.model import load_instrument
+from psfcore.noise import Noise
+from psfcore.psf import Psf
+
+ERROR_ESTIMATE = "error estimate"  # its steps are noise realisations
+
+
+@dataclass(frozen=True)
+class Assessed:
+    """What a deconvolution changed, and the quality plane [y, x] (bits of `QualityBit`)."""
+
+    found: Changes
+    quality: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Work:
+    """One deconvolution. It runs once for the image, and again for each noise realisation and each possible PSF.
+
+    psf: the PSF on the image's pixels. method: the name of a method. parameters: of this method.
+    """
+
+    image: Image
+    psf: Psf
+    method: str
+    conditions: Conditions
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    def run(
+        self, image: Image | None = None, psf: Psf | None = None, progress: Progress | None = None
+    ) -> Deconvolved:
+        """Run the method on the image, or on another image of its shape, with the PSF or with another one."""
+        conditions = replace(self.conditions, progress=progress)
+        return method_named(self.method)(image or self.image, psf or self.psf, conditions, **self.parameters)
+
+    def errors(
+        self,
+        result: Deconvolved,
+        draws: int,
+        *,
+        possible_psfs: Callable[[], Sequence[Psf]] = lambda: (),
+        begin: Callable[[str, int], Progress | None] = lambda stage, steps: None,
+    ) -> ErrorPlanes | None:
+        """The error planes from `draws` noise realisations; None for 0 realisations.
+
+        possible_psfs: makes PSFs on the image's pixels that differ from the PSF by its errors; empty if the errors are not known.
+        begin(stage, steps) is called at the begin of each stage, and returns its progress function. Raises DataError "no-noise-figures".
+        """
+        if not draws:
+            return None
+        noise = self.conditions.noise
+        if noise is None:
+            raise no_noise_figures()
+        told = begin(ERROR_ESTIMATE, draws)
+        planes = error_planes(
+            self.image,
+            self.psf,
+            lambda image: self.run(image).pixels,
+            noise,
+            estimate=result.pixels,
+            draws=draws,
+            edge_px=result.edge_band_px,
+            threads=self.conditions.threads,
+            # The first run is that of the image without noise.
+            progress=None if told is None else lambda done, of: told(done - 1, of - 1),
+        )
+        psfs = possible_psfs()
+        if not psfs:
+            return planes
+        from_psf = psf_error_plane(
+            psfs,
+            lambda psf: self.run(psf=psf).pixels,
+            chance=False,
+            progress=begin("errors of the PSF", len(psfs)),
+        )
+        return with_psf_error(planes, from_psf)
+
+    def assess(self, result: Deconvolved, errors: ErrorPlanes | None) -> Assessed:
+        """Measure what changed, and make the quality plane."""
+        edge_px = counted_edge_px(result)
+        found = measure_changes(
+            self.image, result.pixels, self.psf, noise=self.conditions.noise, edge_px=edge_px
+        )
+        quality = quality_plane(
+            self.image,
+            result.pixels,
+            edge_px=edge_px,
+            suspected=found.artefacts.suspected,
+            error=None if errors is None else errors.error,
+        )
+        return Assessed(found, quality)
+
+
+def counted_edge_px(result: Deconvolved) -> int:
+    """The width of the edge band that is marked: at most a quarter of the shorter side."""
+    return min(result.edge_band_px, min(result.pixels.shape) // 4)
+
+
+def input_warnings(psf: Psf, image: Image, *, other_channel: bool) -> dict[str, str]:
+    """What the user must know about the inputs: sentences by their codes, "channel" and "saturation".
+
+    Raises DataError "channel-mismatch" if the PSF is of another channel and may not be.
+    """
+    found = {"channel": check_channel(psf, image.header, other_channel=other_channel)}
+    if image.saturation is not None:
+        found["saturation"] = image.saturation.warning
+    return {code: message for code, message in found.items() if message is not None}
+
+
+def known_noise(instrument: str | None, header: Header) -> Noise | None:
+    """The noise figures that the file of a shipped instrument gives for the gain mode of an image; None if unknown."""
+    return None if instrument is None else noise_for(load_instrument(instrument), header)

@@ -1,0 +1,152 @@
+"""The error for an image whose PSF is not known. It tells what can be done: which PSFs could fit, and the ways on.
+
+This module imports no numerical library, so that the web process can import it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from psfcore.errors import DataError
+from psfcore.instruments.files import instrument_names
+from psfcore.instruments.model import load_instrument
+from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
+
+WAYS = (
+    {
+        "way": "name",
+        "text": "name a PSF: psf_id in the request, --psf ID on the command line; `heliopsf psf build --instrument NAME -o "
+        "PSF.fits` makes the PSF of an instrument above, and prints its id",
+    },
+    {
+        "way": "upload",
+        "text": "bring your own: upload a PSF (`heliopsf psf upload FILE`, or --psf FILE), or write an instrument file "
+        "(docs/instruments.md) and build its PSF (`heliopsf psf build --instrument FILE.toml`)",
+    },
+    {
+        "way": "fit",
+        "text": "fit the scatter to a transit of this telescope (images in which the Moon or a planet covers a part of "
+        "the Sun): `heliopsf psf fit TRANSIT`",
+    },
+)
+# What is published for telescopes without an instrument file (docs/instruments.md): a word of the header's TELESCOP,
+# INSTRUME or DETECTOR, the way on, and a sentence.
+PUBLISHED = (
+    ("xrt", "upload", "SolarSoft has PSFs of XRT as FITS files (hinode/xrt/idl/util/XRT*.PSF560.fits)"),
+    ("trace", "fit", "DeForest et al. (2009) used the transit of Venus of 2004 for TRACE 171"),
+    ("euvi", "fit", "Shearer et al. (2012) used the transit of the Moon of 2007 for EUVI-B"),
+)
+_NAMES = {"telescope": "telescope", "channel": "channel", "plate_scale": "pixel scale"}
+
+
+def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str | None:
+    """The channel: the wavelength in whole angstrom, such as 174.
+
+    If the wavelength is not given, the wavelength of the instrument description is used. None if there is none.
+    """
+    if wavelength_angstrom is None and instrument in instrument_names():
+        wavelength_angstrom = load_instrument(instrument).wavelength_angstrom
+    # A header card may contain any number.
+    if wavelength_angstrom is None or not 0.5 <= wavelength_angstrom < 1e6:
+        return None
+    return str(round(wavelength_angstrom))
+
+
+def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, Any]] = ()) -> DataError:
+    """The error "no-psf-for-instrument" for an image with this header summary (`psfcore.fits.header.HeaderSummary` as a table).
+
+    Its fields: `image`, the name of the telescope; `instruments` that can be built, those first that agree most with the image;
+    the given `psfs` that could fit; and `ways` on. `same` of an instrument says what agrees with the image, and `told` also
+    what does not.
+    """
+    named = " ".join(str(header[key]) for key in ("telescop", "instrume", "detector") if header[key])
+    channel = channel_of(None, header["wavelnth"])
+    seen = f"'{named or 'an unnamed instrument'}'" + (f" at {channel} angstrom" if channel else "")
+    instruments = [_instrument(name, header) for name in instrument_names()]
+    instruments.sort(key=lambda one: (-len(one["same"]), one["wavelength_angstrom"]))
+    could = [f"PSF {psf['id']} ({psf['name']})" for psf in psfs] + [
+        f"instrument {one['name']}" for one in instruments if {"telescope", "channel"} <= set(one["same"])
+    ]
+    return DataError(
+        "no-psf-for-instrument",
+        f"expected an image of an instrument whose PSF is known, or a PSF in the request; got an image of {seen} and no "
+        f"PSF. Could fit: {', '.join(could) or 'none that is known here'}. Name a PSF (psf in Python, psf_id in a request, --psf in a command), upload a PSF or an "
+        "instrument file, or fit a PSF to a transit",
+        {
+            "image": named or "this telescope",
+            "instruments": instruments,
+            "psfs": list(psfs),
+            "ways": _ways(header),
+        },
+    )
+
+
+def _ways(header: Mapping[str, Any]) -> list[dict[str, str]]:
+    """The ways on; a way that a publication makes possible for this telescope says so."""
+    seen = _words_of(header)
+    published = {way: sentence for word, way, sentence in PUBLISHED if word in seen}
+    return [
+        one | {"text": f"{one['text']}. {published[one['way']]}"} if one["way"] in published else dict(one)
+        for one in WAYS
+    ]
+
+
+def _instrument(name: str, header: Mapping[str, Any]) -> dict[str, Any]:
+    known = load_instrument(name)
+    scale = known.detector.plate_scale_arcsec
+    channel = channel_of(name, None)
+    same = same_as_image(name, channel, scale, header)
+    return {
+        "name": name,
+        "wavelength_angstrom": known.wavelength_angstrom,
+        "plate_scale_arcsec": scale,
+        "same": same,
+        "told": agreement_with_image(same, channel, scale, header),
+    }
+
+
+def same_as_image(
+    instrument: str | None, channel: str | None, plate_scale_arcsec: float | None, header: Mapping[str, Any]
+) -> list[str]:
+    """What a PSF shares with an image: "telescope", "channel", "plate_scale"."""
+    words = _words_of(header)
+    wanted = channel_of(None, header["wavelnth"])
+    image_scale = header["cdelt1"]
+    same = []
+    if words & _words(instrument):
+        same.append("telescope")
+    if channel is not None and channel == wanted:
+        same.append("channel")
+    if image_scale and plate_scale_arcsec:
+        ratio = abs(image_scale) / plate_scale_arcsec
+        if abs(ratio - 1) <= PLATE_SCALE_TOLERANCE:
+            same.append("plate_scale")
+    return same
+
+
+def agreement_with_image(
+    same: Sequence[str], channel: str | None, plate_scale_arcsec: float | None, header: Mapping[str, Any]
+) -> str:
+    """In what a PSF agrees with an image and in what it does not, such as "same telescope, but another channel".
+
+    same: the answer of `same_as_image`.
+    """
+    wanted, image_scale = channel_of(None, header["wavelnth"]), header["cdelt1"]
+    other = []
+    if wanted and channel and channel != wanted:
+        other.append(f"another channel ({channel}, not {wanted} Å)")
+    if image_scale and plate_scale_arcsec and "plate_scale" not in same:
+        other.append(f"another pixel scale ({plate_scale_arcsec:g}, not {abs(image_scale):g} arcsec)")
+    parts = [f"same {' and '.join(_NAMES[one] for one in same)}"] if same else []
+    return ", but ".join([*parts, *([" and ".join(other)] if other else [])])
+
+
+def _words_of(header: Mapping[str, Any]) -> set[str]:
+    return set().union(*(_words(header[key]) for key in ("telescop", "instrume", "detector")))
+
+
+def _words(text: str | None) -> set[str]:
+    """The words of a name that begin with a letter, such as "sdo" and "aia" of "SDO/AIA"."""
+    return set(re.findall(r"(?<![a-z0-9])[a-z][a-z0-9]+", (text or "").lower()))

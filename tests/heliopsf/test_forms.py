@@ -1,0 +1,295 @@
+"""Images as people have them: Maps, NDData, arrays, files and lists; the result has the form of the image."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+import pytest
+import sunpy.map
+from astropy.io import fits
+from astropy.nddata import CCDData, NDData
+from astropy.wcs import WCS
+
+import heliopsf
+from heliopsf.images import DataError
+from psfcore.deconvolve.assess.quality import QualityBit
+from psfcore.psf_sampling import rebinned_kernel
+from tests.conftest import SMALL_INSTRUMENT
+
+SHAPE = (96, 128)
+SCALE = 2.0
+
+
+@pytest.fixture
+def psf(tmp_path: Path) -> heliopsf.Psf:
+    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
+    return heliopsf.build_psf(tmp_path / "small.toml", size=64)
+
+
+def pixels(seed: int = 1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    y, x = np.indices(SHAPE)
+    return 20 + np.rint(300 * np.exp(-((x - 40) ** 2 + (y - 50) ** 2) / 18)) + rng.poisson(30, SHAPE)
+
+
+def cards(**more: Any) -> dict[str, Any]:
+    return {
+        "telescop": "SMALL",
+        "instrume": "SMALL_1",
+        "wavelnth": 171,
+        "waveunit": "angstrom",
+        "bunit": "DN",
+        "exptime": 2.0,
+        "date-obs": "2024-03-01T12:00:00",
+        "cdelt1": SCALE,
+        "cdelt2": SCALE,
+        "cunit1": "arcsec",
+        "cunit2": "arcsec",
+        "crpix1": 64.5,
+        "crpix2": 48.5,
+        "crval1": 0.0,
+        "crval2": 0.0,
+        "ctype1": "HPLN-TAN",
+        "ctype2": "HPLT-TAN",
+        "hgln_obs": 0.0,
+        "hglt_obs": 0.0,
+        "dsun_obs": 1.496e11,
+        **more,
+    }
+
+
+def a_map(data: np.ndarray | None = None, **more: Any) -> Any:
+    return sunpy.map.Map(pixels() if data is None else data, cards(**more))
+
+
+def test_a_map_comes_back_as_a_map_with_its_metadata(psf: heliopsf.Psf) -> None:
+    image = a_map(history="calibrated\nflat-fielded", datamin=1.0, datarms=3.0)
+    before = dict(image.meta)
+    result = heliopsf.deconvolve(image, psf, iterations=5)
+    assert type(result) is type(image) and dict(image.meta) == before
+    kept = {key: value for key, value in before.items() if key not in ("history", "datamin", "datarms")}
+    assert {key: result.meta[key] for key in kept} == kept
+    assert "datarms" not in result.meta
+    assert result.wcs.wcs.compare(image.wcs.wcs)
+    assert result.meta["psfid"] == psf.provenance["psf_id"] and result.meta["psfvers"] == psf.version
+    assert result.meta["dcnviter"] == 5 and result.meta["dcnvpass"] == 1
+    lines = result.meta["history"].splitlines()
+    assert lines[:2] == ["calibrated", "flat-fielded"]
+    assert "richardson-lucy, 5 steps" in lines[2] and psf.version in lines[2]
+    assert result.mask is None and result.uncertainty is None
+
+
+def test_a_saved_map_is_a_product_with_the_same_cards(psf: heliopsf.Psf, tmp_path: Path) -> None:
+    result = heliopsf.deconvolve(a_map(), psf)
+    result.save(tmp_path / "product.fits")
+    header = fits.getheader(tmp_path / "product.fits")
+    assert header["PSFID"] == psf.provenance["psf_id"]
+    for again in (result, tmp_path / "product.fits", sunpy.map.Map(tmp_path / "product.fits")):
+        with pytest.raises(DataError) as caught:
+            heliopsf.deconvolve(again, psf)
+        assert caught.value.code == "already-deconvolved"
+    assert heliopsf.deconvolve(result, psf, again=True).meta["dcnvpass"] == 2
+
+
+def test_every_form_gives_the_same_pixels(psf: heliopsf.Psf, tmp_path: Path) -> None:
+    data = pixels()
+    a_map().save(tmp_path / "image.fits")
+    header = fits.Header({key.upper(): value for key, value in cards().items()})
+    wanted = heliopsf.deconvolve(tmp_path / "image.fits", psf)
+    assert isinstance(wanted, heliopsf.Deconvolution)
+    forms: list[Any] = [
+        a_map(),
+        NDData(data, unit="DN", meta=cards()),
+        CCDData(data, unit="adu", meta=header, wcs=WCS(header)),
+        data,
+        data.astype(">i4"),
+    ]
+    for image in forms:
+        result = heliopsf.deconvolve(image, psf, other_channel=True)
+        assert type(result) is type(image)
+        found = result if isinstance(result, np.ndarray) else result.data
+        np.testing.assert_array_equal(found, wanted.pixels)
+    quantity = heliopsf.deconvolve(data * u.DN, psf)
+    assert quantity.unit == u.DN
+    np.testing.assert_array_equal(quantity.value, wanted.pixels)
+
+
+def test_ccd_data_keeps_unit_wcs_and_header(psf: heliopsf.Psf) -> None:
+    header = fits.Header({key.upper(): value for key, value in cards().items()})
+    image = CCDData(pixels(), unit="DN / s", meta=header, wcs=WCS(header))
+    result = heliopsf.deconvolve(image, psf)
+    assert result.unit == image.unit and result.wcs is image.wcs
+    assert result.header["PSFVERS"] == psf.version and "PSFVERS" not in image.header
+    assert "steps" in str(result.header["HISTORY"])
+
+
+def test_the_plate_scale_of_a_ccd_data_without_cards_is_that_of_its_wcs(psf: heliopsf.Psf) -> None:
+    header = fits.Header({key.upper(): value for key, value in cards(cdelt1=3.0, cdelt2=3.0).items()})
+    image = CCDData(pixels(), unit="DN", wcs=WCS(header))
+    with pytest.raises(DataError) as caught, pytest.warns(UserWarning, match="not compared"):
+        heliopsf.deconvolve(image, psf)
+    assert caught.value.code == "plate-scale-mismatch"
+
+
+def test_pixels_without_a_value_stay_without_one_and_are_masked(psf: heliopsf.Psf) -> None:
+    data = pixels()
+    data[10, 20] = np.nan
+    mask = np.zeros(SHAPE, bool)
+    mask[30, 40] = True
+    image = sunpy.map.Map(data, cards(), mask=mask)
+    result = heliopsf.deconvolve(image, psf)
+    wanted = mask | np.isnan(data)
+    np.testing.assert_array_equal(np.isnan(result.data), wanted)
+    np.testing.assert_array_equal(result.mask, wanted)
+    full = heliopsf.deconvolve(image, psf, full=True)
+    np.testing.assert_array_equal((full.quality & QualityBit.NONFINITE) != 0, wanted)
+
+
+def test_an_uncertainty_is_added_where_asked(psf: heliopsf.Psf) -> None:
+    noise = (2.0, 1.0)
+    result = heliopsf.deconvolve(a_map(), psf, noise=noise, error_draws=4)
+    sigma = result.uncertainty.array
+    # Deconvolution amplifies the photon noise of the background of 50 DN.
+    assert 10.0 < np.median(sigma) < 40.0 and (sigma > 0).all()
+    assert result.meta["dcnvampl"] == pytest.approx(np.median(sigma) / np.sqrt(2 * 50 + 1), rel=0.15)
+    with pytest.raises(DataError, match="no-noise-figures"):
+        heliopsf.deconvolve(a_map(), psf, error_draws=4)
+    with pytest.raises(DataError, match="expected 0, or 2 to 64; got 1"):
+        heliopsf.deconvolve(a_map(), psf, noise=noise, error_draws=1)
+
+
+def test_a_cropped_map_is_deconvolved_with_the_same_psf(psf: heliopsf.Psf) -> None:
+    image = a_map()
+    part = image.submap([20, 20] * u.pix, width=79 * u.pix, height=59 * u.pix)
+    result = heliopsf.deconvolve(part, psf)
+    assert result.data.shape == (60, 80) and result.meta["psfvers"] == psf.version
+    whole = heliopsf.deconvolve(image, psf).data[20:80, 20:100]
+    inner = (slice(20, 40), slice(25, 55))
+    np.testing.assert_allclose(result.data[inner], whole[inner], rtol=0.05)
+
+
+def test_a_rebinned_map_gets_the_rebinned_psf(psf: heliopsf.Psf) -> None:
+    anonymous = heliopsf.Psf.of(psf)
+    binned = a_map().superpixel([2, 2] * u.pix, func=np.mean)
+    unnamed = heliopsf.deconvolve(binned, psf.kernel)  # weights alone have no plate scale
+    assert unnamed.data.shape == (48, 64)
+    with pytest.raises(DataError) as caught:  # the instrument of the image is not known to be that of the PSF
+        heliopsf.deconvolve(binned, anonymous)
+    assert caught.value.code == "plate-scale-mismatch"
+    rebinned = psf.rebinned(2)
+    assert isinstance(rebinned, heliopsf.Psf) and rebinned.plate_scale_arcsec == 2 * SCALE
+    np.testing.assert_array_equal(rebinned.kernel, rebinned_kernel(psf.kernel, 2))
+    result = heliopsf.deconvolve(binned, rebinned)
+    assert result.meta["psfvers"].endswith("+bin2")
+
+
+def test_a_map_resampled_by_a_fraction_is_refused(psf: heliopsf.Psf) -> None:
+    image = a_map().resample([100, 75] * u.pix)
+    with pytest.raises(DataError) as caught:
+        heliopsf.deconvolve(image, psf)
+    assert caught.value.code == "plate-scale-mismatch" and "2.56" in caught.value.message
+
+
+@pytest.mark.filterwarnings("ignore:Missing metadata", "ignore:.*not found", "ignore::UserWarning:sunpy")
+def test_a_map_without_coordinates_is_deconvolved_with_a_warning(psf: heliopsf.Psf) -> None:
+    few = {"telescop": "SMALL", "wavelnth": 171, "waveunit": "angstrom", "cunit1": "deg", "cunit2": "deg"}
+    image = sunpy.map.Map(pixels(), few)
+    with pytest.warns(UserWarning, match=r"no plate scale .* taken to have 2 arcsec/px"):
+        result = heliopsf.deconvolve(image, psf)
+    np.testing.assert_array_equal(result.data, heliopsf.deconvolve(a_map(), psf).data)
+
+
+def test_another_unit_keeps_the_unit_and_ignores_levels_in_dn(psf: heliopsf.Psf) -> None:
+    result = heliopsf.deconvolve(a_map(bunit="ph"), psf)
+    assert result.unit == u.ph
+    np.testing.assert_array_equal(result.data, heliopsf.deconvolve(a_map(), psf).data)
+    with pytest.raises(DataError) as caught:
+        heliopsf.deconvolve(a_map(bunit="ph"), psf, saturation_dn=100.0)
+    assert caught.value.code == "saturation-unit"
+    bright = heliopsf.deconvolve(a_map(), psf, saturation_dn=100.0)
+    assert bright.mask.any() and np.isfinite(bright.data).all()
+    with pytest.raises(DataError) as caught:
+        heliopsf.deconvolve(NDData(pixels(), unit=u.mag), psf)
+    assert caught.value.code == "bad-unit"
+
+
+def test_a_list_gives_a_list_and_an_error_names_the_image(psf: heliopsf.Psf) -> None:
+    images = [a_map(), a_map(pixels(2))]
+    results = heliopsf.deconvolve(images, psf)
+    for image, result in zip(images, results, strict=True):
+        np.testing.assert_array_equal(result.data, heliopsf.deconvolve(image, psf).data)
+    mixed = [a_map(), a_map(wavelnth=304)]
+    with pytest.raises(DataError) as caught:
+        heliopsf.deconvolve(mixed, psf)
+    assert caught.value.code == "channel-mismatch"
+    assert caught.value.message.startswith("image 2 of 2:") and "304" in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("image", "code"),
+    [
+        (None, "bad-input"),
+        ({"a": 1}, "bad-input"),
+        (np.ones((4, 40, 40)), "not-2d"),
+        (np.ones((40, 40), complex), "bad-input"),
+        (np.full((40, 40), np.nan), "all-nan"),
+        (np.zeros((40, 40)), "no-signal"),
+        (np.ones((4, 4)), "too-small"),
+    ],
+)
+def test_what_is_no_image_is_refused(image: Any, code: str, psf: heliopsf.Psf) -> None:
+    with pytest.raises(DataError) as caught:
+        heliopsf.deconvolve(image, psf)
+    assert caught.value.code == code
+
+
+def test_a_psf_may_be_an_object_a_file_or_weights(psf: heliopsf.Psf, tmp_path: Path) -> None:
+    wanted = heliopsf.deconvolve(a_map(), psf).data
+    psf.write(tmp_path / "psf.fits")
+    from_file = heliopsf.deconvolve(a_map(), tmp_path / "psf.fits")
+    np.testing.assert_array_equal(from_file.data, wanted)
+    assert len(from_file.meta["psfid"]) == 64
+    weights = heliopsf.deconvolve(a_map(), psf.kernel)
+    np.testing.assert_array_equal(weights.data, wanted)
+    with pytest.raises(DataError, match=r"psf-not-centred"):
+        heliopsf.deconvolve(a_map(), np.fft.ifftshift(psf.kernel))
+    with pytest.raises(DataError, match=r"psf: expected a Psf.*got dict"):
+        heliopsf.deconvolve(a_map(), {"psf": 1})  # type: ignore[call-overload]
+
+
+def test_calls_of_aiapy_work_unchanged(psf: heliopsf.Psf) -> None:
+    """Names and order of ``aiapy.psf.deconvolve`` (0.10): smap, psf, iterations, clip_negative, use_gpu."""
+    names = list(inspect.signature(heliopsf.deconvolve).parameters)
+    assert names[:5] == ["smap", "psf", "iterations", "clip_negative", "use_gpu"]
+    data = pixels()
+    data[0, 0] = -5.0
+    called = heliopsf.deconvolve(a_map(data), psf=psf.kernel, iterations=25, clip_negative=True, use_gpu=True)
+    assert called.meta["dcnviter"] == 25
+    np.testing.assert_array_equal(called.data, heliopsf.deconvolve(a_map(data), psf, steps=25).data)
+    with pytest.raises(DataError) as caught:
+        heliopsf.deconvolve(a_map(data), psf, clip_negative=False)
+    assert caught.value.code == "negative-pixels"
+    kept = heliopsf.deconvolve(a_map(data), psf, clip_negative=False, method="linear")
+    clipped = heliopsf.deconvolve(a_map(data), psf, clip_negative=True, method="linear")
+    assert kept.data[0, 0] < clipped.data[0, 0]
+    with pytest.raises(DataError, match="got both"):
+        heliopsf.deconvolve(a_map(), psf, iterations=5, steps=5)
+
+
+def test_progress_is_told_to_a_function_or_on_the_terminal(
+    psf: heliopsf.Psf, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told: list[tuple[int, int]] = []
+    heliopsf.deconvolve(a_map(), psf, iterations=3, progress=lambda step, steps: told.append((step, steps)))
+    assert told[-1] == (3, 3) and capsys.readouterr().err == ""
+    heliopsf.deconvolve(a_map(), psf, iterations=3, progress=True)
+    assert "deconvolving: step 3 of 3\n" in capsys.readouterr().err
+
+
+def test_the_number_of_threads_does_not_change_the_result(psf: heliopsf.Psf) -> None:
+    one, two = (heliopsf.deconvolve(a_map(), psf, threads=threads).data for threads in (1, 2))
+    np.testing.assert_array_equal(one, two)

@@ -1,0 +1,170 @@
+"""What is installed: the wheel, its metadata, and what works without the packages of the extras."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from tests.conftest import REPOSITORY, SMALL_INSTRUMENT, write_image
+
+# What pip installs for the core: the five dependencies and what these need.
+CORE = {
+    "astropy",
+    "astropy_iers_data",
+    "erfa",
+    "llvmlite",
+    "numba",
+    "numpy",
+    "packaging",
+    "platformdirs",
+    "scipy",
+    "yaml",
+}
+OURS = {"heliopsf", "psfcore", "workers", "service"}
+BLOCKED = """
+import sys
+class Allowed:
+    def __init__(self, finder):
+        self.finder = finder
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        if top not in ALLOWED and top not in sys.stdlib_module_names and not top.startswith("_"):
+            return None
+        return self.finder.find_spec(name, path, target)
+sys.meta_path[:] = map(Allowed, sys.meta_path)
+"""
+THREE_LINES = """
+import heliopsf
+psf = heliopsf.build_psf("small.toml", size=64)
+sharp = heliopsf.deconvolve("image.fits", psf)
+assert sharp.pixels.shape == (96, 128) and sharp.quality.shape == (96, 128)
+for name, extra in (("Client", "service"), ("fit_scatter", "fit")):
+    try:
+        getattr(heliopsf, name)
+    except heliopsf.MissingExtra as error:
+        assert f"pip install 'heliopsf[{extra}]'" in str(error), error
+    else:
+        raise AssertionError(name)
+try:
+    psf.plot()
+except heliopsf.MissingExtra as error:
+    assert "the package matplotlib" in str(error) and "heliopsf[plot]" in str(error)
+else:
+    raise AssertionError("plot")
+"""
+
+
+def test_the_core_runs_without_the_packages_of_the_extras(tmp_path: Path) -> None:
+    write_image(tmp_path / "image.fits", WAVELNTH=171, CDELT1=2.0, CDELT2=2.0)
+    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
+    script = BLOCKED.replace("ALLOWED", repr(CORE | OURS)) + THREE_LINES
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True)
+
+
+def test_the_command_without_its_extra_is_one_line(tmp_path: Path) -> None:
+    script = BLOCKED.replace("ALLOWED", repr(CORE | OURS)) + "from service.start import main; main()"
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "Error: expected the package click, which is not installed: install heliopsf with the extra 'service', pip install "
+        "'heliopsf[service]'\n"
+    )
+
+
+def test_the_core_depends_on_five_packages_and_extras_name_all_that_is_imported() -> None:
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    names = {Requirement(one).name for one in project["dependencies"]}
+    assert names == {"astropy", "numba", "numpy", "platformdirs", "scipy"}
+    extras = project["optional-dependencies"]
+    assert {"map", "plot", "fit", "service", "s3", "all", "dev"} == set(extras)
+    named = set(re.findall(r'module_of_extra\(\s*"(\w+)"', _sources())) | {"fit", "service"}
+    assert named <= set(extras)
+
+
+def _sources() -> str:
+    files = [path for package in sorted(OURS) for path in sorted((REPOSITORY / package).rglob("*.py"))]
+    assert len(files) > 300
+    return "\n".join(path.read_text("utf-8") for path in files)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    # A copy: a build writes into the folder of the sources.
+    tracked = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+    )
+    if tracked.returncode:
+        pytest.skip("not a git checkout")
+    for name in tracked.stdout.splitlines():
+        if name.split("/")[0] in OURS or "/" not in name:
+            (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+            if (REPOSITORY / name).is_file():
+                (folder / "source" / name).write_bytes((REPOSITORY / name).read_bytes())
+    command = [
+        sys.executable,
+        "-m",
+        "build",
+        "--no-isolation",
+        "-o",
+        str(folder / "dist"),
+        str(folder / "source"),
+    ]
+    subprocess.run(command, check=True, capture_output=True)
+    (found,) = (folder / "dist").glob("*.whl")
+    return found
+
+
+def test_wheel_and_source_have_complete_metadata(wheel: Path) -> None:
+    files = sorted(map(str, wheel.parent.iterdir()))
+    assert len(files) == 2
+    subprocess.run(
+        [sys.executable, "-m", "twine", "check", "--strict", *files], check=True, capture_output=True
+    )
+    with zipfile.ZipFile(wheel) as archive:
+        (path,) = (name for name in archive.namelist() if name.endswith("METADATA"))
+        metadata = archive.read(path).decode()
+    for minor in (11, 12, 13):
+        assert f"Classifier: Programming Language :: Python :: 3.{minor}\n" in metadata
+    assert "Requires-Python: >=3.11" in metadata and "License-Expression: BSD-3-Clause" in metadata
+
+
+def test_the_wheel_holds_the_packages_and_their_files_and_stays_small(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    assert {name.split("/")[0] for name in names if ".dist-info" not in name} == OURS
+    for name in ("heliopsf/py.typed", "psfcore/instruments/hri_euv.toml", "psfcore/drawing/page.html"):
+        assert name in names
+    kept = {f"{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "service" / "pages").rglob("*.html")}
+    assert kept and kept <= names
+    assert wheel.stat().st_size < 1.4e6
+
+
+@pytest.mark.slow
+def test_an_empty_environment_runs_the_three_lines(wheel: Path, tmp_path: Path) -> None:
+    python = tmp_path / "empty" / "bin" / "python"
+    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "empty")], check=True)
+    pip = [str(python), "-m", "pip", "install", "-q", "-c", str(REPOSITORY / "constraints.txt"), str(wheel)]
+    installed = subprocess.run(pip, capture_output=True, text=True)
+    if installed.returncode:
+        pytest.skip(f"the packages cannot be installed here: {installed.stderr[-300:]}")
+    listed = subprocess.run(
+        [str(python), "-m", "pip", "list", "--format", "freeze"], check=True, capture_output=True, text=True
+    )
+    packages = {line.split("==")[0] for line in listed.stdout.split()} - {"pip", "setuptools"}
+    assert "heliopsf" in packages and len(packages) <= 12
+    write_image(tmp_path / "image.fits", WAVELNTH=171, CDELT1=2.0, CDELT2=2.0)
+    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
+    subprocess.run([str(python), "-c", THREE_LINES], cwd=tmp_path, check=True)
