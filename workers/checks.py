@@ -37,16 +37,22 @@ def database(catalogue: Catalogue) -> None:
     try:
         catalogue.ping()
     except SQLAlchemyError as error:
-        raise Unusable(f"the database does not answer ({_kind(error)})") from error
+        raise (
+            _damage(error) if damaged(error) else Unusable(f"the database does not answer ({_kind(error)})")
+        ) from error
     started = time.monotonic()
     if started < _pages_good_until.get(catalogue, 0.0):
         return
     try:
         catalogue.check_pages()
     except SQLAlchemyError as error:
-        raise Unusable(f"the database is damaged ({_kind(error)}); restore a copy of it") from error
+        raise _damage(error) from error
     ended = time.monotonic()
     _pages_good_until[catalogue] = ended + (ended - started) / PAGES_SHARE
+
+
+def _damage(error: SQLAlchemyError) -> Unusable:
+    return Unusable(f"the database is damaged ({_kind(error)}); restore a copy of it")
 
 
 def storage(folder: Path, min_free_mib: int) -> None:

@@ -122,19 +122,32 @@ class Seldom(logging.Filter):
         return True
 
 
+REQUESTS = "service.http.observation"  # the logger of answered requests
 _SELDOM_WARNINGS = Seldom(lambda record: record.levelno < logging.ERROR)
 _SELDOM_ACCEPTS = Seldom(lambda record: record.getMessage().startswith("socket.accept()"))
 
 
-def configure(settings: Settings) -> None:
-    """Write the logs of the process to standard error. Repeated calls change nothing."""
+def _no_request(record: logging.LogRecord) -> bool:
+    """Whether a record is not about an answered request, or about one at which the service failed."""
+    return record.name != REQUESTS or getattr(record, "fields", {}).get("status", 500) >= 500
+
+
+def configure(settings: Settings, *, verbose: bool = False) -> None:
+    """Write the logs of the process to standard error. Repeated calls change nothing.
+
+    A person who starts a service on a terminal does not see a line for each request, unless ``verbose`` is true or
+    HELIOPSF_LOG_FORMAT is set; otherwise these lines would hide the address of the service.
+    """
     stream = sys.__stderr__ or sys.stderr
     form = settings.log_format or ("text" if stream.isatty() else "json")
     handler = logging.StreamHandler(stream)
+    if settings.log_format is None and stream.isatty() and not verbose:
+        handler.addFilter(_no_request)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
     # These libraries log every request, connection and plug-in. Our own log lines say the same, with the request id.
-    for chatty in ("httpx", "httpcore", "uvicorn.access", "alembic.runtime.plugins"):
+    # An upgrade of the database is logged in one line, see ``Schema.upgrade``.
+    for chatty in ("httpx", "httpcore", "uvicorn.access", "alembic.runtime"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     # Clients without a key can cause these: requests that are not HTTP, and more connections than the system allows.
     logging.getLogger("uvicorn.error").addFilter(_SELDOM_WARNINGS)

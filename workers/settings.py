@@ -14,6 +14,7 @@ from typing import Literal
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from psfcore.fits.product.version import software_version as software_version
 from psfcore.transit.archive import ArchiveLimits
 from workers.contract.queues import Queue, queues_named
 from workers.data_folder import default_data_dir
@@ -44,7 +45,7 @@ class Settings(BaseSettings):
     quota_mib: int = Field(
         0,
         ge=0,
-        description="largest size of an owner's stored files, unless the owner has a limit of its own, MiB; 0: unlimited",
+        description="largest size of an owner's stored files and database rows, unless the owner has a limit of its own, MiB; 0: unlimited",
     )
     min_free_mib: int = Field(
         256,
@@ -311,11 +312,6 @@ def _memory_of_a_job_mib(worker_processes: int) -> int:
 def _named(names: str) -> tuple[str, ...]:
     """The names in a list that is separated by commas."""
     return tuple(name.strip() for name in names.split(",") if name.strip())
-
-
-def software_version() -> str:
-    """Version of the installed package, as recorded in products."""
-    return version("heliopsf")
 
 
 def library_versions() -> dict[str, str]:

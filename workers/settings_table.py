@@ -33,6 +33,13 @@ Commands and the Python client read two more variables:
 |---|---|
 | `HELIOPSF_SERVER` | Address of the service, for example `http://127.0.0.1:8765`. |
 | `HELIOPSF_KEY` | Access key that the commands and the Python client send. |
+
+Commands with `--local` and the Python functions keep built PSFs in a cache, which `heliopsf cache` lists and clears:
+
+| variable | meaning |
+|---|---|
+| `HELIOPSF_CACHE_DIR` | Folder of the cache; default: the user's cache folder, on Linux `~/.cache/heliopsf`. |
+| `HELIOPSF_CACHE_MIB` | Largest size of the cache, MiB; default: 2048; 0: PSFs are not kept. |
 """
 
 

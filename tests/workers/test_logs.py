@@ -1,13 +1,21 @@
-"""Messages that clients can cause are written once in a while."""
+"""Which messages are written: those that clients can cause once in a while, requests only if wanted, upgrades in one line."""
 
 from __future__ import annotations
 
+import io
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from sqlalchemy import text
 
+from service.http import observation
+from tests.tables import RUN_REVISIONS
 from workers import logs
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.schema import Schema
+from workers.settings import Settings
 
 
 @pytest.fixture
@@ -40,3 +48,61 @@ def test_only_the_messages_that_are_meant(clock: list[float]) -> None:
     seldom = logs.Seldom(lambda one: one.levelno < logging.ERROR)
     assert [seldom.filter(record("failed", level=logging.ERROR)) for _ in range(3)] == 3 * [True]
     assert [seldom.filter(record("failed")) for _ in range(3)] == [True, False, False]
+
+
+class Terminal(io.StringIO):
+    """A stream that says whether it is a terminal."""
+
+    def __init__(self, *, terminal: bool) -> None:
+        super().__init__()
+        self.isatty = lambda: terminal  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize(
+    ("terminal", "asked", "verbose", "shown"),
+    [
+        (True, None, False, False),
+        (True, None, True, True),
+        (True, "text", False, True),
+        (True, "json", False, True),
+        (False, None, False, True),
+    ],
+)
+def test_requests_are_shown_on_a_terminal_only_if_wanted(
+    monkeypatch: pytest.MonkeyPatch, terminal: bool, asked: str | None, verbose: bool, shown: bool
+) -> None:
+    root, stream = logging.getLogger(), Terminal(terminal=terminal)
+    monkeypatch.setattr(root, "handlers", [])  # the test runner's own come back afterwards
+    monkeypatch.setattr("sys.__stderr__", stream)
+    level = root.level
+    try:
+        logs.configure(Settings.model_validate({"log_format": asked}), verbose=verbose)
+        for status in (200, 404, 500):
+            fields = {"fields": {"status": status}}
+            logging.getLogger(observation.__name__).info("GET /%d", status, extra=fields)
+        logging.getLogger("service.api.jobs").info("job 1: submitted")
+        logging.getLogger("alembic.runtime.migration").info("Running upgrade")
+    finally:
+        root.setLevel(level)
+        logging.captureWarnings(False)
+    said = stream.getvalue()
+    assert [f"GET /{status}" in said for status in (200, 404, 500)] == [shown, shown, True]
+    assert "job 1: submitted" in said and "Running upgrade" not in said
+
+
+def test_an_upgrade_of_the_database_is_one_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Schema, "upgrade", RUN_REVISIONS)  # other tests get a copy of ready tables
+    caplog.set_level(logging.INFO, "workers.catalogue.schema")
+    catalogue = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
+    catalogue.upgrade()
+    wanted = catalogue.schema.status().wanted
+    assert caplog.messages == [f"database: created, revision {wanted}"]
+    with catalogue._engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '0016'"))
+    caplog.clear()
+    catalogue.upgrade()
+    catalogue.upgrade()
+    catalogue.close()
+    assert caplog.messages == [f"database: upgraded from 0016 to {wanted}"]

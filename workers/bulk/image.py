@@ -21,9 +21,11 @@ from workers.contract.requests import Deconvolve
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files import beneath
+from workers.files.full_disk import is_disk_full
 from workers.files.store import sha256_of
 from workers.intake import estimates
 from workers.intake.requests import resolved_deconvolution
+from workers.intake.withdrawn import details_now
 from workers.tasks import deconvolve as deconvolve_task
 from workers.tasks.context import Context
 from workers.tasks.data import product
@@ -117,6 +119,8 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
             with beneath.opened(path, allowed) as file:
                 sha256 = archive_files.copy_hashed(file, copy, context.settings.max_upload_bytes)
         except OSError as error:
+            if is_disk_full(error):  # the copy cannot be written; this concerns every image
+                raise
             reason = archive_files.reason_of(error)
             raise DataError(
                 "unreadable-file", f"expected a readable file; the system says: {reason}"
@@ -226,7 +230,7 @@ def _kept(context: Context, row: ProductRow, target: Path | None, *, reused: boo
         sha256=row.file_sha256,
         bytes=row.bytes,
         score=float(row.details["changes"]["artefacts"]["score"]),
-        statistics=statistics_of(row.details),
+        statistics=statistics_of(details_now(context.catalogue, row)),
     )
 
 
@@ -252,7 +256,7 @@ def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _put(context: Context, source: Path, target: Path) -> None:
-    """Copy a file to its path in the output folder. Raises DataError "output-not-written"."""
+    """Copy a file to its path in the output folder. Raises DataError "output-not-written", and OSError if the disk is full."""
     with _write_errors():
         beneath.put(source, target, _output_roots(context))
 
@@ -266,6 +270,8 @@ def _write_errors() -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if is_disk_full(error):  # this concerns every image
+            raise
         reason = archive_files.reason_of(error)
         raise DataError(
             "output-not-written",

@@ -11,6 +11,7 @@ from psfcore.errors import DataError
 from workers.catalogue.bulk_tables import MOST_LETTERS, BulkRow
 from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, Listed
 from workers.catalogue.jobs import Lease
+from workers.catalogue.owners import OverQuota
 from workers.contract.bulk import BulkWork, Condition
 from workers.contract.phases import Fault, JobError
 from workers.files import archive as archive_files
@@ -19,6 +20,7 @@ from workers.tasks.context import Context
 
 LIST_AT_ONCE = 200
 MOST_IMAGES = 1_000_000
+NOT_LISTED = "not all files that the patterns match could be listed"  # a reason for Usage.no_room
 TELL_EVERY_S = 1.0  # interval at which a turn reports its progress and checks whether it must stop
 
 
@@ -38,7 +40,7 @@ def list_files(context: Context, bulk: BulkRow, lease: Lease) -> bool:
     try:
         listed = _listed(context, work_of(bulk))
         while batch := list(islice(listed, LIST_AT_ONCE)):
-            if not bulks.add_listed(bulk.id, lease, batch):
+            if not bulks.add_listed(bulk.id, lease, batch, context.settings.quota_mib):
                 return False
         there = bulks.get(bulk.id)
         if there is not None and there.total == 0:
@@ -48,6 +50,10 @@ def list_files(context: Context, bulk: BulkRow, lease: Lease) -> bool:
             )
     except DataError as error:
         bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code=error.code, message=error.message))
+        return False
+    except OverQuota as over:
+        message = f"{over.usage.no_room(NOT_LISTED)}, then resume the run"
+        bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code="quota-exceeded", message=message))
         return False
     return bulks.end_listing(bulk.id, lease)
 

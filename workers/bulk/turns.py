@@ -17,6 +17,7 @@ from workers.contract.bulk import BulkPhase
 from workers.contract.identities import canonical_hash
 from workers.contract.phases import Fault, JobError, Phase
 from workers.contract.queues import Queue
+from workers.files.full_disk import STORAGE_FULL
 from workers.settings import Settings
 
 KIND = "bulk"
@@ -54,9 +55,13 @@ def _wanted(bulk: BulkRow, processes: int) -> int:
 
 
 def _forget(catalogue: Catalogue, turn: JobRow) -> None:
-    """Delete an ended turn. If it failed with an error that the next turn would also meet, stop the bulk run."""
+    """Delete an ended turn. If it failed with an error that the next turn would also meet, stop the bulk run.
+
+    A full disk passes only when somebody makes room, and until then each turn would deconvolve an image for nothing.
+    """
     error = JobError.model_validate(turn.error) if turn.error else None
-    if error is not None and error.fault != Fault.TRANSIENT and error.code != "worker-lost":
+    stops = error is not None and (error.fault != Fault.TRANSIENT or error.code == STORAGE_FULL)
+    if error is not None and stops and error.code != "worker-lost":
         bulk_id = turn.parameters["bulk_id"]
         if catalogue.bulks.stop_with(bulk_id, error):
             log.error("bulk run %s: stopped: %s", bulk_id, error.message)

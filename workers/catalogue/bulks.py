@@ -24,6 +24,7 @@ from workers.catalogue.bulk_progress import BATCH, BulkProgress
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.database import Database
 from workers.catalogue.jobs import Lease
+from workers.catalogue.owners import ROW_BYTES, add_bytes, add_held, check_fits, counted_bytes
 from workers.catalogue.tables import JobRow
 from workers.contract.bulk import AT_WORK, OPEN, STOPPED, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError, Phase
@@ -78,17 +79,23 @@ class Bulks:
         with self._database.reading() as session:
             return sorted(session.scalars(query), key=lambda bulk: bulk.created_at)
 
-    def create(self, row: BulkRow, uploaded: Iterable[str]) -> tuple[BulkRow, bool]:
+    def create(
+        self, row: BulkRow, uploaded: Sequence[str], quota_mib: int | None = None
+    ) -> tuple[BulkRow, bool]:
         """Create a run whose first images are these uploads, or find the open run of an identical request.
 
-        Returns the run, and whether it is new.
+        Returns the run, and whether it is new. quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
         """
+        row.total = len(uploaded)
         for _ in range(3):  # between the two statements, the identical run may end
             try:
                 with self._database.writing.begin() as session:
+                    check_fits(session, row.owner, counted_bytes(row), quota_mib)
                     session.add(row)
                     session.flush()
-                    row.total = _add(session, row.id, 0, (Listed(one, True) for one in uploaded))
+                    _add(session, row.id, 0, (Listed(one, True) for one in uploaded))
+                    # Only now, so that the owner's count is not locked while many images are added.
+                    add_held(session, row.owner, counted_bytes(row), quota_mib)
                 return row, True
             except IntegrityError:
                 existing = self._equal_open(row)
@@ -177,17 +184,26 @@ class Bulks:
                 return False
             files = delete(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.uploaded.is_(False))
             bulk.lister, bulk.failed = lease.token, 0
-            bulk.total -= _changed(session, files)
+            removed = _changed(session, files)
+            bulk.total -= removed
+            add_bytes(session, bulk.owner, -ROW_BYTES * removed)
             return True
 
-    def add_listed(self, bulk_id: str, lease: Lease, images: Sequence[Listed]) -> bool:
-        """Add images to a run. False if another lease now lists the files, or if the run is not LISTING."""
+    def add_listed(
+        self, bulk_id: str, lease: Lease, images: Sequence[Listed], quota_mib: int | None = None
+    ) -> bool:
+        """Add images to a run. False if another lease now lists the files, or if the run is not LISTING.
+
+        quota_mib: as for ``create``.
+        """
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
             if bulk is None or bulk.phase != BulkPhase.LISTING or bulk.lister != lease.token:
                 return False
             bulk.failed += sum(image.error is not None for image in images)
-            bulk.total += _add(session, bulk_id, bulk.total, images)
+            added = _add(session, bulk_id, bulk.total, images)
+            bulk.total += added
+            add_held(session, bulk.owner, ROW_BYTES * added, quota_mib)
             return True
 
     def end_listing(self, bulk_id: str, lease: Lease) -> bool:

@@ -6,7 +6,7 @@ that are common to all content-addressed rows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TypeVar
 
 from sqlalchemy import Select, String, cast, select, tuple_
@@ -25,7 +25,7 @@ from workers.catalogue.database import Database, begins_with
 from workers.catalogue.followed.rows import followed_bulks, followed_jobs
 from workers.catalogue.jobs import Jobs
 from workers.catalogue.named_files import NamedFiles
-from workers.catalogue.owners import Owners, add_bytes, counted_bytes, hold_to_quota
+from workers.catalogue.owners import Owners, add_bytes, add_held, counted_bytes
 from workers.catalogue.parts import Parts
 from workers.catalogue.psfs import Psfs
 from workers.catalogue.schema import Schema
@@ -116,11 +116,8 @@ class Catalogue:
             with self._database.writing.begin() as session:
                 session.add(row)
                 session.flush()
-                count = counted_bytes(row)
-                add_bytes(session, row.owner, count)
-                if quota_mib is not None:
-                    removable = isinstance(row, SolutionRow)
-                    hold_to_quota(session, row.owner, count, quota_mib, removable=removable)
+                removable = isinstance(row, SolutionRow)
+                add_held(session, row.owner, counted_bytes(row), quota_mib, removable=removable)
             return row, True
         except IntegrityError:
             existing = self.get(type(row), row.id, row.owner)
@@ -131,6 +128,7 @@ class Catalogue:
     def refile(self, row: Made) -> Made:
         """Let the existing row of this identity refer to the files of ``row``; returns the existing row."""
         with self._database.writing.begin() as session:
+            add_bytes(session, row.owner, 0)  # locks the owner first: no deadlock with a deletion
             there = session.get(type(row), (row.owner, row.id), with_for_update=True)
             if there is None:  # it was deleted meanwhile
                 session.add(row)
@@ -170,7 +168,8 @@ class Catalogue:
             if user is not None:
                 raise DataError(
                     "psf-in-use",
-                    f"expected a PSF that nothing uses; {user} uses PSF {psf_id}: it can only be deleted without this",
+                    f"expected a PSF that nothing uses; {user[0]} {user[1][:SHOWN_DIGITS]} uses PSF {psf_id}: "
+                    + _FIRST[user[0]].format(id=user[1][:SHOWN_DIGITS]),
                 )
             session.delete(row)
             add_bytes(session, owner, -counted_bytes(row))
@@ -182,6 +181,12 @@ class Catalogue:
         query = select(table.id).where(table.owner == owner, begins_with(table.id, digits))
         with self._database.reading() as session:
             return session.scalars(query.order_by(table.id).limit(MOST_CANDIDATES)).all()
+
+    def ids_among(self, table: type[AnyRow], identities: Collection[str], owner: str) -> set[str]:
+        """Those of the ids that the catalogue has."""
+        query = select(table.id).where(table.owner == owner, table.id.in_(identities))
+        with self._database.reading() as session:
+            return set(session.scalars(query))
 
     def delete_product(self, identity: str, owner: str) -> bool:
         """Remove a product from the catalogue; returns whether it was there.
@@ -223,6 +228,17 @@ class Catalogue:
             return session.scalars(query).all()
 
 
+# What to do before a PSF can be deleted, by what uses it.
+_FIRST = {
+    "product": "delete that product first: `heliopsf product delete {id}`",
+    "context": "a context never changes, so its PSFs are kept",
+    "bulk run": "cancel that run first: `heliopsf bulk cancel {id}`",
+    "job": "wait until the job has ended, or cancel it: `heliopsf job cancel {id}`",
+    "PSF": "that PSF was made from this one; delete it first: `heliopsf psf delete {id}`",
+}
+SHOWN_DIGITS = 12  # of ids in messages; every command accepts ids that are cut like this
+
+
 def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:
     """Give the completed jobs with this result other keys, because their result is deleted.
 
@@ -235,8 +251,8 @@ def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:
         job.request_key = canonical_hash({"request_key": job.request_key, "deleted": job.id})
 
 
-def _user_of(session: Session, psf: PsfRow) -> str | None:
-    """A thing that uses a PSF, as words for a message; None if nothing uses it."""
+def _user_of(session: Session, psf: PsfRow) -> tuple[str, str] | None:
+    """A thing that uses a PSF: what it is, a key of _FIRST, and its id; None if nothing uses the PSF."""
     found: str | None
     owner = psf.owner
     products = select(ProductRow.id).where(ProductRow.owner == owner, ProductRow.psf_id == psf.id)
@@ -262,5 +278,5 @@ def _user_of(session: Session, psf: PsfRow) -> str | None:
     ):
         found = session.scalars(query.limit(1)).first()
         if found is not None:
-            return f"{what} {found}"
+            return what, found
     return None

@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.database import Database, begins_with, several_ids_fit
+from workers.catalogue.owners import add_held, counted_bytes
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow, PsfRow
 from workers.contract.identities import canonical_hash
 from workers.contract.short_ids import SHORT_ID
@@ -43,11 +44,19 @@ class Contexts:
         self._database = database
 
     def create(
-        self, name: str, owner: str, by: str, *, reason: str = "", pins: Sequence[Pin] | None = None
+        self,
+        name: str,
+        owner: str,
+        by: str,
+        *,
+        reason: str = "",
+        pins: Sequence[Pin] | None = None,
+        quota_mib: int | None = None,
     ) -> tuple[PsfContextRow, bool]:
         """Create a context of these pins; if ``pins`` is None, of all certified PSFs.
 
         Returns the context, and whether it is new. If the name exists with the same pins, that context is returned.
+        quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
 
         Raises ``DataError``: "bad-name", "name-taken", "no-such-psf", "no-line", "nothing-to-pin", "ranges-overlap".
         """
@@ -62,6 +71,8 @@ class Contexts:
                 rows = _certified(session, owner) if pins is None else _given(session, owner, pins)
                 made = _context(name, owner, by, reason, rows)
                 session.add_all((made, *rows))
+                session.flush()
+                add_held(session, owner, counted_bytes(made), quota_mib)
             return made, True
         except IntegrityError:
             existing = self.find(name, owner)
@@ -125,16 +136,19 @@ class Contexts:
             context_id = session.scalars(query.order_by(DefaultContextRow.number.desc()).limit(1)).first()
             return None if context_id is None else session.get(PsfContextRow, (owner, context_id))
 
-    def set_default(self, id_or_name: str | None, owner: str, by: str, reason: str = "") -> None:
+    def set_default(
+        self, id_or_name: str | None, owner: str, by: str, reason: str = "", quota_mib: int | None = None
+    ) -> None:
         """Set an owner's default context; None: use the PSFs that are certified now.
 
-        Raises ``DataError`` "no-such-context".
+        quota_mib: as for ``Catalogue.add``, because every change is stored. Raises ``OverQuota``, and ``DataError``
+        "no-such-context".
         """
         context_id = None if id_or_name is None else self.named(id_or_name, owner).id
+        row = DefaultContextRow(owner=owner, context_id=context_id, at=time.time(), by=by, reason=reason)
         with self._database.writing.begin() as session:
-            session.add(
-                DefaultContextRow(owner=owner, context_id=context_id, at=time.time(), by=by, reason=reason)
-            )
+            session.add(row)
+            add_held(session, owner, counted_bytes(row), quota_mib)
 
     def default_changes(self, owner: str, limit: int = 200) -> Sequence[DefaultContextRow]:
         """The changes of an owner's default context, latest first."""

@@ -20,6 +20,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from workers.catalogue.database import Database
+from workers.catalogue.owners import add_held, counted_bytes
 from workers.catalogue.tables import JobRow, OwnerTurnRow, TermsRow
 from workers.contract.identities import canonical_hash
 from workers.contract.kinds import queue_of
@@ -60,12 +61,14 @@ class Jobs:
         *,
         queue: Queue | None = None,
         estimate: dict[str, Any] | None = None,
+        quota_mib: int | None = None,
     ) -> tuple[JobRow, bool]:
         """Queue a new job, or share the live job of an identical request; also returns whether the job is new.
 
         queue: None: the queue of the job's kind. A shared job that waits in a less urgent queue moves to ``queue``.
         A cancelled job and a job with UWS terms are not shared. In this case the new job gets a different key. It waits
-        while the other job executes, and then uses the result of the other job, if there is one.
+        while the other job executes, and then uses the result of the other job, if there is one. quota_mib: as for
+        ``Catalogue.add``; raises ``OverQuota``.
         """
         queue = queue or queue_of(kind)
         for _ in range(3):  # between the two statements, the identical job may fail
@@ -86,6 +89,7 @@ class Jobs:
             )
             try:
                 with self._database.writing.begin() as session:
+                    add_held(session, owner, counted_bytes(row), quota_mib)
                     session.add(row)
                 return row, True
             except IntegrityError:

@@ -15,7 +15,7 @@ from sqlalchemy import JSON, String, Table, cast, literal, or_, select, tuple_
 
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.database import Database
-from workers.catalogue.owners import COUNTED
+from workers.catalogue.owners import WITH_FILES
 from workers.catalogue.tables import (
     Base,
     ImageRow,
@@ -56,7 +56,7 @@ class NamedFiles:
         """
         named: set[str] = set()
         with self._database.reading() as session:
-            for table in (row.__table__ for row in COUNTED):
+            for table in (row.__table__ for row in WITH_FILES):
                 texts = [cast(one, String) for one in table.columns if isinstance(one.type, String | JSON)]
                 for digest in digests - named:
                     contains = or_(*(text.contains(digest) for text in texts))

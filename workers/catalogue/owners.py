@@ -1,8 +1,12 @@
 """The number of bytes that each owner keeps, and the owner's quota.
 
 The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The rows count too,
-because many small files take more room in the database than on the disk. The count changes in the transaction that adds the
-row.
+because many small files take more room in the database than on the disk: also the rows of jobs, bulk runs and their images,
+contexts, and changes of a PSF's status, which have no files. The count changes in the transaction that adds, changes or removes
+the row. Rows of which an owner has only a few (keys, turns) do not count.
+
+A transaction that changes jobs or PSFs locks the owner's row before it locks theirs (``add_bytes``, if need be of 0 bytes), so
+that two of them cannot wait for each other.
 
 A solution can be made again, so it never takes room from anything else: the oldest solutions are removed if an upload or
 another solution needs their room.
@@ -12,28 +16,51 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-from sqlalchemy import ColumnElement, String, cast, delete, func, select, update
+from sqlalchemy import BigInteger, ColumnElement, String, cast, delete, func, literal, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import CursorResult
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
+from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.database import Database, strict_json
 from workers.catalogue.tables import (
-    Base,
+    DefaultContextRow,
     ImageRow,
+    JobRow,
     OwnerRow,
+    PartRow,
     ProductRow,
+    PsfChangeRow,
+    PsfContextRow,
     PsfRow,
     ReportRow,
     SolutionRow,
     TransitRow,
 )
 
-COUNTED = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
+WITH_FILES = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 MIB = 2**20
 ROW_BYTES = 2**10  # the columns of a row without its JSON, and its entries in the indexes
-NOT_KEPT = "the result of this job could not be kept"  # a reason for Usage.no_room
+# Reasons for Usage.no_room:
+NOT_KEPT = "the result of this job could not be kept"
+ROWS_NOT_KEPT = "what this request adds to the database could not be kept"
+
+CountedRow = (
+    ImageRow
+    | TransitRow
+    | PsfRow
+    | ProductRow
+    | ReportRow
+    | SolutionRow
+    | JobRow
+    | BulkRow
+    | PsfContextRow
+    | PsfChangeRow
+    | DefaultContextRow
+    | PartRow
+)
 
 
 @dataclass(frozen=True)
@@ -69,7 +96,7 @@ class Usage:
 
 
 class OverQuota(Exception):
-    """A file does not fit into the owner's quota. usage: the owner's usage without this file."""
+    """A file or a row does not fit into the owner's quota. usage: the owner's usage without it."""
 
     def __init__(self, usage: Usage) -> None:
         super().__init__(usage.owner)
@@ -100,14 +127,14 @@ class Owners:
             session.execute(update(OwnerRow).where(OwnerRow.owner == owner).values(quota_mib=quota_mib))
 
     def recount(self) -> Sequence[str]:
-        """Count the bytes of all files again and correct the counts; returns the owners whose count was wrong."""
+        """Count the bytes of all files and rows again and correct the counts; returns the owners whose count was wrong."""
         wrong = []
         with self._database.writing.begin() as session:
             # If another transaction adds a row now, it waits for these locks before it changes the count.
             rows = session.scalars(select(OwnerRow).with_for_update()).all()
             truth: dict[str, int] = {}
-            for table in COUNTED:
-                sums = select(table.owner, func.sum(_counted(table))).group_by(table.owner)
+            for table, counted in COUNTED.items():
+                sums = select(table.owner, func.sum(counted)).group_by(table.owner)
                 for owner, total in session.execute(sums):
                     truth[owner] = truth.get(owner, 0) + int(total)
             for row in rows:
@@ -137,21 +164,73 @@ class Owners:
                 _forget(session, row)
 
 
-def counted_bytes(row: ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | SolutionRow) -> int:
-    """What a row counts: its file and the row itself. A solution counts its file alone: it can be removed at any time."""
-    if isinstance(row, SolutionRow):
-        return row.bytes
-    about = row.summary if isinstance(row, ImageRow | TransitRow) else row.details
-    return row.bytes + ROW_BYTES + len(strict_json(about))
+def counted_bytes(row: CountedRow) -> int:
+    """What a row counts: its file and the row itself. A solution counts its file alone: it can be removed at any time.
+
+    A bulk run counts with its images, a context with its pins, a job with its UWS terms. The progress, the estimate and the
+    error of a job are short and count as part of the row.
+    """
+    match row:
+        case SolutionRow():
+            return row.bytes
+        case ImageRow() | TransitRow():
+            return row.bytes + ROW_BYTES + len(strict_json(row.summary))
+        case PsfRow() | ProductRow() | ReportRow():
+            return row.bytes + ROW_BYTES + len(strict_json(row.details))
+        case JobRow():
+            return ROW_BYTES + len(strict_json(row.parameters))
+        case BulkRow():
+            return (row.total + 1) * ROW_BYTES + len(strict_json(row.request))
+        case PsfContextRow():
+            return (row.pins + 1) * ROW_BYTES
+        case _:
+            return ROW_BYTES
+
+
+def _length(column: InstrumentedAttribute[dict[str, Any]]) -> ColumnElement[int]:
+    return func.length(cast(column, String))
+
+
+# ``counted_bytes`` of the rows of each table, in SQL.
+COUNTED: dict[type[Any], ColumnElement[int]] = {
+    **{row: row.bytes + ROW_BYTES + _length(row.summary) for row in (ImageRow, TransitRow)},
+    **{row: row.bytes + ROW_BYTES + _length(row.details) for row in (PsfRow, ProductRow, ReportRow)},
+    SolutionRow: SolutionRow.bytes.expression,
+    JobRow: ROW_BYTES + _length(JobRow.parameters),
+    BulkRow: cast(BulkRow.total + 1, BigInteger) * ROW_BYTES + _length(BulkRow.request),
+    PsfContextRow: (PsfContextRow.pins + 1) * ROW_BYTES,
+    **{row: literal(ROW_BYTES) for row in (PsfChangeRow, DefaultContextRow, PartRow)},
+}
 
 
 def add_bytes(session: Session, owner: str, count: int) -> None:
-    """Add bytes to an owner's count. Call it in the transaction that adds the row of the file."""
+    """Add bytes to an owner's count, and lock it. Call it in the transaction that adds, changes or removes the row."""
     insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
     row = insert(OwnerRow).values(owner=owner, bytes=count)
     session.execute(
         row.on_conflict_do_update(index_elements=["owner"], set_={"bytes": OwnerRow.bytes + count})
     )
+
+
+def add_held(
+    session: Session, owner: str, count: int, quota_mib: int | None, *, removable: bool = False
+) -> None:
+    """Add bytes to an owner's count, and raise OverQuota if they do not fit. quota_mib, removable: as for ``hold_to_quota``.
+
+    quota_mib None: no limit applies. Fewer bytes than before are never refused.
+    """
+    add_bytes(session, owner, count)
+    if quota_mib is not None and count > 0:
+        hold_to_quota(session, owner, count, quota_mib, removable=removable)
+
+
+def check_fits(session: Session, owner: str, count: int, quota_mib: int | None) -> None:
+    """Raise OverQuota if so many bytes do not fit now. Nothing is locked: ``add_held`` decides when the bytes are added."""
+    if quota_mib is None:
+        return
+    usage = _usage(session, owner, quota_mib)
+    if not usage.allows(count):
+        raise OverQuota(usage)
 
 
 def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int, *, removable: bool) -> None:
@@ -197,17 +276,9 @@ def _forget(session: Session, row: SolutionRow) -> None:
         add_bytes(session, row.owner, -row.bytes)
 
 
-def _counted(table: type[Base]) -> ColumnElement[int]:
-    """``counted_bytes`` of the rows of a table, in SQL."""
-    columns = table.__table__.c
-    about = columns.get("summary", columns.get("details"))
-    if about is None:
-        return columns.bytes
-    return columns.bytes + ROW_BYTES + func.length(cast(about, String))
-
-
 def _usage(session: Session, owner: str, quota_mib: int) -> Usage:
-    row = session.get(OwnerRow, owner)
+    # The statements of `add_bytes` do not change an object that this session has read before.
+    row = session.get(OwnerRow, owner, populate_existing=True)
     own = None if row is None else row.quota_mib
     limit_mib = quota_mib if own is None else own
     removable = session.scalar(

@@ -7,6 +7,7 @@ the lock of the database upgrades the database in one transaction. The others wa
 
 from __future__ import annotations
 
+import logging
 import threading
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,6 +28,7 @@ LOCK = 0x68656C696F  # PostgreSQL's advisory lock for upgrades: "helio"
 # Alembic stores the running upgrade in a module variable, so this process can run only one upgrade at a time.
 _ONE_AT_A_TIME = threading.Lock()
 
+log = logging.getLogger(__name__)
 State = Literal["empty", "unversioned", "older", "current", "newer"]
 
 
@@ -79,6 +81,10 @@ class Schema:
             config = _config()
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
+        if status.state == "empty":
+            log.info("database: created, revision %s", status.wanted)
+        else:
+            log.info("database: upgraded from %s to %s", status.revision or "no revision", status.wanted)
 
     def check(self) -> None:
         """Raise ``SchemaError`` if the database is not at the revision of this version. The message says what to do."""

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import delete, select
-from sqlalchemy.engine import CursorResult
 from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
 
 from workers.catalogue.database import Database
 from workers.catalogue.jobs import Jobs
+from workers.catalogue.owners import add_bytes, add_held, counted_bytes
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.contract.identities import canonical_hash
 from workers.contract.kinds import queue_of
@@ -46,8 +47,12 @@ class UwsJobs:
         run_id: str | None = None,
         execution_duration_s: int = 0,
         destruction_at: float | None = None,
+        quota_mib: int | None = None,
     ) -> JobRow:
-        """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it."""
+        """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it.
+
+        quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
+        """
         row = JobRow(
             id=uuid.uuid4().hex,
             owner=owner,
@@ -65,16 +70,24 @@ class UwsJobs:
             destruction_at=destruction_at,
         )
         with self._database.writing.begin() as session:
+            add_held(session, owner, counted_bytes(row), quota_mib)
             session.add_all((row, terms))
         return row
 
-    def amend(self, job_id: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> bool:
-        """Change the parameters of a PENDING job. In any other phase, nothing changes; returns False."""
+    def amend(
+        self,
+        job_id: str,
+        change: Callable[[dict[str, Any]], dict[str, Any]],
+        quota_mib: int | None = None,
+    ) -> bool:
+        """Change the parameters of a PENDING job. In any other phase, nothing changes; returns False. quota_mib: as for ``draft``."""
         with self._database.writing.begin() as session:
-            row = session.get(JobRow, job_id, with_for_update=True)
+            row = _locked(session, job_id)
             if row is None or row.phase != Phase.PENDING:
                 return False
+            before = counted_bytes(row)
             row.parameters = change(dict(row.parameters))
+            add_held(session, row.owner, counted_bytes(row) - before, quota_mib)
             return True
 
     def start(
@@ -93,11 +106,13 @@ class UwsJobs:
         for key in (request_key, canonical_hash({"request_key": request_key, "job": job_id})):
             try:
                 with self._database.writing.begin() as session:
-                    row = session.get(JobRow, job_id, with_for_update=True)
+                    row = _locked(session, job_id)
                     if row is None or row.phase != Phase.PENDING or row.parameters != given:
                         return False
+                    before = counted_bytes(row)
                     row.phase, row.parameters, row.request_key = Phase.QUEUED, parameters, key
                     row.work_key, row.estimate = request_key, estimate
+                    add_bytes(session, row.owner, counted_bytes(row) - before)
                 return True
             except IntegrityError:
                 continue
@@ -106,10 +121,13 @@ class UwsJobs:
     def destroy(self, job_id: str) -> bool:
         """Delete a job, in any phase. Its worker loses the lease and stops. Its result stays."""
         with self._database.writing.begin() as session:
+            row = _locked(session, job_id)
             session.execute(delete(TermsRow).where(TermsRow.job_id == job_id))
-            result = session.execute(delete(JobRow).where(JobRow.id == job_id))
-            assert isinstance(result, CursorResult)
-            return bool(result.rowcount)
+            if row is None:
+                return False
+            session.delete(row)
+            add_bytes(session, row.owner, -counted_bytes(row))
+            return True
 
     def terms(self, job_id: str) -> TermsRow:
         """The UWS terms of a job: run id, time limit, destruction time."""
@@ -162,3 +180,12 @@ class UwsJobs:
         query = query.order_by(JobRow.created_at.desc(), JobRow.id.desc()).limit(last)
         with self._database.reading() as session:
             return [JobLine(*line) for line in session.execute(query)]
+
+
+def _locked(session: Session, job_id: str) -> JobRow | None:
+    """The row of a job, locked until the transaction ends, after the count of its owner; None if there is no such job."""
+    owner = session.scalar(select(JobRow.owner).where(JobRow.id == job_id))
+    if owner is None:
+        return None
+    add_bytes(session, owner, 0)
+    return session.get(JobRow, job_id, with_for_update=True)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable
 from typing import Any
 
+from psfcore.built.recipe import Recipe
+from psfcore.built.recipe import canonical_hash as canonical_hash
 from psfcore.gap.effect_sources import library_sha256
 from psfcore.instruments.files import instrument_path
 from workers.contract.methods import Parameters
@@ -20,12 +20,6 @@ from workers.contract.resolved import (
     ResolvedReport,
     ResolvedRerun,
 )
-
-
-def canonical_hash(content: dict[str, Any]) -> str:
-    """SHA-256 of a JSON object in canonical form (sorted keys, no spaces)."""
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def instrument_text(build: PsfBuild) -> str:
@@ -44,13 +38,18 @@ def psf_identity(build: PsfBuild) -> str:
 
     Raises DataError "unknown-instrument" if no instrument file with this name is shipped.
     """
-    return canonical_hash(
-        {
-            "kind": "psf-build",
-            "instrument_file": hashlib.sha256(instrument_text(build).encode()).hexdigest(),
-            "parameters": build.model_dump(mode="json", include={"mask_id", "size", "component"}),
-            "algorithm_version": build.algorithm_version,
-        }
+    return recipe_of(build).identity
+
+
+def recipe_of(build: PsfBuild) -> Recipe:
+    """The recipe of a build, with the text of its instrument file. Raises DataError "unknown-instrument"."""
+    return Recipe(
+        text=instrument_text(build),
+        name=build.instrument,
+        mask_id=build.mask_id,
+        size=build.size,
+        component=build.component,
+        algorithm_version=build.algorithm_version,
     )
 
 

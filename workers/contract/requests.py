@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from psfcore.built.recipe import BUILD_VERSION
 from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise_figures import NoiseFigures
 from workers.contract.methods import Method, Parameters, RichardsonLucy
@@ -55,7 +56,7 @@ ShapeName = Literal[
 class PsfBuild(Parameters):
     """Build a PSF from a shipped instrument file or from your own instrument file."""
 
-    algorithm_version: ClassVar[int] = 2
+    algorithm_version: ClassVar[int] = BUILD_VERSION
     instrument: str | None = Field(None, description="name of a shipped instrument file, for example hri_euv")
     instrument_file: str | None = Field(
         None,
@@ -211,7 +212,7 @@ class GapDiagnose(Parameters):
     """Diagnose the gap between an uploaded transit and the model that was fitted to it. The report says how large the gap is,
     where in the data it appears, and which effects explain it."""
 
-    algorithm_version: ClassVar[int] = 4
+    algorithm_version: ClassVar[int] = 5
     transit_id: TransitId
     psf_id: Identity | None = Field(
         None,
@@ -220,6 +221,12 @@ class GapDiagnose(Parameters):
     noise: TransitNoise = None
     saturation_dn: Saturation = None
     seed: int = Field(1, ge=0, lt=2**31, description="seed of the simulation and of the confidence intervals")
+    coverage: float = Field(
+        0.9,
+        ge=0.5,
+        le=0.95,
+        description="probability with which the answer set contains the true cause, for transits like the simulated ones of the calibration",
+    )
     correct: bool = Field(
         True,
         description="if the diagnosis finds an effect, also add a corrected PSF to the catalogue: a fit with this effect in the model",

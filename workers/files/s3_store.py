@@ -17,6 +17,7 @@ import aiohttp
 import s3fs
 from botocore.exceptions import BotoCoreError
 
+from workers.files.full_disk import is_disk_full
 from workers.files.store import DAMAGED, BadFile, Blob, Store, StoreAway, sha256_of, sync
 
 LOOK_AFTER_S = 10.0  # shortest time between two measurements of the size of the copies
@@ -215,6 +216,8 @@ def _answering() -> Iterator[None]:
     except FileNotFoundError:
         raise
     except (BotoCoreError, aiohttp.ClientError, OSError) as error:
+        if is_disk_full(error):  # that of the local copies
+            raise
         raise StoreAway(
             f"the object store does not answer ({type(error).__name__}): try again later"
         ) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from pydantic import ValidationError
@@ -41,6 +42,21 @@ def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
         return False
     row = catalogue.get(table, job.result_id, job.owner)
     return (row is None or not intact(store, row)) and catalogue.again.reopen(job.id)
+
+
+def without_results(jobs: Sequence[JobRow], catalogue: Catalogue) -> frozenset[str]:
+    """The ids of those completed jobs of one owner whose result was deleted since."""
+    gone: set[str] = set()
+    for result, table in TABLES.items():
+        done = {
+            job.id: job.result_id
+            for job in jobs
+            if job.phase == Phase.COMPLETED and job.result_id and KINDS[job.kind].result == result
+        }
+        if done:
+            known = catalogue.ids_among(table, done.values(), jobs[0].owner)
+            gone |= {job_id for job_id, result_id in done.items() if result_id not in known}
+    return frozenset(gone)
 
 
 def there(result: Result, identity: str, owner: str, catalogue: Catalogue, store: Store) -> bool:

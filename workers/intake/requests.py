@@ -20,8 +20,10 @@ from workers.contract.kinds import KINDS, JobRequest, Kind, load
 from workers.contract.methods import Parameters
 from workers.contract.requests import Deconvolve, PsfBuild
 from workers.contract.resolved import ResolvedDeconvolve
+from workers.intake import compatibility
 from workers.intake.no_psf import no_psf
 from workers.intake.psf_choice import picked_for_image
+from workers.intake.withdrawn import check_not_withdrawn
 from workers.lineage import made_by
 
 
@@ -47,9 +49,9 @@ def resolve(
     """Resolved parameters, and the identity of the job's result.
 
     added_effects: modules with effects that the operator adds to the library of a gap diagnosis. Raises
-    ``DataError`` "no-such-image", "no-such-psf", "no-such-transit", "no-such-product", "no-psf-for-instrument",
-    "no-noise-figures", "no-known-psf", "unknown-instrument", "bad-instrument-file", "already-deconvolved" or
-    "psf-as-image", and the errors of ``workers.intake.psf_choice`` and ``workers.lineage.made_by``.
+    ``DataError`` "no-such-image", "no-such-psf", "no-such-transit", "no-such-product", "no-psf-for-instrument", "psf-deprecated",
+    "no-noise-figures", "no-known-psf", "unknown-instrument", "bad-instrument-file", "already-deconvolved", "psf-as-image",
+    "channel-mismatch" or "plate-scale-mismatch", and the errors of ``workers.intake.psf_choice`` and ``workers.lineage.made_by``.
     """
     kind = KINDS[request.kind]
     resolver = load(kind.resolver)
@@ -77,7 +79,7 @@ def resolve_by_ids(asked: Asked) -> Parameters:
     if "diffraction_recipe" not in asked.kind.resolved.model_fields:
         return asked.resolved()
     summary = _transit(asked.catalogue, parameters.transit_id, asked.owner).summary
-    return asked.resolved(diffraction_recipe=_diffraction_of(summary, parameters.noise))
+    return asked.resolved(diffraction_recipe=_diffraction_of(asked, summary))
 
 
 def resolve_psf_build(asked: Asked) -> Parameters:
@@ -137,9 +139,11 @@ def resolved_deconvolution(
     # The summaries of images that were uploaded by earlier versions lack "content"; the worker checks the header itself.
     if not wanted.again:
         check_not_deconvolved(header.get("content", IMAGE))
-    return ResolvedDeconvolve(
+    resolved = ResolvedDeconvolve(
         **_psf_for(catalogue, header, wanted, owner), **wanted.model_dump(exclude={"psf_id", "context"})
     )
+    compatibility.check(resolved, catalogue.get(PsfRow, resolved.psf_id, owner), header)
+    return resolved
 
 
 def _image(catalogue: Catalogue, image_id: str, owner: str) -> ImageRow:
@@ -174,9 +178,9 @@ def _check_noise(summary: dict[str, Any], noise: NoiseFigures | None) -> None:
         )
 
 
-def _diffraction_of(summary: dict[str, Any], noise: NoiseFigures | None) -> PsfBuild | None:
+def _diffraction_of(asked: Asked, summary: dict[str, Any]) -> PsfBuild | None:
     """The recipe of the diffraction PSF of a transit; None if the transit contains this PSF."""
-    _check_noise(summary, noise)
+    _check_noise(summary, asked.parameters.noise)
     if summary["known_psf"] is not None:
         return None
     if summary["instrument"] not in instrument_names():
@@ -185,7 +189,16 @@ def _diffraction_of(summary: dict[str, Any], noise: NoiseFigures | None) -> PsfB
             f"expected known_psf in transit.json, or one of the instruments {', '.join(instrument_names())}; "
             f"got neither ({summary['instrument']!r})",
         )
-    return PsfBuild(instrument=summary["instrument"], component="diffraction")
+    recipe = PsfBuild(instrument=summary["instrument"], component="diffraction")
+    check_not_withdrawn(
+        asked.catalogue,
+        psf_identity(recipe),
+        asked.owner,
+        f"the diffraction PSF that heliopsf builds for {recipe.instrument}",
+        "name a file with another diffraction PSF as known_psf in transit.json, or use it anyway: `heliopsf psf download "
+        "{psf} -o FILE` writes it",
+    )
+    return recipe
 
 
 def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, owner: str) -> dict[str, Any]:
@@ -204,4 +217,12 @@ def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, o
         raise no_psf(catalogue, header, owner)
     # The shipped instrument file at full size.
     recipe = PsfBuild(instrument=header["instrument"])
-    return {"psf_id": psf_identity(recipe), "psf_recipe": recipe}
+    identity = psf_identity(recipe)
+    check_not_withdrawn(
+        catalogue,
+        identity,
+        owner,
+        f"the PSF that heliopsf builds for {recipe.instrument}",
+        "name another PSF, or use it anyway with --psf {psf} (psf_id in a request)",
+    )
+    return {"psf_id": identity, "psf_recipe": recipe}

@@ -100,6 +100,7 @@ def uploaded_psf_row(
             "plate_scale_arcsec": summary.cdelt1,
             "wavelength_angstrom": summary.wavelnth,
             "filename": filename,
+            "cards": header["cards"],
         },
     )
 
@@ -111,7 +112,11 @@ def label(text: str | None, most: int) -> str:
 
 def _summary(summary: HeaderSummary) -> dict[str, Any]:
     """The summary of a header as JSON. A card may continue over thousands of cards; its text is cut."""
-    return {
-        name: label(value, TEXT_LENGTH) if isinstance(value, str) else value
-        for name, value in dataclasses.asdict(summary).items()
+    return _cut(dataclasses.asdict(summary))
+
+
+def _cut(values: dict[str, Any]) -> dict[str, Any]:
+    found = {
+        name: label(value, TEXT_LENGTH) if isinstance(value, str) else value for name, value in values.items()
     }
+    return found | {name: _cut(value) for name, value in values.items() if isinstance(value, dict)}

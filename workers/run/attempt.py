@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 REPORT_EVERY_S = 0.3
+COMPILING = "compiling kernels (only once)"  # a stage of any job, in the first jobs of an installation
 LOOK_EVERY_S = 0.1
 
 
@@ -71,6 +72,7 @@ class Attempt:
     stopped: threading.Event = field(default_factory=threading.Event)
     ended: threading.Event = field(default_factory=threading.Event)
     last_report: float = 0.0
+    last_stage: str = ""
     times: StageTimer = field(default_factory=StageTimer)
 
     @contextmanager
@@ -149,10 +151,19 @@ class Attempt:
         with self.times.step(stage, step):
             self._report(stage, step, steps)
 
+    def compiling(self, done: bool) -> None:
+        """The task begins to compile a kernel, or has compiled one. Raises as ``report``.
+
+        Without steps no short job runs meanwhile: numba must not be called while it compiles.
+        """
+        with self.times.step(COMPILING, int(done)):
+            if not done:
+                self._report(COMPILING, 0, 0)
+
     def _report(self, stage: str, step: int, steps: int) -> None:
         now = time.monotonic()
-        if step == steps or now - self.last_report >= REPORT_EVERY_S:
-            self.last_report = now
+        if step == steps or stage != self.last_stage or now - self.last_report >= REPORT_EVERY_S:
+            self.last_report, self.last_stage = now, stage
             try:
                 if not self.catalogue.jobs.progress(self.lease, stage, step, steps):
                     self.stopped.set()
@@ -166,7 +177,7 @@ class Attempt:
         if time.monotonic() - self.started > self.limit_s:
             raise TookTooLong(self.limit_s)
         if self.also_report is not None:
-            self.also_report(stage, step, steps)
+            self.also_report(stage, step, max(steps, 1))
 
     def _let_short_jobs_run(self) -> None:
         """Run waiting jobs that need no longer than this job has worked since its last pause.

@@ -23,6 +23,7 @@ from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.kinds import KINDS
 from workers.contract.phases import Fault, JobError, Phase
 from workers.contract.queues import Queue
+from workers.files.full_disk import NO_ROOM, STORAGE_FULL, is_disk_full
 from workers.files.store import Store
 from workers.run.attempt import Assistance, Attempt, Cancelled, Progress, TookTooLong
 from workers.run.child import MARGIN, Child, allowed_mib, is_out_of_memory
@@ -32,6 +33,7 @@ from workers.tasks.context import Context, TurnOver
 from workers.tasks.stage_timer import StageTimer
 
 log = logging.getLogger(__name__)
+FAILED = "job %s: %s (%s)"  # log line about a failed job: its id, and the message and the code of its error
 
 TRANSIENT = (OperationalError, InterfaceError, ConnectionError, TimeoutError)
 
@@ -94,6 +96,9 @@ class Runner:
         self._run(lease)
 
     def _run(self, lease: Lease, on_progress: Progress | None = None) -> None:
+        # numba is imported only when a job runs, so that a process with a runner starts fast.
+        from psfcore.compiled import listening
+
         job = self._catalogue.jobs.get(lease.job_id)
         if job is None:
             log.info("job %s: nothing to do: it was deleted", lease.job_id)
@@ -114,7 +119,7 @@ class Runner:
                 run_short=self._short_jobs_beside(job),
             )
             try:
-                with attempt.beating():
+                with attempt.beating(), listening(attempt.compiling):
                     self._attempt(job, lease, attempt)
             finally:
                 self._keep_times(job, attempt.times)
@@ -271,6 +276,8 @@ class Runner:
         except DataError as error:
             return JobError(fault=Fault.USER, code=error.code, message=error.message)
         except Exception as error:
+            if is_disk_full(error):
+                raise
             log.exception("job %s: a piece of its work failed", job.id)
             return self._unexpected(job, error)
         return None
@@ -289,7 +296,10 @@ class Runner:
         return int((job.estimate or {}).get("memory_mib", self._settings.max_job_memory_mib))
 
     def _unexpected(self, job: JobRow, error: Exception) -> JobError:
-        """The error of a job whose task raised an exception that is no error of the user: no memory left, or a fault of the software."""
+        """The error of a job whose task raised an exception that is no error of the user: no room on the disk, no memory left, or
+        a fault of the software."""
+        if is_disk_full(error):
+            return JobError(fault=Fault.TRANSIENT, code=STORAGE_FULL, message=NO_ROOM)
         if not is_out_of_memory(error):
             return _internal(job, error)
         estimate_mib = self._estimate_mib(job)
@@ -311,13 +321,15 @@ class Runner:
         log.warning("job %s: temporary failure in attempt %d: %s", job.id, job.attempt, error)
         if job.attempt < self._settings.max_attempts:
             self._persist(lambda: self._catalogue.jobs.requeue(lease))
+        elif is_disk_full(error):  # that of the database
+            self._fail(lease, JobError(fault=Fault.TRANSIENT, code=STORAGE_FULL, message=NO_ROOM))
         else:
             message = f"expected a temporary failure to pass; {job.attempt} attempts failed ({type(error).__name__}): try again later"
             self._fail(lease, JobError(fault=Fault.TRANSIENT, code="gave-up", message=message))
 
     def _fail(self, lease: Lease, error: JobError) -> None:
         self._persist(lambda: self._catalogue.jobs.fail(lease, error))
-        log.warning("job %s: %s (%s)", lease.job_id, error.message, error.code)
+        log.warning(FAILED, lease.job_id, error.message, error.code)
 
     def _persist(self, write: Callable[[], bool]) -> bool:
         """Write the outcome of a job. While the database does not answer, try again for the length of a lease."""

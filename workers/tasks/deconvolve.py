@@ -9,20 +9,14 @@ from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from psfcore.deconvolve.assess.changes import measure_changes
-from psfcore.deconvolve.assess.error_planes import ErrorPlanes, error_planes, psf_error_plane, with_psf_error
-from psfcore.deconvolve.assess.quality import quality_plane
 from psfcore.deconvolve.conditions import Conditions
-from psfcore.deconvolve.methods.registry import method_named
-from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.whole import Work, input_warnings
 from psfcore.errors import DataError
-from psfcore.fits.channel import check_channel
-from psfcore.fits.gain import noise_for
+from psfcore.fits.gain import no_noise_figures
 from psfcore.fits.header import check_not_deconvolved, content_of
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
 from psfcore.image import Image
-from psfcore.instruments.model import load_instrument
 from psfcore.noise import Noise
 from psfcore.psf import Psf
 from psfcore.psf_sampling import psf_for_image
@@ -30,6 +24,8 @@ from psfcore.scatter.samples import possible_psfs
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.identities import product_identity
 from workers.contract.resolved import ResolvedDeconvolve
+from workers.intake import withdrawn
+from workers.intake.compatibility import noise_of, of_upload
 from workers.tasks.context import Context
 from workers.tasks.data.prepared_psfs import PreparedPsfs
 from workers.tasks.data.product import Inputs, Made, Warned, details_of, keep, save_preview, write
@@ -87,8 +83,8 @@ def _prepared(max_bytes: int) -> PreparedPsfs:
 
 
 @dataclass(frozen=True)
-class _Work:
-    """One deconvolution with its inputs. It runs once for the image, and again for each noise realisation and each possible PSF."""
+class _Asked:
+    """What a request asks for, with its inputs."""
 
     inputs: Inputs
 
@@ -116,29 +112,21 @@ class _Work:
         """What the user must know about the inputs. Raises DataError "channel-mismatch"."""
         psf, row = self.psf, self.inputs.psf_row
         # The request of an upload may give an instrument and a channel that the file does not.
-        if psf.instrument is None:
-            psf = replace(psf, instrument=row.instrument)
-        if psf.wavelength_angstrom is None and row.channel is not None and row.channel.isdecimal():
-            psf = replace(psf, wavelength_angstrom=float(row.channel))
+        instrument, angstrom = of_upload(row, psf.instrument, psf.wavelength_angstrom)
+        psf = replace(psf, instrument=instrument, wavelength_angstrom=angstrom)
         # A rerun repeats what was allowed once, also by versions that did not compare channels.
         allowed = self.request.other_channel or self.context.anew
-        found = {"channel": check_channel(psf, self.inputs.image.header, other_channel=allowed)}
-        if self.inputs.image.saturation is not None:
-            found["saturation"] = self.inputs.image.saturation.warning
-        return [Warned(code, message) for code, message in found.items() if message is not None]
+        withdrawn_text = withdrawn.withdrawn_warning(self.context.catalogue, row)
+        found = {} if withdrawn_text is None else {withdrawn.CODE: withdrawn_text}
+        found |= input_warnings(psf, self.inputs.image, other_channel=allowed)
+        return [Warned(code, message) for code, message in found.items()]
 
     @cached_property
     def noise(self) -> Noise | None:
         """The noise figures of the request; if there are none, the noise figures of the instrument that took the image."""
-        if self.request.noise is not None:
-            return self.request.noise.noise()
-        recipe = self.request.psf_recipe
-        instrument = self.request.picked_for if recipe is None else recipe.instrument
-        return (
-            None if instrument is None else noise_for(load_instrument(instrument), self.inputs.image.header)
-        )
+        figures = noise_of(self.request, self.inputs.image.header)
+        return None if figures is None else figures.noise()
 
-    @cached_property
     def possible_psfs(self) -> list[Psf]:
         """PSFs that differ from the PSF by its errors, on the image's pixels; empty if the file of the PSF contains no errors."""
         psf = read_psf(self.context.store.verified(self.inputs.psf_row.file_sha256), self.context.limits)
@@ -147,57 +135,32 @@ class _Work:
         possible = possible_psfs(psf, threads=self.context.settings.threads)
         return [psf_for_image(one, self.inputs.image.header) for one in possible]
 
-    def run(self, image: Image, stage: str | None = None, psf: Psf | None = None) -> Deconvolved:
-        """Run the method on an image of this shape. Progress is reported under ``stage``; None: no progress."""
+    @cached_property
+    def work(self) -> Work:
+        """The deconvolution, with the engines that this process has prepared."""
         method = self.request.method
-        conditions = Conditions(
-            edges=method.edges,
-            margin_px=method.margin_px,
-            noise=self.noise,
-            threads=self.context.settings.threads,
-            progress=None if stage is None else self.progress(stage),
-            engine_for=self.prepared.engine_for,
+        return Work(
+            self.inputs.image,
+            self.psf,
+            method.name,
+            Conditions(
+                edges=method.edges,
+                margin_px=method.margin_px,
+                noise=self.noise,
+                threads=self.context.settings.threads,
+                engine_for=self.prepared.engine_for,
+            ),
+            method.model_dump(exclude=_CONDITIONS),
         )
-        return method_named(method.name)(
-            image, psf or self.psf, conditions, **method.model_dump(exclude=_CONDITIONS)
-        )
+
+    def begin(self, stage: str, steps: int) -> Callable[[int, int], None]:
+        """Report the begin of a stage; returns a progress function for code that counts its own steps."""
+        self.context.report(stage, 0, steps)
+        return self.progress(stage)
 
     def progress(self, stage: str) -> Callable[[int, int], None]:
         """A progress function for code that counts its own steps."""
         return lambda step, steps: self.context.report(stage, step, steps)
-
-    def errors(self, result: Deconvolved) -> ErrorPlanes | None:
-        """The error planes, or None if the request does not ask for them. Raises DataError "no-noise-figures"."""
-        if not self.request.error_draws:
-            return None
-        if self.noise is None:
-            raise DataError(
-                "no-noise-figures",
-                "expected noise (photon_gain_dn and read_noise_dn) to simulate noise realisations; got none, and the "
-                "instrument's figures are unknown: give them in the request, or set error_draws to 0",
-            )
-        self.context.times.begin("drawing errors")
-        planes = error_planes(
-            self.inputs.image,
-            self.psf,
-            lambda image: self.run(image).pixels,
-            self.noise,
-            estimate=result.pixels,
-            draws=self.request.error_draws,
-            edge_px=result.edge_band_px,
-            threads=self.context.settings.threads,
-            progress=self.progress("drawing errors"),
-        )
-        if not self.possible_psfs:
-            return planes
-        self.context.times.begin("errors of the PSF")
-        from_psf = psf_error_plane(
-            self.possible_psfs,
-            lambda psf: self.run(self.inputs.image, psf=psf).pixels,
-            chance=False,
-            progress=self.progress("errors of the PSF"),
-        )
-        return with_psf_error(planes, from_psf)
 
 
 def make(
@@ -205,25 +168,20 @@ def make(
 ) -> Made:
     """Deconvolve an image and measure what changed in it. ``preview``: also draw the preview picture."""
     inputs = Inputs(context, request, psf_row, image)
-    work = _Work(inputs)
-    warnings = work.warnings()
+    asked = _Asked(inputs)
+    work = asked.work
+    warnings = asked.warnings()
+    if request.error_draws and work.conditions.noise is None:
+        raise no_noise_figures()
     context.times.begin("deconvolving")
-    result = work.run(image, "deconvolving")
-    errors = work.errors(result)
+    result = work.run(progress=asked.progress("deconvolving"))
+    errors = work.errors(result, request.error_draws, possible_psfs=asked.possible_psfs, begin=asked.begin)
     context.report("saving", 0, 1)
-    edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
     draw = partial(save_preview, inputs, result)
     with ThreadPoolExecutor(1) as beside:
         # A worker with one thread draws the picture in this thread: a second thread would slow down the other workers.
         picture = beside.submit(draw).result if preview and context.settings.threads > 1 else draw
-        found = measure_changes(image, result.pixels, work.psf, noise=work.noise, edge_px=edge_px)
-        quality = quality_plane(
-            image,
-            result.pixels,
-            edge_px=edge_px,
-            suspected=found.artefacts.suspected,
-            error=None if errors is None else errors.error,
-        )
-        details = details_of(inputs, result, errors, found, warnings)
+        assessed = work.assess(result, errors)
+        details = details_of(inputs, result, errors, assessed.found, warnings)
         preview_sha256 = picture() if preview else None
-    return Made(inputs, result, errors, found, quality, warnings, details, preview_sha256)
+    return Made(inputs, result, errors, assessed.found, assessed.quality, warnings, details, preview_sha256)

@@ -51,6 +51,7 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
         shape=shape,
         start=start,
         seed=request.seed,
+        coverage=request.coverage,
         threads=context.settings.threads,
         progress=context.report,
         solution=solver(context, request),

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.build import build_psf
+from psfcore.build import build_recipe
 from psfcore.drawing import plots
 from psfcore.errors import DataError
 from psfcore.fits.images import read_image
 from psfcore.fits.psfs import write_psf
 from psfcore.instruments.model import Instrument, parse_instrument
 from workers.catalogue.tables import PsfRow
-from workers.contract.identities import instrument_text, psf_identity
+from workers.contract.identities import recipe_of
 from workers.contract.requests import PsfBuild
 from workers.contract.resolved import ResolvedDeconvolve
-from workers.settings import library_versions, software_version
+from workers.settings import library_versions
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import named_psf, psf_row
 from workers.versions.series import TOTAL
@@ -54,34 +52,20 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
 
 def built_psf(context: Context, build: PsfBuild) -> PsfRow:
     """The row of the PSF of a recipe. If the catalogue does not contain this PSF, build it and add it."""
-    identity = psf_identity(build)
+    recipe = recipe_of(build)
+    identity = recipe.identity
     row = context.made(PsfRow, identity)
     if row is not None:
         return row
-    text = instrument_text(build)
-    instrument = parse_instrument(text, build.instrument or "instrument_file")
-    psf = build_psf(
-        instrument,
-        size=build.size,
-        component=build.component and build.component.upper(),
+    instrument = parse_instrument(recipe.text, recipe.name or "instrument_file")
+    psf = build_recipe(
+        recipe,
         mount_image=_mount_image(context, build, instrument),
         threads=context.settings.threads,
         progress=lambda step, steps: context.report("building the PSF", step, steps),
     )
-    psf = dataclasses.replace(
-        psf,
-        version=f"{psf.version}+{identity[:8]}",
-        provenance={
-            **psf.provenance,
-            "psf_id": identity,
-            "instrument_file_sha256": hashlib.sha256(text.encode()).hexdigest(),
-            "parameters": build.model_dump(mode="json", exclude={"instrument_file"}, exclude_none=True),
-            "algorithm_version": build.algorithm_version,
-            "software_version": software_version(),
-        },
-    )
     with context.store.temporary() as path, context.store.temporary() as picture:
-        write_psf(path, psf, instrument_file=text.encode())
+        write_psf(path, psf, instrument_file=recipe.text.encode())
         plots.psf_png(psf, picture)
         row = psf_row(
             psf,

@@ -6,8 +6,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from psfcore.instruments.files import instrument_names
-from psfcore.instruments.model import load_instrument
+from psfcore.instruments.unknown import channel_of as channel_of
 
 TOTAL = "total"  # a total PSF, with which images are deconvolved
 UPLOADED = "uploaded"  # an uploaded PSF whose kind is not known
@@ -18,19 +17,6 @@ _NOT_OF_A_WORD = re.compile(r"[^a-z0-9_.]+")
 def series_of(instrument: str | None, channel: str | None, kind: str) -> str | None:
     """The name of a series, instrument/channel/kind; None if the instrument is unknown."""
     return f"{instrument}/{channel or '-'}/{kind}" if instrument else None
-
-
-def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str | None:
-    """The channel: the wavelength in whole angstrom, such as 174.
-
-    If the wavelength is not given, the wavelength of the instrument description is used. None if there is none.
-    """
-    if wavelength_angstrom is None and instrument in instrument_names():
-        wavelength_angstrom = load_instrument(instrument).wavelength_angstrom
-    # A header card may contain any number.
-    if wavelength_angstrom is None or not 0.5 <= wavelength_angstrom < 1e6:
-        return None
-    return str(round(wavelength_angstrom))
 
 
 def instrument_of(header: Mapping[str, Any]) -> str | None:

@@ -5,10 +5,11 @@
                       +------+              +--------+
                   another range         a successor named
 
-A draft is used only by requests that name it. If a request names no PSF, the certified PSF of the image's series is
-used. A certified PSF has a version that no other PSF of its series has. Its range of observation times does not overlap
-with the range of any other certified PSF of its series. A request can still name a deprecated PSF. Once the successor
-of a deprecated PSF is named, it cannot change.
+If a request names no PSF, the certified PSF of the image's series is used; if the series has none, the PSF that is
+built from the shipped instrument file. Every other draft is used only by requests that name it. A certified PSF has a
+version that no other PSF of its series has. Its range of observation times does not overlap with the range of any other
+certified PSF of its series. The service never chooses a deprecated PSF by itself; a request can still name one, and a
+context can still pin one. Once the successor of a deprecated PSF is named, it cannot change.
 """
 
 from __future__ import annotations

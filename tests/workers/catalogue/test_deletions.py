@@ -35,6 +35,10 @@ def test_a_draft_is_deleted_unless_something_uses_it(catalogue: Catalogue) -> No
     assert [refused(catalogue, name) for name in ("used", "parent", "asked", "certified", "never")] == [
         "psf-in-use", "psf-in-use", "psf-in-use", "not-a-draft", "no-such-psf",
     ]  # fmt: skip
+    with pytest.raises(DataError) as caught:
+        catalogue.delete_draft(identity("used"), OWNER)
+    product_id = identity("product of used")[:12]
+    assert f"delete that product first: `heliopsf product delete {product_id}`" in caught.value.message
     before = catalogue.owners.usage(OWNER, 0).used_bytes
     free = catalogue.get(PsfRow, identity("free"), OWNER)
     assert free is not None and catalogue.delete_draft(free.id, OWNER).name == "free"

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
 import pytest
+from sqlalchemy import event, select
 
+from tests.workers.psf_examples import OWNER, identity, psf
+from workers.catalogue.bulk_tables import BulkRow
+from workers.catalogue.bulks import Listed, new_id
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import MIB, ROW_BYTES, OverQuota, counted_bytes
-from workers.catalogue.tables import ImageRow, PsfRow, SolutionRow
+from workers.catalogue.contexts import Pin
+from workers.catalogue.jobs import Lease
+from workers.catalogue.owners import COUNTED, MIB, ROW_BYTES, OverQuota, counted_bytes
+from workers.catalogue.psfs import StatusAsked
+from workers.catalogue.tables import ImageRow, JobRow, PsfRow, SolutionRow
+from workers.contract.bulk import BulkPhase
+from workers.versions.status import PsfStatus
 
 ROW = ROW_BYTES + len("{}")  # what the row of such an image counts, besides its file
 
@@ -114,3 +126,189 @@ def test_the_json_of_a_row_counts_too_and_when_it_changes(catalogue: Catalogue) 
     catalogue.psfs.describe(identity, "o", tables_sha256="b" * 64, preview_sha256="c" * 64)
     assert catalogue.owners.usage("o", 0).used_bytes == before + len(', "tables_sha256": ""') + 64
     assert catalogue.owners.recount() == []
+
+
+# Rows without files -----------------------------------------------------------------------------------
+
+
+@contextmanager
+def counting(catalogue: Catalogue, expected: int, owner: str = OWNER) -> Iterator[None]:
+    """Check that the block changes the count of an owner by so much, and that a recount agrees."""
+    before = catalogue.owners.usage(owner, 0).used_bytes
+    yield
+    assert catalogue.owners.usage(owner, 0).used_bytes - before == expected
+    assert catalogue.owners.recount() == []
+
+
+def bulk(images_listed: bool = True, key: str = "k") -> BulkRow:
+    return BulkRow(
+        id=new_id(), owner=OWNER, name="", phase=BulkPhase.RUNNING if images_listed else BulkPhase.LISTING, request={},
+        request_key=key, psf_id="p" * 64, created_at=time.time(), running_since=time.time(), listed=images_listed,
+    )  # fmt: skip
+
+
+def ids(count: int) -> list[str]:
+    return [f"{number:064x}" for number in range(count)]
+
+
+def lease_of_a_turn(catalogue: Catalogue) -> Lease:
+    job, _ = catalogue.jobs.submit("bulk", {}, new_id(), OWNER)
+    lease = catalogue.jobs.claim(job.id, "w")
+    assert lease is not None
+    return lease
+
+
+def certification(**more: str) -> StatusAsked:
+    return StatusAsked(PsfStatus.CERTIFIED, "tested", **more)
+
+
+def test_jobs_count_with_their_parameters_until_they_are_destroyed(catalogue: Catalogue) -> None:
+    parameters = {"instrument_file": "sun \u2609" * 100}
+    with counting(catalogue, ROW_BYTES + len(json.dumps(parameters))):
+        job, _ = catalogue.jobs.submit("psf-build", parameters, "k", OWNER)
+    with counting(catalogue, 0):  # a shared job, and what a job goes through
+        assert not catalogue.jobs.submit("psf-build", parameters, "k", OWNER)[1]
+        lease = catalogue.jobs.claim(job.id, "w")
+        assert lease is not None and catalogue.jobs.complete(lease, "r")
+    with counting(catalogue, -ROW_BYTES - len(json.dumps(parameters))):
+        assert catalogue.uws.destroy(job.id) and not catalogue.uws.destroy(job.id)
+
+
+def test_uws_jobs_count_by_their_present_parameters(catalogue: Catalogue) -> None:
+    with counting(catalogue, ROW_BYTES + len('{"size": "64"}')):
+        job = catalogue.uws.draft("psf-build", {"size": "64"}, owner=OWNER)
+    with counting(catalogue, len(', "a": "bc"')):
+        assert catalogue.uws.amend(job.id, lambda given: given | {"a": "bc"})
+    given = {"size": "64", "a": "bc"}
+    with counting(catalogue, len('{"size": 64}') - len(json.dumps(given))):
+        assert catalogue.uws.start(job.id, given, {"size": 64}, "k")
+    with counting(catalogue, 0):
+        assert not catalogue.uws.amend(job.id, lambda given: given | {"more": "x" * 100})
+        assert not catalogue.uws.start(job.id, given, {"size": 128}, "k")
+    with counting(catalogue, -ROW_BYTES - len('{"size": 64}')):
+        assert catalogue.uws.destroy(job.id)
+
+
+def test_bulk_runs_count_with_their_images(catalogue: Catalogue) -> None:
+    lease = lease_of_a_turn(catalogue)
+    row = bulk(images_listed=False)
+    with counting(catalogue, ROW_BYTES * (1 + 3) + len("{}")):
+        assert catalogue.bulks.create(row, ids(3))[1]
+    with counting(catalogue, 0):
+        assert not catalogue.bulks.create(bulk(images_listed=False), ids(3))[1], "the same run"
+    with counting(catalogue, 2 * ROW_BYTES):
+        assert catalogue.bulks.begin_listing(row.id, lease)
+        assert catalogue.bulks.add_listed(row.id, lease, [Listed("/a", False), Listed("/b", False)])
+    other = lease_of_a_turn(catalogue)
+    with counting(catalogue, -2 * ROW_BYTES):
+        assert catalogue.bulks.begin_listing(row.id, other)
+
+
+def test_contexts_and_changes_count(catalogue: Catalogue) -> None:
+    for name in ("a", "b"):
+        catalogue.add(psf(name))
+    with counting(catalogue, ROW_BYTES):
+        catalogue.psfs.change(identity("a"), OWNER, certification(version="1.0.0"), "x")
+    superseding = StatusAsked(PsfStatus.CERTIFIED, "better", version="2.0.0", supersedes=(identity("a"),))
+    with counting(catalogue, 2 * ROW_BYTES):  # of both PSFs
+        catalogue.psfs.change(identity("b"), OWNER, superseding, "x")
+    with counting(catalogue, 2 * ROW_BYTES):
+        assert catalogue.contexts.create("first", OWNER, "x", pins=[Pin(identity("b"))])[1]
+    with counting(catalogue, 0):
+        assert not catalogue.contexts.create("first", OWNER, "x", pins=[Pin(identity("b"))])[1]
+    with counting(catalogue, ROW_BYTES):
+        catalogue.contexts.set_default("first", OWNER, "x")
+
+
+def test_parts_count_once(catalogue: Catalogue) -> None:
+    with counting(catalogue, 4 * ROW_BYTES):
+        catalogue.parts.open(OWNER, "k", 3)
+        catalogue.parts.open(OWNER, "k", 4)
+
+
+@pytest.mark.parametrize(
+    "add",
+    [
+        lambda catalogue: catalogue.jobs.submit("psf-build", {}, "new", OWNER, quota_mib=1),
+        lambda catalogue: catalogue.uws.draft("psf-build", {}, owner=OWNER, quota_mib=1),
+        lambda catalogue: catalogue.bulks.create(bulk(), ids(1), 1),
+        lambda catalogue: catalogue.contexts.create("c", OWNER, "x", quota_mib=1),
+        lambda catalogue: catalogue.contexts.set_default(None, OWNER, "x", quota_mib=1),
+        lambda catalogue: catalogue.psfs.change(identity("a"), OWNER, certification(), "x", 1),
+        lambda catalogue: catalogue.psfs.change(identity("b"), OWNER, certification(version="2.0.0"), "x", 1),
+    ],
+    ids=["job", "uws", "bulk", "context", "default", "range", "certification"],
+)
+def test_rows_over_the_quota_are_refused_and_add_nothing(
+    catalogue: Catalogue, add: Callable[[Catalogue], object]
+) -> None:
+    catalogue.add(psf("a"))
+    catalogue.psfs.change(identity("a"), OWNER, certification(version="1.0.0"), "x")
+    catalogue.add(psf("b", channel="304"))
+    used = catalogue.owners.usage(OWNER, 1).used_bytes
+    catalogue.add(
+        ImageRow(owner=OWNER, id="f" * 64, created_at=1.0, bytes=MIB - used - ROW - 100, summary={})
+    )
+    with counting(catalogue, 0):
+        with pytest.raises(OverQuota) as refused:
+            add(catalogue)
+        assert refused.value.usage.used_bytes == MIB - 100
+        for table in COUNTED:
+            with catalogue._database.reading() as session:
+                rows = session.scalars(select(table)).all()
+            assert len(rows) == {"psfs": 2, "psf_changes": 1, "images": 1}.get(table.__tablename__, 0)
+    catalogue.owners.set_quota(OWNER, 2)
+    add(catalogue)
+    assert catalogue.owners.usage(OWNER, 1).used_bytes > MIB
+
+
+def test_a_wrong_psf_is_deprecated_whatever_the_quota(catalogue: Catalogue) -> None:
+    catalogue.add(psf("a"))
+    catalogue.psfs.change(identity("a"), OWNER, certification(version="1.0.0"), "x")
+    catalogue.add(ImageRow(owner=OWNER, id="f" * 64, created_at=1.0, bytes=MIB, summary={}))
+    with counting(catalogue, ROW_BYTES):
+        wrong = StatusAsked(PsfStatus.DEPRECATED, "wrong")
+        assert catalogue.psfs.change(identity("a"), OWNER, wrong, "x", 1).status == "deprecated"
+
+
+def test_a_pending_job_does_not_grow_over_the_quota(catalogue: Catalogue) -> None:
+    job = catalogue.uws.draft("psf-build", {}, owner=OWNER)
+    catalogue.add(ImageRow(owner=OWNER, id="f" * 64, created_at=1.0, bytes=MIB, summary={}))
+    with counting(catalogue, 0), pytest.raises(OverQuota):
+        catalogue.uws.amend(job.id, lambda given: {"a": "b"}, 1)
+    there = catalogue.jobs.get(job.id)
+    assert there is not None and there.parameters == {}
+
+
+def test_simultaneous_jobs_are_accepted_up_to_the_quota(catalogue: Catalogue) -> None:
+    catalogue.add(ImageRow(owner=OWNER, id="f" * 64, created_at=1.0, bytes=MIB - 5 * ROW, summary={}))
+
+    def submit(number: int) -> bool:
+        try:
+            return catalogue.jobs.submit("psf-build", {}, str(number), OWNER, quota_mib=1)[1]
+        except OverQuota:
+            return False
+
+    with ThreadPoolExecutor(8) as pool:
+        assert sum(pool.map(submit, range(12))) == 4
+    assert catalogue.owners.usage(OWNER, 1).used_bytes == MIB and catalogue.owners.recount() == []
+    assert len(catalogue.page(JobRow, owner=OWNER, limit=99)) == 4
+
+
+def test_a_large_bulk_run_is_counted_in_one_statement_and_a_refused_one_adds_no_row(
+    catalogue: Catalogue,
+) -> None:
+    said: list[str] = []
+
+    def hear(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        said.append(statement)
+
+    event.listen(catalogue._engine, "before_cursor_execute", hear)
+    with counting(catalogue, ROW_BYTES * 3001 + len("{}")):
+        catalogue.bulks.create(bulk(), ids(3000), 4)
+    counts = [one for one in said if one.startswith(("INSERT INTO owners", "UPDATE owners"))]
+    assert len(counts) == 1
+    said.clear()
+    with pytest.raises(OverQuota):
+        catalogue.bulks.create(bulk(key="other"), ids(3000), 4)
+    assert not [one for one in said if one.startswith("INSERT")], "nothing is written to be removed again"

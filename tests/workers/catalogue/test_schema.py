@@ -22,13 +22,27 @@ from tests.tables import RUN_REVISIONS
 from tests.whole.stack import Missing, postgres_database
 from workers.bulk import intake
 from workers.catalogue import schema
+from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.migrations.versions.r0001_baseline import METADATA as BASELINE
 from workers.catalogue.migrations.versions.r0003_psf_versions import BATCH
+from workers.catalogue.owners import ROW_BYTES
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.schema import Schema, SchemaError
 from workers.catalogue.stage_times import Spent
-from workers.catalogue.tables import Base, ImageRow, ProductRow, PsfRow, ReportRow
+from workers.catalogue.tables import (
+    Base,
+    DefaultContextRow,
+    ImageRow,
+    JobRow,
+    OwnerRow,
+    PartRow,
+    ProductRow,
+    PsfChangeRow,
+    PsfContextRow,
+    PsfRow,
+    ReportRow,
+)
 from workers.contract.identities import canonical_hash
 from workers.settings import Settings
 from workers.versions.series import series_of
@@ -198,6 +212,36 @@ def test_a_revision_between_is_upgraded(catalogue: Catalogue) -> None:
     assert catalogue.schema.status().state == "current" and differences(catalogue) == []
     with catalogue._engine.connect() as connection:
         assert connection.scalar(select(PsfRow.bytes)) == 7
+
+
+def test_rows_without_files_count_after_the_upgrade(catalogue: Catalogue) -> None:
+    """Also those of an owner who had no count. Revision 0017 changes no table, so that 0016 has the present ones."""
+    catalogue.upgrade()
+    rows: list[Base] = []
+    for owner in ("counted", "new"):
+        rows += [
+            JobRow(id=f"{owner:x<32}", owner=owner, kind="psf-build", parameters={"a": owner}, request_key="k",
+                   phase="QUEUED", created_at=1.0),
+            BulkRow(id=f"{owner:x<32}", owner=owner, name="", phase="RUNNING", request={"b": owner}, request_key="k",
+                    created_at=1.0, listed=True, total=3),
+            PsfContextRow(owner=owner, id="c" * 64, name="c", created_at=1.0, created_by="x", reason="", pins=2),
+            PsfChangeRow(owner=owner, psf_id="d" * 64, at=1.0, by="x", status_before="draft", status="certified",
+                         version_before="0", version="1", reason=""),
+            DefaultContextRow(owner=owner, at=1.0, by="x", reason=""),
+            PartRow(owner=owner, request_key="k", number=0),
+        ]  # fmt: skip
+    with catalogue._database.writing.begin() as session:
+        session.add_all(rows)
+        session.add(OwnerRow(owner="counted", bytes=0))
+        session.execute(text("UPDATE alembic_version SET version_num = '0016'"))
+    catalogue.upgrade()
+    assert catalogue.schema.status().state == "current"
+    # A job, a bulk run of three images, a context of two pins, a change of a PSF and of the default, and a part.
+    expected = ROW_BYTES * (1 + 4 + 3 + 1 + 1 + 1)
+    for owner in ("counted", "new"):
+        json_bytes = len(f'{{"a": "{owner}"}}{{"b": "{owner}"}}')
+        assert catalogue.owners.usage(owner, 0).used_bytes == expected + json_bytes
+    assert catalogue.owners.recount() == []
 
 
 def test_a_later_revision_is_refused_and_left_alone(catalogue: Catalogue) -> None:

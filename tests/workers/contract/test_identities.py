@@ -139,11 +139,11 @@ FROZEN: list[tuple[Callable[[], str], str]] = [
     ),
     (
         lambda: _gap(psf_id=B, diffraction_recipe=RECIPE),
-        "09fc30bb6fe337c0f815768ee371e998968d45010ed9786e81a7e689c5776338",
+        "8923caaf92865339c6ff9724efe8b4ad91a09e725f480d2835eefa3fff302ce3",
     ),
     (
         lambda: _gap(added_effects=("m",), added_effects_sha256=(A,)),
-        "5dc6aff1bd16a3310877f5c3107abe7a9e3f874b75768d30ceeca237e6810580",
+        "d110c7d06f82695b0ddd23ec1e5748de822ad892b88ae72a8b14916171219b16",
     ),
     (
         lambda: corrected_psf_identity(A),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import time
@@ -183,6 +184,21 @@ def test_a_file_kept_while_it_is_removed_is_not_lost(tmp_path: Path, monkeypatch
 def s3_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     with opened_store("s3", tmp_path, monkeypatch) as opened:
         yield opened
+
+
+def test_a_full_disk_of_the_copies_is_not_an_object_store_that_is_away(
+    s3_store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    digest = kept(s3_store)
+    fresh = elsewhere(s3_store, tmp_path)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(fresh._s3, "get_file", full)  # type: ignore[attr-defined]
+    with pytest.raises(OSError, match="No space left") as error:
+        fresh.path(digest)
+    assert not isinstance(error.value, StoreAway)
 
 
 def test_a_file_aside_with_a_row_is_restored(s3_store: Store, tmp_path: Path) -> None:

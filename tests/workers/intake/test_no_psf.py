@@ -13,7 +13,8 @@ from psfcore.instruments.files import instrument_names
 from service.local import LocalService
 from tests.conftest import write_image, write_psf
 
-AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171, "CDELT1": 0.6, "CDELT2": 0.6}
+# TELESCOP differs from that of the archive, so the image is not recognised as one of aia_171.
+AIA = {"TELESCOP": "SDO", "INSTRUME": "AIA_3", "WAVELNTH": 171, "CDELT1": 0.6, "CDELT2": 0.6}
 
 
 def upload(local: LocalService, path: Path, size: int, **cards: object) -> str:
@@ -24,6 +25,7 @@ def upload(local: LocalService, path: Path, size: int, **cards: object) -> str:
 
 
 def refused(local: LocalService, tmp_path: Path, **cards: object) -> DataError:
+    tmp_path.mkdir(exist_ok=True)
     write_image(tmp_path / "i.fits", **cards)
     with pytest.raises(DataError) as caught:
         local.deconvolve(tmp_path / "i.fits")
@@ -44,15 +46,55 @@ def test_the_error_names_instruments_psfs_and_ways(local: LocalService, tmp_path
     assert instruments["aia_171"]["same"] == ["telescope", "channel", "plate_scale"]
     assert instruments["hri_euv"]["same"] == []
     assert [way["way"] for way in error.fields["ways"]] == ["name", "upload", "fit"]
-    for named in (of_telescope, "aia_171", "SDO/AIA AIA_3", "171 angstrom"):
+    for named in (of_telescope, "aia_171", "SDO AIA_3", "171 angstrom"):
         assert named in error.message
     assert "hri_euv" not in error.message
+
+
+def test_what_does_not_agree_is_told_too(local: LocalService, tmp_path: Path) -> None:
+    upload(local, tmp_path / "aia.fits", 32, INSTRUME="AIA_3", CDELT1=0.6)
+    error = refused(local, tmp_path, **{**AIA, "WAVELNTH": 1600, "CDELT1": 2.4, "CDELT2": 2.4})
+    instruments = {one["name"]: one["told"] for one in error.fields["instruments"]}
+    other_scale = "another pixel scale (0.599489, not 2.4 arcsec)"
+    assert instruments["aia_171"] == (
+        f"same telescope, but another channel (171, not 1600 Å) and {other_scale}"
+    )
+    assert [psf["told"] for psf in error.fields["psfs"]] == [
+        "same telescope, but another pixel scale (0.6, not 2.4 arcsec)"
+    ]
+    error = refused(local, tmp_path / "again", **{**AIA, "WAVELNTH": 1600})
+    instruments = {one["name"]: one["told"] for one in error.fields["instruments"]}
+    assert instruments["aia_171"] == "same telescope and pixel scale, but another channel (171, not 1600 Å)"
+    assert error.fields["image"] == "SDO AIA_3"
 
 
 def test_an_image_without_any_name_gets_the_ways_too(local: LocalService, tmp_path: Path) -> None:
     error = refused(local, tmp_path, TELESCOP="")
     assert error.fields["psfs"] == [] and len(error.fields["ways"]) == 3
     assert "an unnamed instrument" in error.message
+
+
+def test_instruments_that_agree_most_come_first(local: LocalService, tmp_path: Path) -> None:
+    instruments = refused(local, tmp_path, **AIA).fields["instruments"]
+    assert instruments[0]["name"] == "aia_171"
+    assert [one["name"] for one in instruments[1:4]] == ["aia_94", "aia_131", "aia_193"]
+
+
+@pytest.mark.parametrize(
+    ("cards", "way", "published"),
+    [
+        ({"TELESCOP": "HINODE", "INSTRUME": "XRT"}, "upload", "SolarSoft"),
+        ({"TELESCOP": "TRACE", "INSTRUME": "TRACE", "WAVE_LEN": "171"}, "fit", "Venus of 2004"),
+        ({"OBSRVTRY": "STEREO_B", "INSTRUME": "SECCHI", "DETECTOR": "EUVI", "WAVELNTH": 171}, "fit", "2007"),
+        ({"TELESCOP": "PROBA2", "INSTRUME": "SWAP", "WAVELNTH": 174}, "fit", "covers a part of the Sun"),
+    ],
+)
+def test_the_ways_name_what_is_published_for_the_telescope(
+    local: LocalService, tmp_path: Path, cards: dict[str, object], way: str, published: str
+) -> None:
+    texts = {one["way"]: one["text"] for one in refused(local, tmp_path, **cards).fields["ways"]}
+    assert published in texts[way]
+    assert [name for name, text in texts.items() if published in text] == [way]
 
 
 def test_the_fields_survive_the_way_between_processes(local: LocalService, tmp_path: Path) -> None:

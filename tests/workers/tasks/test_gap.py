@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from psfcore.errors import DataError
+from psfcore.gap.verdict.calibration import COVERAGE, shipped_calibration
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from service.client.http import ServiceError
 from service.local import LocalService
@@ -65,7 +66,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 def test_the_report_names_the_effect_its_size_and_the_inputs(made: dict[str, Any]) -> None:
     row, report = made["row"], made["json"]
     assert row["kind"] == "gap" and row["html"] == f"/v1/reports/{row['id']}/page"
-    assert report["schema"] == "gap/1" and report["verdict"] == "attributed"
+    assert report["schema"] == "gap/2" and report["verdict"] == "attributed"
     assert report["answer"] == row["details"]["answer"] == ["dark_offset"]
     offset = report["effects"][0]["parameters"]["offset"]
     assert offset["value"] == pytest.approx(small_gaps.OFFSET_DN, abs=4 * offset["sigma"])
@@ -73,6 +74,7 @@ def test_the_report_names_the_effect_its_size_and_the_inputs(made: dict[str, Any
     assert row["details"]["strongest_axis"] == report["where"][0]["axis"]
     provenance = report["provenance"]
     assert provenance["seed"] == provenance["parameters"]["seed"] == 3
+    assert provenance["parameters"]["coverage"] == report["set"]["coverage"] == 0.9
     assert provenance["started_from_psf"] is None and provenance["added_effects"] == {}
     assert {"numpy", "scipy", "numba", "astropy"} <= set(provenance["libraries"])
     assert report["inputs_sha256"] == small_gaps.with_offset().sha256
@@ -167,6 +169,14 @@ def test_a_given_psf_is_the_start_of_the_fit_and_a_parent_of_the_corrected_psf(
     assert started == {"name": "hri_euv-gap-corrected", "version": f"0.1.0+{parent[:8]}", "id": parent}
 
 
+def test_a_request_chooses_the_coverage_of_the_answer_set(
+    service: LocalService, transit: Path, asked: list[dict[str, Any]]
+) -> None:
+    service.diagnose_gap(transit, coverage=0.5, correct=False)
+    service.diagnose_gap(transit, seed=11, correct=False)
+    assert [how["coverage"] for how in asked] == [0.5, COVERAGE]
+
+
 def test_no_corrected_psf_is_made_without_a_request(
     service: LocalService, transit: Path, asked: list[dict[str, Any]]
 ) -> None:
@@ -257,10 +267,20 @@ def test_a_diagnosis_is_valid_without_its_corrected_psf(
     local.close()
 
 
+def test_the_shipped_calibration_has_enough_cases_for_every_coverage_that_a_request_may_choose() -> None:
+    for coverage in (0.5, 0.95):
+        asked = GapDiagnose(transit_id="a" * 64, coverage=coverage)
+        assert 0 <= shipped_calibration().threshold(asked.coverage) <= 1
+    for coverage in (0.49, 0.96):
+        with pytest.raises(ValueError, match="coverage"):
+            GapDiagnose(transit_id="a" * 64, coverage=coverage)
+
+
 def test_other_parameters_make_another_diagnosis() -> None:
     first = ResolvedGapDiagnose(transit_id="a" * 64)
     others: tuple[dict[str, Any], ...] = (
         {"seed": 2},
+        {"coverage": 0.8},
         {"psf_id": "b" * 64},
         {"correct": False},
         {"saturation_dn": 9.0},

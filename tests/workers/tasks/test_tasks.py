@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from psfcore.deconvolve import whole
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.errors import DataError
 from psfcore.fits.product.planes import read_planes
@@ -58,7 +59,7 @@ def test_an_identical_request_is_not_computed_again(
 ) -> None:
     psf_id = local.upload_psf(psf_file)["id"]
     first = local.deconvolve(image_file, psf_id=psf_id)
-    monkeypatch.delattr(deconvolve_task, "method_named")
+    monkeypatch.delattr(deconvolve_task, "Work")
     assert local.deconvolve(image_file, psf_id=psf_id) == first
 
 
@@ -69,17 +70,17 @@ def test_a_worker_with_one_thread_draws_in_that_thread(
     """A second thread would slow down the worker beside it."""
     of_threads: dict[str, int] = {}
 
-    def noted(name: str) -> None:
-        real = getattr(deconvolve_task, name)
+    def noted(where: object, name: str) -> None:
+        real = getattr(where, name)
 
         def wrapped(*arguments: Any, **named: Any) -> Any:
             of_threads[name] = threading.get_ident()
             return real(*arguments, **named)
 
-        monkeypatch.setattr(deconvolve_task, name, wrapped)
+        monkeypatch.setattr(where, name, wrapped)
 
-    noted("save_preview")
-    noted("measure_changes")
+    noted(deconvolve_task, "save_preview")
+    noted(whole, "measure_changes")
     local = LocalService(settings.model_copy(update={"worker_threads": threads}))
     local.deconvolve(image_file, psf_id=local.upload_psf(psf_file)["id"])
     local.close()
@@ -210,7 +211,7 @@ def test_error_planes_need_known_noise(
 ) -> None:
     psf_id = local.upload_psf(psf_file)["id"]
     wanted = {"psf_id": psf_id, "steps": 3, "error_draws": 4}
-    with pytest.raises(ServiceError) as caught:
+    with pytest.raises(DataError) as caught:
         local.deconvolve(image_file, **wanted)
     assert caught.value.code == "no-noise-figures"
     product = local.deconvolve(image_file, tmp_path / "o.fits", noise=(6.0, 2.0), **wanted)

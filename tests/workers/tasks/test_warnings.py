@@ -10,7 +10,7 @@ import pytest
 from astropy.io import fits
 
 from psfcore.deconvolve.assess.quality import QualityBit
-from service.client.errors import ServiceError
+from psfcore.errors import DataError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from workers.tasks.data import product as product_task
@@ -81,7 +81,7 @@ def test_an_unsure_saturation_is_a_warning_in_header_and_details(
 def test_a_psf_of_another_channel_is_refused_unless_told(local: LocalService, tmp_path: Path) -> None:
     write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
     psf_id = psf_of(local, tmp_path / "p.fits", **AIA)
-    with pytest.raises(ServiceError) as caught:
+    with pytest.raises(DataError) as caught:
         local.deconvolve(tmp_path / "i.fits", psf_id=psf_id, **FEW)
     assert caught.value.code == "channel-mismatch"
     product = local.deconvolve(
@@ -96,7 +96,7 @@ def test_the_channel_that_an_upload_was_given_counts(local: LocalService, tmp_pa
     write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
     write_psf(tmp_path / "p.fits")
     psf_id = local.upload_psf(tmp_path / "p.fits", instrument="aia_171", channel="171", kind="total")["id"]
-    with pytest.raises(ServiceError) as caught:
+    with pytest.raises(DataError) as caught:
         local.deconvolve(tmp_path / "i.fits", psf_id=psf_id, **FEW)
     assert caught.value.code == "channel-mismatch"
 

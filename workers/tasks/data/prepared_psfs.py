@@ -14,10 +14,11 @@ from astropy.io.fits import Header
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Shape, new_engine
+from psfcore.fits.binning import binning_factor
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.psf import Psf
-from psfcore.psf_sampling import binning_factor, rebinned
+from psfcore.psf_sampling import rebinned
 
 Thing = TypeVar("Thing", Psf, tuple[Psf, Engine])
 

@@ -16,6 +16,7 @@ from psfcore.deconvolve.assess.changes import Changes
 from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 from psfcore.deconvolve.assess.plots import changes_png
 from psfcore.deconvolve.assess.quality import MEANINGS
+from psfcore.deconvolve.cards import UsedPsf, deconvolution_cards, deconvolution_history
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.drawing import plots
 from psfcore.drawing.thumbnail import write_thumbnail
@@ -155,44 +156,36 @@ def _save_changes_picture(made: Made) -> str:
 def _cards(
     inputs: Inputs, identity: str, result: Deconvolved, errors: ErrorPlanes | None
 ) -> dict[str, tuple[Any, str]]:
-    # A hash fills its card, so cards with a hash have no comment.
-    cards: dict[str, tuple[Any, str]] = {
-        "PRODID": (identity, ""),
-        "PSFID": (inputs.psf_row.id, ""),
-        "PSFVERS": (inputs.psf_row.version, "PSF version"),
-        "PSFNAME": (inputs.psf_row.name, "PSF name"),
-        "PSFSTAT": (inputs.psf_row.status, "PSF status"),
-        "DCNVMETH": (inputs.request.method.name, "deconvolution method"),
-        "DCNVITER": (result.steps_done, "deconvolution steps done"),
-        "DCNVSTOP": (result.stopped_because, "why the iteration stopped"),
-        "DCNVEDGE": (result.edges, "assumed scene beyond the edges"),
-        "DCNVBAND": (result.edge_band_px, "[px] width of band affected by DCNVEDGE"),
-        "DCNVALGV": (inputs.request.method.algorithm_version, "algorithm version"),
-        "SWHELIO": (software_version(), "heliopsf version"),
-        "INPSHA": (inputs.request.image_id, ""),
-    }
-    saturation = inputs.image.saturation
-    if saturation is not None and saturation.found is not None and saturation.level is not None:
-        cards["DCNVSATL"] = (saturation.level, "saturation level, in the unit of the image")
-        cards["DCNVSATF"] = (saturation.found, "where the saturation level was found")
-    if errors is not None and errors.amplification is not None:
-        cards["DCNVAMPL"] = (errors.amplification, "noise of result / noise of input")
-    return cards
+    cards = deconvolution_cards(
+        _used_psf(inputs),
+        result,
+        saturation=inputs.image.saturation,
+        amplification=None if errors is None else errors.amplification,
+    )
+    # The order of the cards is that of earlier versions: equal requests give equal bytes.
+    ordered: dict[str, tuple[Any, str]] = {"PRODID": (identity, "")}
+    for key, card in cards.items():
+        if key == "SWHELIO":
+            ordered["DCNVALGV"] = (inputs.request.method.algorithm_version, "algorithm version")
+        ordered[key] = card
+        if key == "SWHELIO":
+            ordered["INPSHA"] = (inputs.request.image_id, "")
+    return ordered
+
+
+def _used_psf(inputs: Inputs) -> UsedPsf:
+    psf = inputs.psf_row
+    return UsedPsf(psf.id, psf.name, psf.version, psf.status)
 
 
 def _history(inputs: Inputs, result: Deconvolved, warnings: Sequence[Warned]) -> list[str]:
-    psf = inputs.psf_row
-    return [
-        f"heliopsf {software_version()}: {inputs.request.method.name}, {result.steps_done} steps, "
-        f"edges {result.edges}, PSF {psf.name} {psf.version} ({psf.status})",
-        *(f"WARNING ({one.code}): {one.message}" for one in warnings),
-    ]
+    return deconvolution_history(_used_psf(inputs), result, {one.code: one.message for one in warnings})
 
 
 def _title(inputs: Inputs) -> str:
     header = inputs.image.header
     seen_by = optional_text(header, "DETECTOR", "INSTRUME") or "image"
-    date = optional_text(header, "DATE-BEG", "DATE-OBS")
+    date = optional_text(header, "DATE-BEG", "DATE-OBS", "DATE_OBS")
     return f"{seen_by}{f' {date}' if date else ''}   PSF {inputs.psf_row.name} {inputs.psf_row.version}"
 
 

@@ -1,0 +1,146 @@
+"""A request is refused for what the headers of its image and its PSF say, with the error that the job would have."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+from astropy.io import fits
+
+from psfcore.errors import DataError
+from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.noise_figures import NoiseFigures
+from service.local import LocalService
+from tests.conftest import write_image, write_psf
+from workers.catalogue.tables import ImageRow, PsfRow
+from workers.contract.methods import RichardsonLucy
+from workers.contract.requests import PsfBuild
+from workers.contract.resolved import ResolvedDeconvolve
+from workers.intake.compatibility import check, noise_of
+from workers.intake.uploads import image_row, uploaded_psf_row
+
+AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171, "CDELT1": 0.6, "CDELT2": 0.6}
+XRT = {"TELESCOP": "HINODE", "INSTRUME": "XRT", "CDELT1": 1.03, "CDELT2": 1.03}
+LIMITS = FitsLimits(max_pixels=512 * 512)
+
+
+def summary_of(tmp_path: Path, **cards: Any) -> dict[str, Any]:
+    write_image(tmp_path / "i.fits", **cards)
+    row: ImageRow = image_row("a", "0" * 64, 1, "i.fits", read_summary(tmp_path / "i.fits", LIMITS))
+    return dict(row.summary)
+
+
+def psf_of(
+    tmp_path: Path, *, instrument: str | None = None, channel: str | None = None, **cards: Any
+) -> PsfRow:
+    write_psf(tmp_path / "p.fits")
+    for key, value in cards.items():
+        fits.setval(tmp_path / "p.fits", key, value=value)
+    summary = read_summary(tmp_path / "p.fits", LIMITS)
+    return uploaded_psf_row("a", "1" * 64, 1, "p.fits", summary, instrument=instrument, channel=channel)
+
+
+def request(**more: Any) -> ResolvedDeconvolve:
+    return ResolvedDeconvolve(image_id="0" * 64, psf_id="1" * 64, method=RichardsonLucy(), **more)
+
+
+def refusal(wanted: ResolvedDeconvolve, psf: PsfRow | None, header: dict[str, Any]) -> DataError:
+    with pytest.raises(DataError) as caught:
+        check(wanted, psf, header)
+    return caught.value
+
+
+def test_another_channel_is_refused_unless_the_request_allows_it(tmp_path: Path) -> None:
+    header, psf = summary_of(tmp_path, **{**AIA, "WAVELNTH": 193}), psf_of(tmp_path, **AIA)
+    error = refusal(request(), psf, header)
+    assert error.code == "channel-mismatch"
+    assert error.fields["differences"] == [
+        "the image is of aia_193, the PSF of aia_171",
+        "the image is of 193 angstrom, the PSF of 171 angstrom",
+    ]
+    check(request(other_channel=True), psf, header)
+
+
+def test_the_channel_that_an_upload_was_given_counts(tmp_path: Path) -> None:
+    header = summary_of(tmp_path, **{**AIA, "WAVELNTH": 193})
+    assert (
+        refusal(request(), psf_of(tmp_path, instrument="aia_171", channel="171"), header).code
+        == "channel-mismatch"
+    )
+
+
+def test_another_filter_is_refused(tmp_path: Path) -> None:
+    header, psf = summary_of(tmp_path, **AIA, FILTER="thin"), psf_of(tmp_path, **AIA, FILTER="thick")
+    assert "FILTER" in refusal(request(), psf, header).message
+
+
+def test_the_units_of_the_cards_count(tmp_path: Path) -> None:
+    in_nm = {
+        **AIA,
+        "WAVELNTH": 17.1,
+        "WAVEUNIT": "nm",
+        "CDELT1": 0.01,
+        "CDELT2": 0.01,
+        "CUNIT1": "arcmin",
+        "CUNIT2": "arcmin",
+    }
+    check(request(), psf_of(tmp_path, **AIA), summary_of(tmp_path, **in_nm))
+
+
+def test_a_psf_that_is_not_built_yet_is_compared_by_its_instrument_file(tmp_path: Path) -> None:
+    wanted = request(psf_recipe=PsfBuild(instrument="hri_euv"))
+    error = refusal(wanted, None, summary_of(tmp_path, **XRT))
+    assert error.fields["differences"] == ["the image is of HINODE XRT, the PSF of hri_euv"]
+
+
+def test_the_pixels_of_an_image_with_a_matrix_are_compared_too(tmp_path: Path) -> None:
+    matrix = {"CD1_1": 1.92, "CD1_2": -1.44, "CD2_1": 1.44, "CD2_2": 1.92}
+    header = summary_of(tmp_path, **{key: AIA[key] for key in ("TELESCOP", "INSTRUME", "WAVELNTH")}, **matrix)
+    error = refusal(request(other_channel=True), psf_of(tmp_path, **AIA, PSFNAME="aia"), header)
+    assert (error.code, error.fields["factor"]) == ("plate-scale-mismatch", 4)
+
+
+def test_pixels_of_another_size_are_refused_with_the_factor_that_helps(tmp_path: Path) -> None:
+    # The PSF names its instrument, and the image does not, so a whole multiple may be a coincidence.
+    psf = psf_of(tmp_path, **AIA, PSFNAME="aia")
+    header = summary_of(tmp_path, **{**AIA, "CDELT1": 2.4, "CDELT2": 2.4})
+    error = refusal(request(other_channel=True), psf, header)
+    assert (error.code, error.fields["factor"]) == ("plate-scale-mismatch", 4)
+    assert "heliopsf psf rebin PSF --factor 4" in error.message
+    odd = {**header, "cards": {**header["cards"], "CDELT1": 1.5, "CDELT2": 1.5}}
+    assert refusal(request(other_channel=True), psf, odd).fields["factor"] is None
+
+
+def test_noise_realisations_need_figures(tmp_path: Path) -> None:
+    header, psf = summary_of(tmp_path, **AIA), psf_of(tmp_path, **AIA)
+    error = refusal(request(error_draws=8), psf, header)
+    assert error.code == "no-noise-figures" and "--noise GAIN READ" in error.message
+    given = request(error_draws=8, noise=NoiseFigures(photon_gain_dn=2.0, read_noise_dn=1.0))
+    check(given, psf, header)
+    assert noise_of(given, {}) == given.noise and noise_of(request(), {}) is None
+
+
+def test_headers_that_an_earlier_version_kept_are_left_to_the_job(tmp_path: Path) -> None:
+    header, psf = summary_of(tmp_path, **{**AIA, "WAVELNTH": 193}), psf_of(tmp_path, **AIA)
+    assert refusal(request(), psf, header).code == "channel-mismatch"
+    check(request(), psf, {name: value for name, value in header.items() if name != "cards"})
+    psf.details = {name: value for name, value in psf.details.items() if name != "cards"}
+    check(request(), psf, header)
+
+
+def test_the_summary_of_a_file_that_was_not_uploaded_is_checked_too(tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
+    header = dataclasses.asdict(read_summary(tmp_path / "i.fits", LIMITS))
+    assert refusal(request(), psf_of(tmp_path, **AIA), header).code == "channel-mismatch"
+
+
+def test_the_request_for_a_job_is_refused_before_the_job(local: LocalService, tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
+    write_psf(tmp_path / "p.fits")
+    fits.setval(tmp_path / "p.fits", "WAVELNTH", value=171)
+    psf_id = local.upload_psf(tmp_path / "p.fits")["id"]
+    with pytest.raises(DataError) as caught:
+        local.deconvolve(tmp_path / "i.fits", psf_id=psf_id)
+    assert caught.value.code == "channel-mismatch"

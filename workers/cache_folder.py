@@ -1,0 +1,33 @@
+"""The cache of built PSFs of this user. Commands with ``--local`` and the Python functions share it.
+
+This module needs no other module of ``workers``, so that the package ``heliopsf`` can import it alone.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from platformdirs import user_cache_path
+
+from psfcore.built.cache import PsfCache
+from psfcore.errors import DataError
+
+FOLDER, LARGEST = "HELIOPSF_CACHE_DIR", "HELIOPSF_CACHE_MIB"
+DEFAULT_MIB = 2048  # about 15 PSFs of 2048 px with their components
+_PSFS = "psfs"  # a folder of its own, because the cache closes its folder to other users
+
+
+def psf_cache() -> PsfCache:
+    """The cache in the folder that HELIOPSF_CACHE_DIR names, or in the user's cache folder, such as ``~/.cache/heliopsf``.
+
+    Raises DataError "bad-setting" if HELIOPSF_CACHE_MIB is no whole number.
+    """
+    named = os.environ.get(FOLDER)
+    folder = Path(named).expanduser() if named else user_cache_path("heliopsf", appauthor=False)
+    largest = os.environ.get(LARGEST) or str(DEFAULT_MIB)
+    if not (largest.isascii() and largest.isdigit()):
+        raise DataError(
+            "bad-setting", f"{LARGEST}: expected a whole number of MiB, 0 for no cache; got {largest!r}"
+        )
+    return PsfCache(folder / _PSFS, int(largest) * 2**20)

@@ -1,0 +1,31 @@
+"""Recognises errors that say that a disk is full, of the files or of the database."""
+
+from __future__ import annotations
+
+import errno
+
+from sqlalchemy.exc import SQLAlchemyError
+
+STORAGE_FULL = "storage-full"  # the code of such an error
+NO_ROOM = "expected free space on the disk of the service; the disk is full: ask the operator to make room, then try again"
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+
+
+def is_disk_full(error: BaseException) -> bool:
+    """Whether an exception says that a disk is full, or that a quota of the file system is used up.
+
+    A library may raise an OSError of its own while it handles that of the system; then the latter is the context of the former.
+    Databases have their own codes: SQLITE_FULL of SQLite, 53100 of PostgreSQL.
+    """
+    if isinstance(error, SQLAlchemyError):
+        original = getattr(error, "orig", None)
+        return (
+            getattr(original, "sqlite_errorname", None) == "SQLITE_FULL"
+            or getattr(original, "sqlstate", None) == "53100"
+        )
+    cause: BaseException | None = error
+    while isinstance(cause, OSError):
+        if cause.errno in _FULL:
+            return True
+        cause = cause.__cause__ or cause.__context__
+    return False

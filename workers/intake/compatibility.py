@@ -1,0 +1,90 @@
+"""Checks an image, a PSF and the options of a deconvolution against each other, by what the catalogue keeps of their headers.
+
+The job makes the same checks, with the same functions, on the headers of the files. Uploads of versions that did not keep
+these cards are checked by the job alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from psfcore.fits.binning import binning_factor
+from psfcore.fits.cards import Cards
+from psfcore.fits.channel import check_channel
+from psfcore.fits.gain import no_noise_figures, noise_figures_for
+from psfcore.fits.header import origin_of, plate_scale_arcsec, wavelength_angstrom
+from psfcore.instruments.model import load_instrument
+from psfcore.noise_figures import NoiseFigures
+from workers.catalogue.tables import PsfRow
+from workers.contract.resolved import ResolvedDeconvolve
+
+
+@dataclass(frozen=True)
+class PsfOrigin:
+    """What is known of a PSF without its weights. cards: see `psfcore.psf.Psf`."""
+
+    name: str
+    instrument: str | None
+    wavelength_angstrom: float | None
+    plate_scale_arcsec: float | None
+    cards: Mapping[str, str]
+
+
+def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: Mapping[str, Any]) -> None:
+    """Raise the errors that the job would raise for the headers of its image and its PSF.
+
+    psf: the row of the PSF; None: the PSF is not built yet. header: the header summary that is stored with the image. Codes:
+    "channel-mismatch", "plate-scale-mismatch", "no-noise-figures".
+    """
+    cards = header.get("cards") or {}
+    origin = _origin(request, psf)
+    if cards and origin is not None:
+        check_channel(origin, cards, other_channel=request.other_channel)
+        binning_factor(origin, cards)
+    if request.error_draws and noise_of(request, {"GAINCOMB": header["gain_mode"]}) is None:
+        raise no_noise_figures()
+
+
+def noise_of(request: ResolvedDeconvolve, header: Cards) -> NoiseFigures | None:
+    """The noise figures of the request; if there are none, the noise figures of the instrument that took the image."""
+    if request.noise is not None:
+        return request.noise
+    recipe = request.psf_recipe
+    instrument = request.picked_for if recipe is None else recipe.instrument
+    known = None if instrument is None else noise_figures_for(load_instrument(instrument), header)
+    return None if known is None else NoiseFigures(photon_gain_dn=known[0], read_noise_dn=known[1])
+
+
+def of_upload(row: PsfRow, instrument: str | None, angstrom: float | None) -> tuple[str | None, float | None]:
+    """The instrument and the wavelength of a PSF. What its file does not give, the request of the upload may have given."""
+    if angstrom is None and row.channel is not None and row.channel.isdecimal():
+        angstrom = float(row.channel)
+    return instrument or row.instrument, angstrom
+
+
+def _origin(request: ResolvedDeconvolve, psf: PsfRow | None) -> PsfOrigin | None:
+    """What is known of the PSF of a request; None if the catalogue keeps too little of it."""
+    if psf is None:
+        recipe = request.psf_recipe
+        return None if recipe is None or recipe.instrument is None else _origin_of(recipe.instrument)
+    if psf.origin != "uploaded":
+        return PsfOrigin(
+            psf.name,
+            psf.instrument,
+            psf.details.get("wavelength_angstrom"),
+            psf.details.get("plate_scale_arcsec"),
+            {},
+        )
+    kept = psf.details.get("cards")
+    if kept is None:
+        return None
+    named, cards = origin_of(kept)
+    instrument, angstrom = of_upload(psf, named, wavelength_angstrom(kept))
+    return PsfOrigin(psf.name, instrument, angstrom, plate_scale_arcsec(kept), cards)
+
+
+def _origin_of(name: str) -> PsfOrigin:
+    known = load_instrument(name)
+    return PsfOrigin(known.name, known.name, known.wavelength_angstrom, known.detector.plate_scale_arcsec, {})

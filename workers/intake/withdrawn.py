@@ -1,0 +1,60 @@
+"""Deprecated PSFs: the service never chooses one by itself, and a product that was made with one has a warning.
+
+A context chooses the PSFs that it pins, also if they were deprecated later: this keeps its results reproducible.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from psfcore.errors import DataError
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import ProductRow, PsfRow
+from workers.versions.status import PsfStatus
+
+CODE = "psf-deprecated"  # of the error and of the warning
+SHOWN_DIGITS = 12
+
+
+def check_not_withdrawn(catalogue: Catalogue, psf_id: str, owner: str, what: str, ways: str) -> None:
+    """Raise ``DataError`` "psf-deprecated" if the PSF that the service would choose is deprecated.
+
+    what: the PSF as words for the message. ways: what the user can do; it may contain {psf}, the id of the PSF.
+    """
+    row = catalogue.get(PsfRow, psf_id, owner)
+    if row is None or row.status != PsfStatus.DEPRECATED:
+        return
+    instead = "" if row.successor_id is None else f" (its successor is {row.successor_id[:SHOWN_DIGITS]})"
+    raise DataError(
+        CODE,
+        f"expected a PSF that is still in use; {what} was withdrawn ({_reason(catalogue, row)}){instead}: "
+        + ways.format(psf=psf_id[:SHOWN_DIGITS]),
+    )
+
+
+def withdrawn_warning(catalogue: Catalogue, psf: PsfRow) -> str | None:
+    """The warning for users of a deprecated PSF; None for every other PSF."""
+    if psf.status != PsfStatus.DEPRECATED:
+        return None
+    better = "another PSF" if psf.successor_id is None else f"its successor {psf.successor_id[:SHOWN_DIGITS]}"
+    return (
+        f"PSF {psf.id[:SHOWN_DIGITS]} ({psf.name} {psf.version}) was withdrawn ({_reason(catalogue, psf)}); "
+        f"use {better} for new products"
+    )
+
+
+def details_now(catalogue: Catalogue, product: ProductRow) -> dict[str, Any]:
+    """The details of a product. If its PSF is deprecated now, its warnings say so, also if the product was made before that."""
+    psf = catalogue.get(PsfRow, product.psf_id, product.owner)
+    message = None if psf is None else withdrawn_warning(catalogue, psf)
+    if message is None:
+        return product.details
+    others = [one for one in product.details.get("warnings", ()) if one["code"] != CODE]
+    return {**product.details, "warnings": [*others, {"code": CODE, "message": message}]}
+
+
+def _reason(catalogue: Catalogue, psf: PsfRow) -> str:
+    """Why a PSF was deprecated: the reason that was given last, because naming a successor later may give none."""
+    changes = catalogue.psfs.changes(psf.id, psf.owner)
+    reasons = [one.reason for one in changes if one.status == PsfStatus.DEPRECATED and one.reason]
+    return f"reason: {reasons[-1]}" if reasons else "no reason was given"
