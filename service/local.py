@@ -6,6 +6,7 @@ Images, PSFs and transits are read from the user's paths and are not copied.
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,9 +16,11 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from psfcore.built.cache import PsfCache
 from psfcore.errors import DataError
 from psfcore.fits.cutout import cutout
 from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.psfs import stated_id
 from psfcore.fits.weights import check_is_psf
 from psfcore.tables import lookup
 from psfcore.transit.archive import ArchiveLimits, list_archive
@@ -31,17 +34,22 @@ from service.client.errors import ServiceError
 from service.client.operations import Operations
 from service.client.outputs import written
 from service.client.versions import Progress
+from workers.cache_folder import psf_cache
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
 from workers.contract.kinds import JobRequest
 from workers.contract.phases import Phase
+from workers.contract.requests import PsfBuild
 from workers.contract.suggestions import explained
 from workers.files.intact import files_of
 from workers.files.store import Store, sha256_of
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
+from workers.intake.withdrawn import details_now
+from workers.run import runner
 from workers.run.runner import Runner
 from workers.settings import Settings
+from workers.tasks.data.cached_psfs import CachedPsfs, recipes_in
 
 _Seen = dict[Path, tuple[int, int]]
 
@@ -65,6 +73,10 @@ class LocalStore(Store):
         _check(seen)
         self._files[digest] = seen
         return digest
+
+    def add_checked(self, file: Path, digest: str) -> None:
+        """Add a file whose SHA-256 was just checked."""
+        self._files[digest] = _states(file)
 
     def add_folder(self, folder: Path) -> FolderTransit:
         """Add the transit in a folder. Raises the same DataError as ``transit_in``."""
@@ -124,12 +136,27 @@ def _check(seen: _Seen) -> None:
 class LocalService(Operations):
     """The requests to a service, which are executed in this process."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, cache: PsfCache | None = None) -> None:
+        """cache: where built PSFs are kept for later commands; None: nowhere."""
         self._settings = settings
+        self._recipes: dict[str, list[PsfBuild]] = {}  # of the PSFs that a job may build, by the job's id
         self._store = LocalStore(settings.data_dir)
         self._catalogue = Catalogue(settings.catalogue_url)
         self._catalogue.upgrade()
         self._runner = Runner(settings, self._catalogue, self._store)
+        self._built = (
+            None
+            if cache is None
+            else CachedPsfs(
+                cache,
+                self._catalogue,
+                self._store,
+                DEFAULT_OWNER,
+                limits=FitsLimits(max_pixels=settings.max_pixels),
+                threads=settings.threads,
+                adopt=self._store.add_checked,
+            )
+        )
 
     def close(self) -> None:
         """Close the catalogue."""
@@ -170,7 +197,7 @@ class LocalService(Operations):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        """Add a PSF."""
+        """Add a PSF. As in a service, the file of a PSF that heliopsf made keeps its id, unless the request describes it anew."""
         source = Path(path)
         limits = FitsLimits(max_pixels=self._settings.max_pixels)
         summary = read_summary(source, limits)
@@ -188,6 +215,8 @@ class LocalService(Operations):
             channel=channel,
             kind=kind,
         )
+        if not any((name, version, instrument, channel, kind)):
+            row.id = stated_id(source, limits) or row.id
         return PsfView.of(self._catalogue.add(row)[0]).model_dump(mode="json")
 
     def image_id(self, path: str | Path, sha256: str) -> str:
@@ -210,6 +239,10 @@ class LocalService(Operations):
         """Add a job; ``wait`` runs it."""
         resolved = self._resolved(kind, parameters)
         row, _ = self._catalogue.jobs.submit(kind, *resolved, DEFAULT_OWNER)
+        if self._built is not None:
+            self._recipes[row.id] = recipes_in(kind, resolved[0])
+            for recipe in self._recipes[row.id]:
+                self._built.recall(recipe)
         return JobView.of(row).model_dump(mode="json")
 
     def _resolved(self, kind: str, parameters: dict[str, Any]) -> tuple[dict[str, Any], str]:
@@ -231,6 +264,9 @@ class LocalService(Operations):
             row = self._catalogue.jobs.get(job["id"])
             assert row is not None
             job = JobView.of(row).model_dump(mode="json")
+        for recipe in self._recipes.pop(job["id"], ()):
+            assert self._built is not None
+            self._built.remember(recipe)
         return self._ended(job)
 
     def get(self, address: str) -> dict[str, Any]:
@@ -238,7 +274,7 @@ class LocalService(Operations):
         row = self._row(address)
         match row:
             case ProductRow():
-                return ProductView.of(row).model_dump(mode="json")
+                return ProductView.of(row, details_now(self._catalogue, row)).model_dump(mode="json")
             case ReportRow():
                 return ReportView.of(row).model_dump(mode="json")
             case _:
@@ -308,12 +344,23 @@ class LocalService(Operations):
         return row
 
 
+def _says_more(record: logging.LogRecord) -> bool:
+    """Whether a log line says more than the error of a job, which the caller gets anyway."""
+    return record.msg != runner.FAILED
+
+
 @contextmanager
 def local_service(*, gap_effects: str = "") -> Iterator[LocalService]:
-    """A local service on a temporary folder. gap_effects: the same as the setting of this name."""
+    """A local service on a temporary folder, with the user's cache of built PSFs.
+
+    gap_effects: the same as the setting of this name.
+    """
     with TemporaryDirectory(prefix="heliopsf-") as folder:
-        service = LocalService(Settings.apart(Path(folder), gap_effects=gap_effects))
+        service = LocalService(Settings.apart(Path(folder), gap_effects=gap_effects), psf_cache())
+        jobs = logging.getLogger(runner.__name__)
+        jobs.addFilter(_says_more)
         try:
             yield service
         finally:
+            jobs.removeFilter(_says_more)
             service.close()

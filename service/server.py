@@ -29,13 +29,16 @@ from workers.settings import Settings
 log = logging.getLogger(__name__)
 
 
-def serve(settings: Settings, host: str, port: int, announce: Callable[[str], None]) -> None:
-    """Serve until interrupted. Port 0: any free port. ``announce`` is called with the address.
+def serve(
+    settings: Settings, host: str, port: int, announce: Callable[[str], None], *, verbose: bool = False
+) -> None:
+    """Serve until interrupted. Port 0: any free port. ``announce`` is called with the address. verbose: also
+    log every request on a terminal.
 
     On SIGTERM or Control-C the server accepts no more connections. Running requests may continue for ``stop_s`` seconds. Then
     the server stops the embedded worker, which takes at most ``gone_s`` seconds.
     """
-    logs.configure(settings)
+    logs.configure(settings, verbose=verbose)
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))

@@ -12,7 +12,7 @@ from psfcore.errors import DataError
 from service.http.callers import Bulk, Caller, KeyFirst, Reading
 from service.http.paging import Cursor, Limit, Page, following, page, place, position
 from service.http.problems import RESPONSES, Problem, problem
-from service.http.quotas import check_room
+from service.http.quotas import check_room, rows_held
 from service.http.state import Shared
 from workers.bulk import turns as bulk_turns
 from workers.bulk.intake import begin
@@ -166,7 +166,8 @@ def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shar
     if body.keeps_products:
         check_room(state, caller.owner)
     try:
-        row, new = begin(body, state.catalogue, caller.owner, state.settings)
+        with rows_held():
+            row, new = begin(body, state.catalogue, caller.owner, state.settings)
     except DataError as error:
         raise problem(error) from error
     if new:

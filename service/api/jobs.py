@@ -13,14 +13,14 @@ from psfcore.errors import DataError
 from service.http.callers import Caller, KeyFirst, Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem, problem
-from service.http.quotas import check_room
+from service.http.quotas import check_room, rows_held
 from service.http.state import Shared
 from workers.catalogue.tables import JobRow
 from workers.contract.kinds import KINDS, JobRequest
 from workers.contract.phases import JobError, Phase
 from workers.contract.queues import Queue
 from workers.intake import estimates
-from workers.intake.again import reopened
+from workers.intake.again import reopened, without_results
 from workers.intake.requests import resolve
 
 log = logging.getLogger(__name__)
@@ -71,10 +71,15 @@ class JobView(BaseModel):
         description="the parameters, with every default and the PSF filled in; for a PENDING job as the client sent them"
     )
     result: str | None = Field(description="address of the result; null until the job is COMPLETED")
+    result_deleted: bool = Field(
+        False,
+        description="whether the result was deleted; the same request makes it again. Only lists and the answers to a "
+        "submission and to `GET /v1/jobs/{id}` look; events have false",
+    )
     error: JobError | None
 
     @classmethod
-    def of(cls, row: JobRow, waiting_before: int | None = None) -> JobView:
+    def of(cls, row: JobRow, waiting_before: int | None = None, *, result_deleted: bool = False) -> JobView:
         """The view of a row of the catalogue. waiting_before: None if it was not counted."""
         return cls(
             id=row.id,
@@ -91,6 +96,7 @@ class JobView(BaseModel):
             estimate=Estimate.model_validate(row.estimate) if row.estimate else None,
             parameters=row.parameters,
             result=f"{KINDS[row.kind].result}/{row.result_id}" if row.result_id else None,
+            result_deleted=result_deleted,
             error=JobError.model_validate(row.error) if row.error else None,
         )
 
@@ -118,9 +124,16 @@ def submit_job(body: JobRequest, response: Response, caller: Submitting, state: 
     job was deleted or lost, the job is queued again."""
     parameters, request_key, estimate = prepared(body, caller, state)
     queue = None if body.queue is None else Queue(body.queue)
-    row, new = state.catalogue.jobs.submit(
-        body.kind, parameters, request_key, caller.owner, queue=queue, estimate=estimate
-    )
+    with rows_held():
+        row, new = state.catalogue.jobs.submit(
+            body.kind,
+            parameters,
+            request_key,
+            caller.owner,
+            queue=queue,
+            estimate=estimate,
+            quota_mib=state.settings.quota_mib,
+        )
     if new:
         log.info("job %s: %s, submitted", row.id, body.kind, extra={"fields": {"job": row.id}})
     if not new and reopened(row, state.catalogue, state.store):
@@ -132,7 +145,7 @@ def submit_job(body: JobRequest, response: Response, caller: Submitting, state: 
         state.reconciler.wake()
     response.status_code = 202 if new else 200
     response.headers["Location"] = f"/v1/jobs/{row.id}"
-    return JobView.of(row, state.catalogue.places.before(row))
+    return _view(row, state)
 
 
 def prepared(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str, Any], str, dict[str, Any]]:
@@ -179,14 +192,14 @@ def list_jobs(
     rows = state.catalogue.page(
         JobRow, owner=caller.owner, limit=limit + 1, after=position(cursor), phase=phase
     )
-    return page(request, rows, limit, JobView.of)
+    gone = without_results(rows, state.catalogue)
+    return page(request, rows, limit, lambda row: JobView.of(row, result_deleted=row.id in gone))
 
 
 @router.get("/{job_id}", summary="Show a job: phase, progress, result or error")
 def get_job(job_id: JobId, caller: Reading, state: Shared) -> JobView:
     """The present state of the job."""
-    row = find(state, caller, job_id)
-    return JobView.of(row, state.catalogue.places.before(row))
+    return _view(find(state, caller, job_id), state)
 
 
 @router.delete("/{job_id}", status_code=202, summary="Cancel a job")
@@ -195,6 +208,12 @@ def cancel_job(job_id: JobId, caller: Submitting, state: Shared) -> JobView:
     check_own(find(state, caller, job_id))
     state.catalogue.jobs.cancel(job_id)
     return JobView.of(find(state, caller, job_id))
+
+
+def _view(row: JobRow, state: Shared) -> JobView:
+    """The view of a job, with all that must be counted or looked for."""
+    gone = bool(without_results([row], state.catalogue))
+    return JobView.of(row, state.catalogue.places.before(row), result_deleted=gone)
 
 
 def time_left_s(row: JobRow, now: float | None = None) -> float | None:

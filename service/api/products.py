@@ -16,6 +16,7 @@ from workers.catalogue.tables import ProductRow
 from workers.contract.requests import Identity
 from workers.files.collection import remove_unnamed
 from workers.files.intact import files_of
+from workers.intake.withdrawn import details_now
 
 router = APIRouter(prefix="/v1/products", tags=["products"], responses=RESPONSES)
 
@@ -44,8 +45,8 @@ class ProductView(BaseModel):
     )
 
     @classmethod
-    def of(cls, row: ProductRow) -> ProductView:
-        """The view of a row."""
+    def of(cls, row: ProductRow, details: dict[str, Any] | None = None) -> ProductView:
+        """The view of a row. details: the product's details as they are now; default: those of the row."""
         here = f"/v1/products/{row.id}"
         return cls(
             id=row.id,
@@ -56,7 +57,7 @@ class ProductView(BaseModel):
             psf_version=row.psf_version,
             bytes=row.bytes,
             sha256=row.file_sha256,
-            details=row.details,
+            details=row.details if details is None else details,
             file=f"{here}/file",
             preview=f"{here}/preview",
             thumbnail=f"{here}/thumbnail" if row.details.get("thumbnail_sha256") else None,
@@ -88,8 +89,9 @@ def list_products(
 
 @router.get("/{product_id}", summary="One product")
 def get_product(product_id: Identity, caller: Reading, state: Shared) -> ProductView:
-    """A product's metadata, with links to its files."""
-    return ProductView.of(find(state, caller, product_id))
+    """A product's metadata, with links to its files. If its PSF was deprecated since, `details.warnings` says so."""
+    row = find(state, caller, product_id)
+    return ProductView.of(row, details_now(state.catalogue, row))
 
 
 @router.get("/{product_id}/file", summary="The product as FITS", response_class=Response)

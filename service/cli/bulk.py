@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,8 +38,10 @@ from service.cli.options import (
     writes_files,
 )
 from service.cli.progress import duration
+from service.cli.results.job import MOST, moment
 from service.client.errors import ServiceError
 from service.client.outputs import written
+from workers.versions.status import PsfStatus
 
 if TYPE_CHECKING:
     from service.client.http import Client
@@ -131,10 +134,15 @@ def submit(
         sent, refused = _uploaded(service, fits_files(uploads))
         if refused and not (sent or images or patterns):
             raise click.ClickException("no file could be uploaded, so no bulk run was started")
+        psf_id = named_psf(service, psf)
+        if psf_id is not None and service.psf(psf_id)["status"] == PsfStatus.DEPRECATED:
+            click.echo(
+                f"warning: PSF {short(psf_id)} was withdrawn; every product has this warning", err=True
+            )
         made = service.submit_bulk(
             images=[*whole_ids(service, "images", images), *sent],
             files=[{"glob": pattern, "where": _where(conditions)} for pattern in patterns],
-            psf_id=named_psf(service, psf),
+            psf_id=psf_id,
             context=context,
             output=output,
             only=only,
@@ -151,25 +159,35 @@ def submit(
                 made = service.wait_for_bulk(made["id"], progress=report)
         click.echo("\n".join(_said(made)))
     if refused:
-        raise click.ClickException(f"{refused} files were not uploaded; the reasons are listed above")
+        were = "file was" if refused == 1 else "files were"
+        raise click.ClickException(f"{refused} {were} not uploaded; the reasons are listed above")
     if wait:
         _end_with_status(made)
 
 
+@bulk.command("list", short_help="List your bulk runs.")
+@MOST
+@SERVER
+def list_bulks(most: int, server: str | None) -> None:
+    """List your bulk runs, newest first."""
+    with user_errors(), remote(server) as service:
+        rows = list(islice(service.bulks(), most))
+    if not rows:
+        click.echo("no bulk run yet; `heliopsf bulk submit` starts one")
+    for row in rows:
+        click.echo(
+            f"{short(row['id'])}  {row['phase']:<9}  {moment(row['created_at'])}  {row['done']} of {row['total']} done, "
+            f"{row['failed']} failed  {row['name']}".rstrip()
+        )
+
+
 @bulk.command("status", short_help="Show progress, speed and time left.")
-@click.argument("bulk_id", type=ID, metavar="[ID]", required=False)
+@BULK_ID
 @WAIT
 @SERVER
-def status(bulk_id: str | None, wait: bool, server: str | None) -> None:
-    """Show the progress, speed and time left of a bulk run. Without an ID, list all bulk runs."""
+def status(bulk_id: str, wait: bool, server: str | None) -> None:
+    """Show the progress, speed and time left of a bulk run. `bulk list` lists your bulk runs."""
     with user_errors(), remote(server) as service:
-        if bulk_id is None:
-            for row in service.bulks():
-                click.echo(
-                    f"{short(row['id'])}  {row['phase']:<9}  {row['done']} of {row['total']} done, {row['failed']} failed  "
-                    f"{row['name']}".rstrip()
-                )
-            return
         if wait:
             with progress_bar() as report:
                 service.wait_for_bulk(bulk_id, progress=report)
@@ -241,7 +259,9 @@ def report(
         for row in failed[:most]:
             click.echo(f"failed: {row['source']}: {row['error']['message']}")
         if len(failed) > most:
-            click.echo(f"... and {len(failed) - most} more failures")
+            click.echo(
+                f"... and {len(failed) - most} more {'failure' if len(failed) == most + 1 else 'failures'}"
+            )
         if output is not None:
             is_table = output.suffix.lower() == ".csv"
             kind = "csv" if is_table else "ndjson"

@@ -21,6 +21,7 @@ from service.cli.options import (
     OVERWRITE,
     SATURATION,
     STEPS,
+    counted,
     fits_files,
     limits,
     progress_bar,
@@ -173,7 +174,7 @@ def _lines(content: dict[str, Any]) -> list[str]:
     lines += [f"not deconvolved: {failure['name']}: {failure['reason']}" for failure in content["failures"]]
     summary = content["summary"]
     lines.append(
-        f"{summary['images']} images, {summary['to_look_at']} to look at, {summary['failures']} not deconvolved"
+        f"{counted(summary['images'], 'image')}, {summary['to_look_at']} to look at, {summary['failures']} not deconvolved"
     )
     return lines
 

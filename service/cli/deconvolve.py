@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,9 @@ from service.cli.options import (
     OUTPUT,
     SATURATION,
     STEPS,
+    OutputPlace,
+    Place,
+    counted,
     fits_files,
     percent,
     progress_bar,
@@ -39,7 +41,7 @@ AGAIN = click.option(
     "-o",
     "--output",
     required=True,
-    type=click.Path(),
+    type=OutputPlace(decides=True),
     metavar="FILE|FOLDER/",
     help="Write the deconvolved image (FITS) to this file; several images: to this folder",
 )
@@ -72,7 +74,7 @@ AGAIN = click.option(
 @writes_files
 def deconvolve(
     images: tuple[Path, ...],
-    output: str,
+    output: Place,
     psf: str | None,
     other_channel: bool,
     context: str | None,
@@ -93,7 +95,8 @@ def deconvolve(
     """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with the PSF that you name.
 
     The output is a folder if there are several images, or if its name ends in /. Images whose product is in the folder
-    are skipped. If an image fails, the others follow; the failures are listed at the end, and the exit status is 1.
+    are skipped. A service gets the next images while it works on the first ones, at most four. If an image fails, the others
+    follow; the failures are listed at the end, and the exit status is 1.
     """
     files = fits_files(images)
     if not files:
@@ -111,7 +114,7 @@ def deconvolve(
         "again": again,
         "overwrite": overwrite,
     }
-    into_folder = len(files) > 1 or any(path.is_dir() for path in images) or _is_folder(output)
+    into_folder = len(files) > 1 or any(path.is_dir() for path in images) or output.is_folder
     if into_folder and (plot or changes):
         raise click.UsageError(
             "--plot and --changes: expected one image and an output file; for several images use `heliopsf changes`"
@@ -119,23 +122,21 @@ def deconvolve(
     with user_errors():
         psf_files = [Path(psf)] if psf and Path(psf).is_file() else []
         if into_folder:
-            check_output_folder(output)
+            check_output_folder(output.path)
         else:
-            check_outputs((output, plot, changes), inputs=[*files, *psf_files], overwrite=overwrite)
+            check_outputs((output.path, plot, changes), inputs=[*files, *psf_files], overwrite=overwrite)
     with user_errors(), connection(server, local) as service, progress_bar() as report:
         parameters["psf_id"] = named_psf(service, psf)
         if not into_folder:
-            lines = _one(service, files[0], Path(output), plot, changes, report, parameters)
+            lines = _one(service, files[0], output.path, plot, changes, report, parameters)
             failures: list[Outcome] = []
         else:
-            lines, failures = _many(service, files, output, report, parameters)
+            lines, failures = _many(service, files, output.path, report, parameters)
     click.echo("\n".join(lines))
     if failures:
-        raise click.ClickException(f"{len(failures)} of {len(files)} images failed; see the list above")
-
-
-def _is_folder(output: str) -> bool:
-    return output.endswith(("/", os.sep)) or Path(output).is_dir()
+        raise click.ClickException(
+            f"{len(failures)} of {counted(len(files), 'image')} failed; see the list above"
+        )
 
 
 def _one(
@@ -160,7 +161,7 @@ def _one(
 
 
 def _many(
-    service: Operations, files: list[Path], folder: str, report: Report, parameters: dict[str, Any]
+    service: Operations, files: list[Path], folder: Path, report: Report, parameters: dict[str, Any]
 ) -> tuple[list[str], list[Outcome]]:
     """Deconvolve images into a folder; returns the lines to print, and the failures."""
     outcomes = list(
@@ -168,6 +169,9 @@ def _many(
             service, files, folder, progress=lambda done, of: report("images", done, of), **parameters
         )
     )
+    for one in outcomes:
+        for warning in one.warnings:
+            click.echo(f"warning: {one.image}: {warning}", err=True)
     failures = [one for one in outcomes if one.failure is not None]
     existed = sum(one.existed for one in outcomes)
     done = len(outcomes) - len(failures) - existed
@@ -175,5 +179,5 @@ def _many(
     lines += [f"failed: {one.image}: {one.failure}" for one in failures]
     return [
         *lines,
-        f"{len(outcomes)} images: {done} deconvolved, {existed} existed already, {len(failures)} failed",
+        f"{counted(len(outcomes), 'image')}: {done} deconvolved, {existed} existed already, {len(failures)} failed",
     ], failures

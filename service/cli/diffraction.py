@@ -140,8 +140,8 @@ def arms(
             with written(plot, overwrite=overwrite) as picture:
                 arms_png(flare.pixels, found, picture, unit=unit_label(flare))
     for angle, sigma in zip(found.angles_deg, found.angles_sigma_deg, strict=True):
-        click.echo(f"arm at {angle:8.3f} +- {sigma:.3f} degrees from +x towards +y")
-    click.echo(f"spacing  {found.spacing_px:8.4f} +- {found.spacing_sigma_px:.4f} px")
+        click.echo(f"arm at {angle:8.3f} ± {sigma:.3f} degrees from +x towards +y")
+    click.echo(f"spacing  {found.spacing_px:8.4f} ± {found.spacing_sigma_px:.4f} px")
     write_json(
         json_file,
         {

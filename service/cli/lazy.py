@@ -17,6 +17,9 @@ INTERRUPTED = 130  # exit status of a command that was ended by Control-C: 128 +
 REJOIN = {"job": "heliopsf job wait {id}", "bulk": "heliopsf bulk status {id} --wait"}
 
 
+_FETCH = "                      it prints the command that writes the result, such as heliopsf product get ID -o FILE\n"
+
+
 class Lazy(NamedTuple):
     """A command that is not imported yet: its module, its name in the module, and the line that ``--help`` shows."""
 
@@ -107,10 +110,15 @@ def _interrupted(stop: KeyboardInterrupt) -> str:
     if not isinstance(stop, WaitInterrupted):
         return "interrupted"
     there = "" if stop.server == DEFAULT_SERVER else f" --server {stop.server}"
-    short = stop.identity[:SHOWN_DIGITS]
-    rejoin = REJOIN[stop.what].format(id=short)
+    ids = " ".join(one[:SHOWN_DIGITS] for one in (stop.identity, *stop.others))
+    several = bool(stop.others)
+    rejoin = REJOIN[stop.what].format(id=ids)
+    # The named command waits, but only the interrupted command knows the files that it was to write.
+    files = "  write the files:    run the same command again; it continues with the same work\n"
     return (
-        f"interrupted; {stop.what} {short} goes on\n"
-        f"  wait for it again: {rejoin}{there}\n"
-        f"  cancel it:         heliopsf {stop.what} cancel {short}{there}"
+        f"interrupted; {f'{stop.what}s {ids} go' if several else f'{stop.what} {ids} goes'} on\n"
+        f"{files if stop.what == 'job' else ''}"
+        f"  wait for {'them' if several else 'it'} again: {rejoin}{there}\n"
+        f"{_FETCH if stop.what == 'job' else ''}"
+        f"  {'cancel them:       ' if several else 'cancel it:        '} heliopsf {stop.what} cancel {ids}{there}"
     )

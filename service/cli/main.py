@@ -34,6 +34,7 @@ SECTIONS = {
         "doctor": Lazy("service.cli.operator.doctor", "doctor", "Check settings, database, broker and disk."),
         "database": Lazy("service.cli.operator.database", "database", "Show or upgrade the database's tables."),
         "store": Lazy("service.cli.operator.store", "store", "Check and clean up stored files; set quotas."),
+        "cache": Lazy("service.cli.operator.cache", "cache", "List and remove built PSFs that are kept."),
         "key": Lazy("service.cli.operator.key", "key", "Create, list and revoke access keys."),
     },
     "Studies": {

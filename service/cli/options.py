@@ -6,8 +6,10 @@ This file imports no numerical libraries, so that commands start fast.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
@@ -29,15 +31,74 @@ FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
 
+def _not_stdout(
+    self: click.Path, value: Any, param: click.Parameter | None, ctx: click.Context | None
+) -> None:
+    """Refuse "-", which many programs take for standard output. Commands write text there, which would damage a file."""
+    if str(value) == "-":
+        self.fail(
+            "expected a name; got '-': results are not written to standard output. './-' is a file of this name",
+            param,
+            ctx,
+        )
+
+
 class OutputFile(click.Path):
     """The type of an option that names a file to write. ``writes_files`` checks the files of these options."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path. "-" is refused."""
+        _not_stdout(self, value, param, ctx)
+        return super().convert(value, param, ctx)
+
+
+class OutputPlace(OutputFile):
+    """The type of an option that names a file to write, or a folder for a file with a name of its own.
+
+    decides: the command itself decides whether the path is a folder, and checks it.
+    """
+
+    def __init__(self, *, decides: bool = False) -> None:
+        super().__init__()
+        self.decides = decides
+
+    def convert(  # type: ignore[override]
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> Place:
+        """The path, and whether it is a folder: it exists as one, or the text ends in a slash."""
+        path = super().convert(value, param, ctx)
+        return Place(Path(path), is_folder=str(value).endswith(("/", os.sep)) or Path(path).is_dir())
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where to write a result."""
+
+    path: Path
+    is_folder: bool
+
+    def file(self, name: str) -> Path:
+        """The path of the file. name: its name if the place is a folder, which is made if needed."""
+        if not self.is_folder:
+            return self.path
+        self.path.mkdir(parents=True, exist_ok=True)
+        return self.path / name
+
+    def __str__(self) -> str:
+        return str(self.path)
 
 
 class OutputFolder(click.Path):
     """The type of an option that names a folder to write to."""
 
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path. "-" is refused."""
+        _not_stdout(self, value, param, ctx)
+        return super().convert(value, param, ctx)
+
 
 OUTPUT = OutputFile(dir_okay=False, path_type=Path)
+OUTPUT_PLACE = OutputPlace()
 OUTPUT_FOLDER = OutputFolder(file_okay=False, path_type=Path)
 METHODS = [get_args(kind.model_fields["name"].annotation)[0] for kind in get_args(get_args(Method)[0])]
 
@@ -84,6 +145,8 @@ DATA = click.option(
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace output files that exist")
 
+NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (`heliopsf key create` of the operator makes keys)"
+
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
@@ -95,7 +158,8 @@ def user_errors() -> Iterator[None]:
     except DataError as error:
         raise click.ClickException("\n".join(error_lines(error.message, error.fields))) from error
     except ServiceError as error:
-        raise click.ClickException("\n".join(error_lines(str(error), error.fields))) from error
+        message = NO_KEY if error.code == "no-key" else str(error)
+        raise click.ClickException("\n".join(error_lines(message, error.fields))) from error
     except OSError as error:
         raise click.ClickException(str(error)) from error
 
@@ -118,6 +182,9 @@ def writes_files(command: Command) -> Command:
     def checked(**given: Any) -> Any:
         outputs, inputs = _files_of(click.get_current_context().command.params, given)
         with user_errors():
+            for place in given.values():
+                if isinstance(place, Place) and place.is_folder:
+                    check_output_folder(place.path)
             check_outputs(outputs, inputs=inputs, overwrite=given["overwrite"])
         return command(**given)
 
@@ -132,7 +199,11 @@ def _files_of(
     inputs: list[Path] = []
     for parameter in parameters:
         value = given.get(parameter.name or "")
+        if isinstance(parameter.type, OutputPlace) and parameter.type.decides:
+            continue
         if isinstance(parameter.type, OutputFile):
+            if isinstance(value, Place):
+                value = None if value.is_folder else value.path
             outputs.append(value)
         elif not isinstance(parameter.type, OutputFolder):
             values = value if isinstance(value, tuple) else (value,)
@@ -183,6 +254,17 @@ def fits_files(paths: Sequence[Path]) -> list[Path]:
 
 def _is_fits(path: Path) -> bool:
     return path.name.lower().endswith((".fits", ".fits.gz", ".fts", ".fit"))
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things, such as "1 image" or "2 images"."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words as a list in a sentence: "a", "a and b", "a, b and c"."""
+    *others, last = words
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def percent(value: float | None, digits: int = 1) -> str:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 LINE_EVERY_S = 10.0
+STEPS_OF = {"error estimate": "realisation"}  # what the steps of a stage are; others are only steps
 UNITS = (("days", 86_400), ("h", 3600), ("min", 60))
 
 Report = Callable[[str, int, int], None]
@@ -49,6 +50,13 @@ def duration(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
+def told(stage: str, step: int, steps: int) -> str:
+    """A stage and its step as text. A stage of one step is a stage whose steps are not known, until it ends."""
+    if (steps <= 1 and step < steps) or not steps:
+        return stage
+    return f"{stage}: {STEPS_OF.get(stage, 'step')} {step} of {steps}"
+
+
 class _Teller:
     """Writes the progress of one command."""
 
@@ -74,7 +82,7 @@ class _Teller:
             elif now_s - self.told_s >= LINE_EVERY_S:
                 self.told_s = now_s
                 elapsed = duration(now_s - self.started_s)
-                sys.stderr.write(f"{stage}: step {step} of {steps} after {elapsed}{left}\n")
+                sys.stderr.write(f"{told(stage, step, steps)} after {elapsed}{left}\n")
                 sys.stderr.flush()
 
     def line(self, text: str) -> None:

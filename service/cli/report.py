@@ -31,7 +31,7 @@ from service.cli.options import (
 @click.option(
     "--dark-offsets/--no-dark-offsets",
     default=True,
-    help="Also fit with wrong dark levels, +-3 and +-5 DN (slow)",
+    help="Also fit with wrong dark levels, +-3 and ±5 DN (slow)",
 )
 @click.option(
     "--shapes",

@@ -18,7 +18,10 @@ from workers.contract.queues import Queue, queues_named
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on")
 @click.option("--port", default=8765, show_default=True, help="Port to listen on; 0: any free port")
 @DATA
-def serve(host: str, port: int, data: Path | None) -> None:
+@click.option(
+    "-v", "--verbose", is_flag=True, help="Also show every request; without a terminal, all are logged anyway"
+)
+def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
     """Start a service over HTTP, and keep it running until it is interrupted.
 
     If no broker is set (HELIOPSF_BROKER_URL), the command also starts a worker. If other machines can reach the address, every
@@ -49,7 +52,7 @@ def serve(host: str, port: int, data: Path | None) -> None:
         )
 
     try:
-        run(settings, host, port, announce)
+        run(settings, host, port, announce, verbose=verbose)
     except (SchemaError, NoKeyYet) as error:
         raise click.ClickException(str(error)) from error
     except SQLAlchemyError as error:

@@ -16,7 +16,9 @@ from service.cli.options import (
     JSON,
     OUTPUT_FOLDER,
     check_fresh_folder,
+    counted,
     limits,
+    listed,
     user_errors,
     write_json,
     writes_files,
@@ -145,8 +147,8 @@ def transit(
             raise click.ClickException(f"cannot write {output}: {error.strerror or error}") from error
     exposures = sorted({shot.exposure_s for shot in plan.shots})
     click.echo(
-        f"{output}: {images} images of {size} x {size} px, {len(plan.pointings)} pointings, "
-        f"{', '.join(f'{t:g}' for t in exposures)} s"
+        f"{output}: {counted(images, 'image')} of {size} x {size} px, {counted(len(plan.pointings), 'pointing')}, "
+        f"exposure{'s' if len(exposures) > 1 else ''} of {listed([f'{t:g}' for t in exposures])} s"
     )
     click.echo(
         f"scatter b {b_px:g} px, c {c:g}, total {total:g}; the file of true values is {output / 'truth.json'}"
@@ -173,7 +175,7 @@ COMMANDS = (simulate,)
 def _lines(found: PhotonBound) -> list[str]:
     places = [max(pair) for pair in found.places_px]
     return [
-        f"smallest standard errors from {found.dark_pixels} occulted pixels in {found.images} images:",
+        f"smallest standard errors from {found.dark_pixels} occulted pixels in {counted(found.images, 'image')}:",
         f"b {found.b_px:.3g} px, c {found.c:.3g}, total {found.total:.3g}, a {found.a:.3g}",
         f"stretch {found.stretch:.3g} at {found.stretch_angle_deg:g} degrees",
         f"position of the occulter {min(places):.3f} to {max(places):.3f} px",

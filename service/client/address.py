@@ -35,6 +35,16 @@ def service_address(text: str) -> str:
     return parts.geturl()
 
 
+def how_to_start(server: str) -> str:
+    """What to do if no service answers at this address: the command that starts one there, if the address is of this machine."""
+    parts = urlsplit(server)
+    if parts.scheme != "http" or not is_loopback(parts.hostname or ""):
+        return "check the address, or ask the operator whether the service runs"
+    port = parts.port or 80
+    named = "" if port == urlsplit(DEFAULT_SERVER).port else f" --port {port}"
+    return f"`heliopsf serve{named}` starts a service there"
+
+
 def is_loopback(host: str) -> bool:
     """Whether an address can be reached only from its own machine."""
     try:

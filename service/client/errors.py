@@ -61,9 +61,12 @@ def _same(one: Mapping[str, Any]) -> str:
 class WaitInterrupted(KeyboardInterrupt):
     """Control-C during a wait for a job or a bulk run, which goes on without the client.
 
-    what: "job" or "bulk". identity: its id. server: address of the service.
+    what: "job" or "bulk". identity: its id. server: address of the service. others: ids of further jobs that go on.
     """
 
-    def __init__(self, what: str, identity: str, server: str) -> None:
-        super().__init__(f"the wait was interrupted; {what} {identity} goes on at {server}")
-        self.what, self.identity, self.server = what, identity, server
+    def __init__(self, what: str, identity: str, server: str, others: tuple[str, ...] = ()) -> None:
+        named = (
+            f"{what} {identity} goes on" if not others else f"{what}s {', '.join((identity, *others))} go on"
+        )
+        super().__init__(f"the wait was interrupted; {named} at {server}")
+        self.what, self.identity, self.server, self.others = what, identity, server, others

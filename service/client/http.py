@@ -18,7 +18,7 @@ import httpx
 
 from psfcore.errors import DataError
 from psfcore.transit.archive import pack
-from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS, service_address
+from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS, how_to_start, service_address
 from service.client.bulk import FIRST_WAIT_S, LONGEST_WAIT_S, PASSING, PATIENCE_S, BulkClient, still_waiting
 from service.client.errors import ServiceError, WaitInterrupted
 from service.client.keys import KeysClient
@@ -37,6 +37,9 @@ def _silent(_line: str) -> None:
 
 class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
     """A heliopsf service, over HTTP."""
+
+    server: str
+    jobs_at_once = 4
 
     def __init__(
         self,
@@ -190,8 +193,9 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
                 told = True
             time.sleep(0.1)
             job = self._job_patiently(job["id"])
-            if progress is not None and job["progress"]["steps"]:
-                progress(job["progress"]["stage"], job["progress"]["step"], job["progress"]["steps"])
+            now = job["progress"]
+            if progress is not None and now["stage"]:
+                progress(now["stage"], now["step"], max(now["steps"], 1))
         return job
 
     def _job_patiently(self, job_id: str) -> dict[str, Any]:
@@ -312,7 +316,7 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return response
 
     def _unreachable(self, error: httpx.TransportError) -> ServiceError:
-        return ServiceError(f"no answer from {self.server} ({error}); `heliopsf serve` starts a service")
+        return ServiceError(f"no answer from {self.server} ({error}); {how_to_start(self.server)}")
 
 
 @contextmanager

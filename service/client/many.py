@@ -1,5 +1,8 @@
 """Deconvolves many images into a folder, through a service or in this process.
 
+A few jobs are in flight at a time, so that the workers of a service need not wait for uploads and downloads. One thread does
+everything in the order of the images: it begins images until enough jobs are in flight, then waits for the oldest of them.
+
 The file of a product is named after the image's file and the product's identity. An image is skipped if the folder holds
 the product of its bytes with the same PSF and parameters, under any name: the cards INPSHA and PRODID of the files decide.
 """
@@ -8,14 +11,16 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from psfcore.errors import DataError, HeaderError
 from psfcore.fits.header import FitsLimits, check_all_headers, first_image_header, optional_text
-from service.client.errors import ServiceError
+from service.client.errors import ServiceError, WaitInterrupted
 from service.client.operations import Operations, deconvolution
 from service.client.outputs import check_output_folder, check_outputs
 from workers.files.archive import safe_name
@@ -28,19 +33,22 @@ LARGEST_PX = 2**26
 
 _Found = dict[tuple[str, str], Path]
 _Answer = TypeVar("_Answer")
+_Step = TypeVar("_Step", bound="_Begun | Outcome")
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What became of one image. output: the file of its product. existed: the folder held the product before.
 
-    failure: why there is no product; None if there is one.
+    failure: why there is no product; None if there is one. warnings: what a user of the product must know; empty if the
+    folder held the product before.
     """
 
     image: Path
     output: Path | None = None
     existed: bool = False
     failure: str | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def deconvolve_many(
@@ -52,58 +60,134 @@ def deconvolve_many(
     progress: Callable[[int, int], None] = lambda done, of: None,
     **parameters: Any,
 ) -> Iterator[Outcome]:
-    """Deconvolve images one after the other into a folder, and yield what became of each image.
+    """Deconvolve images into a folder, and yield what became of each image, in their order.
 
-    parameters: as for ``Operations.deconvolve``, except the pictures. If an image cannot be read, deconvolved or written,
-    its outcome has the reason, and the next image follows. overwrite: replace files that have the name of a product but
-    are not this product. progress(done, of) is called before each image and at the end.
+    At most ``service.jobs_at_once`` jobs are in flight. parameters: as for ``Operations.deconvolve``, except the pictures. If an
+    image cannot be read, deconvolved or written, its outcome has the reason, and the next image follows. overwrite: replace
+    files that have the name of a product but are not this product. progress(done, of) is called at the beginning and after
+    each image.
 
     Raises ``ServiceError`` for an error that concerns every image: "output-not-writable", a refused key, a full quota, or
-    no answer from the service.
+    no answer from the service. Images whose jobs are in flight are finished first, if the service answers. Raises
+    ``WaitInterrupted`` on Control-C; the jobs that it names go on.
     """
     check_output_folder(folder)
     Path(folder).mkdir(parents=True, exist_ok=True)
-    found = _products_in(Path(folder))
-    for number, image in enumerate(map(Path, images)):
+    run = _Run(service, images, Path(folder), overwrite, parameters)
+    progress(0, len(images))
+    for number, outcome in enumerate(run.outcomes(), 1):
+        yield outcome
         progress(number, len(images))
+
+
+@dataclass
+class _Begun:
+    """An image whose outcome is not yet known. key: identity of its product, and SHA-256 of the image.
+
+    job: None if an earlier image in flight has the same product.
+    """
+
+    image: Path
+    key: tuple[str, str]
+    output: Path
+    wanted: dict[str, Any]
+    job: dict[str, Any] | None
+
+
+class _Run:
+    """Images on their way through a service, in their order; the first one is finished first."""
+
+    def __init__(
+        self,
+        service: Operations,
+        images: Sequence[str | Path],
+        folder: Path,
+        overwrite: bool,
+        parameters: dict[str, Any],
+    ) -> None:
+        self._service, self._images, self._folder = service, images, folder
+        self._overwrite, self._parameters = overwrite, parameters
+        self._found = _products_in(folder)
+        self._begun: deque[_Begun | Outcome] = deque()
+
+    def outcomes(self) -> Iterator[Outcome]:
+        """What became of each image. Raises as ``deconvolve_many``."""
         try:
-            yield _one(service, image, images, Path(folder), found, overwrite, parameters)
-        except ServiceError as error:
-            if error.code is None or error.status in FOR_ALL:
+            for image in map(Path, self._images):
+                try:
+                    self._begun.append(_told(image, partial(self._begin, image)))
+                except ServiceError as error:
+                    if error.status in FOR_ALL:
+                        yield from self._finished(leave=0)
+                    raise
+                yield from self._finished(leave=self._service.jobs_at_once - 1)
+            yield from self._finished(leave=0)
+        except KeyboardInterrupt as stop:
+            jobs = [one["id"] for one in self._in_flight()]
+            if self._service.server is None or not jobs:
                 raise
-            yield Outcome(image, failure=str(error))
-        except DataError as error:
-            yield Outcome(image, failure=error.message)
-        except OSError as error:
-            yield Outcome(image, failure=error.strerror or str(error))
-    progress(len(images), len(images))
+            raise WaitInterrupted("job", jobs[0], self._service.server, tuple(jobs[1:])) from stop
+
+    def _in_flight(self) -> list[dict[str, Any]]:
+        return [one.job for one in self._begun if isinstance(one, _Begun) and one.job is not None]
+
+    def _finished(self, leave: int) -> Iterator[Outcome]:
+        """Finish the first images until at most so many jobs are in flight and the first image has one."""
+        while self._begun:
+            first = self._begun[0]
+            if isinstance(first, _Begun):
+                if first.job is not None and len(self._in_flight()) <= leave:
+                    return
+                first = _told(first.image, partial(self._finish, first))
+            self._begun.popleft()  # only now, so that an interruption names its job
+            yield first
+
+    def _begin(self, image: Path) -> _Begun | Outcome:
+        """Upload an image and submit its job, unless its product is in the folder or an earlier image makes it."""
+        with image.open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        image_id = _patiently(lambda: self._service.image_id(image, sha256))
+        wanted = deconvolution(image_id, **self._parameters)
+        product_id = _patiently(lambda: self._service.result_id("deconvolve", **wanted))
+        key = (product_id, sha256)
+        if key in self._found:
+            return Outcome(image, self._found[key], existed=True)
+        begun = _Begun(image, key, self._folder / safe_name(image.name, product_id), wanted, None)
+        if not any(isinstance(one, _Begun) and one.key == key for one in self._begun):
+            begun.job = self._submitted(begun)
+        return begun
+
+    def _submitted(self, begun: _Begun) -> dict[str, Any]:
+        inputs = self._images if begun.output.exists() else ()
+        check_outputs((begun.output,), inputs=inputs, overwrite=self._overwrite)
+        return _patiently(lambda: self._service.submit("deconvolve", **begun.wanted))
+
+    def _finish(self, begun: _Begun) -> Outcome:
+        """Wait for the job of an image, and download its product."""
+        if begun.key in self._found:
+            return Outcome(begun.image, self._found[begun.key], existed=True)
+        if begun.job is None:  # the earlier image failed
+            begun.job = self._submitted(begun)
+        product = self._service.get(self._service.wait(begun.job)["result"])
+        self._service.download(product["file"], begun.output, overwrite=self._overwrite)
+        self._service.release(product)
+        self._found[begun.key] = begun.output
+        warnings = tuple(one["message"] for one in product["details"].get("warnings", ()))
+        return Outcome(begun.image, begun.output, warnings=warnings)
 
 
-def _one(
-    service: Operations,
-    image: Path,
-    images: Iterable[str | Path],
-    folder: Path,
-    found: _Found,
-    overwrite: bool,
-    parameters: dict[str, Any],
-) -> Outcome:
-    with image.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    image_id = _patiently(lambda: service.image_id(image, sha256))
-    wanted = deconvolution(image_id, **parameters)
-    product_id = _patiently(lambda: service.result_id("deconvolve", **wanted))
-    there = found.get((product_id, sha256))
-    if there is not None:
-        return Outcome(image, there, existed=True)
-    output = folder / safe_name(image.name, product_id)
-    check_outputs((output,), inputs=images if output.exists() else (), overwrite=overwrite)
-    job = _patiently(lambda: service.submit("deconvolve", **wanted))
-    product = service.get(service.wait(job)["result"])
-    service.download(product["file"], output, overwrite=overwrite)
-    service.release(product)
-    found[product_id, sha256] = output
-    return Outcome(image, output)
+def _told(image: Path, step: Callable[[], _Step]) -> _Step | Outcome:
+    """The answer of a step, or the outcome of the image if the step failed. Raises ``ServiceError`` if every image would fail."""
+    try:
+        return step()
+    except ServiceError as error:
+        if error.code is None or error.status in FOR_ALL:
+            raise
+        return Outcome(image, failure=str(error))
+    except DataError as error:
+        return Outcome(image, failure=error.message)
+    except OSError as error:
+        return Outcome(image, failure=error.strerror or str(error))
 
 
 def _products_in(folder: Path) -> _Found:

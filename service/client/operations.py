@@ -17,7 +17,13 @@ from service.client.versions import Progress
 
 
 class Operations(ABC):
-    """The requests to a service, over HTTP or in this process. Every method raises ``ServiceError``."""
+    """The requests to a service, over HTTP or in this process. Every method raises ``ServiceError``.
+
+    server: address of the service; None: this process. jobs_at_once: number of jobs that ``service.client.many`` has in flight.
+    """
+
+    server: str | None = None
+    jobs_at_once = 1  # in this process, a job runs when somebody waits for it
 
     @abstractmethod
     def upload_image(self, path: str | Path) -> dict[str, Any]:
@@ -250,7 +256,7 @@ class Operations(ABC):
         """Upload a transit, diagnose the gap between it and the fitted model, and download the report; returns its description.
 
         report, page, preview, noise: as for ``report``. parameters: ``psf_id`` of a fitted PSF to start from, ``seed``,
-        ``correct``. If an effect was found, ``details.corrected_psf_id`` is the id of the PSF that includes it.
+        ``coverage`` of the answer set, ``correct``. If an effect was found, ``details.corrected_psf_id`` is the id of the PSF that includes it.
         """
         check_outputs((report, page, preview), inputs=(transit,), overwrite=overwrite)
         found = self._on_transit("gap-diagnose", transit, progress, noise, parameters)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
@@ -20,12 +19,12 @@ from starlette.exceptions import HTTPException
 from psfcore.errors import DataError
 from workers import checks, logs
 from workers.contract.suggestions import explained
+from workers.files.full_disk import NO_ROOM, STORAGE_FULL, is_disk_full
 from workers.files.store import StoreAway
 
 log = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
 MOST_ERRORS = 20  # errors of one request that an answer lists
-FULL = {errno.ENOSPC, errno.EDQUOT}
 # HTTP status of a DataError, by its code; 422 for every other code.
 STATUS_OF = {
     "already-deconvolved": 409,
@@ -56,6 +55,7 @@ STATUS_OF = {
     "parameters-unknown": 409,
     "plate-scale-mismatch": 409,
     "psf-as-image": 409,
+    "psf-deprecated": 409,
     "psf-in-use": 409,
     "ranges-overlap": 409,
     "several-ids-fit": 409,
@@ -119,18 +119,6 @@ def document(
         **more,
     }
     return JSONResponse(body, status_code=status, media_type=MEDIA_TYPE, headers=headers)
-
-
-NO_ROOM = "expected free space on the disk of the service; the disk is full: ask the operator to make room, then try again"
-
-
-def _disk_full(error: SQLAlchemyError) -> bool:
-    """Whether the database could not write because its disk is full (SQLite: SQLITE_FULL, PostgreSQL: 53100)."""
-    original = getattr(error, "orig", None)
-    return (
-        getattr(original, "sqlite_errorname", None) == "SQLITE_FULL"
-        or getattr(original, "sqlstate", None) == "53100"
-    )
 
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -198,8 +186,8 @@ def install(app: FastAPI, as_page: AsPage) -> None:
     @app.exception_handler(PoolTimeoutError)
     def _database(request: Request, error: SQLAlchemyError) -> Response:
         log.error("database: %s", error)
-        if _disk_full(error):
-            return answer(request, 507, "storage-full", NO_ROOM)
+        if is_disk_full(error):
+            return answer(request, 507, STORAGE_FULL, NO_ROOM)
         return answer(
             request,
             503,
@@ -222,10 +210,10 @@ def install(app: FastAPI, as_page: AsPage) -> None:
 
     @app.exception_handler(OSError)
     def _system(request: Request, error: OSError) -> Response:
-        if error.errno not in FULL:
+        if not is_disk_full(error):
             raise error  # it is answered as an internal error
         log.error("storage: %s", error)
-        return answer(request, 507, "storage-full", NO_ROOM)
+        return answer(request, 507, STORAGE_FULL, NO_ROOM)
 
     @app.exception_handler(StoreAway)
     def _store(request: Request, error: StoreAway) -> Response:

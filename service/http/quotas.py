@@ -1,7 +1,9 @@
-"""Checks the storage quota of an owner before an upload is received and before a job is accepted."""
+"""Checks the storage quota of an owner before an upload is received, before a job is accepted, and when rows are added."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from service.http.callers import Caller
@@ -9,7 +11,8 @@ from service.http.problems import Problem
 from service.http.state import State
 from workers import checks
 from workers.catalogue.catalogue import Row
-from workers.catalogue.owners import MIB, NOT_KEPT, OverQuota, Usage, counted_bytes
+from workers.catalogue.owners import MIB, NOT_KEPT, ROWS_NOT_KEPT, OverQuota, Usage, counted_bytes
+from workers.files.full_disk import STORAGE_FULL
 
 
 class Allowed:
@@ -48,7 +51,7 @@ def check_disk(state: State, more_bytes: int = 0) -> None:
     if free - more_bytes < least:
         raise Problem(
             507,
-            "storage-full",
+            STORAGE_FULL,
             f"expected {least / MIB:.0f} MiB of free disk space after this request (HELIOPSF_MIN_FREE_MIB); "
             f"{max(0, free - more_bytes) / MIB:.0f} MiB would be left: ask the operator to make room, then try again",
         )
@@ -60,6 +63,15 @@ def check_room(state: State, owner: str) -> None:
     usage = _usage(state, owner)
     if usage.full:
         raise _exceeded(507, usage, NOT_KEPT)
+
+
+@contextmanager
+def rows_held() -> Iterator[None]:
+    """Raise ``Problem`` 507 if the rows that the block adds do not fit into the owner's quota."""
+    try:
+        yield
+    except OverQuota as over:
+        raise _exceeded(507, over.usage, ROWS_NOT_KEPT) from over
 
 
 def _usage(state: State, owner: str) -> Usage:

@@ -26,6 +26,13 @@ IDS: dict[str, tuple[type[ListedRow], str, int]] = {
     "bulk_id": (BulkRow, "bulk", 32),
 }
 _SHORT = re.compile(SHORT_ID)
+_NAMED = {"psf": "PSF", "bulk": "bulk run"}
+_LISTED = {
+    "psf": "; `heliopsf psf list` shows them",
+    "product": "; `heliopsf product list` shows them",
+    "job": "; `heliopsf job list` shows them",
+    "bulk": "; `heliopsf bulk list` shows them",
+}
 SHOWN = {"psf": "a PSF", "bulk": "a bulk run", "image": "an image"}
 
 
@@ -48,8 +55,8 @@ def complete(request: Request, state: State, owner: str) -> None:
             raise Problem(
                 404,
                 f"no-such-{thing}",
-                f"expected the id of {shown}, or its first {FEWEST_DIGITS} or more digits; got {text}, with which no id of "
-                f"yours begins: list them",
+                f"expected the id of {shown}, or its first {FEWEST_DIGITS} or more digits; got {text}: no {_NAMED.get(thing, thing)} "
+                f"of yours has an id that begins so{_LISTED.get(thing, '')}",
             )
         if len(found) > 1:
             error = several_ids_fit(text, found)

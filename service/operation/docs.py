@@ -23,6 +23,7 @@ PAGE = """<!doctype html>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>heliopsf API</title>
+<link rel="icon" href="docs/icon.svg" type="image/svg+xml">
 <link rel="stylesheet" href="docs/swagger-ui.css">
 </head>
 <body>
@@ -47,6 +48,7 @@ TYPES = {
     "swagger-ui-bundle.js": "text/javascript",
     "swagger-ui.css": "text/css",
     "start.js": "text/javascript",
+    "icon.svg": "image/svg+xml",
 }
 router = APIRouter(include_in_schema=False)
 
@@ -71,4 +73,6 @@ def part(name: str) -> Response:
 def _content(name: str) -> bytes:
     if name == "start.js":
         return START.encode()
+    if name == "icon.svg":
+        return (files("service.pages") / "static" / name).read_bytes()
     return (files("fastapi_swagger") / "resources" / name).read_bytes()

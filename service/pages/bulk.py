@@ -7,7 +7,7 @@ from pathlib import PurePath
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Form, Query, Request, Response
-from fastapi.responses import RedirectResponse
+from fastapi.responses import JSONResponse, RedirectResponse
 from pydantic import ValidationError
 
 from service.api.bulk import (
@@ -33,6 +33,7 @@ from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.parts import methods
 from service.pages.parts.forms import wrong_fields
+from service.pages.parts.sentences import of_error
 from service.pages.rendering import page, short
 from service.pages.visitors import PageBulk, PageReading
 from workers.catalogue.access.keys import Scope
@@ -133,14 +134,13 @@ def bulk(
     else:
         rows = progress.items(bulk_id, ItemState.DONE, after=after[1] if after else -1, limit=PER_SHEET + 1)
     last = rows[PER_SHEET - 1] if len(rows) > PER_SHEET else None
-    reasons = progress.reasons(bulk_id) if view.images.failed else []
+    reasons = _reasons(bulk_id, caller, state) if view.images.failed else []
     return page(
         request,
         "bulk.html",
         bulk=view,
         reasons=reasons,
         most_explained=MOST_EXPLAINED,
-        examples=_names([reason.example for reason in reasons], caller, state),
         results=_cards(rows[:PER_SHEET], caller, state),
         order=order,
         first_page=cursor is None,
@@ -164,8 +164,18 @@ def failures(
     uploads = state.catalogue.bulks.progress.names_of_uploads(
         [one.source for one in found.items], caller.owner
     )
-    items: list[tuple[Failed, str]] = [(one, uploads.get(one.source, one.source)) for one in found.items]
+    items: list[tuple[Failed, str, str]] = [
+        (one, uploads.get(one.source, one.source), of_error(one.error.code, one.error.message))
+        for one in found.items
+    ]
     return page(request, "bulk_failures.html", bulk=row, items=items, next=found.next)
+
+
+@router.get("/{bulk_id}/reasons")
+def reasons(bulk_id: BulkId, caller: PageReading, state: Shared) -> Response:
+    """The failures by reason, for the script of the page of a run."""
+    find(state, caller, bulk_id)
+    return JSONResponse(_reasons(bulk_id, caller, state))
 
 
 @router.post("/{bulk_id}/{change}")
@@ -178,6 +188,25 @@ def change_run(
     """Pause, resume, retry or cancel a run, and show it."""
     CHANGES[change](bulk_id, caller, state)
     return RedirectResponse(f"/bulk/{bulk_id}", 303)
+
+
+def _reasons(bulk_id: str, caller: Caller, state: State) -> list[dict[str, Any]]:
+    """The reasons of failures: the number of images, the code, and an example with its image."""
+    found = state.catalogue.bulks.progress.reasons(bulk_id)
+    names = _names([reason.example for reason in found], caller, state)
+    return [
+        {
+            "images": reason.images,
+            "code": reason.code,
+            "told": f"{names[reason.example.position]}: {_told(reason.example)}",
+        }
+        for reason in found
+    ]
+
+
+def _told(failed: BulkItemRow) -> str:
+    error = failed.error or {}
+    return of_error(error.get("code", ""), error.get("message", ""))
 
 
 def _pace(line: BulkLine, caller: Caller, state: State) -> BulkView | None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from http import HTTPStatus
 from typing import Any
 
 from fastapi import Request, Response
 
+from service.pages.parts.sentences import of_error
 from service.pages.rendering import page
 
 TITLES = {
@@ -32,18 +32,11 @@ KEPT = "Nothing is lost: what you uploaded before is kept, and need not be chose
 
 
 def problem_page(
-    request: Request, status: int, code: str, detail: str, _fields: Mapping[str, Any]
+    request: Request, status: int, code: str, detail: str, fields: Mapping[str, Any]
 ) -> Response:
     """The page of an error."""
-    title = (
-        TITLES_OF_CODES.get(code)
-        or TITLES.get(status)
-        or (
-            "The service failed"
-            if status >= 500
-            else "The service cannot do that: " + HTTPStatus(status).phrase
-        )
-    )
+    usual = "The service failed" if status >= 500 else "The service cannot do that"
+    title = TITLES_OF_CODES.get(code) or TITLES.get(status) or usual
     kept = KEPT if status in (429, 500, 503, 507) else ""
     return page(
         request,
@@ -51,8 +44,16 @@ def problem_page(
         status=status,
         told_status=status,
         title=title,
-        detail=detail,
+        detail=_told(request, code, detail, fields),
         code=code,
         kept=kept,
         linked=status not in WITHOUT_LINKS,
     )
+
+
+def _told(request: Request, code: str, detail: str, fields: Mapping[str, Any]) -> str:
+    if code == "http-404":
+        return f"Nothing is at {request.url.path}. Choose a page above."
+    if any(str(one["at"]).startswith("path/") for one in fields.get("errors", [])):
+        return f"{request.url.path} is not the address of a page. Copy the whole address, or choose a page above."
+    return of_error(code, detail, fields)

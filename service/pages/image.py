@@ -2,30 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import RedirectResponse
+from fastapi.responses import JSONResponse, RedirectResponse
 
-from service.api.estimates import estimate_job
+from service.api.estimates import ChosenPsf, EstimateView, estimate_job
 from service.api.jobs import submit_job
 from service.api.products import ProductView
 from service.http.callers import Caller
 from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.images import image_line
-from service.pages.parts import methods
-from service.pages.parts.forms import Sent, text, wanted_job
-from service.pages.rendering import page
+from service.pages.parts import methods, options
+from service.pages.parts.forms import Sent, fields, text, wanted_job
+from service.pages.parts.sentences import of_problem
+from service.pages.rendering import duration, page
 from service.pages.visitors import PageReading, PageSubmitting
 from workers.catalogue.psfs import PsfFilter
-from workers.catalogue.tables import ImageRow, ProductRow
-from workers.contract.kinds import JobRequest
+from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
+from workers.contract.phases import Phase
 from workers.contract.requests import Identity
 
 MOST_PSFS = MOST_PRODUCTS = 50
+# Statuses of problems that other options of the form can solve.
+OF_OPTIONS = (404, 409, 413, 422)
+TO_ALLOW = ("channel-mismatch", "already-deconvolved", "psf-as-image")
+SURE = "If you are sure, allow it below."
+START, OPEN, CHECK = "Start", "Open the product", "Check and start"
 router = APIRouter(prefix="/images/{image_id}", include_in_schema=False)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What the check of the options found. lines: sentences, the most important first. button: the words on the button."""
+
+    good: bool
+    lines: tuple[str, ...]
+    button: str
+    problem: Problem | None = None
+
+    @property
+    def code(self) -> str:
+        """The code of the problem; empty if there is none."""
+        return "" if self.problem is None else self.problem.code
 
 
 @router.get("")
@@ -33,24 +55,31 @@ def image(image_id: Identity, request: Request, caller: PageReading, state: Shar
     """The image, its PSF and the estimate for the options in the query."""
     row = _find(state, caller, image_id)
     asked = request.query_params
-    estimate, problem = None, None
-    try:
-        estimate = estimate_job(_wanted(image_id, asked), caller, state)
-    except Problem as refused:
-        problem = refused
-    psfs = state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_PSFS)
+    checked = _checked(image_id, asked, caller, state)
+    psfs = _psfs(text(asked, "psf_id"), caller, state)
     products = state.catalogue.page(ProductRow, owner=caller.owner, limit=MOST_PRODUCTS, image_id=image_id)
     return page(
         request,
         "image.html",
         image=row,
         facts=_facts(row),
-        estimate=estimate,
-        problem=problem,
+        checked=checked,
+        ways={} if checked.problem is None else checked.problem.more,
         psfs=psfs,
-        products=[ProductView.of(product) for product in products],
+        unknown=checked.code == "no-psf-for-instrument",
+        products=[product_line(ProductView.of(product)) for product in products],
         methods=methods.choices(),
-        asked=_shown(asked),
+        asked=options.shown(asked),
+    )
+
+
+@router.get("/check")
+def check(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """The check of the options in the query, for the script of the page."""
+    _find(state, caller, image_id)
+    found = _checked(image_id, request.query_params, caller, state)
+    return JSONResponse(
+        {"good": found.good, "lines": found.lines, "button": found.button, "code": found.code}
     )
 
 
@@ -58,30 +87,82 @@ def image(image_id: Identity, request: Request, caller: PageReading, state: Shar
 async def start(
     image_id: Identity, request: Request, response: Response, caller: PageSubmitting, state: Shared
 ) -> Response:
-    """Start the deconvolution with the options of the form, and go to its job or to the product that exists already."""
-    form = await request.form()
-    job = await run_in_threadpool(lambda: submit_job(_wanted(image_id, form), response, caller, state))
+    """Start the deconvolution with the options of the form, and go to its job or to the product that exists already.
+
+    Options that are refused lead back to the page of the image, which keeps them and says why.
+    """
+    form = await fields(request)
+    try:
+        job = await run_in_threadpool(
+            lambda: submit_job(options.wanted(image_id, form), response, caller, state)
+        )
+    except Problem as problem:
+        if problem.status not in OF_OPTIONS:
+            raise
+        return RedirectResponse(options.address(image_id, form), 303)
     return RedirectResponse(f"/jobs/{job.id}", 303)
 
 
-def _wanted(image_id: str, asked: Sent) -> JobRequest:
-    """The request for a job from the options of a form. Raises ``Problem`` 422 for a wrong option."""
-    parameters = {
-        "image_id": image_id,
-        "psf_id": text(asked, "psf_id") or None,
-        "method": methods.chosen(asked),
-        "error_draws": text(asked, "error_draws") or 0,
-        "other_channel": bool(text(asked, "other_channel")),
-        "again": bool(text(asked, "again")),
+@router.post("/build")
+async def build(
+    image_id: Identity, request: Request, response: Response, caller: PageSubmitting, state: Shared
+) -> Response:
+    """Build the PSF of an instrument; then the page of the image is shown with this PSF."""
+    form = await fields(request)
+    asked = wanted_job("psf-build", {"instrument": text(form, "instrument")})
+    job = await run_in_threadpool(lambda: submit_job(asked, response, caller, state))
+    if job.phase == Phase.COMPLETED and job.result is not None:
+        return RedirectResponse(f"/images/{image_id}?psf_id={job.result.rpartition('/')[2]}", 303)
+    return RedirectResponse(f"/jobs/{job.id}?image={image_id}", 303)
+
+
+def product_line(product: ProductView) -> dict[str, Any]:
+    """What the list of the products of an image shows of one."""
+    done = product.details.get("steps_done", product.details["method"]["steps"])
+    return {
+        "id": product.id,
+        "told": f"{product.details['method']['name']}, {done} step{'' if done == 1 else 's'}, PSF {product.psf_version}",
+        "created_at": product.created_at,
     }
-    return wanted_job("deconvolve", parameters)
 
 
-def _shown(asked: Sent) -> dict[str, Any]:
-    """The options as the form shows them again."""
-    names = ("psf_id", "method", "steps", "error_draws", "other_channel", "again")
-    shown = {name: text(asked, name) for name in names}
-    return shown | {"error_draws": shown["error_draws"] or "0", "changed": any(shown.values())}
+def _psfs(chosen: str, caller: Caller, state: State) -> list[PsfRow]:
+    """The PSFs that the form offers: the newest, and the chosen one."""
+    found = list(state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_PSFS))
+    if chosen and chosen not in [psf.id for psf in found]:
+        row = state.catalogue.get(PsfRow, chosen, caller.owner)
+        found += [] if row is None else [row]
+    return found
+
+
+def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> Checked:
+    try:
+        found = estimate_job(options.wanted(image_id, asked), caller, state)
+    except Problem as problem:
+        if problem.status not in OF_OPTIONS:
+            raise
+        advice = (SURE,) if problem.code in TO_ALLOW else ()
+        return Checked(False, (of_problem(problem), *advice), CHECK, problem)
+    return Checked(True, tuple(_lines(found)), OPEN if found.existing else START)
+
+
+def _lines(found: EstimateView) -> list[str]:
+    assert found.psf is not None
+    why = found.psf.why.replace("The request names this PSF.", "You chose this PSF.")
+    lines = [f"{_psf(found.psf)}. {why}"]
+    if found.existing:
+        return [*lines, "This product exists already."]
+    waiting = ""
+    if found.waiting_before:
+        waiting = f", after {found.waiting_before} other job{'' if found.waiting_before == 1 else 's'}"
+    seconds = found.estimate.seconds
+    time = duration(seconds).capitalize() if seconds < 1 else f"About {duration(seconds)}"
+    return [*lines, f"{time} and {found.estimate.memory_mib} MiB{waiting}."]
+
+
+def _psf(psf: ChosenPsf) -> str:
+    status = "" if psf.status is None else f" ({psf.status})"
+    return f"PSF {psf.name}{f' {psf.version}' if psf.version else ''}{status}"
 
 
 def _facts(row: ImageRow) -> list[tuple[str, str]]:

@@ -19,6 +19,7 @@ from service.api.products import ProductView
 from service.http.callers import Caller
 from service.http.quotas import Allowed
 from service.http.state import Shared, State
+from service.pages.jobs import job_lines
 from service.pages.rendering import page, short
 from service.pages.visitors import PageReading, PageSubmitting
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow
@@ -38,11 +39,13 @@ def home(request: Request, caller: PageReading, state: Shared) -> Response:
     return page(
         request,
         "home.html",
-        known=buildable(),
+        known=" and ".join(buildable()),
         most_bytes=state.settings.max_upload_bytes,
         products=[product_card(state, row) for row in catalogue.page(ProductRow, owner=owner, limit=LATEST)],
         images=[image_line(row) for row in images],
-        jobs=[JobView.of(row) for row in catalogue.page(JobRow, owner=owner, limit=LATEST)],
+        jobs=job_lines(
+            [JobView.of(row) for row in catalogue.page(JobRow, owner=owner, limit=LATEST)], caller, state
+        ),
     )
 
 

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from collections.abc import Sequence
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from pydantic import BaseModel
 
 from service.api.jobs import JobId, JobView, cancel_job, get_job, list_jobs
+from service.http.callers import Caller
 from service.http.paging import Cursor
-from service.http.state import Shared
-from service.pages.rendering import page
+from service.http.state import Shared, State
+from service.pages.parts import options
+from service.pages.parts.sentences import of_error
+from service.pages.rendering import page, page_of
 from service.pages.visitors import PageReading, PageSubmitting
 from workers.contract.phases import Phase
+from workers.contract.requests import Identity
 
 PER_PAGE = 50
 TITLES = {
@@ -37,12 +42,28 @@ def job_list(
     """The jobs, newest first."""
     wanted = Phase(phase) if phase in set(Phase) else None
     found = list_jobs(request, caller, state, wanted, PER_PAGE, cursor)
-    return page(request, "jobs.html", jobs=found.items, next=found.next, phases=list(Phase), phase=phase)
+    return page(
+        request,
+        "jobs.html",
+        jobs=job_lines(found.items, caller, state),
+        next=found.next,
+        phases=list(Phase),
+        phase=phase,
+    )
 
 
 @router.get("/{job_id}")
-def job(job_id: JobId, request: Request, caller: PageReading, state: Shared) -> Response:
-    """The state of a job; a script keeps it up to date, and opens the result at its end."""
+def job(
+    job_id: JobId,
+    request: Request,
+    caller: PageReading,
+    state: Shared,
+    image: Annotated[Identity | None, Query()] = None,
+) -> Response:
+    """The state of a job; a script keeps it up to date, and opens the result at its end.
+
+    image: the job builds a PSF for this image; at its end the page of the image is opened, with the PSF chosen.
+    """
     view = get_job(job_id, caller, state)
     return page(
         request,
@@ -52,6 +73,9 @@ def job(job_id: JobId, request: Request, caller: PageReading, state: Shared) -> 
         ended=view.phase.ended,
         waiting_before=view.waiting_before,
         again=_again(view),
+        error=None if view.error is None else of_error(view.error.code, view.error.message),
+        image=image,
+        result=None if view.result is None else result_page(view.result, image),
         parameters=_pretty(view),
     )
 
@@ -65,8 +89,29 @@ def cancel(job_id: JobId, caller: PageSubmitting, state: Shared) -> Response:
 
 def _again(view: JobView) -> str | None:
     """The address where the request can be changed and started again."""
-    image_id = view.parameters.get("image_id")
-    return f"/images/{image_id}" if view.kind == "deconvolve" and image_id else None
+    # The parameters of a job that was not started yet are as the client sent them.
+    whole = {"image_id", "psf_id", "method"} <= view.parameters.keys()
+    return options.address_of(view.parameters) if view.kind == "deconvolve" and whole else None
+
+
+def result_page(result: str, image: str | None) -> str:
+    """The page that follows a job. result: address of its result. image: see ``job``."""
+    return page_of(result) if image is None else f"/images/{image}?psf_id={result.rpartition('/')[2]}"
+
+
+def job_lines(jobs: Sequence[JobView], caller: Caller, state: State) -> list[dict[str, Any]]:
+    """What lists show of jobs: also the name of the file of the image, and the error."""
+    images = [str(job.parameters.get("image_id")) for job in jobs if job.parameters.get("image_id")]
+    names = state.catalogue.bulks.progress.names_of_uploads(images, caller.owner)
+    return [
+        {
+            "view": job,
+            "title": TITLES.get(job.kind, job.kind),
+            "name": names.get(str(job.parameters.get("image_id")), ""),
+            "error": None if job.error is None else of_error(job.error.code, job.error.message),
+        }
+        for job in jobs
+    ]
 
 
 def _pretty(view: BaseModel) -> str:

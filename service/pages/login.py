@@ -10,6 +10,7 @@ from fastapi.responses import RedirectResponse
 from service.http.callers import BEARER, address_of, cookie_name
 from service.http.rates import Bucket
 from service.http.state import Shared, State
+from service.pages.parts.sentences import of_error
 from service.pages.rendering import page
 from service.pages.visitors import PageVisiting
 from workers.catalogue.access.keys import KeyRefused
@@ -56,7 +57,7 @@ def log_in(
         row = state.catalogue.keys.check(key.strip())
     except KeyRefused as refused:
         state.rates.take(Bucket.READS, address_of(request))
-        return _form(request, state, next_address, error=refused.message)
+        return _form(request, state, next_address, error=of_error(refused.code, refused.message))
     state.rates.take(Bucket.SUBMISSIONS, row.id)
     _close(request, state)
     state.catalogue.sessions.sweep()

@@ -8,15 +8,18 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.background import BackgroundTasks
 
+from service.api.bulk import LOOK_FROM
 from service.api.files.pixels import prepare_image
 from service.api.lineage import get_product_lineage, rerun_product
 from service.api.products import ProductView, delete_product, find
 from service.http import downloads
 from service.http.problems import Problem
 from service.http.state import Shared, State
+from service.pages.parts import options
+from service.pages.parts.sentences import of_problem
 from service.pages.rendering import number, page, short
 from service.pages.visitors import PageReading, PageSubmitting
-from workers.catalogue.tables import ImageRow, PsfRow, ReportRow
+from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow
 from workers.contract.requests import Identity
 
 MOST_RERUNS = 10
@@ -43,6 +46,9 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         image_lost=image_lost,
         warnings=[one["message"] for one in row.details.get("warnings", [])],
         changed=_changed(row.details),
+        look_at=(_score(row.details) or 0.0) >= LOOK_FROM,
+        look_from=LOOK_FROM,
+        again=_again(row),
         made=_made(row.details),
         lineage=get_product_lineage(product_id, caller, state),
         reruns=[one for one in reruns if one.kind == "rerun"],
@@ -78,13 +84,26 @@ def _lost(state: State, digest: str, size: int) -> str | None:
     try:
         downloads.found(state.store, digest, size)
     except Problem as problem:
-        return problem.detail
+        return of_problem(problem)
     return None
+
+
+def _again(row: ProductRow) -> str:
+    """The page of the image, with the options of the product."""
+    known = row.details.get("parameters") or {}
+    made = {"image_id": row.image_id, "psf_id": row.psf_id, "method": row.details["method"]}
+    return options.address_of(made | {name: value for name, value in known.items() if name not in made})
+
+
+def _score(details: dict[str, Any]) -> float | None:
+    """The artefact score; None if the version that made the product did not measure it."""
+    artefacts = (details.get("changes") or {}).get("artefacts") or {}
+    score: float | None = artefacts.get("score")
+    return score
 
 
 def _changed(details: dict[str, Any]) -> list[tuple[str, str]]:
     """What the deconvolution changed in the image. Products of earlier versions lack some figures."""
-    artefacts = (details.get("changes") or {}).get("artefacts") or {}
     shown = {
         "Total flux": _percent(details.get("flux_change_pct")),
         "Brightest 1 % of the pixels": _percent(details.get("bright_change_pct")),
@@ -93,7 +112,7 @@ def _changed(details: dict[str, Any]) -> list[tuple[str, str]]:
         "Chi-squared per pixel": number(details.get("chi2_per_pixel")),
         "Negative pixels": _count(details.get("negative_pixels")),
         "Saturated pixels": _count((details.get("masked_pixels") or {}).get("saturated")),
-        "Score of artefacts": number(artefacts.get("score")),
+        "Score of artefacts": number(_score(details)),
     }
     return [(name, text) for name, text in shown.items() if text != "-"]
 

@@ -19,6 +19,7 @@ from markupsafe import Markup
 from service.http.callers import Caller
 from service.http.state import state_of
 from service.pages import assets
+from service.pages.parts.sentences import plain
 from workers.settings import software_version
 
 POLICY = (
@@ -82,7 +83,9 @@ def _environment() -> Environment:
         "duration": duration,
         "number": number,
         "percent": percent,
+        "counted": counted,
         "page_of": page_of,
+        "sentence": plain,
     }
     return made
 
@@ -130,6 +133,11 @@ def number(value: float | None, digits: int = 4) -> str:
         return "-"
     said = f"{value:.{digits}g}"
     return f"{float(said):.0f}" if "e+" in said and abs(value) < PLAIN_BELOW else said
+
+
+def counted(count: int, thing: str) -> str:
+    """A number of things, such as "1 image" or "3 images"."""
+    return f"{count} {thing}{'' if count == 1 else 's'}"
 
 
 def percent(value: float | None) -> str:

@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from astropy.io import fits
+from fastapi.testclient import TestClient
 
+import heliopsf
+from psfcore.fits.cutout import cutout
+from psfcore.fits.header import FitsLimits
+from psfcore.fits.psfs import read_psf
+from psfcore.fits.psfs import write_psf as write_built
+from psfcore.psf_sampling import rebinned
 from psfcore.transit.archive import pack
 from service.client.errors import ServiceError
 from service.local import LocalStore, local_service
-from tests.conftest import write_image, write_psf
+from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from tests.service.conftest import upload
 from tests.transit_files import write_transit
+from workers.cache_folder import psf_cache
 from workers.files.store import sha256_of
 from workers.settings import Settings
 
@@ -79,3 +93,113 @@ def test_a_product_does_not_replace_the_image_that_it_was_made_from(tmp_path: Pa
                 )
             assert caught.value.code == "output-is-input"
             assert sha256_of(tmp_path / "image.fits") == before
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The file of a PSF that a service built, and its id."""
+    folder = tmp_path_factory.mktemp("built")
+    (folder / "small.toml").write_text(SMALL_INSTRUMENT)
+    with local_service() as service:
+        return folder / "p.fits", service.build_psf(folder / "small.toml", folder / "p.fits", size=64)["id"]
+
+
+def test_the_file_of_a_built_psf_keeps_its_id_and_that_of_its_products(
+    built: tuple[Path, str], api: TestClient, run_jobs: Callable[[], None], tmp_path: Path
+) -> None:
+    psf, identity = built
+    write_image(tmp_path / "i.fits", WAVELNTH=171)
+    with local_service() as service:
+        assert service.upload_psf(psf)["id"] == heliopsf.read_psf(psf).provenance["psf_id"] == identity
+        product = service.deconvolve(tmp_path / "i.fits", tmp_path / "o.fits", psf_id=identity, steps=1)
+        assert fits.getheader(tmp_path / "o.fits")["PSFID"] == identity
+        assert service.upload_psf(psf, name="another")["id"] == sha256_of(psf), (
+            "described anew: as in a service"
+        )
+    # The service that built the PSF gives the product the same id.
+    build = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 64}}
+    assert api.post("/v1/jobs", json=build).status_code == 202
+    run_jobs()
+    wanted = {"image_id": upload(api, tmp_path / "i.fits"), "psf_id": upload(api, psf, "/v1/psfs")}
+    wanted |= {"method": {"name": "richardson-lucy", "steps": 1}}
+    asked = api.post("/v1/jobs/identity", json={"kind": "deconvolve", "parameters": wanted}).json()
+    assert (wanted["psf_id"], asked["result_id"]) == (identity, product["id"])
+
+
+@pytest.mark.parametrize("how", ["pixel", "card", "rebinned", "cutout", "rewritten", "without checksums"])
+def test_a_file_that_was_changed_does_not_keep_the_id(
+    built: tuple[Path, str], tmp_path: Path, how: str
+) -> None:
+    limits, changed = FitsLimits(max_pixels=2**20), tmp_path / "changed.fits"
+    shutil.copyfile(built[0], changed)
+    if how == "pixel":
+        with fits.open(changed, mode="update") as hdus:
+            hdus[0].data[3, 3] += np.float32(1e-6)
+    elif how == "card":
+        fits.setval(changed, "PSFNAME", value="mine")
+    elif how == "rebinned":
+        write_built(changed, rebinned(read_psf(built[0], limits), 2))
+    elif how == "cutout":
+        cutout(built[0], 32, limits).write(changed)
+    elif how == "rewritten":
+        write_built(changed, read_psf(built[0], limits))
+    else:
+        with fits.open(built[0]) as hdus:
+            for hdu in hdus:
+                del hdu.header["CHECKSUM"]
+            hdus.writeto(changed, overwrite=True)
+    with local_service() as service:
+        assert service.upload_psf(changed)["id"] == sha256_of(changed) != built[1]
+
+
+def _built(folder: Path) -> tuple[dict[str, Any], list[str], bytes]:
+    """Build the small PSF in a new local service: its description, the stages of the job, and the file."""
+    stages: list[str] = []
+    (folder / "small.toml").write_text(SMALL_INSTRUMENT)
+    with local_service() as service:
+        psf = service.build_psf(
+            folder / "small.toml",
+            folder / "psf.fits",
+            size=64,
+            progress=lambda stage, step, steps: stages.append(stage),
+            overwrite=True,
+        )
+        assert service.ask(psf["id"], "curve", radii=[1.0])["radii_px"] == [1.0]
+    return psf, stages, (folder / "psf.fits").read_bytes()
+
+
+def test_a_psf_is_built_once_and_is_the_same_afterwards(tmp_path: Path) -> None:
+    first, stages, content = _built(tmp_path)
+    assert "building the PSF" in stages
+    again, stages, same = _built(tmp_path)
+    assert "building the PSF" not in stages
+    assert same == content
+    assert again | {"created_at": None} == first | {"created_at": None}
+
+
+def test_a_damaged_psf_of_the_cache_is_built_again(tmp_path: Path) -> None:
+    _, _, content = _built(tmp_path)
+    for file in psf_cache().folder.glob("*.fits"):
+        file.write_bytes(content[:-1] + b"?")
+    _, stages, same = _built(tmp_path)
+    assert "building the PSF" in stages and same == content
+
+
+def test_a_psf_that_python_built_is_used(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
+    heliopsf.build_psf(tmp_path / "small.toml", size=64)
+    used, stages, content = _built(tmp_path)
+    assert "building the PSF" not in stages
+    psf_cache().clear()
+    built, stages, same = _built(tmp_path)
+    assert "building the PSF" in stages and same == content
+    assert used["id"] == built["id"] and used["details"]["provenance"] == built["details"]["provenance"]
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setenv("HELIOPSF_CACHE_DIR", str(tmp_path / "file"))
+    psf, _, _ = _built(tmp_path)
+    assert psf["name"] == "small" and "not kept for later commands" in caplog.text

@@ -56,7 +56,10 @@ def get_psf_for_image(
     context: InContext = None,
     kind: Annotated[str, Query(pattern=WORD)] = TOTAL,
 ) -> Choice:
-    """The PSF for the instrument, channel and time of observation in the image's header."""
+    """The certified PSF for the instrument, channel and time of observation in the image's header, or the PSF that a context pins.
+
+    `POST /v1/estimates` says which PSF a deconvolution would use, also if none is certified.
+    """
     row = state.catalogue.get(ImageRow, image_id, caller.owner)
     if row is None:
         raise Problem(

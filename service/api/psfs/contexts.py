@@ -12,6 +12,7 @@ from service.api.psfs.filters import TEXT
 from service.http.callers import Certifying, KeyFirst, Reading
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, problem
+from service.http.quotas import rows_held
 from service.http.state import Shared
 from workers.catalogue.contexts import NAME, Pin
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow
@@ -146,7 +147,15 @@ def create_context(body: ContextAsked, response: Response, caller: Certifying, s
     contexts = state.catalogue.contexts
     try:
         pins = None if body.pins is None else [_pin(asked) for asked in body.pins]
-        row, new = contexts.create(body.name, caller.owner, caller.name, reason=body.reason, pins=pins)
+        with rows_held():
+            row, new = contexts.create(
+                body.name,
+                caller.owner,
+                caller.name,
+                reason=body.reason,
+                pins=pins,
+                quota_mib=state.settings.quota_mib,
+            )
     except DataError as error:
         raise problem(error) from error
     response.status_code = 201 if new else 200
@@ -178,7 +187,10 @@ def get_default_context(caller: Reading, state: Shared) -> DefaultView:
 def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) -> DefaultView:
     """Set the default context. If `context` is null, there is no default. The history of changes is kept."""
     try:
-        state.catalogue.contexts.set_default(body.context, caller.owner, caller.name, body.reason)
+        with rows_held():
+            state.catalogue.contexts.set_default(
+                body.context, caller.owner, caller.name, body.reason, state.settings.quota_mib
+            )
     except DataError as error:
         raise problem(error) from error
     return get_default_context(caller, state)

@@ -12,6 +12,7 @@ from psfcore.errors import DataError
 from service.api.psfs.filters import TEXT
 from service.http.callers import Caller, Certifying, KeyFirst, Reading
 from service.http.problems import RESPONSES, problem
+from service.http.quotas import rows_held
 from service.http.state import Shared, State
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import PsfChangeRow, PsfRow
@@ -125,7 +126,10 @@ def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, 
     whose range overlaps.
     """
     try:
-        row = state.catalogue.psfs.change(psf_id, caller.owner, _asked(body), caller.name)
+        with rows_held():
+            row = state.catalogue.psfs.change(
+                psf_id, caller.owner, _asked(body), caller.name, state.settings.quota_mib
+            )
     except DataError as error:
         raise problem(error) from error
     log.info("PSF %s: %s, version %s, by %s", row.id, row.status, row.version, caller.name)

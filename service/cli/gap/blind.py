@@ -26,6 +26,8 @@ DIAGNOSE = (
     "{report}",
     "--local",
 )
+# So does the ideal observer: the blind set and the gap library share no code.
+IDEAL = (sys.executable, "-P", "-m", "psfcore.gap.ideal_observer", "{expected}", "{ideal}")
 
 
 @click.command(short_help="Test the diagnosis on simulated cases.")
@@ -45,7 +47,7 @@ DIAGNOSE = (
     type=click.IntRange(1, 64),
     help="Number of diagnoses that run at the same time",
 )
-@click.option("--keep", is_flag=True, help="Keep each transit after its diagnosis")
+@click.option("--keep", is_flag=True, help="Keep the images of each case after their use")
 @click.option("--scenes", multiple=True, type=FILE, help="Take scenes from these images (FITS), in turn")
 @click.option(
     "--only", multiple=True, metavar="EFFECT", help="Withhold only these effects, one per case, in turn"
@@ -57,6 +59,12 @@ DIAGNOSE = (
     type=click.FloatRange(0.05, 50),
     metavar="PCT",
     help="Residual that the effect of a case leaves in the discs after a refit; repeat to vary it [default: random, 0.5 to 10]",
+)
+@click.option(
+    "--simulator",
+    default="",
+    metavar="FILE.py|MODULE",
+    help="Let the function make_case of this file or module make the cases; its code is executed (docs/gap.md)",
 )
 @click.option("--clean-only", is_flag=True, help="Make only cases without an effect, to count false alarms")
 @click.option(
@@ -78,6 +86,7 @@ def blind(
     scenes: tuple[Path, ...],
     only: tuple[str, ...],
     left_pct: tuple[float, ...],
+    simulator: str,
     clean_only: bool,
     synthetic: bool,
     make_only: bool,
@@ -93,8 +102,13 @@ def blind(
 
     if clean_only and only:
         raise click.UsageError("expected one of --clean-only and --only; got both")
+    if simulator and (only or clean_only or synthetic or left_pct or scenes):
+        raise click.UsageError(
+            "expected --simulator without --only, --left, --scenes, --clean-only and --synthetic, because the simulator "
+            "chooses its cases; got one of them"
+        )
     with user_errors(), alone_in(output):
-        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct)
+        plan = SetPlan(cases, seed, size, images, 0, only, clean_only, not synthetic, left_pct, simulator)
         planes = [image_rate(file, limits()) for file in scenes]
         made, not_made = make_set(output, plan, scenes=planes, processes=processes, progress=say)
         numbers = [number for number in plan.numbers if number not in not_made]
@@ -106,7 +120,7 @@ def blind(
         if make_only:
             click.echo(f"{output}: {len(numbers)} of {cases} cases made and sealed")
             return
-        run_set(made, numbers, DIAGNOSE, processes=processes, keep=keep, progress=say)
+        run_set(made, numbers, DIAGNOSE, ideal=IDEAL, processes=processes, keep=keep, progress=say)
         click.echo(write_score(made, numbers, not_made))
 
 

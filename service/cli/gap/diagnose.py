@@ -11,6 +11,7 @@ import click
 
 from service.cli.connection import LOCAL, SERVER, connection, named_psf, psf_option
 from service.cli.gap.blind import blind
+from service.cli.gap.plan import plan
 from service.cli.options import (
     JSON,
     NOISE,
@@ -64,6 +65,13 @@ def gap() -> None:
     metavar="FILE.py|MODULE[,...]",
     help="Also test the effects in these files, whose code is executed. Only with --local; in a service set HELIOPSF_GAP_EFFECTS",
 )
+@click.option(
+    "--coverage",
+    default=0.9,
+    show_default=True,
+    type=click.FloatRange(0.5, 0.95),
+    help="Probability with which the answer set contains the true cause",
+)
 @SEED
 @NOISE
 @SATURATION
@@ -78,6 +86,7 @@ def diagnose(
     psf: str | None,
     corrected_file: Path | None,
     effects: str | None,
+    coverage: float,
     seed: int,
     noise: tuple[float, float] | None,
     saturation_dn: float | None,
@@ -110,6 +119,7 @@ def diagnose(
             psf_id=named_psf(service, psf),
             saturation_dn=saturation_dn,
             seed=seed,
+            coverage=coverage,
             # A service always makes the corrected PSF and keeps it, so that later requests find it.
             correct=corrected_file is not None or not local,
             overwrite=overwrite,
@@ -127,7 +137,7 @@ def diagnose(
 
 def _lines(report: dict[str, Any]) -> list[str]:
     """The report as lines to print."""
-    so_far = "best so far: " if report["verdict"] == "inconclusive" else ""
+    so_far = "most probable: " if report["verdict"] == "inconclusive" else ""
     answer = f" ({so_far}{', '.join(report['answer'])})" if report["answer"] else ""
     out = [report["sentence"], f"verdict: {report['verdict']}{answer}"]
     together = report.get("together", ())  # reports of earlier versions lack this key
@@ -135,14 +145,15 @@ def _lines(report: dict[str, Any]) -> list[str]:
         closure = effect["closure"]
         closed = "" if closure is None else f", held-out closure {100 * closure['value']:.0f} %"
         numbers = ", ".join(
-            f"{name} {p['value']:.3g} +- {p['sigma']:.2g} {p['unit']}".strip()
+            f"{name} {p['value']:.3g} ± {p['sigma']:.2g} {p['unit']}".strip()
             for name, p in effect["parameters"].items()
         )
-        out.append(f"  {effect['name']:<24} p = {effect['p_value']:.2g}{closed}: {numbers}")
-    out += [f"  looks like: {one['form']} (score {one['score']:.1f})" for one in report["looks_like"]]
+        out.append(f"  {effect['name']:<24} P = {effect['probability']:.2f}{closed}: {numbers}")
+    out += [f"  looks like: {one['form']} (P = {one['probability']:.2f})" for one in report["looks_like"]]
     out += [f"  not testable: {one['name']} ({one['why']})" for one in report["untestable"]]
     return out + [f"  caution: {caution}" for caution in report["cautions"]]
 
 
 gap.add_command(blind)
+gap.add_command(plan)
 COMMANDS = (gap,)

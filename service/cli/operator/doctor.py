@@ -37,6 +37,7 @@ State = Literal["ok", "warning", "broken"]
 SIGNS: dict[State, str] = {"ok": "green", "warning": "yellow", "broken": "red"}
 PINS = Path(__file__).parents[3] / "constraints.txt"
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+EXTRAS = ("service", "fit", "plot")  # of which the commands need all packages
 LITTLE_ROOM_BYTES = 5 * 2**30
 
 
@@ -108,7 +109,7 @@ def versions(pins: Path = PINS) -> Finding:
     wrong, other, count = [], [], 0
     tested = _pinned(pins)
     for requirement in map(Requirement, requires("heliopsf") or []):
-        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+        if requirement.name == "heliopsf" or not _is_needed(requirement):
             continue
         count += 1
         try:
@@ -361,6 +362,13 @@ def _database(settings: Settings) -> tuple[str, bool]:
 
 def _start(settings: Settings) -> str:
     return "`heliopsf serve` starts one" if settings.embedded else "start `heliopsf worker`"
+
+
+def _is_needed(requirement: Requirement) -> bool:
+    """Whether the commands and the service need a library: it is required always, or by one of their extras."""
+    return requirement.marker is None or any(
+        requirement.marker.evaluate({"extra": extra}) for extra in ("", *EXTRAS)
+    )
 
 
 def _pinned(file: Path) -> dict[str, str]:

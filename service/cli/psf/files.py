@@ -7,19 +7,20 @@ from pathlib import Path
 import click
 
 from service.cli.connection import SERVER, id_argument, remote, short
-from service.cli.options import JSON, OUTPUT, PLOT, user_errors, writes_files
+from service.cli.options import JSON, OUTPUT_PLACE, PLOT, Place, user_errors, writes_files
 
 
 @click.command("download")
 @id_argument()
-@click.option("-o", "--output", required=True, type=OUTPUT, help="Write the PSF (FITS)")
+@click.option("-o", "--output", required=True, type=OUTPUT_PLACE, metavar="FILE|FOLDER/",
+              help="Write the PSF (FITS) to this file, or into this folder")  # fmt: skip
 @PLOT
 @JSON
 @SERVER
 @writes_files
 def download(
     identity: str,
-    output: Path,
+    output: Place,
     plot: Path | None,
     json_file: Path | None,
     server: str | None,
@@ -28,10 +29,11 @@ def download(
     """Download a PSF, and if wanted its plot and the report of its fit."""
     with user_errors(), remote(server) as service:
         found = service.psf(identity)
-        for part, path in (("file", output), ("preview", plot), ("report", json_file)):
+        file = output.file(f"psf-{short(found['id'])}.fits")
+        for part, path in (("file", file), ("preview", plot), ("report", json_file)):
             if path is not None:
                 service.download(f"/v1/psfs/{found['id']}/{part}", path, overwrite=overwrite)
-    click.echo(f"{output}: PSF {short(found['id'])}, {found['name']} {found['version']} ({found['status']})")
+    click.echo(f"{file}: PSF {short(found['id'])}, {found['name']} {found['version']} ({found['status']})")
 
 
 @click.command("instruments")

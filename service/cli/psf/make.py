@@ -130,12 +130,12 @@ def fit(
     click.echo(f"{output}: {fitted['name']} {fitted['version']} ({fitted['status']})")
     click.echo(found["sentence"])
     for name, parameter in found["parameters"].items():
-        click.echo(f"  {name:<12} {parameter['value']:10.4f} +- {parameter['sigma']:.4f} {parameter['unit']}")
+        click.echo(f"  {name:<12} {parameter['value']:10.4f} ± {parameter['sigma']:.4f} {parameter['unit']}")
     curve = found["curve"]
     for radius, beyond, sigma in zip(
         curve["radii_px"], curve["light_beyond_pct"], curve["sigma"], strict=True
     ):
-        click.echo(f"  light beyond {radius:>6g} px  {beyond:6.2f} +- {sigma:.2f} %")
+        click.echo(f"  light beyond {radius:>6g} px  {beyond:6.2f} ± {sigma:.2f} %")
     for limit in found["limits"]:
         click.echo(f"  note: {limit}")
 

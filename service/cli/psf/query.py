@@ -183,7 +183,7 @@ def _width(name: str, sigma: dict[str, Any]) -> int:
 
 
 def _with_sigma(value: float, sigma: float | None) -> str:
-    return f"{value:.3f}" if sigma is None else f"{value:.3f} +- {sigma:.3f}"
+    return f"{value:.3f}" if sigma is None else f"{value:.3f} ± {sigma:.3f}"
 
 
 def _annulus_lines(answer: dict[str, Any]) -> list[str]:

@@ -11,10 +11,11 @@ import click
 
 from service.cli.connection import CONTEXT, ID, SERVER, id_argument, remote, short, whole_id, whole_ids
 from service.cli.options import FILE, JSON, progress_bar, user_errors, write_json, writes_files
+from workers.versions.series import TOTAL
 from workers.versions.status import PsfStatus
 
 if TYPE_CHECKING:
-    pass
+    from service.client.http import Client
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 REASON = click.option("--reason", default="", help="Reason, kept in the history")
@@ -155,7 +156,8 @@ def delete_psf(psf_id: str, server: str | None) -> None:
 def best(
     image: Path | None, json_file: Path | None, server: str | None, overwrite: bool, **filters: str | None
 ) -> None:
-    """Find the PSF that fits an image, or the PSF that has the given properties."""
+    """Show the PSF with which `heliopsf deconvolve` would deconvolve an image, and why; or find the PSF that has the given
+    properties. With --kind other than total, only certified PSFs and those of a context are searched for an image."""
     given = _given(filters)
     if image is not None and set(given) - {"context", "kind"}:
         raise click.UsageError(
@@ -164,10 +166,15 @@ def best(
     with user_errors(), remote(server) as service:
         if image is None:
             found = service.best_psf(**given)
+        elif given.get("kind", TOTAL) == TOTAL:
+            found = _chosen(service, image, given.get("context"))
         else:
             found = service.psf_for_image(service.upload_image(image)["id"], **given)
     psf = found["psf"]
-    click.echo(f"{short(psf['id'])}  {psf['name']}  {psf['version']}  {psf['status']}{_validity(psf)}")
+    status = "not built yet" if psf["status"] is None else f"{psf['status']}{_validity(psf)}"
+    click.echo(f"{short(psf['id'])}  {psf['name']}  {psf['version']}  {status}")
+    if "why" in found:
+        click.echo(f"  {found['why']}")
     write_json(json_file, found, overwrite=overwrite)
 
 
@@ -206,6 +213,14 @@ def rerun(identity: str, product: bool, json_file: Path | None, server: str | No
 
 
 COMMANDS = (list_psfs, upload_psf, certify, deprecate, delete_psf, best, lineage, rerun)
+
+
+def _chosen(service: Client, image: Path, context: str | None) -> dict[str, Any]:
+    """The PSF that a deconvolution of an image would use, and why. A PSF that is not built yet has no description of its own."""
+    image_id = service.upload_image(image)["id"]
+    chosen = service.estimate("deconvolve", image_id=image_id, context=context)["psf"]
+    psf = chosen if chosen["status"] is None else service.psf(chosen["id"])
+    return {"psf": psf, "why": chosen["why"]}
 
 
 def _given(filters: dict[str, str | None]) -> dict[str, str]:

@@ -11,7 +11,7 @@ import click
 
 from service.cli.connection import SERVER, id_argument, remote, short
 from service.cli.options import JSON, progress_bar, user_errors, write_json, writes_files
-from service.cli.progress import duration
+from service.cli.progress import duration, told
 from service.client.errors import ServiceError
 from workers.contract.phases import Phase
 
@@ -22,6 +22,7 @@ NEXT = {
     "reports": "report {id}: repeat the command that started the job; it ends at once and writes its files",
     "bulk": "bulk run {id}: heliopsf bulk status {id}{at}",
 }
+NAMES = {"products": "product", "psfs": "PSF", "reports": "report", "bulk": "bulk run"}
 MOST = click.option(
     "--most",
     default=20,
@@ -116,13 +117,15 @@ def _state(found: dict[str, Any], server: str | None) -> str:
         return str(found["error"]["message"])
     if found["result"] is not None:
         things, identity = found["result"].split("/")[-2:]
+        if found["result_deleted"]:
+            return f"{NAMES[things]} {short(identity)} was deleted; the same request makes it again"
         at = "" if server is None else f" --server {server}"
         return NEXT[things].format(id=short(identity), at=at)
     now = found["progress"]
-    if not now["steps"]:
+    if Phase(found["phase"]) != Phase.EXECUTING:
         return ""
     left = "" if now["time_left_s"] is None else f", {duration(now['time_left_s'])} left"
-    return f"{now['stage']}: step {now['step']} of {now['steps']}{left}"
+    return f"{told(now['stage'], now['step'], now['steps'])}{left}"
 
 
 def _lines(found: dict[str, Any], server: str | None) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from service.cli.connection import ID, SERVER, id_argument, remote, short, whole_id
-from service.cli.options import OUTPUT, PLOT, user_errors, writes_files
+from service.cli.options import OUTPUT, OUTPUT_PLACE, PLOT, Place, user_errors, writes_files
 from service.cli.results.job import MOST, moment
 
 
@@ -45,7 +45,8 @@ def list_products(image_id: str | None, psf_id: str | None, most: int, server: s
 
 @product.command("get", short_help="Download a product.")
 @id_argument()
-@click.option("-o", "--output", type=OUTPUT, help="Write the product (FITS)")
+@click.option("-o", "--output", type=OUTPUT_PLACE, metavar="FILE|FOLDER/",
+              help="Write the product (FITS) to this file, or into this folder")  # fmt: skip
 @PLOT
 @click.option(
     "--changes", type=OUTPUT, help="Write difference, ratio and histograms (PNG), if the job drew them"
@@ -54,19 +55,22 @@ def list_products(image_id: str | None, psf_id: str | None, most: int, server: s
 @writes_files
 def get(
     identity: str,
-    output: Path | None,
+    output: Place | None,
     plot: Path | None,
     changes: Path | None,
     server: str | None,
     overwrite: bool,
 ) -> None:
     """Download a product and its pictures. Name at least one output."""
-    parts = {"file": output, "preview": plot, "changes": changes}
-    wanted = {part: path for part, path in parts.items() if path is not None}
-    if not wanted:
+    if output is None and plot is None and changes is None:
         raise click.UsageError("expected an output: -o FILE, --plot FILE or --changes FILE; got none of them")
     with user_errors(), remote(server) as service:
         found = service.product(identity)
+        # Products of earlier versions have no name of their own.
+        name = found["details"].get("filename", f"heliopsf-{short(found['id'])}.fits")
+        file = None if output is None else output.file(name)
+        parts = {"file": file, "preview": plot, "changes": changes}
+        wanted = {part: path for part, path in parts.items() if path is not None}
         for part, path in wanted.items():
             service.download(f"/v1/products/{found['id']}/{part}", path, overwrite=overwrite)
     written = ", ".join(str(path) for path in wanted.values())

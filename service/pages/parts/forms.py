@@ -47,7 +47,11 @@ def noise(form: Sent) -> dict[str, Any]:
     try:
         figures = {name: float(value) for name, value in given.items()}
     except ValueError as error:
-        raise Problem(422, "invalid-request", f"noise: expected numbers in DN; got {given}") from error
+        raise Problem(
+            422,
+            "invalid-request",
+            f"expected photon gain and read noise as numbers in DN; got {', '.join(given.values())}",
+        ) from error
     return {"noise": figures} if figures else {}
 
 

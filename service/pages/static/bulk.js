@@ -1,6 +1,6 @@
 // Keeps the bulk runs that a page shows up to date. Elements with data-bulk hold parts with data-part.
 import { listen } from "./events.js";
-import { duration, json, moment } from "./page.js";
+import { duration, element, json, moment, sentence, whileThere } from "./page.js";
 
 const AT_WORK = ["LISTING", "RUNNING"];
 const OPEN = [...AT_WORK, "PAUSED", "ERROR"];
@@ -10,14 +10,18 @@ const lost = document.getElementById("lost");
 const newer = document.getElementById("newer");
 const doneAtFirst = one === null ? 0 : Number(one.querySelector('[data-part="done"]').textContent);
 
+let failedShown = one === null ? 0 : Number(one.querySelector('[data-part="failed"]').textContent);
+
 function show(place, run) {
   const tell = (name, text) => {
     const part = place.querySelector(`[data-part="${name}"]`);
     if (part !== null && part.textContent !== text) part.textContent = text;
   };
   const phase = place.querySelector('[data-part="phase"]');
-  phase.className = `phase ${run.phase}`;
-  tell("phase", run.phase);
+  const { total, failed } = run.images;
+  const flawed = run.phase === "COMPLETED" && failed > 0;
+  phase.className = `phase ${flawed ? "flawed" : run.phase}`;
+  tell("phase", flawed ? `COMPLETED, ${failed} of ${total} failed` : run.phase);
   for (const [name, count] of Object.entries(run.images)) tell(name, String(count));
   const pace = place === one || AT_WORK.includes(run.phase) ? run.images_an_hour : null;
   const unknown = place === one ? "unknown" : "";
@@ -27,17 +31,28 @@ function show(place, run) {
   if (place === one) showOne(run);
 }
 
+/** Show the failures by reason. failed: their number. */
+async function explain(failed) {
+  failedShown = failed;
+  const found = await json(`/bulk/${one.dataset.bulk}/reasons`);
+  const rows = found.map(({ images, code, told }) =>
+    element("tr", {}, element("td", { class: "number" }, images), element("td", {}, element("code", {}, code)), element("td", { class: "name" }, told)));
+  document.querySelector("#reasons tbody").replaceChildren(...rows);
+  document.getElementById("reasons").hidden = rows.length === 0;
+}
+
 function showOne(run) {
   const part = (name) => one.querySelector(`[data-part="${name}"]`);
   const { total, done, failed } = run.images;
   part("bar").max = total || 1;
   part("bar").value = done + failed;
   part("error").hidden = run.error === null;
-  part("error").textContent = run.error === null ? "" : run.error.message;
+  part("error").textContent = run.error === null ? "" : sentence(run.error.message);
   part("ended").textContent = moment(run.ended_at);
   for (const change of one.querySelectorAll("[data-phases]")) {
     change.hidden = !change.dataset.phases.split(" ").includes(run.phase) || (change.hasAttribute("data-failed") && failed === 0);
   }
+  if (failed !== failedShown) explain(failed);
   const more = done - doneAtFirst;
   newer.hidden = more <= 0;
   newer.firstElementChild.textContent = more === 1 ? "One more image is done." : `${more} more images are done.`;
@@ -56,11 +71,12 @@ async function look() {
   }
 }
 
+for (const form of document.querySelectorAll("#bulk form")) whileThere(form, lost);
 listen(({ name, data }) => {
   if (name === "bulk" && places.has(data.id)) show(places.get(data.id), data);
   if (lost !== null && name === "lost") {
     lost.hidden = false;
-    lost.textContent = "The service does not answer. The run continues when the service is back, and so does this page.";
+    lost.textContent = "The service does not answer. When it is back, the run continues and this page updates itself.";
   }
   if (name === "found") {
     if (lost !== null) lost.hidden = true;

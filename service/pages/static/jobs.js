@@ -1,11 +1,12 @@
 // Keeps the jobs that a page shows up to date. Elements with data-job hold parts with data-part.
 import { listen } from "./events.js";
-import { duration, element, json, moment } from "./page.js";
+import { duration, element, json, moment, sentence, whileThere } from "./page.js";
 
 const ENDED = ["COMPLETED", "ERROR", "ABORTED"];
 
 function progress(job) {
   if (job.phase === "QUEUED") return "waiting";
+  if (job.error !== null) return sentence(job.error.message);
   if (job.phase !== "EXECUTING") return "";
   const { stage, step, steps, time_left_s: left } = job.progress;
   const pace = left === null ? "" : `, ${duration(left)} left`;
@@ -22,12 +23,18 @@ export function pageOf(result) {
   return result.replace(/^\/v1/, "");
 }
 
+/** The page that follows a job: that of its result, or that of the image for which a PSF was built. */
+function nextPage(place, job) {
+  const image = place.dataset.image;
+  return image ? `/images/${image}?psf_id=${job.result.split("/").pop()}` : pageOf(job.result);
+}
+
 function show(place, job) {
   const part = (name) => place.querySelector(`[data-part="${name}"]`);
   const phase = part("phase");
   phase.textContent = job.phase;
   phase.className = `phase ${job.phase}`;
-  part("progress").textContent = progress(job);
+  part("progress").textContent = place.id === "job" && job.error !== null ? "" : progress(job);
   if (place.id === "job") return showOne(place, part, job);
   if (job.result !== null) part("result").replaceChildren(element("a", { href: pageOf(job.result) }, "open"));
 }
@@ -42,7 +49,7 @@ function showOne(place, part, job) {
   if (typeof job.waiting_before === "number") waiting.textContent = placeInQueue(job.waiting_before);
   const error = part("error");
   error.hidden = job.error === null;
-  error.textContent = job.error === null ? "" : job.error.message;
+  error.textContent = job.error === null ? "" : sentence(job.error.message);
   const again = part("again");
   if (again) again.hidden = !["ERROR", "ABORTED"].includes(job.phase);
   part("started").textContent = moment(job.started_at);
@@ -53,9 +60,9 @@ function showOne(place, part, job) {
   if (cancel) cancel.hidden = true;
   part("done").hidden = job.result === null;
   if (job.result === null) return;
-  part("result").href = pageOf(job.result);
+  part("result").href = nextPage(place, job);
   // Back must lead to the page before the job, not to a page that leads on at once.
-  if (place.dataset.follow === "yes") location.replace(pageOf(job.result));
+  if (place.dataset.follow === "yes") location.replace(nextPage(place, job));
 }
 
 const places = new Map([...document.querySelectorAll("[data-job]")].map((place) => [place.dataset.job, place]));
@@ -76,12 +83,14 @@ async function look() {
   }
 }
 
+const cancel = document.querySelector("[data-part=cancel]");
+if (cancel !== null) whileThere(cancel, lost);
 if (open().length > 0) {
   listen(({ name, data }) => {
     if (name === "job" && places.has(data.id)) show(places.get(data.id), data);
     if (lost !== null && name === "lost") {
       lost.hidden = false;
-      lost.textContent = "The service does not answer. The job goes on when the service is back, and so does this page.";
+      lost.textContent = "The service does not answer. When it is back, the job continues and this page updates itself.";
     }
     if (name === "found") {
       if (lost !== null) lost.hidden = true;

@@ -73,7 +73,27 @@ export function forgetEndOfSession() {
 /** What to say of an error. */
 export function told(error) {
   if (error instanceof TypeError) return "The service does not answer. Nothing is lost: wait a moment, then try again.";
-  return error.message;
+  return sentence(error.message);
+}
+
+/** A message of the service as a sentence for people: without what only commands and programs need. */
+export function sentence(message) {
+  const text = message.replace(/\s*\((?:--|psf_id\b)[^()]*\)|\s*\([^()]*(?:in a request|on the command line)[^()]*\)/g, "").trim();
+  return text.charAt(0).toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".");
+}
+
+/** Send a form only while the service answers: otherwise the browser would leave the page for an error page of its own. */
+export function whileThere(form, place) {
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    try {
+      await request("/v1/jobs?limit=1");
+    } catch (error) {
+      if (error.shown) return;
+      if (error instanceof TypeError) return say(place, told(error));
+    }
+    form.submit();
+  });
 }
 
 /** Show a message in an element with the role status or alert; null hides it. */

@@ -1,5 +1,5 @@
 // Sends a file and shows how much has arrived, in the elements sending, sending-name, sending-done, sending-bar and stop.
-import { forgetEndOfSession, request, say, serviceError, size } from "./page.js";
+import { forgetEndOfSession, request, say, serviceError, size, told } from "./page.js";
 
 const part = (name) => document.getElementById(name);
 
@@ -8,7 +8,7 @@ export function send(file, name, address, type, said, arrived) {
   const sending = part("sending");
   const done = part("sending-done");
   const post = new XMLHttpRequest();
-  const refused = (error) => error.shown || say(said, error.message, "error");
+  const refused = (error) => error.shown || say(said, told(error), "error");
   const lost = () => say(said, `The connection to the service ended before all of ${name} had arrived. Nothing was kept of it. The file is still chosen: send it again.`, "error");
   forgetEndOfSession();
   post.open("POST", `${address}?filename=${encodeURIComponent(name)}`);

@@ -98,10 +98,14 @@ async function check(manifest, files) {
   show(found.errors, found.unknown);
   const count = found.errors.length;
   if (count > 0) return say(said, `${manifest.name} has ${count} error${count === 1 ? "" : "s"}. Correct ${count === 1 ? "it" : "them"} and choose it again.`, "error");
-  if (files === null) return say(said, `${manifest.name} is correct; it names ${found.files.length} files. Choose the folder to check that they are there.`, "good");
+  if (files === null) return say(said, `${manifest.name} is correct; it names ${counted(found.files.length)}. Choose the folder to check that they are there.`, "good");
   const whole = checked.reduce((sum, file) => sum + file.size, 0);
   sendFolder.hidden = false;
-  say(said, `${manifest.name} is correct, and all ${found.files.length} files that it names are there (${size(whole)}).`, "good");
+  say(said, `${manifest.name} is correct, and its ${counted(found.files.length)} ${found.files.length === 1 ? "is" : "are"} there (${size(whole)}). The names and sizes were checked. The service checks the content of the files after the upload.`, "good");
+}
+
+function counted(files) {
+  return files === 1 ? "1 file" : `${files} files`;
 }
 
 /** Compare the names in transit.json with the chosen files; files that it does not name are not sent. */

@@ -12,9 +12,8 @@ export async function refused(file, most) {
   const start = new Uint8Array(await file.slice(0, 9).arrayBuffer());
   const zipped = start[0] === 0x1f && start[1] === 0x8b;
   const text = String.fromCharCode(...start);
-  if (!zipped && text !== "SIMPLE  =") {
-    return `Expected a FITS file, which starts with "SIMPLE  ="; ${file.name} starts with ${JSON.stringify(text)}. Choose another file.`;
-  }
+  if (file.size === 0) return `${file.name} is empty. Choose another file.`;
+  if (!zipped && text !== "SIMPLE  =") return `${file.name} is not a FITS file: a FITS file begins with SIMPLE. Choose another file.`;
   return null;
 }
 

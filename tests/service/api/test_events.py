@@ -49,7 +49,9 @@ def test_a_job_is_followed_to_its_end(live: Live) -> None:
     live.catalogue.jobs.complete(lease, "r" * 64)
     following.join(10)
     assert [event["phase"] for event in seen] == ["EXECUTING", "EXECUTING", "COMPLETED"]
-    assert seen[1]["progress"]["stage"] == "building" and seen[2] == live.client.job(job_id)
+    assert seen[1]["progress"]["stage"] == "building" and seen[2]["result"].endswith("r" * 64)
+    # The result that this job names was never made; only the answer about one job looks whether it is there.
+    assert {**seen[2], "result_deleted": True} == live.client.job(job_id)
     assert live.streams() == 0
 
 

@@ -35,7 +35,9 @@ def test_bad_files_are_named_and_the_run_starts_with_the_others(
     assert told.endswith("Error: 2 files were not uploaded; the reasons are listed above\n")
     [run] = api.get("/v1/bulk").json()["items"]
     assert run["total"] == 2 and f"bulk {run['id'][:12]}" in told
-    assert f"{run['id'][:12]}  " in command("bulk", "status")
+    [line] = command("bulk", "list").splitlines()
+    assert line.startswith(f"{run['id'][:12]}  RUNNING") and "0 of 2 done, 0 failed" in line
+    assert "0 of 2 done" in command("bulk", "status", run["id"][:8])
     assert "CANCELLED" in command("bulk", "cancel", run["id"][:8])
 
 
@@ -45,6 +47,7 @@ def test_a_folder_of_bad_files_starts_nothing(
     psf = upload(api, psf_file, "/v1/psfs")
     for name in ("1.fits", "3.fits"):
         (folder / name).unlink()
+    assert "no bulk run yet" in command("bulk", "list")
     told = command("bulk", "submit", "--upload", folder, "--psf", psf, code=1)
     assert "no file could be uploaded, so no bulk run was started" in told
     assert api.get("/v1/bulk").json()["items"] == api.get("/v1/images").json()["items"] == []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +43,8 @@ def test_images_go_into_a_folder(folder: Path, given: str) -> None:
     done = run("deconvolve", *images, "-o", f"{folder}/out/", *options(folder))
     assert done.exit_code == 0, done.output
     count = 1 if given == "one" else 2
-    assert f"{count} images: {count} deconvolved, 0 existed already, 0 failed" in done.output
+    named = "1 image" if count == 1 else f"{count} images"
+    assert f"{named}: {count} deconvolved, 0 existed already, 0 failed" in done.output
     made = sorted((folder / "out").iterdir())
     assert [path.name.split("-")[0] for path in made] == ["0", "1"][:count]
     again = run("deconvolve", *images, "-o", folder / "out", *options(folder))
@@ -62,6 +65,18 @@ def test_a_failure_is_named_and_ends_with_status_1(folder: Path) -> None:
     assert "3 images: 2 deconvolved, 0 existed already, 1 failed" in done.output
     assert "1 of 3 images failed" in done.output
     assert len(list((folder / "out").iterdir())) == 2
+
+
+def test_an_error_is_told_once_with_local(folder: Path) -> None:
+    """In a process of its own, because pytest replaces the handlers of the logs."""
+    wrong = ("--errors", 2, "--steps", 1, "--psf", folder / "psf.dat", "--local")
+    line = ("deconvolve", folder / "in" / "0.fits", "-o", folder / "o.fits", *wrong)
+    done = subprocess.run(
+        [sys.executable, "-m", "service.cli", *map(str, line)], capture_output=True, text=True
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("expected noise (photon_gain_dn and read_noise_dn)") == 1, done.stderr
+    assert "job " not in done.stderr
 
 
 def test_what_does_not_fit_together_is_refused(folder: Path) -> None:
@@ -102,6 +117,9 @@ def test_a_bulk_run_with_failures_ends_with_status_1(
 
         def bulk(self, bulk_id: str) -> dict[str, Any]:
             return bulk
+
+        def psf(self, psf_id: str) -> dict[str, Any]:
+            return {"status": "draft"}
 
         def submit_bulk(self, **_: Any) -> dict[str, Any]:
             return bulk

@@ -73,8 +73,18 @@ def test_names_are_completed_without_importing_commands() -> None:
             WaitInterrupted("job", "0123456789abcdef" * 2, "http://127.0.0.1:8765"),
             [
                 "job 0123456789ab goes on",
+                "run the same command again",
                 "heliopsf job wait 0123456789ab\n",
+                "heliopsf product get ID -o FILE",
                 "heliopsf job cancel 0123456789ab\n",
+            ],
+        ),
+        (
+            WaitInterrupted("job", "a" * 32, "http://127.0.0.1:8765", ("b" * 32, "c" * 32)),
+            [
+                "jobs aaaaaaaaaaaa bbbbbbbbbbbb cccccccccccc go on",
+                "heliopsf job wait aaaaaaaaaaaa bbbbbbbbbbbb cccccccccccc\n",
+                "heliopsf job cancel aaaaaaaaaaaa bbbbbbbbbbbb cccccccccccc\n",
             ],
         ),
         (

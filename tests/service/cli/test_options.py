@@ -138,3 +138,32 @@ def test_warnings_of_a_product_are_printed(tmp_path: Path) -> None:
     assert refused.exit_code == 1 and "--other-channel" in refused.output
     taken = CliRunner().invoke(main, [*arguments, "--other-channel"])
     assert taken.exit_code == 0 and "warning: the PSF" in taken.stderr and "193 angstrom" in taken.stderr
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "deconvolve IMAGE -o - --local",
+        "psf show IMAGE --plot -",
+        "simulate transit -o -",
+        "psf query IMAGE --json -",
+    ],
+)
+def test_a_minus_is_no_name_of_an_output(
+    line: str, image_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(image_file.parent)
+    refused = CliRunner().invoke(main, line.replace("IMAGE", str(image_file)).split())
+    assert refused.exit_code == 2 and "'./-' is a file of this name" in refused.output
+    assert not (image_file.parent / "-").exists()
+
+
+def test_numbers_and_lists_in_sentences() -> None:
+    assert [cli_options.counted(n, "image") for n in (0, 1, 2)] == ["0 images", "1 image", "2 images"]
+    assert [cli_options.listed("abc"[:n]) for n in (1, 2, 3)] == ["a", "a and b", "a, b and c"]
+
+
+def test_a_missing_key_is_told_as_a_command_needs_it() -> None:
+    refused = ServiceError("expected a key: 'Authorization: Bearer ...'", status=401, code="no-key")
+    with pytest.raises(click.ClickException, match="set HELIOPSF_KEY"), cli_options.user_errors():
+        raise refused

@@ -33,7 +33,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, diffraction: Path) -> Path:
     folder = tmp_path_factory.mktemp("transits") / "one"
     result = run("transit", "-o", folder, *SMALL, "--diffraction", diffraction, "--stretch", "0.1")
     assert result.exit_code == 0, result.output
-    assert "3 images of 64 x 64 px" in result.output
+    assert "3 images of 64 x 64 px, 3 pointings, exposures of 1.8 and 5 s" in result.output
     return folder
 
 
@@ -45,6 +45,26 @@ def test_a_folder_is_written_with_its_truth(made: Path) -> None:
     truth = json.loads((made / "truth.json").read_text())
     assert truth["psf"]["b"] == 6.15 and truth["psf"]["stretch"] == 0.1
     assert fits.getdata(made / "diffraction.fits").shape == (64, 64)
+
+
+def test_the_diffraction_psf_of_a_folder_is_not_deconvolved(
+    made: Path, diffraction: Path, tmp_path: Path
+) -> None:
+    line = [
+        "deconvolve",
+        made,
+        "-o",
+        tmp_path / "out",
+        "--psf",
+        diffraction,
+        "--other-channel",
+        "--steps",
+        1,
+        "--local",
+    ]
+    done = CliRunner().invoke(main, [str(word) for word in line])
+    assert f"failed: {made}/diffraction.fits: expected an image; the header (PSFSUM)" in done.output
+    assert "4 images: 3 deconvolved, 0 existed already, 1 failed" in done.output
 
 
 def test_the_bound_is_said_and_written(made: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import httpx
 import pytest
 
 from service.client.address import service_address
@@ -41,6 +42,26 @@ def test_other_addresses_are_refused_with_an_example(said: str, told: str) -> No
     with pytest.raises(ServiceError) as refused:
         service_address(said)
     assert refused.value.code == "bad-address" and told in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("server", "told"),
+    [
+        ("localhost:8765", "`heliopsf serve` starts"),
+        ("localhost:9321", "`heliopsf serve --port 9321` starts"),
+        ("http://[::1]:9321", "`heliopsf serve --port 9321` starts"),
+        ("http://localhost", "`heliopsf serve --port 80` starts"),
+        ("https://localhost:9321", "ask the operator"),
+        ("http://sun.example:8765", "ask the operator"),
+    ],
+)
+def test_an_error_says_how_to_start_a_service_at_this_address(server: str, told: str) -> None:
+    def refused(request: httpx.Request) -> httpx.Response:
+        raise httpx.ConnectError("connection refused")
+
+    with Client(server, transport=httpx.MockTransport(refused)) as client, pytest.raises(ServiceError) as no:
+        client.health()
+    assert told in str(no.value)
 
 
 def test_the_client_takes_the_address_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

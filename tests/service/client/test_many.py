@@ -12,7 +12,7 @@ from astropy.io import fits
 from fastapi.testclient import TestClient
 
 from service.client import many
-from service.client.errors import ServiceError
+from service.client.errors import ServiceError, WaitInterrupted
 from service.client.http import Client
 from service.client.many import Outcome, deconvolve_many
 from service.client.operations import Operations
@@ -180,6 +180,133 @@ def test_an_error_that_concerns_every_image_ends_the_run(tmp_path: Path, images:
     (tmp_path / "file").touch()
     with local_service() as here, pytest.raises(ServiceError, match="expected a folder"):
         list(deconvolve_many(here, images, tmp_path / "file"))
+
+
+class Told(Client):
+    """A client of the application in this process. A job runs when somebody waits for it; what happens is told."""
+
+    def __init__(self, api: TestClient, run_jobs: Callable[[], None]) -> None:
+        super().__init__("http://testserver", transport=api._transport)
+        self.run_jobs, self.told = run_jobs, list[str]()
+        self.psf_id = ""
+
+    def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
+        self.told.append("submit")
+        return super().submit(kind, queue=queue, **parameters)
+
+    def wait(self, job: dict[str, Any], **more: Any) -> dict[str, Any]:
+        self.told.append("wait")
+        self.run_jobs()
+        return super().wait(job, **more)
+
+    def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
+        super().download(address, path, overwrite=overwrite)
+        self.told.append("download")
+
+    def many(self, images: list[Path], folder: Path, **more: Any) -> Iterator[Outcome]:
+        return deconvolve_many(self, images, folder, psf_id=self.psf_id, steps=1, **more)
+
+
+@pytest.fixture
+def told(api: TestClient, run_jobs: Callable[[], None], tmp_path: Path) -> Told:
+    client = Told(api, run_jobs)
+    write_psf(tmp_path / "psf.fits")
+    client.psf_id = client.upload_psf(tmp_path / "psf.fits")["id"]
+    return client
+
+
+@pytest.fixture
+def six(tmp_path: Path) -> list[Path]:
+    paths = [tmp_path / f"{number}.fits" for number in range(6)]
+    for seed, path in enumerate(paths):
+        write_image(path, seed=seed)
+    return paths
+
+
+def test_a_service_has_a_few_jobs_at_a_time_and_a_process_one(
+    told: Told, six: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[int, int]] = []
+    outcomes = list(told.many(six, tmp_path / "out", progress=lambda *step: seen.append(step)))
+    assert [one.image for one in outcomes] == six and all(one.failure is None for one in outcomes)
+    collected = ["wait", "download"]
+    assert told.told == ["submit"] * 4 + [*collected, "submit"] * 2 + collected * 4
+    assert seen == [(number, 6) for number in range(7)]
+    told.told.clear()
+    monkeypatch.setattr(told, "jobs_at_once", 1)  # as that of a service in this process
+    list(told.many(six[:2], tmp_path / "other"))
+    assert told.told == ["submit", *collected] * 2
+    with local_service() as here:
+        assert here.jobs_at_once == 1
+
+
+def test_outcomes_keep_the_order_of_the_images(told: Told, six: list[Path], tmp_path: Path) -> None:
+    """A file that is refused, a job that fails, and products that exist, beside jobs in flight."""
+    list(told.many(six[3:5], tmp_path / "out"))
+    (tmp_path / "letter.fits").write_text("Dear archive,\n" * 300)
+    with fits.open(six[1], mode="update") as opened:
+        opened[0].data[:] = float("nan")
+    images = [*six[:2], tmp_path / "letter.fits", *six[2:]]
+    outcomes = list(told.many(images, tmp_path / "out"))
+    assert [one.image for one in outcomes] == images
+    assert [one.failure is not None for one in outcomes] == [False, True, True, False, False, False, False]
+    assert [one.existed for one in outcomes] == [False] * 4 + [True, True, False]
+    assert "finite" in str(outcomes[1].failure) and "expected a FITS file" in str(outcomes[2].failure)
+
+
+def test_a_copy_of_an_image_in_flight_waits_for_it_and_follows_where_it_fails(
+    told: Told, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (first, _, copy) = told.many(images, tmp_path / "out")
+    assert copy.existed and copy.output == first.output and told.told.count("submit") == 2
+    download, failures = told.download, [OSError(5, "the disk failed")]
+
+    def fail_once(*given: Any, **more: Any) -> None:
+        if failures:
+            raise failures.pop()
+        download(*given, **more)
+
+    monkeypatch.setattr(told, "download", fail_once)
+    (first, _, copy) = told.many(images, tmp_path / "other")
+    assert first.failure == "the disk failed"
+    assert copy.failure is None and not copy.existed and copy.output is not None and copy.output.is_file()
+
+
+def test_a_full_quota_ends_the_run_after_the_jobs_in_flight(
+    told: Told, six: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submit = told.submit
+
+    def full_after_two(kind: str, **parameters: Any) -> dict[str, Any]:
+        if told.told.count("submit") == 2:
+            raise ServiceError("expected free room in your quota", status=507, code="quota-exceeded")
+        return submit(kind, **parameters)
+
+    monkeypatch.setattr(told, "submit", full_after_two)
+    outcomes: list[Outcome] = []
+    with pytest.raises(ServiceError, match="expected free room"):
+        outcomes.extend(told.many(six, tmp_path / "out"))
+    assert [one.output for one in outcomes] == sorted((tmp_path / "out").iterdir())
+    assert [one.image for one in outcomes] == six[:2]
+
+
+def test_control_c_names_all_jobs_in_flight(
+    told: Told, six: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited: list[str] = []
+    wait = told.wait
+
+    def interrupt_the_second(job: dict[str, Any], **more: Any) -> dict[str, Any]:
+        waited.append(job["id"])
+        if len(waited) == 2:
+            raise KeyboardInterrupt
+        return wait(job, **more)
+
+    monkeypatch.setattr(told, "wait", interrupt_the_second)
+    with pytest.raises(WaitInterrupted, match=r"jobs .* go on at http://testserver") as stopped:
+        list(told.many(six, tmp_path / "out"))
+    named = (stopped.value.identity, *stopped.value.others)
+    assert named[0] == waited[1] and len(set(named)) == 4 and waited[0] not in named
 
 
 def test_a_busy_service_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:

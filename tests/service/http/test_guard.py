@@ -111,7 +111,7 @@ def test_a_refusal_is_a_page_for_browsers_and_json_for_programs(
     browser = headers | {"Accept": "text/html,application/xhtml+xml;q=0.9,*/*;q=0.8"}
     page = api.request(method, "/images/sample", headers=browser)
     assert page.status_code == status and page.headers["Content-Type"].startswith("text/html")
-    assert f"<h1>{title}</h1>" in page.text and code in page.text and "expected" in page.text
+    assert f"<h1>{title}</h1>" in page.text and code in page.text and "Expected" in page.text
     assert "style-src 'self'" in page.headers["Content-Security-Policy"]
     assert ("To the images" in page.text) == (status == 403), "no link to a page that is refused too"
     for address, sent in (("/images/sample", headers), ("/v1/jobs", browser)):

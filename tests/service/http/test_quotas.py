@@ -22,8 +22,8 @@ from tests.service.conftest import upload
 from tests.service.keyed import keyed
 from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import counted_bytes
-from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
+from workers.catalogue.owners import ROW_BYTES, counted_bytes
+from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
@@ -89,6 +89,86 @@ def test_work_is_refused_where_nothing_could_be_kept(
     assert catalogue.jobs.of_kind("deconvolve") == [] and api.get("/v1/bulk").json()["items"] == []
 
 
+def test_rows_without_files_are_refused_where_they_do_not_fit(
+    api: TestClient, image_file: Path, psf_file: Path
+) -> None:
+    """Some bytes are left, so that the quota is not full; but no row fits."""
+    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    body = {
+        "status": "certified",
+        "reason": "r",
+        "version": "1.0.0",
+        "instrument": "i",
+        "channel": "1",
+        "kind": "total",
+    }
+    assert api.post(f"/v1/psfs/{psf_id}/status", json=body).status_code == 200
+    form = {"KIND": "psf-build"}
+    drafts = [
+        api.post("/uws/jobs", data=form, follow_redirects=False).headers["Location"][-32:] for _ in range(2)
+    ]
+    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    last = ImageRow(owner="local", id="b" * 64, created_at=1.0, bytes=0, summary={})
+    last.bytes = 2**20 - counted(api) - 10 - counted_bytes(last)
+    catalogue.add(last)
+    asked: list[tuple[str, str, dict[str, Any]]] = [
+        ("POST", "/v1/jobs", {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id}}),
+        ("POST", "/v1/bulk", {"images": [image_id], "psf_id": psf_id}),
+        ("POST", "/v1/contexts", {"name": "c"}),
+        ("PUT", "/v1/contexts/default", {"context": None}),
+        ("POST", f"/v1/psfs/{psf_id}/status", {"status": "certified", "reason": "again"}),
+    ]
+    for method, where, body in asked:
+        answer = api.request(method, where, json=body)
+        problem = answer.json()
+        assert (answer.status_code, problem["type"]) == (507, "urn:heliopsf:quota-exceeded"), (
+            where,
+            answer.text,
+        )
+        assert (problem["used_bytes"], problem["limit_bytes"]) == (2**20 - 10, 2**20)
+        assert "what this request adds to the database could not be kept" in problem["detail"]
+    for where in ("/uws/jobs", f"/uws/jobs/{drafts[0]}/parameters"):
+        answer = api.post(where, data={"KIND": "psf-build", "instrument": "hri_euv"})
+        assert answer.status_code == 507 and "expected free room in your quota" in answer.text
+    assert counted(api) == 2**20 - 10 and catalogue.owners.recount() == []
+    for draft in drafts:
+        assert api.delete(f"/uws/jobs/{draft}", follow_redirects=False).status_code == 303
+    assert api.post(asked[0][1], json=asked[0][2]).status_code == 202, "deleted jobs make room"
+
+
+def test_a_listing_that_fills_the_quota_stops_and_goes_on_with_room(
+    api: TestClient, tmp_path: Path, settings: Settings, psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.bulk.listing.LIST_AT_ONCE", 4)
+    (tmp_path / "archive").mkdir()
+    for number in range(12):
+        (tmp_path / "archive" / f"{number}.fits").touch()
+    request = {"files": [{"glob": f"{tmp_path}/archive/*"}], "psf_id": upload(api, psf_file, "/v1/psfs")}
+    here = f"/v1/bulk/{api.post('/v1/bulk', json=request).json()['id']}"
+    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    keep_turns(catalogue, settings)
+    last = ImageRow(owner="local", id="b" * 64, created_at=1.0, bytes=0, summary={})
+    last.bytes = 2**20 - counted(api) - 6 * ROW_BYTES - counted_bytes(last)
+    catalogue.add(last)
+    runner = Runner(settings, catalogue, Store(settings.data_dir))
+
+    def work() -> dict[str, Any]:
+        keep_turns(catalogue, settings)
+        for turn in catalogue.jobs.of_kind("bulk"):
+            runner.run(turn.id)
+        return dict(api.get(here).json())
+
+    stopped = work()
+    assert (stopped["phase"], stopped["error"]["code"]) == ("ERROR", "quota-exceeded")
+    assert "not all files that the patterns match could be listed" in stopped["error"]["message"]
+    assert stopped["images"]["total"] == 4 and counted(api) <= 2**20
+    catalogue.owners.set_quota("local", 2)
+    assert api.post(f"{here}/resume").status_code == 200
+    assert work()["images"]["total"] == 12
+    keep_turns(catalogue, settings)
+    assert catalogue.owners.recount() == []
+
+
 def test_uploads_at_one_moment_that_each_fit_do_not_all_come_in(
     api: TestClient, tmp_path: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -140,12 +220,6 @@ def test_jobs_that_were_queued_while_there_was_room_end_where_there_is_none(
 ) -> None:
     image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
     catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
-    row = catalogue.get(ImageRow, image_id, "local")
-    assert row is not None
-    left = 2**20 - counted(api)
-    last = ImageRow(owner="local", id="b" * 64, created_at=1.0, bytes=0, summary=row.summary)
-    last.bytes = left - 1 - counted_bytes(last)
-    catalogue.add(last)
 
     def parameters(steps: int) -> dict[str, Any]:
         method = {"name": "richardson-lucy", "steps": steps}
@@ -165,6 +239,11 @@ def test_jobs_that_were_queued_while_there_was_room_end_where_there_is_none(
     }
     equal = api.post("/uws/jobs", data=form, follow_redirects=False).headers["Location"][-32:]
     tables = asked("psf-tables", {"psf_id": psf_id})
+    row = catalogue.get(ImageRow, image_id, "local")
+    assert row is not None
+    last = ImageRow(owner="local", id="b" * 64, created_at=1.0, bytes=0, summary=row.summary)
+    last.bytes = 2**20 - counted(api) - 1 - counted_bytes(last)
+    catalogue.add(last)
     runner = Runner(settings, catalogue, Store(settings.data_dir))
     jobs = {}
     for job_id in (first, second, third, equal, tables):
@@ -241,11 +320,11 @@ def test_what_is_counted_is_what_the_rows_say(
     catalogue = Catalogue(settings.catalogue_url)
     rows = [
         row
-        for table in (ImageRow, PsfRow, ProductRow)
+        for table in (ImageRow, PsfRow, ProductRow, JobRow)
         for row in catalogue.page(table, owner="local", limit=9)
     ]
     used = catalogue.owners.usage("local", 1).used_bytes
-    assert len(rows) == 3 and used == sum(counted_bytes(row) for row in rows)
+    assert len(rows) == 4 and used == sum(counted_bytes(row) for row in rows)
     assert catalogue.owners.recount() == []
     with catalogue._engine.begin() as connection:
         connection.exec_driver_sql("UPDATE owners SET bytes = 7")

@@ -85,7 +85,7 @@ def test_a_run_of_all_images_without_a_product_is_started_followed_and_shown(
     api: TestClient, psf_id: str, work: Callable[[], None], tmp_path: Path
 ) -> None:
     first = uploaded(api, tmp_path, 3)
-    assert "3 of your images have no product. All of them are deconvolved." in api.get("/bulk").text
+    assert "This run will deconvolve your 3 images that have no product." in api.get("/bulk").text
     place = started(api, psf_id, name="Rome <1>")
     page = api.get(place).text
     assert "Rome &lt;1&gt;" in page and "Rome <1>" not in page
@@ -128,7 +128,7 @@ def test_a_run_from_the_form_takes_a_limited_number_of_images(
 ) -> None:
     monkeypatch.setattr(bulk_pages, "MOST_STARTED", 2)
     uploaded(api, tmp_path, 3)
-    assert "The newest 2 of your images without a product are deconvolved" in api.get("/bulk").text
+    assert "the newest 2 of your images that have no product" in api.get("/bulk").text
     assert api.get(f"/v1{started(api, psf_id)}").json()["images"]["total"] == 2
 
 
@@ -178,7 +178,9 @@ def test_failures_are_grouped_by_reason_with_an_example(
     made = api.post("/v1/bulk", json=request).json()
     work()
     page = api.get(f"/bulk/{made['id']}").text
-    rows = re.findall(r'<td class="number">(\d+)</td><td><code>([\w-]+)</code></td><td>(.+?)</td>', page)
+    rows = re.findall(
+        r'<td class="number">(\d+)</td><td><code>([\w-]+)</code></td><td class="name">(.+?)</td>', page
+    )
     assert [(count, code) for count, code, _ in rows] == [("2", "not-fits"), ("1", "path-not-utf-8")]
     assert rows[0][2].startswith("&lt;script&gt;alert(1)&lt;-script&gt;.fits: ")
     assert "<script>alert" not in page
@@ -217,12 +219,15 @@ def test_a_run_is_paused_resumed_retried_and_cancelled_by_its_buttons(
     [
         ({}, "choose one"),
         ({"choice": "psf:abc"}, "a PSF of the list"),
-        ({"choice": f"psf:{'0' * 64}"}, "the id of a PSF in the catalogue"),
+        ({"choice": f"psf:{'0' * 64}"}, "There is no such PSF here"),
         ({"choice": "context:none"}, "none"),
         ({"choice": f"psf:{'0' * 64}", "name": "two\nlines"}, "in one line"),
-        ({"choice": f"psf:{'0' * 64}", "steps": "many"}, "steps: Input should be a valid integer"),
-        ({"choice": f"psf:{'0' * 64}", "steps": "201"}, "steps: Input should be less than or equal to 200"),
-        ({"choice": f"psf:{'0' * 64}", "method": "magic"}, "expected name to be one of richardson-lucy"),
+        ({"choice": f"psf:{'0' * 64}", "steps": "many"}, "Steps: Input should be a valid integer"),
+        ({"choice": f"psf:{'0' * 64}", "steps": "201"}, "Steps: Input should be less than or equal to 200"),
+        (
+            {"choice": f"psf:{'0' * 64}", "method": "magic"},
+            "Method: expected name to be one of richardson-lucy",
+        ),
     ],
 )
 def test_a_wrong_form_says_what_was_expected(

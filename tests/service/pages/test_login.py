@@ -225,11 +225,14 @@ def test_a_page_without_a_session_leads_to_the_login_and_back(service: Keyed) ->
     assert client.post("/images/sample", headers=OWN_PAGE).headers["location"] == "/login"
 
 
+NO_KEY = "This is not a key. Copy the whole key; it begins with hpsf_."
+
+
 def test_a_wrong_key_is_refused_with_the_reason_and_counted(settings: Settings) -> None:
     with keyed(settings, reads_per_minute=3) as service:
         expired = service.key("ann", lasts_s=-1)
         client = browser(service)
-        for key, told in (("nonsense", "hpsf_ID_SECRET"), (expired, "has expired"), ("", "hpsf_ID_SECRET")):
+        for key, told in (("nonsense", NO_KEY), (expired, "has expired"), ("", NO_KEY)):
             answer = client.post("/login", data={"key": key, "next": "/jobs"}, headers=OWN_PAGE)
             assert answer.status_code == 401 and told in answer.text and 'value="/jobs"' in answer.text
             assert answer.headers["WWW-Authenticate"] == 'Bearer realm="heliopsf"'

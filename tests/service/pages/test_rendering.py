@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,9 +13,10 @@ from httpx import Response
 from sqlalchemy.exc import OperationalError
 
 from service.app import create_app
-from service.pages.rendering import POLICY, date, duration, number, percent, size
+from service.pages.rendering import POLICY, counted, date, duration, number, percent, size
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload
+from workers.intake.no_psf import buildable
 from workers.settings import Settings
 
 PERSON = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
@@ -168,6 +170,18 @@ def test_addresses_of_the_interface_never_answer_with_pages(api: TestClient) -> 
         assert answer.headers["Content-Type"] == "application/problem+json"
 
 
+def test_the_page_of_the_api_names_its_icon(api: TestClient) -> None:
+    (icon,) = re.findall(r'<link rel="icon" href="([^"]+)"', api.get("/docs").text)
+    found = api.get(f"/{icon}")
+    assert found.status_code == 200 and found.headers["Content-Type"].startswith("image/svg+xml")
+    assert found.content.startswith(b"<svg")
+
+
+def test_the_first_page_says_what_the_service_can_build(api: TestClient) -> None:
+    told = "The service knows the optics of aia_171 and hri_euv, and builds the PSF for your image."
+    assert told.replace("aia_171 and hri_euv", " and ".join(buildable())) in api.get("/").text
+
+
 # Words ----------------------------------------------------------------------------------------------
 
 
@@ -180,5 +194,6 @@ def test_numbers_are_written_with_their_units() -> None:
     assert [number(value, 3) for value in (None, 11_497.0, 999_600.0, 2.5e6, 0.123456, 2e-7)] == [
         "-", "11500", "1000000", "2.5e+06", "0.123", "2e-07",
     ]  # fmt: skip
+    assert [counted(number, "row") for number in (0, 1, 2)] == ["0 rows", "1 row", "2 rows"]
     assert date(None) == "-"
     assert date(0.0) == '<time datetime="1970-01-01T00:00:00+00:00">1970-01-01 00:00:00 UTC</time>'

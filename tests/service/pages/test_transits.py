@@ -79,10 +79,10 @@ def test_a_form_starts_a_job_with_its_options(
 
 def test_wrong_options_and_kinds_are_told_on_a_page(api: TestClient, transit_id: str) -> None:
     for kind, form, told, status in (
-        ("psf-fit", {"seed": "soon"}, "seed: ", 422),
-        ("psf-fit", {"photon_gain_dn": "six"}, "noise: expected numbers", 422),
-        ("cross-validate", {"runs": "999"}, "runs: ", 422),
-        ("deconvolve", {}, "expected one of psf-fit", 404),
+        ("psf-fit", {"seed": "soon"}, "Seed: ", 422),
+        ("psf-fit", {"photon_gain_dn": "six"}, "as numbers in DN; got six", 422),
+        ("cross-validate", {"runs": "999"}, "Runs: ", 422),
+        ("deconvolve", {}, "Expected one of psf-fit", 404),
     ):
         answer = api.post(f"/transits/{transit_id}/jobs/{kind}", data=form, headers=PERSON)
         assert answer.status_code == status and told in answer.text, kind

@@ -166,7 +166,7 @@ def test_an_existing_product_is_not_made_again(
     first = asked(api, files=files, psf_id=psf_id)
     assert api.post("/v1/bulk", json={"files": files, "psf_id": psf_id, "parameters": FEW}).status_code == 200
     work()
-    monkeypatch.delattr(deconvolve_task, "method_named")
+    monkeypatch.delattr("psfcore.deconvolve.whole.method_named")
     second = asked(api, files=files, psf_id=psf_id)
     assert second["id"] != first["id"]
     work()
@@ -392,7 +392,7 @@ def test_a_cancelled_run_stops_at_the_next_reported_step(
     )
     monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
     monkeypatch.setattr("workers.bulk.task.TELL_EVERY_S", 0.0)
-    real = deconvolve_task._Work.progress
+    real = deconvolve_task._Asked.progress
 
     def counted(work: Any, stage: str) -> Callable[[int, int], None]:
         inner = real(work, stage)
@@ -405,7 +405,7 @@ def test_a_cancelled_run_stops_at_the_next_reported_step(
 
         return report
 
-    monkeypatch.setattr(deconvolve_task._Work, "progress", counted)
+    monkeypatch.setattr(deconvolve_task._Asked, "progress", counted)
     work()
     assert steps == [1, 2, 3]
     bulk = seen(api, bulk)

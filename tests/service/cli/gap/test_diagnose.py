@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from service.cli.main import main
 from tests.gap_files import EDGE_GLOW, GLOW_DN_S, answer_at_once, quick_diagnosis, write_gap
 from tests.html_page import check_stands_alone, read_page
 from tests.psfcore.gap import small_gaps
+from tests.psfcore.gap.report.judged import SHARES, with_shares
 from tests.service.conftest import upload
 
 
@@ -31,8 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def without_gap() -> Diagnosis:
-    judged = replace(small_gaps.found().judgement, verdict="none", answer=())
-    return replace(small_gaps.found(), judgement=judged, corrected=(), residual_after=None)
+    return with_shares(SHARES["none"])
 
 
 def run(*arguments: object) -> Result:
@@ -98,7 +97,7 @@ def test_a_transit_becomes_a_page_over_http(
     again = api.get(report["html"], headers={"If-None-Match": page.headers["etag"]})
     assert again.status_code == 304 and again.headers["content-security-policy"] == PAGE_POLICY
     said = api.get(report["file"])
-    assert said.json()["schema"] == "gap/1" and said.json()["provenance"]["seed"] == 7
+    assert said.json()["schema"] == "gap/2" and said.json()["provenance"]["seed"] == 7
     assert api.get(report["preview"]).content.startswith(b"\x89PNG")
     psf = api.get(f"/v1/psfs/{report['details']['corrected_psf_id']}").json()
     assert psf["details"]["parents"] == {"transit": parameters["transit_id"], "report": report["id"]}
@@ -120,6 +119,7 @@ def test_requests_that_cannot_be(api: TestClient, folder: Path, tmp_path: Path) 
     wrong: tuple[dict[str, Any], ...] = (
         {"seed": -1},
         {"correct": "perhaps"},
+        {"coverage": 0.99},
         {"psf_id": "mine"},
         {"added_effects": ["os"]},  # whose code is run is the operator's to say
         {"effects": "mine.py"},
@@ -151,9 +151,10 @@ def test_a_psf_that_was_not_fitted_is_no_start(
 def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    answer_at_once(monkeypatch, without_gap())
+    asked = answer_at_once(monkeypatch, without_gap())
     psf, numbers = tmp_path / "psf.fits", tmp_path / "g.json"
-    done = run(folder, "--local", "--corrected", psf, "--json", numbers)
+    done = run(folder, "--local", "--corrected", psf, "--json", numbers, "--coverage", 0.8)
+    assert [how["coverage"] for how in asked] == [0.8]
     assert done.exit_code == 1 and not psf.exists()
     assert done.output.splitlines()[1] == "verdict: none"
     assert "was not written: the diagnosis found no effect for a corrected PSF (verdict none)" in done.output
@@ -173,6 +174,7 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
         (["--effects", "json", "--local"], "effects of json: expected EFFECTS to be a tuple of Effect"),
         (["--noise", "-1", "2", "--local"], "greater than or equal to 0"),
         (["--seed", "-1", "--local"], "not in the range"),
+        (["--coverage", "0.99", "--local"], "not in the range 0.5<=x<=0.95"),
         (["--server", "http://127.0.0.1:9"], "127.0.0.1:9"),
     ],
 )

@@ -110,6 +110,24 @@ def test_the_best_by_properties_and_by_an_image(sun: Client, tmp_path: Path) -> 
     assert (caught.value.code, caught.value.status) == ("no-psf-fits", 404)
 
 
+def test_the_best_psf_for_an_image_is_the_one_that_deconvolve_uses(sun: Client, tmp_path: Path) -> None:
+    hri = {"DETECTOR": "HRI_EUV", "TELESCOP": "SOLO/EUI/HRI_EUV", "WAVELNTH": 174.0}
+    write_image(tmp_path / "hri.fits", **hri, **{"DATE-BEG": "2020-05-05"})
+    told = ask("psf", "best", "--image", str(tmp_path / "hri.fits"), "--json", str(tmp_path / "b.json"))
+    image_id = sun.upload_image(tmp_path / "hri.fits")["id"]
+    wanted = sun.estimate("deconvolve", image_id=image_id)["psf"]
+    assert told.startswith(f"{short(wanted['id'])}  hri_euv") and "not built yet" in told
+    assert "No PSF of hri_euv/174/total is certified" in told
+    assert json.loads((tmp_path / "b.json").read_text()) == {"psf": wanted, "why": wanted["why"]}
+    certified = uploaded(tmp_path, 32)
+    ask("psf", "certify", certified, "--version", "1.0.0")
+    told = ask("psf", "best", "--image", str(tmp_path / "hri.fits"))
+    assert told.startswith(certified) and "This PSF is certified" in told
+    write_image(tmp_path / "aia.fits", TELESCOP="SDO/AIA", INSTRUME="AIA_3", WAVELNTH=1600)
+    told = ask("psf", "best", "--image", str(tmp_path / "aia.fits"), code=1)
+    assert "Ways on:" in told and "aia_171" in told
+
+
 def test_contexts(sun: Client, tmp_path: Path) -> None:
     assert "no context yet" in ask("context", "list")
     assert "no PSF is certified yet" in ask("context", "create", "one", code=1)

@@ -41,7 +41,7 @@ def test_a_job_is_found_waited_for_and_its_product_fetched_by_short_ids(
     waited = command("job", "wait", short(job))
     product = api.get(f"/v1/jobs/{job}").json()["result"].rpartition("/")[2]
     said = f"product {short(product)}: heliopsf product get {short(product)} -o FILE"
-    assert waited == f"job {short(job)}: {said}\n"
+    assert waited.splitlines()[-1] == f"job {short(job)}: {said}"  # after lines of progress, if it lasts
     assert said in command("job", "list")
     shown = command("job", "show", job[:8].upper(), "--json", tmp_path / "j.json")
     assert f"job {job}: deconvolve, COMPLETED" in shown and f"psf_id {short(psf)}" in shown
@@ -59,7 +59,33 @@ def test_a_job_is_found_waited_for_and_its_product_fetched_by_short_ids(
     assert "expected an output" in command("product", "get", short(product), code=2)
     assert command("product", "delete", short(product)) == f"product {short(product)} is deleted\n"
     assert "no product yet" in command("product", "list")
-    assert "product" in command("product", "delete", short(product), code=1)
+    gone = command("product", "delete", short(product), code=1)
+    assert f"{short(product)}: no product of yours has an id that begins so; `heliopsf product list`" in gone
+    said = f"product {short(product)} was deleted; the same request makes it again\n"
+    assert command("job", "wait", short(job)).endswith(f"job {short(job)}: {said}")
+    assert said in command("job", "list") and said in command("job", "show", job)
+    again = submitted(api, upload(api, image_file), psf)
+    assert again != job
+    command("job", "wait", again)
+    assert said not in command("job", "list"), "made again: no job's result is missing"
+
+
+def test_results_go_into_a_folder_under_their_own_names(
+    command: Command, api: TestClient, image_file: Path, psf: str, tmp_path: Path
+) -> None:
+    job = submitted(api, upload(api, image_file), psf)
+    command("job", "wait", job)
+    found = api.get(api.get(f"/v1/jobs/{job}").json()["result"]).json()
+    (tmp_path / "there").mkdir()
+    for folder in ("there", "new/"):
+        command("product", "get", short(found["id"]), "-o", f"{tmp_path}/{folder}")
+        command("psf", "download", short(psf), "-o", f"{tmp_path}/{folder}")
+        names = {path.name for path in (tmp_path / folder).iterdir()}
+        assert names == {found["details"]["filename"], f"psf-{short(psf)}.fits"}
+    twice = command("psf", "download", short(psf), "-o", tmp_path / "there", code=1)
+    assert "the file exists" in twice
+    (tmp_path / "file").touch()
+    assert "expected a folder" in command("psf", "download", short(psf), "-o", f"{tmp_path}/file/", code=1)
 
 
 def test_jobs_are_cancelled_and_a_wait_for_several_ends_with_1_if_one_failed(
@@ -71,7 +97,7 @@ def test_jobs_are_cancelled_and_a_wait_for_several_ends_with_1_if_one_failed(
     told = command("job", "wait", short(stopped), short(fine), code=1)
     assert f"job {short(stopped)}: ABORTED" in told
     assert f"job {short(fine)}: product" in told
-    assert "no id of yours begins" in command("job", "wait", "01234567", code=1)
+    assert "no job of yours has an id that begins so" in command("job", "wait", "01234567", code=1)
 
 
 @pytest.mark.parametrize("identity", ["0123456", "../../metrics", "x" * 12])

@@ -104,6 +104,35 @@ def test_a_run_is_paused_resumed_and_cancelled_and_another_tab_sees_it(
     assert other.evaluate("window.notReloaded")
 
 
+def test_a_run_whose_images_fail_says_so_without_a_reload(
+    page: Page, site: Stack, psf_id: str, tmp_path: Path
+) -> None:
+    write_image(tmp_path / "product.fits", seed=740, PSFID="0" * 64)
+    image = str(site.client.upload_image(tmp_path / "product.fits")["id"])
+    busy = uploaded(site, tmp_path, 1, side=1024, seed=741)
+    method = {"name": "richardson-lucy", "steps": 60}
+    before = site.client.submit_bulk(images=busy, psf_id=psf_id, name="before", method=method)
+    run = site.client.submit_bulk(images=[image], psf_id=psf_id, name="all fail")
+    page.goto(f"/bulk/{run['id']}")
+    page.evaluate(MARK)
+    site.client.wait_for_bulk(before["id"])
+    phase = page.locator("[data-part=phase]")
+    expect(phase).to_have_text("COMPLETED, 1 of 1 failed", timeout=LONG_MS)
+    expect(phase).to_have_class("phase flawed")
+    row = page.get_by_role("region", name="Failures by reason").locator("tbody tr")
+    expect(row).to_contain_text("product.fits: This file is a product of heliopsf")
+    assert page.evaluate("window.notReloaded"), "the script showed all this"
+    good(page)
+    shown = page.locator("#bulk").inner_text()
+    page.reload()
+    expect(row).to_have_count(1)
+    assert page.locator("#bulk").inner_text() == shown
+    page.goto("/bulk")
+    line = page.locator(f"[data-bulk='{run['id']}'] [data-part=phase]")
+    expect(line).to_have_text("COMPLETED, 1 of 1 failed")
+    expect(line).to_have_class("phase flawed")
+
+
 @pytest.mark.slow  # half a minute: it runs real jobs
 def test_failures_are_grouped_and_retried(page: Page, site: Stack, psf_id: str, tmp_path: Path) -> None:
     # Without --again a product is not deconvolved: all these images fail for one reason.
@@ -132,6 +161,6 @@ def test_failures_are_grouped_and_retried(page: Page, site: Stack, psf_id: str, 
         lambda: all((one["ended_at"] or 0) > before for one in site.client.bulk_failures(run["id"])),
         "no failure is older than the retry",
     )
-    expect(page.locator("[data-part=phase]")).to_have_text("COMPLETED")
+    expect(page.locator("[data-part=phase]")).to_have_text("COMPLETED, 3 of 4 failed")
     expect(page.locator("[data-part=failed]")).to_have_text("3")
     assert len(list(site.client.bulk_failures(run["id"]))) == 3

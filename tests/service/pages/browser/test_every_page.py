@@ -22,11 +22,12 @@ from tests.transit_files import write_simulated, write_transit
 from tests.whole.stack import Stack
 
 UNSERVED = "unserved.test"
+LONG_NAME = "solo_L2_eui-hrieuv174-image_20220401T103005920_pseudolinear_"
 # Each page and a text of its contents.
 PAGES = {
     "home": "Your latest products",
     "image": "Products of this image",
-    "jobs": "deconvolve",
+    "jobs": "Deconvolution",
     "job": "All parameters",
     "product": "Rerun and compare",
     "psfs": "other",
@@ -91,12 +92,58 @@ def test_a_page_is_good_in_every_way_to_look_at_it(page: Page, addresses: dict[s
     good(page)
 
 
+@pytest.fixture(scope="module")
+def long_addresses(site: Stack, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Pages that show a name of 60 characters without a space."""
+    folder, client = tmp_path_factory.mktemp("long"), site.client
+    write_image(folder / f"{LONG_NAME}.fits", seed=91)
+    write_image(folder / f"2{LONG_NAME}.fits", seed=92, PSFID="0" * 64)
+    write_psf(folder / "psf.fits", size=66)
+    psf_id = client.upload_psf(folder / "psf.fits", name=LONG_NAME)["id"]
+    product = client.deconvolve(folder / f"{LONG_NAME}.fits", folder / "o.fits", psf_id=psf_id, steps=2)
+    again = client.upload_image(folder / f"2{LONG_NAME}.fits")["id"]
+    run = client.submit_bulk(images=[again, product["image_id"]], psf_id=psf_id, name=LONG_NAME)
+    client.wait_for_bulk(run["id"])
+    pack(write_transit(folder / "transit", images=5), folder / f"{LONG_NAME}.tar")
+    transit = client.upload_transit(folder / f"{LONG_NAME}.tar")["id"]
+    return [
+        "/",
+        "/jobs",
+        f"/images/{product['image_id']}?psf_id={psf_id}",
+        f"/products/{product['id']}",
+        "/psfs",
+        f"/psfs/{psf_id}",
+        f"/psfs/{psf_id}/products",
+        "/bulk",
+        f"/bulk/{run['id']}",
+        f"/bulk/{run['id']}/failures",
+        "/transits",
+        f"/transits/{transit}",
+    ]
+
+
+@pytest.mark.parametrize("width", [320, 390, 768, 1024, 1280])
+def test_a_long_name_makes_no_page_wider_than_its_window(
+    page: Page, long_addresses: list[str], width: int
+) -> None:
+    page.set_viewport_size({"width": width, "height": 800})
+    for address in long_addresses:
+        page.goto(address)
+        expect(page.get_by_text(LONG_NAME).first).to_be_attached()
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, address
+        beyond = page.locator("main .card, main .card *").evaluate_all(
+            "(all) => all.filter((one) => one.getBoundingClientRect().right > "
+            "(one.closest('.card').getBoundingClientRect().right) + 1).map((one) => one.outerHTML.slice(0, 80))"
+        )
+        assert beyond == [], f"{address}: something is wider than its card"
+
+
 @pytest.mark.parametrize(
     ("address", "status", "told"),
     [
-        ("/nowhere", 404, "nothing is at /nowhere"),
-        (f"/products/{'0' * 64}", 404, "expected the id of a product in the catalogue"),
-        ("/images/short", 422, "image_id"),
+        ("/nowhere", 404, "Nothing is at /nowhere."),
+        (f"/products/{'0' * 64}", 404, "There is no such product here."),
+        ("/images/short", 422, "/images/short is not the address of a page."),
     ],
 )
 def test_a_page_of_an_error_is_good(page: Page, watch: Watch, address: str, status: int, told: str) -> None:

@@ -157,14 +157,22 @@ def test_a_failed_job_says_why_and_what_to_do(
     with fits.open(tmp_path / "dark.fits", mode="update") as file:
         file[0].data[:] = float("nan")
     image = site.client.upload_image(tmp_path / "dark.fits")["id"]
-    job = site.client.submit("deconvolve", image_id=image, psf_id=files["psf"])
+    method = {"name": "linear", "steps": 7}
+    job = site.client.submit("deconvolve", image_id=image, psf_id=files["psf"], method=method)
     page.goto(f"/jobs/{job['id']}")
     expect(page.locator("[data-part=phase]")).to_have_text("ERROR", timeout=LONG_MS)
     message = site.client.job(job["id"])["error"]["message"]
-    expect(page.get_by_role("alert")).to_have_text(message)
+    told = f"{message[:1].upper()}{message[1:]}."
+    expect(page.get_by_role("alert")).to_have_text(told)
     good(page)
     page.get_by_role("link", name="Change the request and start again").click()
-    expect(page).to_have_url(re.compile(f"/images/{image}$"))
+    expect(page).to_have_url(re.compile(f"/images/{image}[?]psf_id={files['psf']}&method=linear&steps=7$"))
+    expect(page.locator("select[name=method]")).to_have_value("linear")
+    expect(page.locator("input[name=steps]")).to_have_value("7")
+    page.goto("/jobs")
+    row = page.locator(f"[data-job='{job['id']}']")
+    expect(row).to_contain_text("dark.fits")
+    expect(row).to_contain_text(told)
 
 
 @pytest.mark.slow  # half a minute: it runs real jobs
@@ -184,6 +192,9 @@ def test_the_page_continues_after_the_service_was_killed(
     psutil.wait_procs(processes, timeout=10)
     lost = page.locator("#lost")
     expect(lost).to_contain_text("The service does not answer.", timeout=20_000)
+    page.get_by_role("button", name="Cancel the job").click()
+    expect(lost).to_contain_text("Nothing is lost: wait a moment, then try again.")
+    expect(page).to_have_url(re.compile(f"/jobs/{job['id']}$"))
     good(page)
     site.start_server(int(site.client.server.rpartition(":")[2]))
     expect(lost).to_be_hidden(timeout=20_000)

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Locator, Page, expect
+from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.conftest import write_image, write_psf
 from tests.service.pages.browser.checks import good
@@ -37,15 +37,72 @@ def test_an_image_without_a_psf_says_what_to_do_and_goes_on_with_one(
     page.set_input_files("#file", image_file)
     page.get_by_role("button", name="Upload").click()
     expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
-    expect(page.get_by_role("alert")).to_contain_text("This image cannot be deconvolved yet")
-    expect(page.get_by_role("button", name="Start")).to_be_disabled()
+    expect(page.locator("#checked")).to_have_text(
+        "No PSF for TEST is known here. Upload one below, or fit one to a transit."
+    )
+    start = page.locator("#go")
+    expect(start).to_have_text("Check and start")
+    start.click()
+    expect(page.locator("#checked")).to_have_class("error")  # the page says again what is missing
     good(page)
 
     page.locator("select[name=psf_id]").select_option(psf_id)
-    page.get_by_role("button", name="Check these options").click()
-    expect(page.get_by_text("The request names this PSF.")).to_be_visible()
-    page.get_by_role("button", name="Start").click()
+    expect(page.locator("#checked")).to_have_class("good")
+    expect(page.locator("#checked")).to_contain_text(
+        f"PSF psf 0.0.0+{psf_id[:8]} (draft). You chose this PSF."
+    )
+    expect(page.locator("#ways")).to_be_hidden()
+    expect(start).to_have_text("Start")
+    good(page)
+    start.click()
     expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=LONG_MS)
+
+
+def test_options_are_checked_when_they_change(page: Page, site: Stack, image_file: Path, psf_id: str) -> None:
+    image = site.client.upload_image(image_file)["id"]
+    method = {"name": "richardson-lucy", "steps": 2}
+    site.client.wait(site.client.submit("deconvolve", image_id=image, psf_id=psf_id, method=method))
+    page.goto(f"/images/{image}?psf_id={psf_id}&steps=2")
+    go, checked = page.locator("#go"), page.locator("#checked")
+    expect(go).to_have_text("Open the product")
+    page.locator("input[name=steps]").fill("4")
+    page.locator("input[name=steps]").press("Tab")
+    expect(go).to_have_text("Start")
+    page.locator("input[name=error_draws]").fill("8")
+    page.locator("input[name=error_draws]").press("Tab")
+    expect(checked).to_have_text(
+        "The photon gain and the read noise of this camera are not known here. Enter both in the options."
+    )
+    expect(go).to_have_text("Check and start")
+    page.get_by_label("Photon gain (DN)").fill("4")
+    page.get_by_label("Read noise (DN)").fill("1.5")
+    page.get_by_label("Read noise (DN)").press("Tab")
+    expect(checked).to_have_class("good")
+    go.click()
+    expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=LONG_MS)
+    product = site.client.product(page.url.rpartition("/")[2])
+    assert product["details"]["parameters"]["noise"] == {"photon_gain_dn": 4.0, "read_noise_dn": 1.5}
+    page.get_by_role("link", name="Deconvolve again with other options").click()
+    expect(page.get_by_label("Read noise (DN)")).to_have_value("1.5")
+    expect(page.locator("input[name=error_draws]")).to_have_value("8")
+    expect(go).to_have_text("Open the product")
+
+
+def test_options_are_kept_without_scripts(
+    browser: Browser, base_url: str, image_file: Path, site: Stack
+) -> None:
+    image = site.client.upload_image(image_file)["id"]
+    with browser.new_context(java_script_enabled=False, base_url=base_url) as context:
+        page = context.new_page()
+        page.goto(f"/images/{image}")
+        page.locator("input[name=steps]").fill("9")
+        page.get_by_label("Allow a file that was deconvolved before").check()
+        page.locator("#go").click()
+        expect(page).to_have_url(re.compile(f"/images/{image}[?]"))
+        expect(page.locator("#checked")).to_contain_text("No PSF for TEST is known here.")
+        expect(page.locator("input[name=steps]")).to_have_value("9")
+        expect(page.get_by_label("Allow a file that was deconvolved before")).to_be_checked()
+        expect(page.get_by_role("button", name="Check these options")).to_be_visible()
 
 
 def test_a_dropped_file_is_sent(page: Page, image_file: Path) -> None:
@@ -105,10 +162,8 @@ def test_the_keyboard_alone_leads_from_a_file_to_a_blinked_product(
     expect(psfs).to_have_value(psf_id)
     tab_to(page, page.locator("input[name=steps]"))
     page.keyboard.type("3")
-    tab_to(page, page.get_by_role("button", name="Check these options"))
-    page.keyboard.press("Enter")
-    expect(page).to_have_url(re.compile("steps=3"))
-    tab_to(page, page.get_by_role("button", name="Start"))
+    tab_to(page, page.locator("#go"))
+    expect(page.locator("#go")).to_have_text("Start")
     page.keyboard.press("Enter")
     expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=LONG_MS)
     expect(page.locator("#zoom")).to_contain_text("%")
@@ -127,3 +182,22 @@ def test_the_keyboard_alone_leads_from_a_file_to_a_blinked_product(
     expect(shown).to_have_text("after" if first == "before" else "before")
     page.keyboard.press("b")
     expect(shown).to_have_text(first)
+
+
+@pytest.mark.slow  # the PSF of the instrument is built in half a minute; the tests above go the same way with a small PSF
+def test_a_real_image_becomes_a_product_that_is_blinked(page: Page, shared: Path) -> None:
+    """Three clicks (choose, Upload, Start) and one key, without any option."""
+    page.goto("/")
+    page.set_input_files(
+        "#file", shared / "data/real/eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"
+    )
+    page.get_by_role("button", name="Upload").click()
+    expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"), timeout=LONG_MS)
+    page.get_by_role("button", name="Start").click()
+    expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=5 * LONG_MS)
+    page.locator("#mode").select_option("blink")
+    shown = page.locator("#tag-left")
+    expect(shown).to_have_text(re.compile("before|after"))
+    first = shown.inner_text()
+    page.locator("#canvas").press("b")
+    expect(shown).to_have_text("after" if first == "before" else "before")

@@ -19,7 +19,7 @@ def test_noise_figures_become_numbers() -> None:
         "noise": {"photon_gain_dn": 6.5, "read_noise_dn": 2.0}
     }
     assert noise({"photon_gain_dn": ""}) == {}
-    with pytest.raises(Problem, match="expected numbers in DN"):
+    with pytest.raises(Problem, match="as numbers in DN; got many"):
         noise({"photon_gain_dn": "many"})
 
 

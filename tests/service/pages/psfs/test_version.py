@@ -83,7 +83,7 @@ def test_certify_change_the_range_supersede_and_deprecate(
 def test_an_error_of_a_form_is_a_page_that_names_the_field(api: TestClient, psf_id: str) -> None:
     data = {"status": "certified", "with_range": "1", "valid_from": "yesterday"}
     answer = api.post(f"/psfs/{psf_id}/status", data=data, headers=PERSON)
-    assert answer.status_code == 422 and "valid_from" in answer.text
+    assert answer.status_code == 422 and "Valid from: " in answer.text
     assert answer.headers["content-type"].startswith("text/html")
     assert api.get(f"/psfs/{psf_id}/cutout?size=4000", headers=PERSON).status_code == 422
     assert api.get(f"/psfs/{'0' * 64}", headers=PERSON).status_code == 404

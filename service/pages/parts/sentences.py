@@ -1,0 +1,107 @@
+"""Errors in sentences for people who use the pages: without the words of the command line and of the interface."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from service.http.problems import Problem
+
+_THINGS = {
+    "no-such-bulk": "bulk run",
+    "no-such-image": "image",
+    "no-such-job": "job",
+    "no-such-product": "product",
+    "no-such-psf": "PSF",
+    "no-such-report": "report",
+    "no-such-transit": "transit",
+}
+# The names of fields that differ from what the forms call them.
+_FIELDS = {"error_draws": "Noise realisations", "psf_id": "PSF", "image_id": "Image"}
+_FIELD = re.compile(r"(?:^|(?<=; ))(?:[a-z_-]+\.)*([a-z_]+): ")
+_NO_FIELDS: Mapping[str, Any] = {}
+# Parts of a message that only a command or a program needs, such as "(--again, in a request again = true)".
+_FOR_PROGRAMS = re.compile(
+    r"\s*\((?:--|psf_id\b)[^()]*\)|\s*\([^()]*(?:in a request|on the command line)[^()]*\)"
+)
+
+
+def of_problem(problem: Problem) -> str:
+    """The sentence for a problem."""
+    return of_error(problem.code, problem.detail, problem.more)
+
+
+def of_error(code: str, message: str, fields: Mapping[str, Any] = _NO_FIELDS) -> str:
+    """The sentence for an error. fields: those of its ``DataError``; a stored error of a job has none."""
+    thing = _THINGS.get(code)
+    if thing is not None and message.startswith("expected the id"):
+        return f"There is no such {thing} here. It was deleted, or it belongs to another owner, or its address is not complete."
+    try:
+        return _SENTENCES[code](message, fields)
+    except KeyError:  # another code, or an error without its fields
+        return plain(message)
+
+
+def plain(message: str) -> str:
+    """A message as a sentence: a capital at its beginning, a full stop at its end, nothing for programs alone."""
+    text = _FOR_PROGRAMS.sub("", message).strip()
+    text = text[:1].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) or not text else f"{text}."
+
+
+def _wrong_fields(message: str, _fields: Mapping[str, Any]) -> str:
+    """A message that begins with the name of a field, or several."""
+    text = message.replace("Value error, ", "").removeprefix("the form: ")
+
+    def label(found: re.Match[str]) -> str:
+        return _FIELDS.get(found[1], found[1].replace("_", " ").capitalize()) + ": "
+
+    return plain(_FIELD.sub(label, text))
+
+
+def _no_psf(_message: str, fields: Mapping[str, Any]) -> str:
+    return f"No PSF for {fields['image']} is known here. Upload one below, or fit one to a transit."
+
+
+def _channel(_message: str, fields: Mapping[str, Any]) -> str:
+    return f"PSF {fields['psf']} is not made for this image: {'; '.join(fields['differences'])}. Choose another PSF."
+
+
+def _plate_scale(_message: str, fields: Mapping[str, Any]) -> str:
+    told = (
+        f"The pixels of PSF {fields['psf']} are {fields['psf_arcsec']:g} arcsec wide, those of this image "
+        f"{fields['image_arcsec']} arcsec. "
+    )
+    if fields["factor"] is None:
+        return told + "Choose a PSF with the pixels of the image."
+    return told + (
+        "Rebin the PSF: download it from its page (PSFs), run `heliopsf psf rebin PSF.fits --factor "
+        f"{fields['factor']} -o BINNED.fits`, and upload BINNED.fits on the page PSFs."
+    )
+
+
+_SENTENCES: dict[str, Callable[[str, Mapping[str, Any]], str]] = {
+    "no-psf-for-instrument": _no_psf,
+    "channel-mismatch": _channel,
+    "plate-scale-mismatch": _plate_scale,
+    "no-noise-figures": lambda *_: (
+        "The photon gain and the read noise of this camera are not known here. Enter both in the options."
+    ),
+    "already-deconvolved": lambda *_: (
+        "This file is a product of heliopsf: it was deconvolved before (its header has the card PSFID). Use the original image."
+    ),
+    "psf-as-image": lambda *_: (
+        "This file is a PSF and not an image (the card PSFSUM in its header). Use it as the PSF of an image."
+    ),
+    "invalid-request": _wrong_fields,
+    "not-fits": lambda *_: (
+        "This file is not a FITS file: a FITS file begins with SIMPLE. Choose another file."
+    ),
+    "bad-key": lambda message, _: (
+        "This is not a key. Copy the whole key; it begins with hpsf_."
+        if "hpsf_ID_SECRET" in message
+        else plain(message)
+    ),
+    "http-405": lambda *_: "This address shows no page. Go back, and use a link or a button of the page.",
+}

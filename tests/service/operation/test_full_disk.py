@@ -1,0 +1,187 @@
+"""A disk that is full while a job writes: the job ends with a clear error, nothing stays behind, and it can be submitted again."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+from astropy.io import fits
+from fastapi.testclient import TestClient
+from sqlalchemy.exc import OperationalError
+
+from psfcore.errors import DataError
+from psfcore.fits import hdus
+from tests.conftest import write_image
+from tests.service.conftest import upload
+from workers import checks
+from workers.bulk import image as bulk_image
+from workers.bulk.turns import keep_turns
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import ProductRow
+from workers.files import store as stores
+from workers.files.full_disk import is_disk_full
+from workers.files.store import Store
+from workers.run.runner import Runner
+from workers.settings import Settings
+
+
+def full(number: int = errno.ENOSPC) -> OSError:
+    return OSError(number, os.strerror(number))
+
+
+def the_rename(patched: pytest.MonkeyPatch) -> None:
+    def replace(source: Path, target: Path) -> None:
+        raise full()
+
+    patched.setattr(stores.os, "replace", replace)
+
+
+def the_flush(patched: pytest.MonkeyPatch) -> None:
+    """The quota of the file system, which the system tells when the content is forced to the disk."""
+
+    def sync(path: Path) -> None:
+        raise full(errno.EDQUOT)
+
+    patched.setattr(stores, "sync", sync)
+
+
+def the_content(patched: pytest.MonkeyPatch) -> None:
+    """astropy and numpy lose the number of the error when an array does not fit on the disk."""
+
+    def writeto(self: object, file: Any, **_: object) -> None:
+        file.write(b"SIMPLE")
+        raise OSError("160000 requested and 100144 written")
+
+    def probe(target: Path) -> None:
+        assert target.exists(), "the disk is still full"
+        raise full()
+
+    patched.setattr(fits.HDUList, "writeto", writeto)
+    patched.setattr(hdus, "probe", probe)
+
+
+@pytest.mark.parametrize("fill", [the_rename, the_flush, the_content])
+def test_a_job_that_finds_the_disk_full_says_so_and_can_be_submitted_again(
+    api: TestClient,
+    settings: Settings,
+    run_jobs: Callable[[], None],
+    image_file: Path,
+    psf_file: Path,
+    fill: Callable[[pytest.MonkeyPatch], None],
+) -> None:
+    parameters = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
+    body = {
+        "kind": "deconvolve",
+        "parameters": {**parameters, "method": {"name": "richardson-lucy", "steps": 1}},
+    }
+    first = api.post("/v1/jobs", json=body).json()["id"]
+    with pytest.MonkeyPatch.context() as patched:
+        fill(patched)
+        patched.setattr(checks, "free_bytes", lambda _folder: 0)
+        run_jobs()
+        job = api.get(f"/v1/jobs/{first}").json()
+        assert job["phase"] == "ERROR" and job["attempt"] == 1
+        assert (job["error"]["code"], job["error"]["fault"]) == ("storage-full", "transient")
+        assert "ask the operator to make room" in job["error"]["message"]
+        ready = api.get("/readyz")
+        assert ready.status_code == 503 and "0 MiB of free space" in ready.json()["parts"]["storage"]
+    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    assert list((settings.data_dir / "tmp").iterdir()) == []
+    assert catalogue.page(ProductRow, owner="local", limit=1) == [] and catalogue.owners.recount() == []
+    catalogue.check_pages()
+    again = api.post("/v1/jobs", json=body)
+    assert again.status_code == 202 and again.json()["id"] != first
+    run_jobs()
+    done = api.get(f"/v1/jobs/{again.json()['id']}").json()
+    assert done["phase"] == "COMPLETED"
+    assert api.get(f"{done['result']}/file").status_code == 200
+
+
+def test_a_full_disk_of_the_database_is_tried_again_and_then_said(
+    api: TestClient,
+    settings: Settings,
+    run_jobs: Callable[[], None],
+    image_file: Path,
+    psf_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    parameters = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
+    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()["id"]
+
+    def fail(*_: object, **__: object) -> None:
+        raise OperationalError("INSERT", {}, psycopg.errors.DiskFull())
+
+    monkeypatch.setattr(Catalogue, "add", fail)
+    for attempt in range(1, settings.max_attempts + 1):
+        run_jobs()
+        found = api.get(f"/v1/jobs/{job}").json()
+        assert found["attempt"] == attempt
+    assert (found["phase"], found["error"]["code"]) == ("ERROR", "storage-full")
+
+
+def test_a_bulk_run_that_finds_the_disk_full_stops_and_goes_on_with_room(
+    api: TestClient, tmp_path: Path, settings: Settings, psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = []
+    for seed in range(3):
+        write_image(tmp_path / f"{seed}.fits", seed=seed)
+        images.append(upload(api, tmp_path / f"{seed}.fits"))
+    method = {"method": {"name": "richardson-lucy", "steps": 1}}
+    body = {"images": images, "psf_id": upload(api, psf_file, "/v1/psfs"), "parameters": method}
+    here = f"/v1/bulk/{api.post('/v1/bulk', json=body).json()['id']}"
+    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    runner = Runner(settings, catalogue, Store(settings.data_dir))
+
+    def work() -> dict[str, Any]:
+        for _ in range(4):
+            keep_turns(catalogue, settings)
+            for turn in catalogue.jobs.of_kind("bulk"):
+                runner.run(turn.id)
+        return dict(api.get(here).json())
+
+    write = bulk_image.product.write
+    written: list[Path] = []
+
+    def write_one(made: Any, path: Path) -> None:
+        written.append(path)
+        if len(written) > 1:
+            raise full()
+        write(made, path)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(bulk_image.product, "write", write_one)
+        stopped = work()
+    assert (stopped["phase"], stopped["error"]["code"]) == ("ERROR", "storage-full")
+    assert (stopped["images"]["done"], stopped["images"]["failed"]) == (1, 0)
+    assert len(written) == 2, "no further image is deconvolved for nothing"
+    assert api.post(f"{here}/resume").status_code == 200
+    finished = work()
+    assert (finished["phase"], finished["images"]["done"]) == ("COMPLETED", 3)
+
+
+def test_a_full_output_folder_concerns_every_image_of_a_bulk_run() -> None:
+    with pytest.raises(OSError, match="No space left"), bulk_image._write_errors():
+        raise full()
+    with pytest.raises(DataError, match="Permission denied"), bulk_image._write_errors():
+        raise full(errno.EACCES)
+
+
+def test_a_full_disk_is_known_by_the_error_of_the_system() -> None:
+    assert is_disk_full(full()) and is_disk_full(full(errno.EDQUOT)) and not is_disk_full(full(errno.EIO))
+    with pytest.raises(OSError, match="not enough") as wrapped:
+        try:
+            raise full()
+        except OSError as error:
+            raise OSError("not enough space") from error
+    assert is_disk_full(wrapped.value)
+    with pytest.raises(ValueError, match="else") as other:
+        try:
+            raise full()
+        except OSError as error:
+            raise ValueError("something else") from error
+    assert not is_disk_full(other.value)

@@ -1,0 +1,228 @@
+"""The page of an image: what the check of the options says, what it offers, and which options it keeps."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.pages.parts.options import address_of
+from service.pages.parts.sentences import of_error, plain
+from tests.conftest import write_image
+from tests.service.conftest import upload
+from workers.catalogue.tables import JobRow
+
+PERSON = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
+AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 1600, "CDELT1": 0.6, "CDELT2": 0.6}
+XRT = {
+    "TELESCOP": "HINODE",
+    "INSTRUME": "XRT",
+    "DATE_OBS": "2012-06-05T22:00:00.123",
+    "CDELT1": 1.03,
+    "CDELT2": 1.03,
+}
+HRI = {"DETECTOR": "HRI_EUV", "WAVELNTH": 174, "CDELT1": 0.492, "CDELT2": 0.492}
+FORM = {"method": "richardson-lucy", "steps": "2"}
+
+
+def image(api: TestClient, tmp_path: Path, **cards: Any) -> str:
+    write_image(tmp_path / "i.fits", **cards)
+    identity = upload(api, tmp_path / "i.fits")
+    (tmp_path / "i.fits").unlink()
+    return identity
+
+
+def checked(api: TestClient, image_id: str, **options: str) -> list[str]:
+    """What the page says of the options; the script gets the same."""
+    page = api.get(f"/images/{image_id}", params=options).text
+    (box,) = re.findall(r'<div id="checked" [^>]*>(.*?)</div>', page)
+    lines = [line.replace("&#39;", "'") for line in re.findall("<p>(.*?)</p>", box)]
+    found = api.get(f"/images/{image_id}/check", params=options).json()
+    assert found["lines"] == lines and found["button"] in page
+    return lines
+
+
+# What the check says --------------------------------------------------------------------------------
+
+
+def test_an_image_without_a_psf_is_told_so(api: TestClient, tmp_path: Path) -> None:
+    xrt = image(api, tmp_path, **XRT)
+    assert checked(api, xrt) == [
+        "No PSF for HINODE XRT is known here. Upload one below, or fit one to a transit."
+    ]
+    page = api.get(f"/images/{xrt}").text
+    assert "none: choose a PSF" in page and "chosen for this image" not in page
+    assert "2012-06-05T22:00:00.123" in page
+    assert f'action="/images/{xrt}/build"' not in page, "no instrument is of this telescope"
+
+
+def test_the_psf_of_another_channel_is_refused_before_a_job(
+    api: TestClient, psf_file: Path, tmp_path: Path
+) -> None:
+    aia = image(api, tmp_path, **{**AIA, "WAVELNTH": 193})
+    psf = api.post("/v1/psfs?instrument=aia_171&channel=171", content=psf_file.read_bytes()).json()["id"]
+    assert checked(api, aia, psf_id=psf) == [
+        "PSF uploaded is not made for this image: the image is of aia_193, the PSF of aia_171; the image is of 193 angstrom, "
+        "the PSF of 171 angstrom. Choose another PSF.",
+        "If you are sure, allow it below.",
+    ]
+    assert checked(api, aia, psf_id=psf, other_channel="1")[0].endswith("You chose this PSF.")
+
+
+def test_the_advice_is_that_of_the_error(api: TestClient, psf_file: Path, tmp_path: Path) -> None:
+    product = image(api, tmp_path, PSFID="0" * 64)
+    psf = upload(api, psf_file, "/v1/psfs")
+    assert checked(api, product, psf_id=psf) == [
+        "This file is a product of heliopsf: it was deconvolved before (its header has the card PSFID). Use the original "
+        "image.",
+        "If you are sure, allow it below.",
+    ]
+    page = api.get(f"/images/{product}?psf_id={psf}").text
+    assert "What you can do" not in page and "Upload a PSF" not in page
+
+
+def test_an_error_plane_needs_figures_and_the_form_takes_them(api: TestClient, tmp_path: Path) -> None:
+    hri = image(api, tmp_path, **HRI)
+    (told,) = checked(api, hri, error_draws="8")
+    assert told.startswith("The photon gain and the read noise of this camera are not known here.")
+    figures = {"photon_gain_dn": "4", "read_noise_dn": "1.5"}
+    assert checked(api, hri, error_draws="8", **figures)[0].startswith("PSF hri_euv 0.2.0. No PSF of hri_euv")
+    sent = api.post(f"/images/{hri}/start", data={"error_draws": "8", **figures}, follow_redirects=False)
+    job = api.get(f"/v1{sent.headers['location']}").json()
+    assert job["parameters"]["noise"] == {"photon_gain_dn": 4.0, "read_noise_dn": 1.5}
+    assert checked(api, hri, photon_gain_dn="four") == [
+        "Expected photon gain and read noise as numbers in DN; got four."
+    ]
+    assert checked(api, hri, error_draws="1") == [
+        "Noise realisations: expected 0, or 2 or more; got 1: the spread cannot be estimated from one realisation."
+    ]
+
+
+def test_a_short_time_is_told_as_a_sentence(api: TestClient, psf_file: Path, tmp_path: Path) -> None:
+    found = checked(api, image(api, tmp_path), psf_id=upload(api, psf_file, "/v1/psfs"), steps="1")
+    assert re.fullmatch(r"(Less than 1 s|About \d+ s) and \d+ MiB\.", found[1])
+    assert re.match(r"PSF uploaded 0\.0\.0\+\w{8} \(draft\)\.", found[0])
+
+
+# One click to a PSF ---------------------------------------------------------------------------------
+
+
+def test_the_psf_of_the_instrument_is_built_for_the_image(api: TestClient, tmp_path: Path) -> None:
+    aia = image(api, tmp_path, **AIA)
+    page = api.get(f"/images/{aia}").text
+    assert "same telescope and pixel scale, but another channel (171, not 1600 Å)." in page
+    assert "plate_scale" not in page
+    assert f'<form method="post" action="/images/{aia}/build">' in page
+    sent = api.post(f"/images/{aia}/build", data={"instrument": "aia_171"}, follow_redirects=False)
+    assert sent.status_code == 303 and sent.headers["location"].endswith(f"?image={aia}")
+    job_id = sent.headers["location"].removeprefix("/jobs/").partition("?")[0]
+    job = api.get(f"/v1/jobs/{job_id}").json()
+    assert (job["kind"], job["parameters"]["instrument"]) == ("psf-build", "aia_171")
+    waiting = api.get(sent.headers["location"]).text
+    assert f'data-image="{aia}"' in waiting and f'<a href="/images/{aia}">Back to the image</a>' in waiting
+    catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+    psf_id = api.post(
+        "/v1/jobs/identity", json={"kind": "psf-build", "parameters": {"instrument": "aia_171"}}
+    )
+    result = psf_id.json()["result_id"]
+    with catalogue.psfs._database.writing.begin() as session:
+        row = session.get(JobRow, job_id)
+        row.phase, row.result_id = "COMPLETED", result
+    done = api.get(f"/jobs/{job_id}?image={aia}").text
+    assert f'href="/images/{aia}?psf_id={result}"' in done and "Deconvolve the image with this PSF" in done
+
+
+# What is kept ---------------------------------------------------------------------------------------
+
+
+def test_a_refused_start_leads_back_with_its_options(api: TestClient, tmp_path: Path) -> None:
+    xrt = image(api, tmp_path, **XRT)
+    answer = api.post(f"/images/{xrt}/start", data={**FORM, "again": "1"}, follow_redirects=False)
+    assert answer.status_code == 303
+    assert answer.headers["location"] == f"/images/{xrt}?method=richardson-lucy&steps=2&again=1"
+    assert 'name="steps" min="1" max="200" value="2"' in api.get(answer.headers["location"]).text
+    assert api.get("/v1/jobs").json()["items"] == []
+
+
+def test_a_failed_job_leads_to_its_options(
+    api: TestClient, psf_file: Path, tmp_path: Path, run_jobs: Callable[[], None]
+) -> None:
+    psf = upload(api, psf_file, "/v1/psfs")
+    given = {
+        **FORM,
+        "psf_id": psf,
+        "error_draws": "2",
+        "photon_gain_dn": "4",
+        "read_noise_dn": "1.5",
+        "again": "1",
+    }
+    sent = api.post(f"/images/{image(api, tmp_path)}/start", data=given, follow_redirects=False)
+    page = api.get(sent.headers["location"]).text
+    (kept,) = re.findall(r'href="(/images/[^"]*)">Change the request', page)
+    query = kept.replace("&amp;", "&").partition("?")[2]
+    assert dict(part.split("=") for part in query.split("&")) == given
+
+
+def test_a_psf_that_the_service_chose_is_chosen_again() -> None:
+    made = {"image_id": "1" * 64, "psf_id": "2" * 64, "method": {"name": "linear", "steps": 5}}
+    for name, value in (("picked_for", "hri_euv"), ("psf_recipe", {"instrument": "hri_euv"})):
+        assert "psf_id" not in address_of(made | {name: value})
+    assert "psf_id=2222" in address_of(made)
+
+
+def test_products_of_an_image_are_told_apart(
+    api: TestClient, psf_file: Path, tmp_path: Path, run_jobs: Callable[[], None]
+) -> None:
+    psf, sun = upload(api, psf_file, "/v1/psfs"), image(api, tmp_path)
+    for steps in ("1", "3"):
+        api.post(f"/images/{sun}/start", data={**FORM, "psf_id": psf, "steps": steps})
+    run_jobs()
+    page = api.get(f"/images/{sun}").text
+    assert set(re.findall(r"richardson-lucy, (\d steps?), PSF 0\.0\.0", page)) == {"1 step", "3 steps"}
+    jobs = api.get("/jobs").text
+    assert jobs.count("Deconvolution <") == 2
+
+
+# Sentences ------------------------------------------------------------------------------------------
+
+
+def test_a_message_becomes_a_sentence_without_words_for_programs() -> None:
+    assert (
+        plain("expected one PSF (psf_id in a request, --psf in a command); got two")
+        == "Expected one PSF; got two."
+    )
+    assert plain("use it (--again, in a request again = true)") == "Use it."
+    assert plain("expected 2 axes (NAXIS); got 3!") == "Expected 2 axes (NAXIS); got 3!"
+    assert plain("") == ""
+
+
+@pytest.mark.parametrize(
+    ("code", "message", "told"),
+    [
+        ("no-such-psf", "expected the id of a PSF; got x", "There is no such PSF here."),
+        ("no-such-context", "expected the id or name of a context; got x", "Expected the id or name"),
+        ("channel-mismatch", "expected an image; got another", "Expected an image; got another."),
+        ("invalid-request", "error_draws: x; valid_from: y", "Noise realisations: x; Valid from: y."),
+        ("not-fits", "expected a FITS file, got b'\\x00'", "This file is not a FITS file"),
+        ("bad-key", "this key has expired", "This key has expired."),
+    ],
+)
+def test_an_error_without_its_fields_is_told_too(code: str, message: str, told: str) -> None:
+    assert of_error(code, message).startswith(told)
+
+
+def test_the_advice_on_pixels_of_another_size() -> None:
+    fields = {"psf": "aia", "psf_arcsec": 0.6, "image_arcsec": "2.4 x 2.4", "factor": 4}
+    told = of_error("plate-scale-mismatch", "", fields)
+    assert "`heliopsf psf rebin PSF.fits --factor 4 -o BINNED.fits`" in told
+    assert told.startswith("The pixels of PSF aia are 0.6 arcsec wide, those of this image 2.4 x 2.4 arcsec.")
+    assert "rebin" not in of_error("plate-scale-mismatch", "", fields | {"factor": None})
+
+
+def test_a_wrong_address_is_a_sentence(api: TestClient) -> None:
+    page = api.get("/images/short", headers=PERSON).text
+    assert "/images/short is not the address of a page." in page and "String should match" not in page
