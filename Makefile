@@ -11,7 +11,7 @@ DEV := $(VENV)/.installed-dev
 $(RUN): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "heliopsf needs Python 3.11 or newer, found " + sys.version.split()[0] + ": make PYTHON=/path/to/python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[service]'
 	touch $@
 
 $(DEV): $(RUN)
@@ -37,11 +37,14 @@ bench: $(DEV)
 	$(BIN)/python -m benchmarks.bulk --images 24
 	$(BIN)/python -m benchmarks.viewer
 
-# Other programs in their own environment, timed in turn with heliopsf on the same data.
+# Other programs in their own environment, timed in turn with heliopsf on the same data. The second command writes
+# docs/aia.md, the PSFs of AIA beside those of aiapy, if there is an image (level 1 at 171 angstrom).
+AIA_IMAGE ?= $(or $(HELIOPSF_SHARED),../shared)/data/real/aia/aia_171_cutout_20130310.fits
 bench-peers: $(DEV)
 	test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt numpy scipy 'scikit-image>=0.24' 'aiapy>=0.9'
 	$(BIN)/python -m benchmarks.peers .venv-peers/bin/python
+	$(BIN)/python -m benchmarks.aia .venv-peers/bin/python "$(AIA_IMAGE)" docs/aia.md
 
 # Runs jobs while workers, Redis, PostgreSQL and the service are killed at random. Needs Redis and PostgreSQL.
 chaos: $(DEV)

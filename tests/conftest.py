@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -60,9 +62,24 @@ LONGEST_FIRST = (
 )
 
 
+_CACHE = TemporaryDirectory(prefix="heliopsf-tests-")
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    """Have xdist keep our order of files: its own begins with those of the most tests."""
+    """Have xdist keep our order of files: its own begins with those of the most tests.
+
+    No test may use the cache folder of the user. Fixtures of modules use that of this process.
+    """
     config.option.loadscopereorder = False
+    os.environ["HELIOPSF_CACHE_DIR"] = _CACHE.name
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An empty cache of built PSFs, so that no test depends on what another one built."""
+    with TemporaryDirectory(dir=_CACHE.name) as folder:
+        monkeypatch.setenv("HELIOPSF_CACHE_DIR", folder)
+        yield
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

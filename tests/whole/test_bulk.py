@@ -147,7 +147,7 @@ def test_the_command_line_from_submission_to_report(stack: Stack, psf_file: Path
     said = bulk(*asked, status=1)  # an image failed
     bulk_id = said.split()[1]
     assert f"COMPLETED: {IMAGES} of {IMAGES + 1} done, 1 failed" in said
-    assert f"{bulk_id}  COMPLETED" in bulk("status")
+    assert f"{bulk_id[:12]}  COMPLETED" in bulk("list")
     manifest, failures = tmp_path / "m.csv", tmp_path / "f.ndjson"
     said = bulk("report", bulk_id, "-o", str(manifest), "--failures", str(failures), "--most", "3")
     assert said.count("/archive/") == 4, "three images and one failure"

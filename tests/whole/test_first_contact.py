@@ -123,7 +123,11 @@ def test_control_c_leaves_the_job_and_the_commands_that_it_names_work(stack: Sta
     address = stack.client.server.removeprefix("http://")
     terminal, other_end = pty.openpty()
     waiting = subprocess.Popen(
-        [*COMMAND, "job", "wait", job[:12], "--server", address], stderr=other_end, stdout=subprocess.DEVNULL
+        [*COMMAND, "job", "wait", job[:12], "--server", address],
+        stderr=other_end,
+        stdout=subprocess.DEVNULL,
+        # A shell starts commands in the background with SIGINT ignored, and the tests may run there.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     os.close(other_end)
     shown = b""

@@ -16,8 +16,11 @@ from tests.whole.stack import Stack
 
 HRI = "data/real/eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"
 FSI = "data/real/eui/solo_L2_eui-fsi174-image_20240109T200055237_V01.fits"
-AIA = "data/real/aia/aia_171_cutout_20130310.fits"
-AIA_GZ = "data/real/aia/AIA20110319_105400_0171.fits.gz"
+AIA = "data/real/aia/aia.lev1_euv_12s.2022-04-02T132423Z.304.image.fits"
+AIA_GZ = "data/real/aia/AIA20110319_105400_0171.fits.gz"  # binned 4 x 4
+SWAP = "data/real/other/swap_lv1_20110607_063329.fits.gz"
+TRACE = "data/real/other/trace_19980519_222143_171.fits.gz"
+XRT = "data/real/occultation/L1_XRT20120605_215839.9.fits"
 JP2 = "data/real/eui/solo_L3_eui-hrieuv174-image_20220401T103005920_V01.jp2"
 
 
@@ -42,7 +45,18 @@ def test_the_real_hri_image(stack: Stack, shared: Path, tmp_path: Path) -> None:
         assert sunpy_map.fits_header[card] == before[card]
 
 
-@pytest.mark.parametrize("name", [FSI, AIA, AIA_GZ], ids=["FSI", "AIA", "AIA in gzip"])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "psf"), [(AIA, "aia_304"), (AIA_GZ, "aia_171")])
+def test_real_aia_images_need_no_option(
+    stack: Stack, shared: Path, tmp_path: Path, name: str, psf: str
+) -> None:
+    product = stack.client.deconvolve(shared / name, tmp_path / "out.fits")
+    assert abs(product["details"]["flux_change_pct"]) < 1
+    assert product["details"]["dark_change_pct"] < 0 < product["details"]["bright_change_pct"]
+    assert fits.getheader(tmp_path / "out.fits")["PSFNAME"] == psf
+
+
+@pytest.mark.parametrize("name", [FSI, SWAP, TRACE, XRT], ids=["FSI", "SWAP", "TRACE", "XRT"])
 def test_images_of_other_telescopes_need_a_psf_of_theirs(
     stack: Stack, shared: Path, tmp_path: Path, psf_file: Path, name: str
 ) -> None:
