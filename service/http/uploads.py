@@ -1,5 +1,5 @@
-"""Receives an upload: streams it to the store, and hashes, counts and checks its bytes meanwhile. The upload is never held in
-memory as a whole."""
+"""Receives an upload: streams it to the store, and at the same time hashes, counts and checks its bytes. The whole upload is
+never in memory."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
-FORM_BYTES = 2**16  # largest number of bytes that a form may add to the file
+FORM_BYTES = 2**16  # largest size of a form without its file
 LARGE = frozenset(
     {f"{root}/{kind}" for root in ("", "/v1") for kind in ("images", "psfs", "transits")}
 )  # upload addresses; they have their own limits
@@ -122,7 +122,7 @@ async def receive_psf(
 ) -> AsyncIterator[Upload[HeaderSummary]]:
     """Stream the request's FITS file to a temporary path and check that it can be a PSF.
 
-    Raises the same ``Problem`` as ``receive``, and 422 if the file is plainly no PSF.
+    Raises the same ``Problem`` as ``receive``, and 422 if the file cannot be a PSF.
     """
     async with _receive(request, store, _PsfFile(limits), max_bytes, take) as upload:
         yield upload
@@ -223,7 +223,7 @@ class _Archive:
 
 
 def _refuse_by_length(request: Request, max_bytes: int) -> int:
-    """The length that the request declares; 0 if it declares none."""
+    """The length that the request declares; 0 if it declares none. Raises ``Problem`` 413 if the length is too large."""
     text = request.headers.get("content-length", "")
     declared = int(text) if text.isdecimal() else 0
     if declared > max_bytes + FORM_BYTES:
@@ -245,7 +245,7 @@ def fits_summary(path: Path, limits: FitsLimits) -> HeaderSummary:
 
 
 def psf_summary(path: Path, limits: FitsLimits) -> HeaderSummary:
-    """As ``fits_summary``, for a PSF. Raises ``Problem`` 422 if the file is plainly no PSF."""
+    """As ``fits_summary``, for a PSF. Raises ``Problem`` 422 if the file cannot be a PSF."""
     return _inspected(path, _PsfFile(limits))
 
 

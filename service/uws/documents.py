@@ -1,6 +1,6 @@
 """Writes UWS 1.1 documents (job list, job, parameters, results) as XML of the IVOA schema.
 
-Citation: REC-UWS-1.1 (24 October 2016), appendix B, which also defines the order of elements. Times are UTC and end in Z.
+Citation: REC-UWS-1.1 (24 October 2016), appendix B. It also defines the order of the elements. Times are UTC and end in Z.
 """
 
 from __future__ import annotations
@@ -137,6 +137,6 @@ def _add_time(parent: ElementTree.Element, name: str, seconds: float | None) -> 
 
 def _written(root: ElementTree.Element) -> bytes:
     text = ElementTree.tostring(root, encoding="unicode")
-    # A bare carriage return would be read back as a line feed.
+    # XML parsers would read a carriage return as a line feed.
     text = text.replace("\r", "&#13;")
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + text.encode()
