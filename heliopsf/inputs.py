@@ -103,7 +103,7 @@ def header_of(image: Any) -> Header:
 
 
 def unit_text(unit: Any) -> str | None:
-    """A unit as the card BUNIT: "DN" and "DN/s" also for adu and counts. Raises ``DataError`` "bad-unit"."""
+    """The value of the card BUNIT for a unit; adu and counts also become "DN". Raises ``DataError`` "bad-unit"."""
     if unit is None:
         return None
     logarithmic = {units.mag, units.dex, units.dB}
@@ -111,7 +111,7 @@ def unit_text(unit: Any) -> str | None:
         raise DataError(
             "bad-unit",
             f"expected pixels that are proportional to the light, such as DN or DN/s; got the logarithmic unit {unit}: convert "
-            "them first",
+            "the pixels first",
         )
     pixel_free = unit * units.pix if units.pix in getattr(unit, "bases", ()) else unit
     for count in (units.DN, units.adu, units.ct):

@@ -139,7 +139,7 @@ class LocalService(Operations):
     def __init__(self, settings: Settings, cache: PsfCache | None = None) -> None:
         """cache: keeps built PSFs for later commands; None: built PSFs are not kept."""
         self._settings = settings
-        self._recipes: dict[str, list[PsfBuild]] = {}  # of the PSFs that a job may build, by the job's id
+        self._recipes: dict[str, list[PsfBuild]] = {}  # recipes of the PSFs that a job may build, by its id
         self._store = LocalStore(settings.data_dir)
         self._catalogue = Catalogue(settings.catalogue_url)
         self._catalogue.upgrade()

@@ -148,7 +148,7 @@ def delete_psf(psf_id: str, server: str | None) -> None:
 
 
 @click.command("best")
-@click.option("--image", type=FILE, help="Image (FITS) that the PSF is for")
+@click.option("--image", type=FILE, help="Image (FITS) for which a PSF is wanted")
 @_filter_options
 @JSON
 @SERVER
@@ -156,8 +156,8 @@ def delete_psf(psf_id: str, server: str | None) -> None:
 def best(
     image: Path | None, json_file: Path | None, server: str | None, overwrite: bool, **filters: str | None
 ) -> None:
-    """Show the PSF with which `heliopsf deconvolve` would deconvolve an image, and why; or find the PSF that has the given
-    properties. With --kind other than total, only certified PSFs and those of a context are searched for an image."""
+    """With --image, show the PSF that `heliopsf deconvolve` would use for the image, and why. Without it, find the PSF with the
+    given properties. With --image and a --kind other than total, only certified PSFs or the PSFs of a context are searched."""
     given = _given(filters)
     if image is not None and set(given) - {"context", "kind"}:
         raise click.UsageError(
