@@ -268,7 +268,9 @@ def _with_steps(parameters: Mapping[str, Any], iterations: int | None) -> dict[s
     if iterations is None:
         return dict(parameters)
     if "steps" in parameters:
-        raise DataError("bad-steps", "expected iterations or steps; got both: give one of them, they mean the same")
+        raise DataError(
+            "bad-steps", "expected iterations or steps; got both: give one of them, they mean the same"
+        )
     return {**parameters, "steps": iterations}
 
 

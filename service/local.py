@@ -329,7 +329,10 @@ class LocalService(Operations):
     def _psf(self, psf_id: str) -> PsfRow:
         row = self._catalogue.get(PsfRow, psf_id, DEFAULT_OWNER)
         if row is None:
-            raise ServiceError(f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it", code="no-such-psf")
+            raise ServiceError(
+                f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it",
+                code="no-such-psf",
+            )
         return row
 
     def _row(self, address: str) -> ProductRow | PsfRow | ReportRow:

@@ -26,7 +26,9 @@ class ChosenPsf(BaseModel):
 
     id: str
     name: str
-    version: str = Field(description="version of the PSF; if the PSF is not built yet: version of its instrument file")
+    version: str = Field(
+        description="version of the PSF; if the PSF is not built yet: version of its instrument file"
+    )
     status: str | None = Field(description="draft, certified or deprecated; null: the PSF is not built yet")
     why: str = Field(description="a sentence that says why this PSF was chosen")
 

@@ -40,7 +40,9 @@ class NewKey(BaseModel):
         "", max_length=LABEL_LENGTH, description="a note for lists, such as the purpose of the key"
     )
     scopes: list[Scope] = Field(
-        min_length=1, max_length=len(Scope), description="scopes of the new key; your own key must have them, or the scope admin"
+        min_length=1,
+        max_length=len(Scope),
+        description="scopes of the new key; your own key must have them, or the scope admin",
     )
     expires_at: float | None = Field(
         None,
@@ -52,7 +54,8 @@ class NewKey(BaseModel):
         None, gt=0, le=36_500, description="lifetime of the key in days, instead of expires_at"
     )
     owner: OwnerName | None = Field(
-        None, description="owner of the key; to name another owner than your own, your key needs the scope admin"
+        None,
+        description="owner of the key; to name another owner than your own, your key needs the scope admin",
     )
 
     @model_validator(mode="after")
@@ -78,9 +81,7 @@ class KeyView(BaseModel):
     expires_at: float | None = Field(description="null: the key is valid until it is revoked")
     revoked_at: float | None
     last_used_at: float | None = Field(description="time of the last use, to the minute; null: never used")
-    made_by: str | None = Field(
-        description="id of the key that made this key; null: the operator made it"
-    )
+    made_by: str | None = Field(description="id of the key that made this key; null: the operator made it")
 
     @classmethod
     def of(cls, row: KeyRow) -> KeyView:
@@ -103,7 +104,10 @@ def list_keys(
     state: Shared,
     owner: Annotated[
         str | None,
-        Query(max_length=64, description="owner of the keys; `*`: all owners. Others than your own need the scope admin"),
+        Query(
+            max_length=64,
+            description="owner of the keys; `*`: all owners. Others than your own need the scope admin",
+        ),
     ] = None,
     limit: Limit = 50,
     cursor: Cursor = None,
@@ -162,7 +166,9 @@ def revoke_key(
     state: Shared,
     and_made: Annotated[
         bool,
-        Query(description="also revoke all keys that were made with this key, for example because it was stolen"),
+        Query(
+            description="also revoke all keys that were made with this key, for example because it was stolen"
+        ),
     ] = False,
 ) -> KeyView:
     """Revoke a key. From now on, requests with it are refused; its logins in browsers and its event streams end. Jobs that were

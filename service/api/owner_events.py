@@ -132,9 +132,7 @@ async def follow_all(
     ] = None,
     bulk: Annotated[
         list[Id] | None,
-        Query(
-            max_length=MOST_NAMED, description="ids of bulk runs to send first, in any phase"
-        ),
+        Query(max_length=MOST_NAMED, description="ids of bulk runs to send first, in any phase"),
     ] = None,
     last_id: Moment = None,
 ) -> Response:

@@ -131,7 +131,11 @@ OTHER_CHANNEL = click.option(
     help="Use the PSF even if it is of another telescope, channel or filter than the image",
 )
 CENTRE = click.option(
-    "--centre", nargs=2, type=float, metavar="X Y", help="Position of the flare, px [default: searched in IMAGE]"
+    "--centre",
+    nargs=2,
+    type=float,
+    metavar="X Y",
+    help="Position of the flare, px [default: searched in IMAGE]",
 )
 BACKGROUND = "Image of the same frame before the flare (FITS)"
 SEED = click.option(

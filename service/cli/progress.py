@@ -64,7 +64,9 @@ class _Teller:
         self.bar = bar
         self.started_s = self.told_s = time.monotonic()
         self.pace, self.lock = Pace(), threading.Lock()
-        self.open_line = False  # whether a bar is the last text on the terminal; other text then needs a new line
+        self.open_line = (
+            False  # whether a bar is the last text on the terminal; other text then needs a new line
+        )
 
     def report(self, stage: str, step: int, steps: int) -> None:
         """Show that this step of a stage is done."""

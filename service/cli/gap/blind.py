@@ -49,9 +49,7 @@ IDEAL = (sys.executable, "-P", "-m", "psfcore.gap.ideal_observer", "{expected}",
 )
 @click.option("--keep", is_flag=True, help="Keep the images of each case after their use")
 @click.option("--scenes", multiple=True, type=FILE, help="Take scenes from these images (FITS), in turn")
-@click.option(
-    "--only", multiple=True, metavar="EFFECT", help="Use only these effects, one per case, in turn"
-)
+@click.option("--only", multiple=True, metavar="EFFECT", help="Use only these effects, one per case, in turn")
 @click.option(
     "--left",
     "left_pct",

@@ -289,7 +289,9 @@ def stuck_jobs(settings: Settings, catalogue: Catalogue) -> Finding:
     left = catalogue.census.count_unsubmitted(max(30.0, 5 * settings.reconcile_s))
     if not silent and not left:
         return Finding("stuck jobs", "ok", "none")
-    found = f"{silent} in progress whose worker does not report, {left} queued but not submitted to the broker"
+    found = (
+        f"{silent} in progress whose worker does not report, {left} queued but not submitted to the broker"
+    )
     return Finding(
         "stuck jobs",
         "warning" if settings.embedded else "broken",

@@ -42,7 +42,7 @@ export function follow(canvas, viewer) {
     canvas.addEventListener(name, (event) => {
       const started = touches.delete(event.pointerId);
       dividing = false;
-      // A finger has no cursor that rests: the touched pixel is read.
+      // A touch leaves no cursor on the picture, so the readout shows the touched pixel.
       if (started && event.pointerType === "touch" && viewer.source.overview) viewer.readout.show(viewer.pixelAt(event.clientX, event.clientY));
     });
   }
