@@ -74,9 +74,9 @@ def deconvolve(
 
     The first parameters are those of ``aiapy.psf.deconvolve``; calls of it work unchanged.
 
-    smap: the image. A sunpy Map, an NDData or a CCDData gives an object of the same class. An array gives an array, and needs
-    ``psf``. A path of a FITS file or an ``Image`` gives a ``Deconvolution``. A list of these gives a list. Cut-outs work
-    like whole images. Pixels that are NaN or masked are not used; they are NaN in the result.
+    smap: the image. A sunpy Map, an NDData or a CCDData gives an object of the same class. An array gives an array, and
+    needs ``psf``. A path of a FITS file or an ``Image`` gives a ``Deconvolution``. A list of these gives a list.
+    Cut-outs work like whole images. Pixels that are NaN or masked are not used; they are NaN in the result.
     psf: a ``Psf``, a path of a FITS file, or an array whose centre is [ny // 2, nx // 2]; default: the PSF that is built for
     the telescope in the header, see ``psf_for``. The PSF is rebinned if the image is binned.
     iterations: number of steps; default: that of the method (Richardson-Lucy: 20; aiapy: 25).
@@ -97,8 +97,8 @@ def deconvolve(
     progress: True, or a function that is called with (step, steps) after each step of the deconvolution.
     parameters: further parameters of the method, such as ``stop="discrepancy"``.
 
-    A Map or NDData keeps its metadata. The result also has the cards of products (PSFID, PSFVERS, ...), HISTORY, and a mask of
-    the pixels without a measurement (QUALITY 1 or 2: not finite, masked or saturated).
+    A Map or NDData keeps its metadata. The result also has the cards of products (PSFID, PSFVERS, ...), HISTORY, and a
+    mask of the pixels without a measurement (QUALITY 1 or 2: not finite, masked or saturated).
 
     Raises ``DataError``; its ``code`` is the reason, such as "no-psf-for-instrument", "not-fits", "already-deconvolved",
     "plate-scale-mismatch", "channel-mismatch" or "unknown-method". Gives a ``UserWarning`` if saturated pixels may be

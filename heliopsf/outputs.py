@@ -101,7 +101,7 @@ def in_form_of(image: Any, result: Deconvolution) -> Any:
 
 
 def used_psf(psf: Psf) -> UsedPsf:
-    """The PSF as the cards of a result name it. Its id is the one that a service would use: that of its recipe or file."""
+    """The PSF as the cards of a result name it, with the id that a service would use: that of its recipe or file."""
     identity = psf.provenance.get("psf_id")
     if identity is None:  # weights in memory
         identity = hashlib.sha256(f"{psf.kernel.shape}".encode() + psf.kernel.tobytes()).hexdigest()

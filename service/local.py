@@ -197,8 +197,8 @@ class LocalService(Operations):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        """Add a PSF. As in a service, a PSF that heliopsf made keeps its id, unless name, version, instrument, channel or kind is
-        given."""
+        """Add a PSF. As in a service, a PSF that heliopsf made keeps its id, unless name, version, instrument, channel
+        or kind is given."""
         source = Path(path)
         limits = FitsLimits(max_pixels=self._settings.max_pixels)
         summary = read_summary(source, limits)

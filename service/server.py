@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 def serve(
     settings: Settings, host: str, port: int, announce: Callable[[str], None], *, verbose: bool = False
 ) -> None:
-    """Serve until interrupted. Port 0: any free port. ``announce`` is called with the address of the server. verbose: also log
-    every request on a terminal.
+    """Serve until interrupted. Port 0: any free port. ``announce`` is called with the address of the server. verbose:
+    also log every request on a terminal.
 
     On SIGTERM or Control-C the server accepts no more connections. Running requests may continue for ``stop_s`` seconds. Then
     the server stops the embedded worker, which takes at most ``gone_s`` seconds.
@@ -89,7 +89,8 @@ class _Server(uvicorn.Server):
     """Tells the application about a shutdown. Requests that wait for a job are then answered at once."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen. The event loop accepts ``backlog`` connections at once; the system keeps up to ``LISTEN`` connections waiting."""
+        """Listen. The event loop accepts ``backlog`` connections at once; the system keeps up to ``LISTEN`` connections
+        waiting."""
         await super().startup(sockets)
         for listener in sockets or []:
             listener.listen(LISTEN)

@@ -54,8 +54,9 @@ class EstimateView(BaseModel):
 
 @router.post("", summary="Estimate a job without submitting it")
 def estimate_job(body: JobRequest, caller: Submitting, state: Shared) -> EstimateView:
-    """Estimate a job without starting it. The request and its errors are the same as for `POST /v1/jobs`. The answer contains the
-    expected time and memory, the place in the queue and, for a deconvolution, the PSF and the reason for its choice."""
+    """Estimate a job without starting it. The request and its errors are the same as for `POST /v1/jobs`. The answer
+    contains the expected time and memory, the place in the queue and, for a deconvolution, the PSF and the reason for
+    its choice."""
     parameters, result_id, estimate = prepared(body, caller, state)
     queue = queue_of(body.kind) if body.queue is None else Queue(body.queue)
     result = KINDS[body.kind].result

@@ -35,8 +35,8 @@ class Progress(BaseModel):
     step: int
     steps: int
     time_left_s: float | None = Field(
-        description="estimated time until the last of `steps`, s; null: unknown. The estimate uses the speed since the job began "
-        "to count these steps"
+        description="estimated time until the last of `steps`, s; null: unknown. It is estimated from the speed since the "
+        "job began to count these steps"
     )
 
 
@@ -60,9 +60,9 @@ class JobView(BaseModel):
     attempt: int
     cancel_requested: bool
     waiting_before: int | None = Field(
-        description="number of waiting jobs that are expected to start before this job: the jobs of more urgent queues, and jobs of "
-        "this queue, in which the owners take turns; 1000: 1000 or more; null: the job is not QUEUED. Only the answers to a "
-        "submission and to `GET /v1/jobs/{id}` contain this number; in lists and events it is null"
+        description="number of waiting jobs that are expected to start before this job: the jobs of more urgent queues, and "
+        "jobs of this queue, in which the owners take turns; 1000: 1000 or more; null: the job is not QUEUED. Only the "
+        "answers to a submission and to `GET /v1/jobs/{id}` contain this number; in lists and events it is null"
     )
     progress: Progress
     estimate: Estimate | None = Field(
@@ -220,8 +220,8 @@ def _view(row: JobRow, state: Shared) -> JobView:
 def time_left_s(row: JobRow, now: float | None = None) -> float | None:
     """Estimated time left of a running job, s; None if unknown.
 
-    The estimate uses the speed since the job began to count its present steps. Earlier work, such as reading the images, does
-    not count. now: seconds since 1970; default: this machine's clock.
+    The estimate uses the speed since the job began to count its present steps. Earlier work, such as reading the
+    images, does not count. now: seconds since 1970; default: this machine's clock.
     """
     now = time.time() if now is None else now
     done = row.step - row.count_step
@@ -231,7 +231,8 @@ def time_left_s(row: JobRow, now: float | None = None) -> float | None:
 
 
 def check_own(row: JobRow) -> JobRow:
-    """The job itself. Raises ``Problem`` 409 if the job is a part of a bulk run: only requests to the bulk run can change it."""
+    """The job itself. Raises ``Problem`` 409 if the job is a part of a bulk run: only requests to the bulk run can
+    change it."""
     if KINDS[row.kind].parameters is None:
         bulk_id = row.parameters["bulk_id"]
         raise Problem(

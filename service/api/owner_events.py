@@ -1,12 +1,13 @@
 """All jobs and bulk runs of an owner in one stream of server-sent events: ``/v1/events``.
 
-Browsers open at most six connections to a server over HTTP/1.1. A page with one stream for each job would use all of them.
+Browsers open at most six connections to a server over HTTP/1.1. A page with one stream for each job would use all of
+them.
 
-A stream reads the database every ``LOOK_EVERY_S`` seconds; the number of queries does not depend on the number of jobs. It
-remembers the last state of each open job (a job that has not ended), and sends the jobs whose state has changed. A remembered
-job that is no longer open has ended or was deleted; the stream reads it by its id, without comparing times. A job that ended
-before the stream first read it is found by the time of its end. The id of an event is a time (database clock): a client that
-reconnects with this id gets the jobs that ended after this time.
+A stream reads the database every ``LOOK_EVERY_S`` seconds; the number of queries does not depend on the number of jobs.
+It remembers the last state of each open job (a job that has not ended), and sends the jobs whose state has changed. A
+remembered job that is no longer open has ended or was deleted; the stream reads it by its id, without comparing times.
+A job that ended before the stream first read it is found by the time of its end. The id of an event is a time (database
+clock): a client that reconnects with this id gets the jobs that ended after this time.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from service.http.problems import RESPONSES
 from service.http.state import Shared
 from workers.catalogue.followed.rows import MOST, Followable, Followed, Place, State
 
-# Rows that ended up to this number of seconds before the last look are read again: they may have been committed late, and the
-# clocks of the machines that write the ends of bulk runs may differ from the clock of the database.
+# Rows that ended up to this number of seconds before the last look are read again: they may have been committed late,
+# and the clocks of the machines that write the ends of bulk runs may differ from the clock of the database.
 OVERLAP_S = 10.0
 MOST_NAMED = 50
 _UNKNOWN = State("", None, ())
@@ -39,8 +40,8 @@ Id = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
 Moment = Annotated[str | None, Header(alias="Last-Event-ID", pattern=r"^[0-9]{1,12}\.[0-9]{3}$")]
 DESCRIBED: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Events `job` and `bulk` are sent for new and changed jobs and bulk runs; the data is the complete job or "
-        'bulk run. Events `gone` are sent for deleted ones; the data is {"kind": "job" or "bulk", "id": ...}.',
+        "description": "Events `job` and `bulk` are sent for new and changed jobs and bulk runs; the data is the complete job "
+        'or bulk run. Events `gone` are sent for deleted ones; the data is {"kind": "job" or "bulk", "id": ...}.',
         "content": {TYPE: {}},
     },
 }
@@ -58,9 +59,9 @@ class News:
 class Watch(Generic[Followable]):
     """The rows of one table (jobs or bulk runs) as a stream last read them.
 
-    kind: name of the events. named: ids that the request names; these rows are followed in any phase. place: the next look
-    reads rows that ended after this place. known: the last state that was sent of each row, by id; None: the last event was
-    ``gone``.
+    kind: name of the events. named: ids that the request names; these rows are followed in any phase. place: the next
+    look reads rows that ended after this place. known: the last state that was sent of each row, by id; None: the last
+    event was ``gone``.
     """
 
     kind: str
@@ -72,7 +73,8 @@ class Watch(Generic[Followable]):
     known: dict[str, State | None] = field(default_factory=dict)
 
     def look(self) -> tuple[list[News], Watch[Followable]]:
-        """The news since the last look, and the watch for the next look. This watch does not change, so a failed look loses nothing."""
+        """The news since the last look, and the watch for the next look. This watch does not change, so a failed look
+        loses nothing."""
         again_from = self.rows.now() - OVERLAP_S
         ended = self.rows.ended(self.owner, self.place)
         open_now = self.rows.open(self.owner)
@@ -136,11 +138,12 @@ async def follow_all(
     ] = None,
     last_id: Moment = None,
 ) -> Response:
-    """First send all jobs and bulk runs that have not ended or that ended in the last seconds. Then send each one when it changes.
+    """First send all jobs and bulk runs that have not ended or that ended in the last seconds. Then send each one when
+    it changes.
 
-    A client that reconnects with `Last-Event-ID` also gets the jobs and bulk runs that ended in the meantime; it may get some of
-    them twice. If an owner has very many waiting jobs, only the newest are sent at first; each of the others is sent when it
-    starts. The turns of bulk runs, which are jobs too, are not sent.
+    A client that reconnects with `Last-Event-ID` also gets the jobs and bulk runs that ended in the meantime; it may
+    get some of them twice. If an owner has very many waiting jobs, only the newest are sent at first; each of the
+    others is sent when it starts. The turns of bulk runs, which are jobs too, are not sent.
     """
     catalogue, owner = state.catalogue, caller.owner
     since = Place(
@@ -174,7 +177,7 @@ async def follow_all(
 
 
 def _with_id(texts: Sequence[str], place: float, *, alone: bool) -> str:
-    """The texts, with the id of ``place`` in the last text only. So a client that gets only some of them asks for all again.
+    """The texts. Only the last contains the id of ``place``, so a client that gets only some asks for all again.
 
     alone: send the id even if there is no text.
     """

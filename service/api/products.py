@@ -135,7 +135,8 @@ def get_product_changes(product_id: Identity, request: Request, caller: Reading,
         raise Problem(
             404,
             "no-effects-picture",
-            "expected a product whose job had changes_picture true; this job had it false: submit the job again with changes_picture true",
+            "expected a product whose job had changes_picture true; this job had it false: submit the job again with "
+            "changes_picture true",
         )
     return files.send(request, state.store, digest, "image/png", None)
 
@@ -145,7 +146,8 @@ def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> R
     """Remove the product from the catalogue and from your quota. The same request makes it again."""
     row = find(state, caller, product_id)
     state.catalogue.delete_product(product_id, caller.owner)
-    # The files are deleted at once. Otherwise an owner who deletes products and submits jobs in turn could exceed the quota.
+    # The files are deleted at once. Otherwise an owner who deletes products and submits jobs in turn could exceed the
+    # quota.
     remove_unnamed(state.catalogue, state.store, [digest for digest, _ in files_of(row)])
     return Response(status_code=204)
 

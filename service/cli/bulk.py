@@ -124,8 +124,8 @@ def submit(
     """Start a bulk run: deconvolve the files on the machine of the service that match PATTERNS.
 
     A pattern is an absolute path in a folder that the operator allows. * ? and [ab] match parts of a name, ** matches any
-    number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context. If the service refuses
-    files of --upload, the command names them and starts the run with the other files; the exit status is then 1.
+    number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context. If the service
+    refuses files of --upload, the command names them, starts the run with the others, and ends with status 1.
     """
     if (psf is None) == (context is None):
         raise click.UsageError("expected either --psf or --context")

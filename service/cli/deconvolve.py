@@ -95,8 +95,8 @@ def deconvolve(
     """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with the PSF that you name.
 
     The output is a folder if there are several images, or if its name ends in /. Images whose product is in the folder
-    are skipped. At most four jobs are open on a service at the same time. If an image fails, the command continues with the
-    others and lists the failures at the end; the exit status is then 1.
+    are skipped. At most four jobs are open on a service at the same time. If an image fails, the command continues with
+    the others and lists the failures at the end; the exit status is then 1.
     """
     files = fits_files(images)
     if not files:

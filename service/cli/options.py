@@ -291,7 +291,8 @@ def read_settings(data: Path | None = None) -> Settings:
 
 
 def data_settings(data: Path | None) -> Settings:
-    """The settings of a command that opens the data folder. If this is the folder of an earlier version, a note is printed."""
+    """The settings of a command that opens the data folder. If this is the folder of an earlier version, a note is
+    printed."""
     from workers.data_folder import told
 
     settings = read_settings(data)

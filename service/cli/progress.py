@@ -51,7 +51,7 @@ def duration(seconds: float) -> str:
 
 
 def told(stage: str, step: int, steps: int) -> str:
-    """A stage and its step as text; only the stage if the number of its steps is unknown (reported as 1 until the stage ends)."""
+    """A stage and its step as text; only the stage if its number of steps is unknown (then it is reported as 1)."""
     if (steps <= 1 and step < steps) or not steps:
         return stage
     return f"{stage}: {STEPS_OF.get(stage, 'step')} {step} of {steps}"
@@ -106,7 +106,7 @@ _tellers: list[_Teller] = []  # of the open blocks of ``progress_bar``, the inne
 
 @contextmanager
 def progress_bar() -> Iterator[Report]:
-    """Show the progress of the block, and the time left in its present stage: a bar on a terminal, else a line every 10 s."""
+    """Show the progress of the block and the time left in its stage: a bar on a terminal, else a line every 10 s."""
     teller = _Teller(bar=sys.stderr.isatty())
     _tellers.append(teller)
     try:

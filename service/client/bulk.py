@@ -28,8 +28,8 @@ class BulkClient(ABC):
     """The requests about bulk runs and events.
 
     Every method raises ``ServiceError``; its ``code`` is the reason ("path-not-allowed", "no-such-bulk", ...).
-    server: address of the service. say: a function that is called with a sentence when the service stops answering during a
-    wait, and when it answers again.
+    server: address of the service. say: a function that is called with a sentence when the service stops answering
+    during a wait, and when it answers again.
     """
 
     server: str
@@ -150,8 +150,8 @@ class BulkClient(ABC):
     def follow(self, address: str) -> Iterator[dict[str, Any]]:
         """Yield the description of a job or bulk run (address ``/v1/jobs/...``, ``/v1/bulk/...``) now and after each change.
 
-        The iteration ends when the job or bulk run ends or is deleted. If the service does not answer, for example during a
-        restart, the client tries again for up to 10 minutes and then raises ``ServiceError``.
+        The iteration ends when the job or bulk run ends or is deleted. If the service does not answer, for example
+        during a restart, the client tries again for up to 10 minutes and then raises ``ServiceError``.
         """
         with closing(self._told(f"{address}/events")) as events:
             for event in events:
@@ -166,17 +166,17 @@ class BulkClient(ABC):
     ) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield all news of your jobs and bulk runs: ("job", description), ("bulk", description), ("gone", {"kind", "id"}).
 
-        The first news are the jobs and bulk runs that have not ended and those in ``jobs`` and ``bulks`` (ids); then comes
-        each one that changes. The iteration does not end by itself. If the service does not answer, the client tries again for up
-        to 10 minutes and then raises ``ServiceError``.
+        The first news are the jobs and bulk runs that have not ended and those in ``jobs`` and ``bulks`` (ids); then
+        comes each one that changes. The iteration does not end by itself. If the service does not answer, the client
+        tries again for up to 10 minutes and then raises ``ServiceError``.
         """
         with closing(self._told("/v1/events", params={"job": list(jobs), "bulk": list(bulks)})) as events:
             for event in events:
                 yield event["event"], json.loads(event["data"])
 
     def _told(self, address: str, **options: Any) -> Generator[dict[str, str], None, None]:
-        """The events of a stream. If the connection is lost, the stream is opened again. The iteration ends if the service has no
-        more events (204)."""
+        """The events of a stream. If the connection is lost, the stream is opened again. The iteration ends if the
+        service has no more events (204)."""
         last_id: str | None = None
         wait_s, heard_at, lost = FIRST_WAIT_S, time.monotonic(), False
         while True:

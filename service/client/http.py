@@ -49,8 +49,9 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         transport: httpx.BaseTransport | None = None,
         say: Callable[[str], None] = _silent,
     ) -> None:
-        """server: address of the service; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY. say: a function that is
-        called with a sentence during a wait, if the job stays in the queue or the service does not answer.
+        """server: address of the service; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY. say: a
+        function that is called with a sentence during a wait, if the job stays in the queue or the service does not
+        answer.
 
         A service of this machine needs no scheme: ``localhost:8765``. Raises ``ServiceError`` "bad-address", and "bad-key" if
         the key cannot be sent.
@@ -118,7 +119,8 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **series})
 
     def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        """Submit a job; returns its description. If an identical job was submitted before, the description is of that job.
+        """Submit a job; returns its description. If an identical job was submitted before, the description is of that
+        job.
 
         queue: "bulk" runs the job after all jobs of other queues; default: the queue of its kind.
         """

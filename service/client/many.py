@@ -3,9 +3,9 @@
 A few jobs are in flight at a time, so that the workers of a service need not wait for uploads and downloads. One thread does
 everything in the order of the images: it begins images until enough jobs are in flight, then waits for the oldest of them.
 
-The file of a product is named after the image's file and the product's identity. An image is skipped if the folder already
-contains its product, made from the same bytes with the same PSF and parameters. Products in the folder are recognised by
-their cards INPSHA and PRODID, whatever their names.
+The file of a product is named after the image's file and the product's identity. An image is skipped if the folder
+already contains its product, made from the same bytes with the same PSF and parameters. Products in the folder are
+recognised by their cards INPSHA and PRODID, whatever their names.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class _Run:
         return [one.job for one in self._begun if isinstance(one, _Begun) and one.job is not None]
 
     def _finished(self, leave: int) -> Iterator[Outcome]:
-        """Finish images, oldest first, until at most ``leave`` jobs are in flight and the oldest open image has a job."""
+        """Finish images, oldest first, until at most ``leave`` jobs are in flight and the oldest image left has one."""
         while self._begun:
             first = self._begun[0]
             if isinstance(first, _Begun):

@@ -1,4 +1,5 @@
-"""The requests to a service. They use a few abstract operations. The HTTP client and the service in this process implement these.
+"""The requests to a service. They use a few abstract operations. The HTTP client and the service in this process
+implement these.
 
 A method that writes files checks them before it sends anything (``service.client.outputs.check_outputs``). An existing
 file is replaced only with ``overwrite=True``, and only when the new file is complete.
@@ -54,7 +55,8 @@ class Operations(ABC):
 
     @abstractmethod
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
-        """Submit a job; returns its description. If an identical job was submitted before, the description is of that job."""
+        """Submit a job; returns its description. If an identical job was submitted before, the description is of that
+        job."""
 
     @abstractmethod
     def result_id(self, kind: str, **parameters: Any) -> str:
@@ -66,7 +68,7 @@ class Operations(ABC):
 
     @abstractmethod
     def release(self, product: dict[str, Any]) -> None:
-        """Delete the files of a downloaded product if the service is in this process. A service over HTTP keeps them."""
+        """Delete the files of a downloaded product if the service runs in this process; over HTTP, keep them."""
 
     @abstractmethod
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:

@@ -80,7 +80,8 @@ def _caller(
     _bearer: Annotated[None, Depends(_AS_BEARER)],
     _basic: Annotated[None, Depends(_AS_PASSWORD)],
 ) -> Caller:
-    """The caller of a request. Raises ``Problem`` if the key lacks a scope that the route needs, or if the caller reached a limit."""
+    """The caller of a request. Raises ``Problem`` if the key lacks a scope that the route needs, or if the caller
+    reached a limit."""
     let_in: Caller | None = getattr(request.state, "let_in", None)  # set by KeyFirst
     return let_in or admit(request, state, needed.scopes)
 
@@ -118,14 +119,14 @@ def address_of(request: Request) -> str:
 def cookie_name(request: Request) -> str:
     """The name of the cookie of a session.
 
-    Browsers accept a cookie with the prefix ``__Host-`` only over HTTPS and only from this host. So no other host of the domain
-    can set it.
+    Browsers accept a cookie with the prefix ``__Host-`` only over HTTPS and only from this host. So no other host of
+    the domain can set it.
     """
     return f"__Host-{SESSION_COOKIE}" if request.url.scheme == "https" else SESSION_COOKIE
 
 
 def still_let_in(state: State, caller: Caller) -> bool:
-    """Whether the key of a caller, and the session if there is one, are valid now. Event streams check this repeatedly."""
+    """Whether a caller's key, and the session if there is one, are valid now. Event streams check this repeatedly."""
     if not state.access.keys:
         return True
     if caller.session is not None:
@@ -180,11 +181,11 @@ def _check_form_token(request: Request, session: SessionRow, sent: str) -> None:
 
 
 def _challenge(request: Request) -> dict[str, str]:
-    """The header that lists the ways to send a key. For a page it does not list Basic: the browser would open its own window
-    and ask for a password.
+    """The header that lists the ways to send a key. For a page it does not list Basic: the browser would open its own
+    window and ask for a password.
 
-    Browsers accept XHTML when a person opens an address. Clients of the Virtual Observatory that are written in Java accept
-    ``text/html`` but not XHTML; for them the header must list Basic.
+    Browsers accept XHTML when a person opens an address. Clients of the Virtual Observatory that are written in Java
+    accept ``text/html`` but not XHTML; for them the header must list Basic.
     """
     page = (
         request.headers.get("sec-fetch-site") == "same-origin"
@@ -212,7 +213,7 @@ def _sent_key(request: Request) -> str:
 
 
 class KeyFirst(APIRoute):
-    """A route with a JSON body. It checks the caller before it reads the body. By default, FastAPI reads the body first.
+    """A route with a JSON body. It checks the caller before it reads the body; FastAPI alone would read the body first.
 
     The bulk runs that one owner submits are read one after the other, because their bodies may be large.
     """

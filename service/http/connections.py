@@ -41,9 +41,9 @@ _FULL_BODY = (
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """most: largest number of connections that are open at the same time. header_s: longest time until the header of a request
-    is complete, from the connection or from the last answer. stalled_s: longest time in which a client takes no part of its
-    answer."""
+    """most: largest number of connections that are open at the same time. header_s: longest time until the header of a
+    request is complete, from the connection or from the last answer. stalled_s: longest time in which a client takes no
+    part of its answer."""
 
     most: int
     header_s: float
@@ -72,7 +72,7 @@ class BoundedConnection(H11Protocol):
         return self.cycle is not None and not self.cycle.response_complete
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Accept the connection. If too many are open, close another one that waits for a request, or refuse this one."""
+        """Accept the connection. If too many are open, close one that waits for a request; if none waits, refuse this."""
         super().connection_made(transport)
         if self._open_connections() > self.limits.most and not self._close_the_longest_waiting():
             log.warning(
@@ -155,7 +155,7 @@ def bounded(limits: ConnectionLimits) -> type[BoundedConnection]:
 
 
 def _most(wanted: int) -> int:
-    """The number of connections for which there are file descriptors. If needed, the process's limit is raised first."""
+    """The number of connections for which there are file descriptors. If needed, it first raises the process's limit."""
     needed = OWN_DESCRIPTORS + PER_CONNECTION * wanted
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < needed:

@@ -1,5 +1,5 @@
-"""Receives an upload: streams it to the store, and at the same time hashes, counts and checks its bytes. The whole upload is
-never in memory."""
+"""Receives an upload: streams it to the store, and at the same time hashes, counts and checks its bytes. The whole
+upload is never in memory."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ class _Archive:
 
 
 def _refuse_by_length(request: Request, max_bytes: int) -> int:
-    """The length that the request declares; 0 if it declares none. Raises ``Problem`` 413 if the length is too large."""
+    """The length that the request declares; 0 if it declares none. Raises ``Problem`` 413 if it is too large."""
     text = request.headers.get("content-length", "")
     declared = int(text) if text.isdecimal() else 0
     if declared > max_bytes + FORM_BYTES:

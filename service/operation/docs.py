@@ -1,7 +1,8 @@
 """The interactive API reference at ``/docs``: Swagger UI, served from this host.
 
-The package ``fastapi-swagger`` contains the scripts and the style sheet of Swagger UI. The page of that package starts Swagger
-UI with an inline script, which our content security policy forbids. The page in this module starts it with a script file.
+The package ``fastapi-swagger`` contains the scripts and the style sheet of Swagger UI. The page of that package starts
+Swagger UI with an inline script, which our content security policy forbids. The page in this module starts it with a
+script file.
 """
 
 from __future__ import annotations

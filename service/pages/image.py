@@ -37,7 +37,7 @@ router = APIRouter(prefix="/images/{image_id}", include_in_schema=False)
 
 @dataclass(frozen=True)
 class Checked:
-    """The result of the check of the options. lines: sentences, the most important first. button: the text of the button."""
+    """The result of a check of the options. lines: sentences, the most important first. button: the button's text."""
 
     good: bool
     lines: tuple[str, ...]

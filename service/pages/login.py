@@ -50,7 +50,8 @@ def log_in(
     key: Annotated[str, Form()] = "",
     next_address: Annotated[str, Form(alias="next")] = "",
 ) -> Response:
-    """Begin a session, and go to the requested page. Every refused key counts against the rate limit of the client's address."""
+    """Begin a session, and go to the requested page. Every refused key counts against the rate limit of the client's
+    address."""
     if not state.access.keys:
         return RedirectResponse(local_address(next_address), 303)
     try:
@@ -77,7 +78,8 @@ def log_out(request: Request, _caller: PageVisiting, state: Shared) -> Response:
 
 
 def local_address(sent: str) -> str:
-    """The address of a page of this service; "/" if the text could lead a browser to another site, or to the login page."""
+    """The address of a page of this service; "/" if the text could lead a browser to another site, or to the login
+    page."""
     elsewhere = not sent.startswith("/") or sent.startswith("//") or "\\" in sent
     if elsewhere or not sent.isprintable() or len(sent) > LONGEST_ADDRESS:
         return "/"

@@ -1,10 +1,11 @@
-"""Identifies the visitor of a page. If keys are required, a visitor without a session is sent to the login page, and then back.
+"""Identifies the visitor of a page. If keys are required, a visitor without a session is sent to the login page, and
+then back.
 
-The routes of pages have a parameter ``PageReading``, ``PageSubmitting``, ``PageBulk``, ``PageCertifying`` or ``PageVisiting``. It
-replaces the parameter from ``service.http.callers`` that routes of the API have. There are two differences: without a session
-the visitor is redirected, and the form token may also be a field of the form. The field is read only if no header says from
-which site the request comes. It is never read from a multipart form, because such a form may contain a large file, which only
-the route may read.
+The routes of pages have a parameter ``PageReading``, ``PageSubmitting``, ``PageBulk``, ``PageCertifying`` or
+``PageVisiting``. It replaces the parameter from ``service.http.callers`` that routes of the API have. There are two
+differences: without a session the visitor is redirected, and the form token may also be a field of the form. The field
+is read only if no header says from which site the request comes. It is never read from a multipart form, because such a
+form may contain a large file, which only the route may read.
 """
 
 from __future__ import annotations
@@ -76,8 +77,8 @@ async def _form_token(request: Request) -> str | None:
 def _came_by_link(request: Request) -> bool:
     """Whether a person followed a link on another site. The browser then withholds the cookie, because it is ``SameSite=Strict``.
 
-    Therefore the answer is a page that opens the login page. That second request comes from a page of this service, so it has
-    the cookie.
+    Therefore the answer is a page that opens the login page. That second request comes from a page of this service, so
+    it has the cookie.
     """
     return request.headers.get("sec-fetch-site") == "cross-site"
 

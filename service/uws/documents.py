@@ -1,6 +1,6 @@
 """Writes UWS 1.1 documents (job list, job, parameters, results) as XML of the IVOA schema.
 
-Citation: REC-UWS-1.1 (24 October 2016), appendix B. It also defines the order of the elements. Times are UTC and end in Z.
+Citation: REC-UWS-1.1 (24 October 2016), appendix B, which also defines the order of elements. Times are UTC and end in Z.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Pixels of images and products, ``.../pixels``: raw numbers, so that a viewer can show exact values.
 
-The first request for a plane decodes it; later requests read the decoded plane (``psfcore.fits.viewing``). The first request
-for pixels loads the numerical libraries.
+The first request for a plane decodes it; later requests read the decoded plane (``psfcore.fits.viewing``). The first
+request for pixels loads the numerical libraries.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ def _part(
         Query(
             ge=1,
             le=LARGEST,
-            description="n: each number of the answer stands for a block of n x n pixels. It is the mean of the finite pixels; for "
-            "`quality` it is the bitwise OR. Blocks at the last rows and columns of the window may be smaller",
+            description="n: each number of the answer stands for a block of n x n pixels. It is the mean of the finite "
+            "pixels; for `quality` it is the bitwise OR. Blocks at the last rows and columns of the window may be smaller",
         ),
     ] = 1,
 ) -> Part:

@@ -27,7 +27,7 @@ from service.http.state import Shared, State
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import Identity
 
-# This number is part of every ETag. Increase it when a new version of the code gives another answer for the same tables.
+# This number is part of every ETag. Increase it when a new version of the code gives other answers for the same tables.
 ANSWERS_VERSION = 1
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 

@@ -120,9 +120,9 @@ async def upload_psf(
 ) -> PsfView:
     """Upload a PSF: one 2-D image with its centre at [n//2, n//2] and a sum of at most 1.
 
-    Header and weights are checked at upload; compressed weights are checked by the jobs that use the PSF. A refused file is not
-    stored. If a job of this service made the same file, and the request gives no name, version, instrument, channel or kind, the
-    answer is the existing PSF.
+    Header and weights are checked at upload; compressed weights are checked by the jobs that use the PSF. A refused
+    file is not stored. If a job of this service made the same file, and the request gives no name, version, instrument,
+    channel or kind, the answer is the existing PSF.
     """
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes

@@ -156,8 +156,9 @@ def delete_psf(psf_id: str, server: str | None) -> None:
 def best(
     image: Path | None, json_file: Path | None, server: str | None, overwrite: bool, **filters: str | None
 ) -> None:
-    """With --image, show the PSF that `heliopsf deconvolve` would use for the image, and why. Without it, find the PSF with the
-    given properties. With --image and a --kind other than total, only certified PSFs or the PSFs of a context are searched."""
+    """With --image, show the PSF that `heliopsf deconvolve` would use for the image, and why. Without it, find the PSF
+    with the given properties. With --image and a --kind other than total, only certified PSFs or the PSFs of a context are
+    searched."""
     given = _given(filters)
     if image is not None and set(given) - {"context", "kind"}:
         raise click.UsageError(

@@ -85,7 +85,8 @@ async def fields(request: Request) -> Sent:
 
 
 def wrong_fields(error: ValidationError, model: Any, *, above: int = 0) -> Problem:
-    """The problem that names each wrong field. model: the validated model. above: the number of its levels above the fields."""
+    """The problem that names each wrong field. model: the validated model. above: the number of its levels above the
+    fields."""
     said = [
         f"{'.'.join(map(str, found['loc'][above:])) or 'the form'}: {told}"
         for found, told in explained(error.errors(), model)

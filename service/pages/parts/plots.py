@@ -20,7 +20,8 @@ Draw = Literal["line", "points"]
 
 @dataclass(frozen=True)
 class Series:
-    """A curve or points. low, high: ends of the band or of the error bars (both or neither); an entry None: no band at this x."""
+    """A curve or points. low, high: ends of the band or of the error bars (both or neither); an entry None: no band at
+    this x."""
 
     label: str
     values: Numbers
@@ -87,7 +88,8 @@ def around(values: Sequence[float], sigma: Sequence[float] | None) -> tuple[Numb
 
 
 def shown_radii(radii: Sequence[float], least: float = 0.0) -> list[int]:
-    """The indices of the radii that a table shows: all radii near the centre; farther out, radii in ratios of at least ``RATIO``.
+    """The indices of the radii that a table shows: all radii near the centre; farther out, radii in ratios of at least
+    ``RATIO``.
 
     least: smaller radii are left out.
     """

@@ -178,7 +178,7 @@ def _banded(label: str, limits: Mapping[str, Numbers]) -> Series:
 
 @dataclass(frozen=True)
 class Disc:
-    """A disc on the map. x, y: position in the picture, with y = 0 at the top. row: its row in the tables of the plots."""
+    """A disc on the map. x, y: position in the picture, y = 0 at the top. row: its row in the tables of the plots."""
 
     row: int
     x: float
@@ -273,7 +273,7 @@ def rerun_arrays(report: Report) -> list[Row]:
 
 
 def rerun_makers(report: Report) -> list[Row]:
-    """The properties in which the making of the first and of the new result differ: name, and the value for each result."""
+    """The properties in which the making of the first and of the new result differ: name, first value, new value."""
     first, again = (_flat(report[name]) for name in ("first", "again"))
     names = [*first, *(name for name in again if name not in first)]
     rows = [(name, first.get(name, "-"), again.get(name, "-")) for name in names if name not in NOT_COMPARED]

@@ -51,7 +51,7 @@ def plain(message: str) -> str:
 
 
 def _wrong_fields(message: str, _fields: Mapping[str, Any]) -> str:
-    """An error message about one or more fields, as a sentence. Each field name is replaced by its label in the form."""
+    """An error message about one or more fields, as a sentence. Each field name is replaced by its form label."""
     text = message.replace("Value error, ", "").removeprefix("the form: ")
 
     def label(found: re.Match[str]) -> str:
