@@ -1,4 +1,4 @@
-"""Results of a deconvolution: as an object of its own, or in the form of the user's image."""
+"""Results of a deconvolution: as a ``Deconvolution``, or in the form of the user's image."""
 
 from __future__ import annotations
 

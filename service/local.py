@@ -330,7 +330,7 @@ class LocalService(Operations):
         row = self._catalogue.get(PsfRow, psf_id, DEFAULT_OWNER)
         if row is None:
             raise ServiceError(
-                f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it",
+                f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
                 code="no-such-psf",
             )
         return row

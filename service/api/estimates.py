@@ -1,4 +1,4 @@
-"""What a job would cost, and which PSF it would use, before it is submitted: ``/v1/estimates``."""
+"""The expected time and memory of a job, and its PSF, before it is submitted: ``/v1/estimates``."""
 
 from __future__ import annotations
 

@@ -248,5 +248,7 @@ def find(state: Shared, caller: Caller, job_id: str) -> JobRow:
     """The row of a job. Raises ``Problem`` 404 if the caller has no such job."""
     row = state.catalogue.jobs.get(job_id)
     if row is None or row.owner != caller.owner:
-        raise Problem(404, "no-such-job", f"expected the id of one of your jobs; got {job_id}")
+        raise Problem(
+            404, "no-such-job", f"expected the id of one of your jobs; got {job_id}: list your jobs"
+        )
     return row

@@ -98,7 +98,7 @@ def get_product(product_id: Identity, caller: Reading, state: Shared) -> Product
 def get_product_file(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the product; its hash is the ETag."""
     row = find(state, caller, product_id)
-    # Products of earlier versions have no name of their own.
+    # Products of earlier versions have no stored file name.
     name = row.details.get("filename", f"heliopsf-{product_id[:12]}.fits")
     return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, name, size=row.bytes)
 
@@ -159,6 +159,6 @@ def find(state: Shared, caller: Caller, product_id: str) -> ProductRow:
         raise Problem(
             404,
             "no-such-product",
-            f"expected the id of a product in the catalogue; got {product_id}, which is not in it",
+            f"expected the id of a product in the catalogue; got {product_id}, which is not in it: list your products",
         )
     return row

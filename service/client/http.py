@@ -61,7 +61,8 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         if not (key.isascii() and key.isprintable()) or " " in key:
             # The key is checked here. Otherwise the HTTP library would print the key in its error about a bad header.
             raise ServiceError(
-                "expected a key of the form hpsf_ID_SECRET; got something else", code="bad-key"
+                "expected a key of the form hpsf_ID_SECRET; got another text: set HELIOPSF_KEY to the whole key",
+                code="bad-key",
             )
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         self.say = say
@@ -128,7 +129,7 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return self._json("POST", "/v1/jobs", json=body)
 
     def estimate(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        """What such a job would cost; no job is started. The arguments and the errors are those of ``submit``.
+        """Estimate a job without starting it. The arguments and the errors are those of ``submit``.
 
         "estimate" has the expected ``seconds`` and ``memory_mib``, "psf" says which PSF a deconvolution would use and why, and
         "existing" is the address of the result if there is one already.

@@ -101,7 +101,7 @@ def admit(request: Request, state: State, scopes: Iterable[str], form_token: str
             raise Problem(
                 403,
                 "scope-missing",
-                f"expected a key with the scope '{scope}'; this key has {', '.join(sorted(caller.scopes))}",
+                f"expected a key with the scope '{scope}'; this key has {', '.join(sorted(caller.scopes))}: use another key, or ask the operator",
             )
         reading = scope in (Scope.READ, Scope.ADMIN)
         bucket = Bucket.READS if reading else Bucket.SUBMISSIONS

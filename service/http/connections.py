@@ -143,7 +143,7 @@ class BoundedConnection(H11Protocol):
             return False
         min(waiting, key=lambda one: one._waits_since).transport.abort()
         log.warning(
-            "all %d connections of this server are open: each new one closes the one that has waited longest for a request",
+            "all %d connections of this server are open: each new connection closes the one that has waited longest for a request",
             self.limits.most,
         )
         return True

@@ -148,7 +148,7 @@ def install(app: FastAPI, as_page: AsPage) -> None:
             return document(status, code, detail, headers=headers, **more)
         made = as_page(request, status, code, detail, more)
         for name, value in (headers or {}).items():
-            made.headers.setdefault(name, value)  # a page has a policy of its own
+            made.headers.setdefault(name, value)  # a page has its own security policy
         return made
 
     @app.exception_handler(Problem)

@@ -185,5 +185,9 @@ def _facts(row: ImageRow) -> list[tuple[str, str]]:
 def _find(state: State, caller: Caller, image_id: str) -> ImageRow:
     row = state.catalogue.get(ImageRow, image_id, caller.owner)
     if row is None:
-        raise Problem(404, "no-such-image", f"expected the id of one of your images; got {image_id}")
+        raise Problem(
+            404,
+            "no-such-image",
+            f"expected the id of one of your images; got {image_id}: upload the image, or list your images",
+        )
     return row

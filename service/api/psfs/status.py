@@ -112,7 +112,8 @@ def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusVi
     if row is None:
         raise problem(
             DataError(
-                "no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it"
+                "no-such-psf",
+                f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
             )
         )
     return _view(state, caller, row)

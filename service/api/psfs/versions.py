@@ -250,6 +250,8 @@ def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
     row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
         raise Problem(
-            404, "no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it"
+            404,
+            "no-such-psf",
+            f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
         )
     return row

@@ -217,7 +217,7 @@ COMMANDS = (list_psfs, upload_psf, certify, deprecate, delete_psf, best, lineage
 
 
 def _chosen(service: Client, image: Path, context: str | None) -> dict[str, Any]:
-    """The PSF that a deconvolution of an image would use, and why. A PSF that is not built yet has no description of its own."""
+    """The PSF that a deconvolution of an image would use, and why. Of a PSF that is not built yet, only the entry of the estimate is known."""
     image_id = service.upload_image(image)["id"]
     chosen = service.estimate("deconvolve", image_id=image_id, context=context)["psf"]
     psf = chosen if chosen["status"] is None else service.psf(chosen["id"])

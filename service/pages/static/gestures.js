@@ -58,7 +58,7 @@ function divide(event, canvas, viewer) {
   viewer.set({ divider: Math.min(Math.max((event.clientX - box.left) / box.width, 0), 1) });
 }
 
-/** Keep what is under two fingers under them. */
+/** Move and zoom so that the points of the image under two fingers stay under them. */
 function pinch(before, after, viewer) {
   const span = ([a, b]) => Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
   const middle = ([a, b]) => [(a.clientX + b.clientX) / 2, (a.clientY + b.clientY) / 2];

@@ -131,7 +131,7 @@ export class Renderer {
   }
 
   /**
-   * Draw one picture. sheets: the later ones over the earlier ones. panels: {left, width, from, to, shown}, device px: the axis of a
+   * Draw one picture. sheets: later sheets are drawn over earlier ones. panels: {left, width, from, to, shown}, device px: the axis of a
    * panel starts at `left` and has `width`; its part between `from` and `to` is drawn. shown: "before", "after" or "change".
    * look: {centre: {x, y}, zoom, limits and colours by what is shown, markQuality, markError (percent, or null)}.
    *

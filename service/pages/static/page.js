@@ -1,4 +1,4 @@
-// What the scripts of all pages share: elements, requests and their errors.
+// Functions that the scripts of all pages share: elements, requests and their errors.
 
 /** An element. attributes: `on...` names add listeners, `class` and others are set as attributes; null ones are left out. */
 export function element(tag, attributes = {}, ...children) {

@@ -23,7 +23,7 @@ const isA = {
   boolean: (value) => typeof value === "boolean",
   null: (value) => value === null,
 };
-// Keywords of JSON Schema that limit a value, with what they expect.
+// Keywords of JSON Schema that limit a value. Each function returns true, or a text that says what was expected.
 const LIMITS = {
   const: (limit, value) => value === limit || `expected ${JSON.stringify(limit)}`,
   enum: (limit, value) => limit.includes(value) || `expected one of ${limit.join(", ")}`,
