@@ -48,7 +48,7 @@ def _is_of(image: Any, module: str, name: str) -> bool:
 
 
 def image_of(image: Any, *, saturation_dn: float | None) -> Image:
-    """The image of the core for an image of the user.
+    """The ``Image`` of psfcore for an image of the user.
 
     Pixels that the mask of a Map or NDData excludes are pixels without a value. Raises ``DataError`` "bad-input" for another
     kind of object, "bad-unit" for a logarithmic unit, and the errors of reading an image.

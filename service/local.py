@@ -349,7 +349,7 @@ class LocalService(Operations):
 
 
 def _says_more(record: logging.LogRecord) -> bool:
-    """Whether a log line is not only the error of a job, which the caller gets anyway."""
+    """Whether a log line says more than that a job failed. The caller gets the error of a failed job anyway."""
     return record.msg != runner.FAILED
 
 

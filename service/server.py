@@ -55,7 +55,7 @@ def serve(
                 http=bounded(ConnectionLimits.of(settings)),
                 ws="none",
                 backlog=ACCEPTED_AT_ONCE,
-                # Without a setting no header says where a request comes from: a client could write any address there.
+                # Without this setting, headers about the address of the client are ignored: a client could write any address.
                 proxy_headers=bool(settings.proxies),
                 forwarded_allow_ips=list(settings.proxies),
             )

@@ -81,7 +81,7 @@ class BodyLimits:
 
 
 class JsonRequest(Request):
-    """A request whose JSON is counted before it is parsed, and parsed in a thread, so that other requests do not wait."""
+    """A request with JSON. Its values are counted before it is parsed; a thread parses it, so that other requests do not wait."""
 
     async def json(self) -> Any:
         """The content of the body. Raises ``Problem`` 413 for too many values, and ValueError if it is not JSON."""

@@ -51,7 +51,7 @@ class ConnectionLimits:
 
     @classmethod
     def of(cls, settings: Settings) -> ConnectionLimits:
-        """The limits in the settings. Fewer connections if the system does not allow enough file descriptors."""
+        """The limits in the settings. The number of connections is smaller if the system allows too few file descriptors."""
         return cls(_most(settings.max_connections), settings.header_s, settings.stalled_s)
 
 

@@ -221,7 +221,9 @@ def _after(cursor: str | None) -> tuple[float, int] | None:
         return None
     if not parts[1].isdecimal() or len(parts[1]) > 9:
         raise Problem(
-            422, "bad-cursor", "expected the address of a page of results: go back to the first page"
+            422,
+            "bad-cursor",
+            "expected the address of a page of results; got another one: go back to the first page",
         )
     return number(parts[0]), int(parts[1])
 

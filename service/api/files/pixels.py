@@ -38,7 +38,7 @@ router = APIRouter(tags=["pixels"], responses=RESPONSES)
 
 @dataclass(frozen=True)
 class Part:
-    """The window that a request asks for, px, and its step. width, height: None if the window ends with the plane."""
+    """The window that a request asks for, px, and its step. width, height: None: up to the last column or row."""
 
     x: int
     y: int

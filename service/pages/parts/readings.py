@@ -22,7 +22,7 @@ Report = Mapping[str, Any]
 Row = tuple[str, ...]
 MAP_PX = 400  # edge length of the map of discs in the units of its picture
 DISC_PX = 9
-NOT_COMPARED = ("id", "created_at")  # always different, or always the same
+NOT_COMPARED = ("id", "created_at")  # these always differ, or are always the same
 # The ends of the scale of residuals; the middle is grey, so that it is seen on light and dark pages.
 BELOW, MIDDLE, ABOVE = (33, 102, 172), (190, 190, 190), (178, 24, 43)
 

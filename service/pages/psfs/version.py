@@ -87,7 +87,7 @@ async def cutout(
     caller: PageReading,
     state: Shared,
 ) -> Response:
-    """The central part of the PSF as FITS; an error is a page."""
+    """The central part of the PSF as FITS; an error is shown as a page."""
     return await get_cutout(psf_id, size, request, caller, state)
 
 
