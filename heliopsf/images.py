@@ -72,7 +72,7 @@ def deconvolve(
         >>> image = sunpy.map.Map("aia.fits")
         >>> sharp = heliopsf.deconvolve(image)
 
-    The first parameters are those of ``aiapy.psf.deconvolve``; calls of it work unchanged.
+    The first parameters are those of ``aiapy.psf.deconvolve``, so calls of that function work unchanged.
 
     smap: the image. A sunpy Map, an NDData or a CCDData gives an object of the same class. An array gives an array, and
     needs ``psf``. A path of a FITS file or an ``Image`` gives a ``Deconvolution``. A list of these gives a list.
