@@ -72,11 +72,11 @@ def deconvolve(
         >>> image = sunpy.map.Map("aia.fits")
         >>> sharp = heliopsf.deconvolve(image)
 
-    The first parameters are those of ``aiapy.psf.deconvolve``; calls of it work unchanged.
+    The first parameters are those of ``aiapy.psf.deconvolve``, so calls of that function work unchanged.
 
-    smap: a sunpy Map (the result is a Map of the same class), an NDData or CCDData (the same), an array (an array; ``psf``
-    is then needed), a path of a FITS file or an ``Image`` (a ``Deconvolution``), or a list of these (a list). Cut-outs work
-    like whole images. Pixels with NaN or a mask are not used, and stay without a value.
+    smap: the image. A sunpy Map, an NDData or a CCDData gives an object of the same class. An array gives an array, and
+    needs ``psf``. A path of a FITS file or an ``Image`` gives a ``Deconvolution``. A list of these gives a list.
+    Cut-outs work like whole images. Pixels that are NaN or masked are not used; they are NaN in the result.
     psf: a ``Psf``, a path of a FITS file, or an array whose centre is [ny // 2, nx // 2]; default: the PSF that is built for
     the telescope in the header, see ``psf_for``. The PSF is rebinned if the image is binned.
     iterations: number of steps; default: that of the method (Richardson-Lucy: 20; aiapy: 25).
@@ -97,8 +97,8 @@ def deconvolve(
     progress: True, or a function that is called with (step, steps) after each step of the deconvolution.
     parameters: further parameters of the method, such as ``stop="discrepancy"``.
 
-    A Map or NDData keeps its metadata. Added are the cards of products (PSFID, PSFVERS, ...), HISTORY, and a mask of the
-    pixels without a measurement (QUALITY 1 or 2: not finite, masked or saturated).
+    A Map or NDData keeps its metadata. The result also has the cards of products (PSFID, PSFVERS, ...), HISTORY, and a
+    mask of the pixels without a measurement (QUALITY 1 or 2: not finite, masked or saturated).
 
     Raises ``DataError``; its ``code`` is the reason, such as "no-psf-for-instrument", "not-fits", "already-deconvolved",
     "plate-scale-mismatch", "channel-mismatch" or "unknown-method". Gives a ``UserWarning`` if saturated pixels may be
@@ -249,7 +249,7 @@ def _possible(psf: Psf, header: Header, threads: int) -> list[CorePsf]:
 
 
 def _clipped(image: Image, clip_negative: bool | None, method: str) -> Image:
-    """The image with pixels below 0 set to 0, if this was asked for. Raises ``DataError`` "negative-pixels"."""
+    """The image; if ``clip_negative`` is true, with pixels below 0 set to 0. Raises ``DataError`` "negative-pixels"."""
     negative = image.valid & (image.pixels < 0)
     if clip_negative is None or not negative.any():
         return image
@@ -268,7 +268,9 @@ def _with_steps(parameters: Mapping[str, Any], iterations: int | None) -> dict[s
     if iterations is None:
         return dict(parameters)
     if "steps" in parameters:
-        raise DataError("bad-steps", "expected iterations or steps; got both: they mean the same")
+        raise DataError(
+            "bad-steps", "expected iterations or steps; got both: give one of them, they mean the same"
+        )
     return {**parameters, "steps": iterations}
 
 

@@ -48,7 +48,7 @@ def _is_of(image: Any, module: str, name: str) -> bool:
 
 
 def image_of(image: Any, *, saturation_dn: float | None) -> Image:
-    """The image of the core for an image of the user.
+    """The ``Image`` of psfcore for an image of the user.
 
     Pixels that the mask of a Map or NDData excludes are pixels without a value. Raises ``DataError`` "bad-input" for another
     kind of object, "bad-unit" for a logarithmic unit, and the errors of reading an image.
@@ -103,7 +103,7 @@ def header_of(image: Any) -> Header:
 
 
 def unit_text(unit: Any) -> str | None:
-    """A unit as the card BUNIT: "DN" and "DN/s" also for adu and counts. Raises ``DataError`` "bad-unit"."""
+    """The value of the card BUNIT for a unit; adu and counts also become "DN". Raises ``DataError`` "bad-unit"."""
     if unit is None:
         return None
     logarithmic = {units.mag, units.dex, units.dB}
@@ -111,7 +111,7 @@ def unit_text(unit: Any) -> str | None:
         raise DataError(
             "bad-unit",
             f"expected pixels that are proportional to the light, such as DN or DN/s; got the logarithmic unit {unit}: convert "
-            "them first",
+            "the pixels first",
         )
     pixel_free = unit * units.pix if units.pix in getattr(unit, "bases", ()) else unit
     for count in (units.DN, units.adu, units.ct):

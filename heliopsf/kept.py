@@ -32,8 +32,8 @@ def kept_psf(
 ) -> Psf:
     """The PSF of a recipe: read from the cache, or built and kept there.
 
-    The PSF is read from its file in both cases, so that it is the same to the last bit. A cache that cannot be used costs
-    time and gives a warning.
+    In both cases the PSF is read from its file, so that it is the same to the last bit. If the cache cannot be used,
+    the PSF is built in every call, with a warning.
     """
     cache = psf_cache()
     fits = cache.find(recipe.identity, FITS)

@@ -1,4 +1,4 @@
-"""Results of a deconvolution: as an object of its own, or in the form of the user's image."""
+"""Results of a deconvolution: as a ``Deconvolution``, or in the form of the user's image."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Statistics of the input's pixels, which are wrong for the result.
+# Cards with statistics of the input's pixels. They are wrong for the result, so they are removed.
 _STATISTICS = re.compile(r"data(min|max|mean|medn|rms|std|skew|kurt|cent|p\d\d)", re.IGNORECASE)
 
 
@@ -101,7 +101,7 @@ def in_form_of(image: Any, result: Deconvolution) -> Any:
 
 
 def used_psf(psf: Psf) -> UsedPsf:
-    """The PSF as the cards of a result name it. The id is that of a service: of the recipe, or of the file."""
+    """The PSF as the cards of a result name it, with the id that a service would use: that of its recipe or file."""
     identity = psf.provenance.get("psf_id")
     if identity is None:  # weights in memory
         identity = hashlib.sha256(f"{psf.kernel.shape}".encode() + psf.kernel.tobytes()).hexdigest()

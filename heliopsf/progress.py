@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Literal
 
 Steps = Callable[[int, int], None]
-# True: a line on standard error; a function is called with (step, steps); None and False: nothing.
+# True: show a line on standard error; a function: call it with (step, steps); None, False: show nothing.
 Told = Steps | bool | None
 Stages = Callable[[str, int, int], None]
 

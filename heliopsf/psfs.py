@@ -124,6 +124,6 @@ def read_psf(path: str | Path) -> Psf:
     Raises ``DataError``, for example "not-fits".
     """
     psf = Psf.of(psfs.read_psf(path, LIMITS))
-    # The id is that of a service to which the file is uploaded: the file of a built PSF keeps its id.
+    # The id that a service would give to this file after an upload: a built PSF keeps the id that its file states.
     identity = psfs.stated_id(path, LIMITS) or sha256_of_file(Path(path))
     return replace(psf, provenance={**psf.provenance, "psf_id": identity})

@@ -1,4 +1,4 @@
-"""Fit a scatter kernel to a transit, and diagnose the gap that the fit leaves. All of it runs in this process."""
+"""Fit a scatter kernel to a transit, and diagnose the gap between the fit and the images, all in this process."""
 
 from __future__ import annotations
 

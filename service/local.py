@@ -137,9 +137,9 @@ class LocalService(Operations):
     """The requests to a service, which are executed in this process."""
 
     def __init__(self, settings: Settings, cache: PsfCache | None = None) -> None:
-        """cache: where built PSFs are kept for later commands; None: nowhere."""
+        """cache: keeps built PSFs for later commands; None: built PSFs are not kept."""
         self._settings = settings
-        self._recipes: dict[str, list[PsfBuild]] = {}  # of the PSFs that a job may build, by the job's id
+        self._recipes: dict[str, list[PsfBuild]] = {}  # recipes of the PSFs that a job may build, by its id
         self._store = LocalStore(settings.data_dir)
         self._catalogue = Catalogue(settings.catalogue_url)
         self._catalogue.upgrade()
@@ -197,7 +197,8 @@ class LocalService(Operations):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        """Add a PSF. As in a service, the file of a PSF that heliopsf made keeps its id, unless the request describes it anew."""
+        """Add a PSF. As in a service, a PSF that heliopsf made keeps its id, unless name, version, instrument, channel
+        or kind is given."""
         source = Path(path)
         limits = FitsLimits(max_pixels=self._settings.max_pixels)
         summary = read_summary(source, limits)
@@ -220,7 +221,7 @@ class LocalService(Operations):
         return PsfView.of(self._catalogue.add(row)[0]).model_dump(mode="json")
 
     def image_id(self, path: str | Path, sha256: str) -> str:
-        """The id of an image, which is added."""
+        """Add an image; returns its id."""
         identity: str = self.upload_image(path)["id"]
         return identity
 
@@ -321,14 +322,17 @@ class LocalService(Operations):
     def _tables(self, psf_id: str) -> dict[str, Any]:
         digest = self._psf(psf_id).details.get("tables_sha256")
         if digest is None:
-            raise ServiceError(f"PSF {psf_id} has no tables yet", code="no-tables")
+            raise ServiceError(f"expected a PSF with tables; PSF {psf_id} has none", code="no-tables")
         tables: dict[str, Any] = json.loads(self._store.path(digest).read_bytes())
         return tables
 
     def _psf(self, psf_id: str) -> PsfRow:
         row = self._catalogue.get(PsfRow, psf_id, DEFAULT_OWNER)
         if row is None:
-            raise ServiceError(f"the catalogue holds no PSF with id {psf_id}", code="no-such-psf")
+            raise ServiceError(
+                f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
+                code="no-such-psf",
+            )
         return row
 
     def _row(self, address: str) -> ProductRow | PsfRow | ReportRow:
@@ -345,7 +349,7 @@ class LocalService(Operations):
 
 
 def _says_more(record: logging.LogRecord) -> bool:
-    """Whether a log line says more than the error of a job, which the caller gets anyway."""
+    """Whether a log line says more than that a job failed. The caller gets the error of a failed job anyway."""
     return record.msg != runner.FAILED
 
 
@@ -353,7 +357,7 @@ def _says_more(record: logging.LogRecord) -> bool:
 def local_service(*, gap_effects: str = "") -> Iterator[LocalService]:
     """A local service on a temporary folder, with the user's cache of built PSFs.
 
-    gap_effects: the same as the setting of this name.
+    gap_effects: as the setting of this name.
     """
     with TemporaryDirectory(prefix="heliopsf-") as folder:
         service = LocalService(Settings.apart(Path(folder), gap_effects=gap_effects), psf_cache())

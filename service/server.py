@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 def serve(
     settings: Settings, host: str, port: int, announce: Callable[[str], None], *, verbose: bool = False
 ) -> None:
-    """Serve until interrupted. Port 0: any free port. ``announce`` is called with the address. verbose: also
-    log every request on a terminal.
+    """Serve until interrupted. Port 0: any free port. ``announce`` is called with the address of the server. verbose:
+    also log every request on a terminal.
 
     On SIGTERM or Control-C the server accepts no more connections. Running requests may continue for ``stop_s`` seconds. Then
     the server stops the embedded worker, which takes at most ``gone_s`` seconds.
@@ -55,7 +55,7 @@ def serve(
                 http=bounded(ConnectionLimits.of(settings)),
                 ws="none",
                 backlog=ACCEPTED_AT_ONCE,
-                # Without a setting no header says where a request comes from: a client could write any address there.
+                # Without this setting, headers about the address of the client are ignored: a client could write any address.
                 proxy_headers=bool(settings.proxies),
                 forwarded_allow_ips=list(settings.proxies),
             )
@@ -89,7 +89,8 @@ class _Server(uvicorn.Server):
     """Tells the application about a shutdown. Requests that wait for a job are then answered at once."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen. ``backlog`` is how many connections the event loop accepts at once; the system keeps more."""
+        """Listen. The event loop accepts ``backlog`` connections at once; the system keeps up to ``LISTEN`` connections
+        waiting."""
         await super().startup(sockets)
         for listener in sockets or []:
             listener.listen(LISTEN)
@@ -146,7 +147,7 @@ def _start_worker(settings: Settings) -> subprocess.Popen[bytes]:
     private_folder(log_file.parent)
     with log_file.open("ab") as output:
         return subprocess.Popen(
-            # -P: nothing is imported from the working folder, to which other users may be able to write.
+            # -P: Python imports nothing from the working folder, because other users may be able to write there.
             [sys.executable, "-P", "-m", "service.cli", "worker", "--stop-with-parent", str(os.getpid())],
             env=os.environ | environment(settings),
             stdin=subprocess.DEVNULL,

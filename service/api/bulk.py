@@ -286,5 +286,9 @@ def _after(cursor: str | None) -> int:
     if parts is None:
         return -1
     if not parts[0].isdecimal() or len(parts[0]) > 9:
-        raise Problem(422, "bad-cursor", "expected the cursor in `next` of an earlier page; got another text")
+        raise Problem(
+            422,
+            "bad-cursor",
+            "expected the cursor in `next` of an earlier page; got another text: start again without a cursor",
+        )
     return int(parts[0])

@@ -25,7 +25,11 @@ NDJSON, CSV = "application/x-ndjson", "text/csv"
 
 
 class Change(BaseModel):
-    """Change of the intensity in the brightest or the darkest 1 % of the blocks of 4 x 4 pixels."""
+    """Change of the intensity in the brightest or the darkest 1 % of the blocks of 4 x 4 pixels.
+
+    sum_pct: change of the summed intensity of these blocks. up_to_pct: percentile 99 of the changes of the bright
+    blocks, or percentile 1 of the changes of the dark blocks.
+    """
 
     sum_pct: float
     up_to_pct: float

@@ -1,4 +1,4 @@
-"""What a job would cost, and which PSF it would use, before it is submitted: ``/v1/estimates``."""
+"""The expected time and memory of a job, and its PSF, before it is submitted: ``/v1/estimates``."""
 
 from __future__ import annotations
 
@@ -26,13 +26,15 @@ class ChosenPsf(BaseModel):
 
     id: str
     name: str
-    version: str = Field(description="of the PSF; of its instrument file if the PSF is not built yet")
+    version: str = Field(
+        description="version of the PSF; if the PSF is not built yet: version of its instrument file"
+    )
     status: str | None = Field(description="draft, certified or deprecated; null: the PSF is not built yet")
     why: str = Field(description="a sentence that says why this PSF was chosen")
 
 
 class EstimateView(BaseModel):
-    """The answer to a request that was not submitted."""
+    """The estimate for a request. The request is not submitted."""
 
     parameters: dict[str, Any] = Field(description="the parameters, with every default and the PSF filled in")
     result_id: str = Field(
@@ -52,8 +54,9 @@ class EstimateView(BaseModel):
 
 @router.post("", summary="Estimate a job without submitting it")
 def estimate_job(body: JobRequest, caller: Submitting, state: Shared) -> EstimateView:
-    """The same request as `POST /v1/jobs`, with the same errors, but no job is started: the expected time and memory, the place
-    in the queue, and, for a deconvolution, the PSF and why it was chosen."""
+    """Estimate a job without starting it. The request and its errors are the same as for `POST /v1/jobs`. The answer
+    contains the expected time and memory, the place in the queue and, for a deconvolution, the PSF and the reason for
+    its choice."""
     parameters, result_id, estimate = prepared(body, caller, state)
     queue = queue_of(body.kind) if body.queue is None else Queue(body.queue)
     result = KINDS[body.kind].result

@@ -1,8 +1,8 @@
 """Progress as server-sent events: ``/v1/jobs/{id}/events`` and ``/v1/bulk/{id}/events``.
 
 A stream reads the row of its job or bulk run from the database every ``LOOK_EVERY_S`` seconds, so any server can send it.
-The id of an event is a hash of the row's state. A client that reconnects with this id (``Last-Event-ID``) gets an event only
-if the state has changed since.
+The id of an event is a hash of the row's state. If a client reconnects with the id of its last event
+(``Last-Event-ID``), it gets an event at once only if the state has changed in the meantime.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ Look = Callable[[], Seen | None]  # None: the row was deleted
 
 @dataclass(frozen=True)
 class Said:
-    """The next text of a stream, empty if there is no news. last: the stream ends after it."""
+    """The next text of a stream; empty if nothing has changed. last: the stream ends after this text."""
 
     text: str
     last: bool = False
@@ -138,9 +138,9 @@ async def _follow(
 def stream(request: Request, state: Shared, caller: Caller, say: Say) -> Response:
     """A stream of the texts of ``say``, which counts as a stream of the caller until it ends.
 
-    It ends after ``Said.last``, after ``stream_s``, when the server stops, and when the key is revoked or expires.
-    ``say`` is called every ``LOOK_EVERY_S`` seconds in a thread. If it raises SQLAlchemyError, it is called again later; so
-    it must not have forgotten anything.
+    The stream ends after a text with ``last``, after ``stream_s`` seconds, when the server stops, and when the key is
+    revoked or expires. ``say`` is called every ``LOOK_EVERY_S`` seconds in a thread. If ``say`` raises SQLAlchemyError,
+    it is called again later and must then return the same news: a failed call must not change its state.
     """
     state.streams.open(caller.name)
     ends_at = time.monotonic() + state.settings.stream_s
@@ -172,7 +172,7 @@ class _Stream(StreamingResponse):
 async def _texts(say: Say, may_read: Callable[[], bool], over: Callable[[], bool]) -> AsyncIterator[str]:
     """The texts of a stream, with comments that keep the connection open while nothing changes.
 
-    It also ends when the key or the session of the caller ends.
+    The stream also ends when the key or the session of the caller ends.
     """
     yield f"retry: {COME_BACK_MS}\n\n"
     said_at = time.monotonic()

@@ -90,6 +90,6 @@ def find(state: Shared, caller: Caller, image_id: str) -> ImageRow:
         raise Problem(
             404,
             "no-such-image",
-            f"expected the id of an uploaded image; got {image_id}, which is not in the catalogue",
+            f"expected the id of an uploaded image; got {image_id}, which is not in the catalogue: upload the image, or list your images",
         )
     return row

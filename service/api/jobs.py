@@ -35,7 +35,8 @@ class Progress(BaseModel):
     step: int
     steps: int
     time_left_s: float | None = Field(
-        description="time left until the last of `steps`, s, from the pace of the present count of steps alone; null if unknown"
+        description="estimated time until the last of `steps`, s; null: unknown. It is estimated from the speed since the "
+        "job began to count these steps"
     )
 
 
@@ -59,9 +60,9 @@ class JobView(BaseModel):
     attempt: int
     cancel_requested: bool
     waiting_before: int | None = Field(
-        description="number of waiting jobs that are expected to start before this job, of this queue by the turns of the owners "
-        "and of more urgent queues; 1000: 1000 or more; null: the job is not QUEUED. Only the answers to a submission and to "
-        "`GET /v1/jobs/{id}` count it; lists and events have null"
+        description="number of waiting jobs that are expected to start before this job: the jobs of more urgent queues, and "
+        "jobs of this queue, in which the owners take turns; 1000: 1000 or more; null: the job is not QUEUED. Only the "
+        "answers to a submission and to `GET /v1/jobs/{id}` contain this number; in lists and events it is null"
     )
     progress: Progress
     estimate: Estimate | None = Field(
@@ -73,8 +74,8 @@ class JobView(BaseModel):
     result: str | None = Field(description="address of the result; null until the job is COMPLETED")
     result_deleted: bool = Field(
         False,
-        description="whether the result was deleted; the same request makes it again. Only lists and the answers to a "
-        "submission and to `GET /v1/jobs/{id}` look; events have false",
+        description="whether the result was deleted; the same request makes the result again. Lists and the answers to a "
+        "submission and to `GET /v1/jobs/{id}` contain the present value; in events it is always false",
     )
     error: JobError | None
 
@@ -211,16 +212,16 @@ def cancel_job(job_id: JobId, caller: Submitting, state: Shared) -> JobView:
 
 
 def _view(row: JobRow, state: Shared) -> JobView:
-    """The view of a job, with all that must be counted or looked for."""
+    """The view of a job, with ``waiting_before`` and ``result_deleted``."""
     gone = bool(without_results([row], state.catalogue))
     return JobView.of(row, state.catalogue.places.before(row), result_deleted=gone)
 
 
 def time_left_s(row: JobRow, now: float | None = None) -> float | None:
-    """Estimated time left of a running job at the pace of its present count of steps; None if unknown.
+    """Estimated time left of a running job, s; None if unknown.
 
-    now: seconds since 1970; default: this machine's clock. The time of earlier counts, such as that of reading the images,
-    does not enter.
+    The estimate uses the speed since the job began to count its present steps. Earlier work, such as reading the
+    images, does not count. now: seconds since 1970; default: this machine's clock.
     """
     now = time.time() if now is None else now
     done = row.step - row.count_step
@@ -230,7 +231,8 @@ def time_left_s(row: JobRow, now: float | None = None) -> float | None:
 
 
 def check_own(row: JobRow) -> JobRow:
-    """The job itself. Raises ``Problem`` 409 if the job is a part of a bulk run, which only requests to the bulk run change."""
+    """The job itself. Raises ``Problem`` 409 if the job is a part of a bulk run: only requests to the bulk run can
+    change it."""
     if KINDS[row.kind].parameters is None:
         bulk_id = row.parameters["bulk_id"]
         raise Problem(
@@ -246,5 +248,7 @@ def find(state: Shared, caller: Caller, job_id: str) -> JobRow:
     """The row of a job. Raises ``Problem`` 404 if the caller has no such job."""
     row = state.catalogue.jobs.get(job_id)
     if row is None or row.owner != caller.owner:
-        raise Problem(404, "no-such-job", f"expected the id of one of your jobs; got {job_id}")
+        raise Problem(
+            404, "no-such-job", f"expected the id of one of your jobs; got {job_id}: list your jobs"
+        )
     return row

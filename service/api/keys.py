@@ -1,7 +1,8 @@
 """The keys of an owner: ``/v1/keys``.
 
-A key can make others for its owner. They allow no more than it does and do not last longer: whoever has a key cannot get more
-from it than it gives. A key with the scope ``admin`` makes keys of any owner, with any scopes and for any time.
+A client can make further keys for its owner. A new key has no scope that the key of the request lacks, and it does not
+last longer, so nobody can gain rights by making keys. With a key of scope ``admin``, a client can make keys for any
+owner, with any scopes and any lifetime.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from service.http.state import Shared
 from workers.catalogue.access.keys import LABEL_LENGTH, OWNER, Scope, TooManyKeys
 from workers.catalogue.tables import KeyRow
 
-MOST_KEYS = 100  # valid keys of one owner that this interface makes
+MOST_KEYS = 100  # an owner with this number of valid keys cannot make more
 DAY_S = 86_400.0
 LATEST = 253_402_300_799  # the end of the year 9999, seconds since 1970
 EVERYBODY = "*"
@@ -39,19 +40,22 @@ class NewKey(BaseModel):
         "", max_length=LABEL_LENGTH, description="a note for lists, such as the purpose of the key"
     )
     scopes: list[Scope] = Field(
-        min_length=1, max_length=len(Scope), description="what the key allows; scopes of your own key alone"
+        min_length=1,
+        max_length=len(Scope),
+        description="scopes of the new key; your own key must have them, or the scope admin",
     )
     expires_at: float | None = Field(
         None,
         ge=0,
         le=LATEST,
-        description="end of the key, seconds since 1970; default: the end of your own key",
+        description="time at which the key expires, seconds since 1970; default: when your own key expires",
     )
     lasts_days: float | None = Field(
-        None, gt=0, le=36_500, description="lifetime of the key, days, in place of expires_at"
+        None, gt=0, le=36_500, description="lifetime of the key in days, instead of expires_at"
     )
     owner: OwnerName | None = Field(
-        None, description="owner of the key; another owner than your own needs the scope admin"
+        None,
+        description="owner of the key; to name another owner than your own, your key needs the scope admin",
     )
 
     @model_validator(mode="after")
@@ -74,12 +78,10 @@ class KeyView(BaseModel):
     scopes: list[Scope]
     state: Literal["valid", "expired", "revoked"]
     created_at: float
-    expires_at: float | None = Field(description="null: it is valid until it is revoked")
+    expires_at: float | None = Field(description="null: the key is valid until it is revoked")
     revoked_at: float | None
-    last_used_at: float | None = Field(description="to the minute; null: never")
-    made_by: str | None = Field(
-        description="id of the key with which it was made; null: the operator made it"
-    )
+    last_used_at: float | None = Field(description="time of the last use, to the minute; null: never used")
+    made_by: str | None = Field(description="id of the key that made this key; null: the operator made it")
 
     @classmethod
     def of(cls, row: KeyRow) -> KeyView:
@@ -102,12 +104,15 @@ def list_keys(
     state: Shared,
     owner: Annotated[
         str | None,
-        Query(max_length=64, description="list the keys of this owner, `*`: of all; needs the scope admin"),
+        Query(
+            max_length=64,
+            description="owner of the keys; `*`: all owners. Others than your own need the scope admin",
+        ),
     ] = None,
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[KeyView]:
-    """Your keys, newest first, with those that have expired or are revoked."""
+    """Your keys, newest first, including expired and revoked keys."""
     _check_used(state)
     owner = owner or caller.owner
     _check_for(caller, owner)
@@ -119,8 +124,8 @@ def list_keys(
 
 @router.post("", status_code=201, summary="Make a key")
 def make_key(body: NewKey, response: Response, caller: Submitting, state: Shared) -> MadeKey:
-    """Make a key. The answer shows it this once. It allows no more than your own key, and does not last longer, unless your key
-    has the scope admin."""
+    """Make a key. Only this answer contains the whole key. The new key has no scope that your own key lacks, and does
+    not last longer, unless your own key has the scope admin."""
     _check_used(state)
     owner = body.owner or caller.owner
     _check_for(caller, owner)
@@ -139,7 +144,8 @@ def make_key(body: NewKey, response: Response, caller: Submitting, state: Shared
         raise Problem(
             409,
             "too-many-keys",
-            f"expected at most {MOST_KEYS} valid keys of an owner; {owner} has as many: revoke one that is not used",
+            f"expected at most {MOST_KEYS} valid keys of an owner; {owner} already has that number: revoke a key that is "
+            "not used",
         ) from error
     row = state.catalogue.keys.get(key.split("_")[1])
     assert row is not None
@@ -161,11 +167,14 @@ def revoke_key(
     state: Shared,
     and_made: Annotated[
         bool,
-        Query(description="revoke also all keys that were made with it, for example after it was stolen"),
+        Query(
+            description="also revoke all keys that were made with this key, for example because it was stolen"
+        ),
     ] = False,
 ) -> KeyView:
-    """Revoke a key. Requests with it are refused from now on, and its logins in browsers and its streams of events end. Jobs that
-    were submitted with it continue. A key that allows more than your own can only be revoked with the scope admin."""
+    """Revoke a key. From now on, requests with it are refused; its logins in browsers and its event streams end. Jobs
+    that were submitted with it continue. To revoke a key with scopes that your own key lacks, your key needs the scope
+    admin."""
     row = _find(state, caller, key_id)
     _check_scopes(caller, map(Scope, row.scopes), "use a key with these scopes, or ask the operator")
     state.catalogue.keys.revoke(key_id, and_made=and_made)
@@ -195,7 +204,7 @@ def _check_used(state: Shared) -> None:
         raise Problem(
             409,
             "keys-not-used",
-            "expected a service that requires keys; this one is open to everybody, so keys are not used: nothing needs to be done",
+            "expected a service that requires keys; this one is open to everybody and uses no keys: send requests without a key",
         )
 
 
@@ -220,7 +229,8 @@ def _check_scopes(caller: Caller, scopes: Iterable[Scope], advice: str) -> None:
 
 
 def _end(state: Shared, caller: Caller, body: NewKey) -> float | None:
-    """The end of a new key. Raises ``Problem`` 422 if it is over, and 403 if the key would last longer than that of the caller."""
+    """The end of a new key. Raises ``Problem`` 422 if it is in the past, and 403 if it is later than the end of the
+    caller's key."""
     now = time.time()
     asked = body.end(now)
     if asked is not None and asked <= now:

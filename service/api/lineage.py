@@ -60,6 +60,7 @@ def _rerun(
 def _missing(of: str, identity: str) -> Exception:
     return problem(
         DataError(
-            f"no-such-{of}", f"expected the id of a {of} in the catalogue; got {identity}, which is not in it"
+            f"no-such-{of}",
+            f"expected the id of a {of} in the catalogue; got {identity}, which is not in it: list the {of}s",
         )
     )

@@ -1,12 +1,13 @@
 """All jobs and bulk runs of an owner in one stream of server-sent events: ``/v1/events``.
 
-Browsers open at most six connections to a server over HTTP/1.1. A page with one stream for each job would use them up.
+Browsers open at most six connections to a server over HTTP/1.1. A page with one stream for each job would use all of
+them.
 
-The database is read every ``LOOK_EVERY_S`` seconds, with the same few queries however many jobs there are. A stream
-remembers the last state of each job that has not ended, and sends those whose state is another one. A job that is no longer
-among them has ended or was deleted: it is read by its id, so no clock decides about it. A job that the stream has not seen
-before it ended is found by the time of its end. The id of an event is the time (database clock) from which a reconnected
-client needs the ends of jobs.
+A stream reads the database every ``LOOK_EVERY_S`` seconds; the number of queries does not depend on the number of jobs.
+It remembers the last state of each open job (a job that has not ended), and sends the jobs whose state has changed. A
+remembered job that is no longer open has ended or was deleted; the stream reads it by its id, without comparing times.
+A job that ended before the stream first read it is found by the time of its end. The id of an event is a time (database
+clock): a client that reconnects with this id gets the jobs that ended after this time.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from service.http.problems import RESPONSES
 from service.http.state import Shared
 from workers.catalogue.followed.rows import MOST, Followable, Followed, Place, State
 
-# Rows that ended up to this long before the last look are read again: they may have been committed late, and the machines
-# that write the ends of bulk runs may have other clocks than the database.
+# Rows that ended up to this number of seconds before the last look are read again: they may have been committed late,
+# and the clocks of the machines that write the ends of bulk runs may differ from the clock of the database.
 OVERLAP_S = 10.0
 MOST_NAMED = 50
 _UNKNOWN = State("", None, ())
@@ -39,8 +40,8 @@ Id = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
 Moment = Annotated[str | None, Header(alias="Last-Event-ID", pattern=r"^[0-9]{1,12}\.[0-9]{3}$")]
 DESCRIBED: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Events `job` and `bulk`: the data is the complete job or bulk run, which is new or has changed. Events "
-        '`gone`: the data is {"kind": "job" or "bulk", "id": ...} of one that was deleted.',
+        "description": "Events `job` and `bulk` are sent for new and changed jobs and bulk runs; the data is the complete job "
+        'or bulk run. Events `gone` are sent for deleted ones; the data is {"kind": "job" or "bulk", "id": ...}.',
         "content": {TYPE: {}},
     },
 }
@@ -48,7 +49,7 @@ DESCRIBED: dict[int | str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class News:
-    """An event. named: it is about a job or bulk run that the request names."""
+    """An event. named: whether the request names the job or bulk run of the event."""
 
     text: str
     named: bool
@@ -56,10 +57,11 @@ class News:
 
 @dataclass(frozen=True)
 class Watch(Generic[Followable]):
-    """What a stream knows of the rows of one table: of the jobs, or of the bulk runs.
+    """The rows of one table (jobs or bulk runs) as a stream last read them.
 
-    kind: name of the events. named: ids that are followed in any phase. place: rows that ended after it are still to be read.
-    known: the state that was sent last, by id; None if it was sent that the row is gone.
+    kind: name of the events. named: ids that the request names; these rows are followed in any phase. place: the next
+    look reads rows that ended after this place. known: the last state that was sent of each row, by id; None: the last
+    event was ``gone``.
     """
 
     kind: str
@@ -71,7 +73,8 @@ class Watch(Generic[Followable]):
     known: dict[str, State | None] = field(default_factory=dict)
 
     def look(self) -> tuple[list[News], Watch[Followable]]:
-        """The news since the last look, and what is known then. This watch does not change, so a failed look loses nothing."""
+        """The news since the last look, and the watch for the next look. This watch does not change, so a failed look
+        loses nothing."""
         again_from = self.rows.now() - OVERLAP_S
         ended = self.rows.ended(self.owner, self.place)
         open_now = self.rows.open(self.owner)
@@ -109,7 +112,7 @@ def _ended_after(state: State | None, moment: float) -> bool:
 
 
 class Gone(BaseModel):
-    """A job or bulk run that was deleted, or that the request names and the owner does not have."""
+    """A job or bulk run that was deleted, or an id in the request that belongs to no job or bulk run of the owner."""
 
     kind: str
     id: str
@@ -127,21 +130,20 @@ async def follow_all(
     state: Shared,
     job: Annotated[
         list[Id] | None,
-        Query(max_length=MOST_NAMED, description="ids of jobs to send first, in whatever phase they are"),
+        Query(max_length=MOST_NAMED, description="ids of jobs to send first, in any phase"),
     ] = None,
     bulk: Annotated[
         list[Id] | None,
-        Query(
-            max_length=MOST_NAMED, description="ids of bulk runs to send first, in whatever phase they are"
-        ),
+        Query(max_length=MOST_NAMED, description="ids of bulk runs to send first, in any phase"),
     ] = None,
     last_id: Moment = None,
 ) -> Response:
-    """Send each job and bulk run that has not ended, and those that ended in the last seconds; then every one that changes.
+    """First send all jobs and bulk runs that have not ended or that ended in the last seconds. Then send each one when
+    it changes.
 
-    A client that reconnects with `Last-Event-ID` also gets those that ended since; it may get one again that it has. Of an owner
-    with very many waiting jobs, the newest are sent; the others when they start. The jobs in which workers process the
-    images of bulk runs are not sent.
+    A client that reconnects with `Last-Event-ID` also gets the jobs and bulk runs that ended in the meantime; it may
+    get some of them twice. If an owner has very many waiting jobs, only the newest are sent at first; each of the
+    others is sent when it starts. The turns of bulk runs, which are jobs too, are not sent.
     """
     catalogue, owner = state.catalogue, caller.owner
     since = Place(
@@ -175,11 +177,11 @@ async def follow_all(
 
 
 def _with_id(texts: Sequence[str], place: float, *, alone: bool) -> str:
-    """The texts with the id of a place in the last one: a client that gets only some of them asks for all of them again.
+    """The texts. Only the last contains the id of ``place``, so a client that gets only some asks for all again.
 
-    alone: send the id also if there is no text.
+    alone: send the id even if there is no text.
     """
-    said = f"id: {math.floor(place * 1000) / 1000:.3f}\n"  # rounded up, it could leave out an end
+    said = f"id: {math.floor(place * 1000) / 1000:.3f}\n"  # rounded down, so that no ended job is left out
     if not texts:
         return f"{said}\n" if alone else ""
     return "".join(texts[:-1]) + said + texts[-1]

@@ -38,7 +38,7 @@ class ProductView(BaseModel):
     file: str = Field(description="address of the FITS file")
     preview: str = Field(description="address of a picture: the image before and after, and the change")
     thumbnail: str | None = Field(
-        description="address of a small picture of the product; null: it was made before products had one"
+        description="address of a small picture of the product; null: the product was made before products had thumbnails"
     )
     changes: str | None = Field(
         description="address of a picture of all changes; null: the request did not ask for it"
@@ -98,7 +98,7 @@ def get_product(product_id: Identity, caller: Reading, state: Shared) -> Product
 def get_product_file(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the product; its hash is the ETag."""
     row = find(state, caller, product_id)
-    # Products of earlier versions have no name of their own.
+    # Products of earlier versions have no stored file name.
     name = row.details.get("filename", f"heliopsf-{product_id[:12]}.fits")
     return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, name, size=row.bytes)
 
@@ -135,7 +135,8 @@ def get_product_changes(product_id: Identity, request: Request, caller: Reading,
         raise Problem(
             404,
             "no-effects-picture",
-            "expected a product whose job had changes_picture true; this job had it false: submit the job again with true",
+            "expected a product whose job had changes_picture true; this job had it false: submit the job again with "
+            "changes_picture true",
         )
     return files.send(request, state.store, digest, "image/png", None)
 
@@ -145,7 +146,8 @@ def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> R
     """Remove the product from the catalogue and from your quota. The same request makes it again."""
     row = find(state, caller, product_id)
     state.catalogue.delete_product(product_id, caller.owner)
-    # The files go at once. Otherwise deletions and new jobs in turn would fill the disk beyond the quota.
+    # The files are deleted at once. Otherwise an owner who deletes products and submits jobs in turn could exceed the
+    # quota.
     remove_unnamed(state.catalogue, state.store, [digest for digest, _ in files_of(row)])
     return Response(status_code=204)
 
@@ -157,6 +159,6 @@ def find(state: Shared, caller: Caller, product_id: str) -> ProductRow:
         raise Problem(
             404,
             "no-such-product",
-            f"expected the id of a product in the catalogue; got {product_id}, which is not in it",
+            f"expected the id of a product in the catalogue; got {product_id}, which is not in it: list your products",
         )
     return row

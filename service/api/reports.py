@@ -144,6 +144,6 @@ def find(state: Shared, caller: Caller, report_id: str) -> ReportRow:
         raise Problem(
             404,
             "no-such-report",
-            f"expected the id of a report in the catalogue; got {report_id}, which is not in it",
+            f"expected the id of a report in the catalogue; got {report_id}, which is not in it: list the reports",
         )
     return row

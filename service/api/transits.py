@@ -121,6 +121,6 @@ def get_transit(transit_id: Identity, caller: Reading, state: Shared) -> Transit
         raise Problem(
             404,
             "no-such-transit",
-            f"expected the id of an uploaded transit; got {transit_id}, which is not in the catalogue",
+            f"expected the id of an uploaded transit; got {transit_id}, which is not in the catalogue: upload the transit, or list your transits",
         )
     return TransitDetails.of(row)

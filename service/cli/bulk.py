@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from service.client.http import Client
 
 _CONDITION = re.compile(r"([A-Z0-9_-]{1,8})\s*(=|!=|<=|>=|<|>)\s*(.+)")
-# Statuses of refusals that concern one file; after any other refusal the next file would be refused too.
+# HTTP statuses with which the service refuses one file. After any other refusal, the next file would be refused too.
 OF_ONE_FILE, OF_ALL_FILES = (400, 413, 415, 422), ("quota-exceeded",)
 BULK_ID = id_argument("bulk_id")
 WAIT = click.option(
@@ -124,8 +124,8 @@ def submit(
     """Start a bulk run: deconvolve the files on the machine of the service that match PATTERNS.
 
     A pattern is an absolute path in a folder that the operator allows. * ? and [ab] match parts of a name, ** matches any
-    number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context. Files of --upload
-    that are refused are named; the run starts with the others, and the exit status is 1.
+    number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context. If the service
+    refuses files of --upload, the command names them, starts the run with the others, and ends with status 1.
     """
     if (psf is None) == (context is None):
         raise click.UsageError("expected either --psf or --context")

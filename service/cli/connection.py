@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from service.client.http import Client
 
 _KEY = "heliopsf.key"
-DIGITS = 64  # of a whole id, other than those of jobs and bulk runs
+DIGITS = 64  # number of digits of a whole id, except ids of jobs and bulk runs
 _ID = re.compile(rf"[0-9a-f]{{{FEWEST_DIGITS},{DIGITS}}}")
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -127,7 +127,7 @@ def id_argument(name: str = "identity", *, several: bool = False) -> Callable[[C
 
 
 def short(identity: str) -> str:
-    """An id as lists show it. Every command accepts ids that are cut like this."""
+    """The first digits of an id, as in lists. Every command accepts such a shortened id."""
     return identity[:SHOWN_DIGITS]
 
 

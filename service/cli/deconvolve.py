@@ -54,7 +54,7 @@ AGAIN = click.option(
 @click.option(
     "--edges",
     type=click.Choice(["zero", "symmetric", "extended"]),
-    help="Assumed scene outside the image [default: the method's own]",
+    help="Assumed scene outside the image [default: depends on the method]",
 )
 @NOISE
 @SATURATION
@@ -95,8 +95,8 @@ def deconvolve(
     """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with the PSF that you name.
 
     The output is a folder if there are several images, or if its name ends in /. Images whose product is in the folder
-    are skipped. A service gets the next images while it works on the first ones, at most four. If an image fails, the others
-    follow; the failures are listed at the end, and the exit status is 1.
+    are skipped. At most four jobs are open on a service at the same time. If an image fails, the command continues with
+    the others and lists the failures at the end; the exit status is then 1.
     """
     files = fits_files(images)
     if not files:

@@ -26,7 +26,7 @@ from service.client.outputs import check_outputs
 from service.client.versions import Progress
 
 DATA = "data"
-LOG = "server.log"  # by this file a later demo recognises the folder of an earlier one
+LOG = "server.log"  # a later demo recognises the folder of an earlier demo by this file
 
 
 @click.command()

@@ -31,8 +31,8 @@ class Lazy(NamedTuple):
 class LazyGroup(click.Group):
     """Commands under headings. A command's file is imported when the command is called.
 
-    sections: the commands under each heading, by name. renamed: from former names of commands and options to the new
-    names. The error about a former name names the new one.
+    sections: the commands under each heading, by name. renamed: the new names of commands and options, by their former
+    names. If a user gives a former name, the error states the new one.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command. If the user gives the former name of an option, the error names the new option.
 
-        Control-C ends the command with status 130, and says how to return to the job that goes on.
+        Control-C ends the command with status 130. If its job continues, a message says how to return to the job.
         """
         try:
             return super().invoke(ctx)
@@ -113,7 +113,7 @@ def _interrupted(stop: KeyboardInterrupt) -> str:
     ids = " ".join(one[:SHOWN_DIGITS] for one in (stop.identity, *stop.others))
     several = bool(stop.others)
     rejoin = REJOIN[stop.what].format(id=ids)
-    # The named command waits, but only the interrupted command knows the files that it was to write.
+    # The command in ``rejoin`` only waits: it does not know which files the interrupted command would have written.
     files = "  write the files:    run the same command again; it continues with the same work\n"
     return (
         f"interrupted; {f'{stop.what}s {ids} go' if several else f'{stop.what} {ids} goes'} on\n"

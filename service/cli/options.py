@@ -34,7 +34,8 @@ FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 def _not_stdout(
     self: click.Path, value: Any, param: click.Parameter | None, ctx: click.Context | None
 ) -> None:
-    """Refuse "-", which many programs take for standard output. Commands write text there, which would damage a file."""
+    """Refuse "-", which many programs take for standard output. Commands write messages to standard output; these would
+    damage a file that is written to it."""
     if str(value) == "-":
         self.fail(
             "expected a name; got '-': results are not written to standard output. './-' is a file of this name",
@@ -53,7 +54,7 @@ class OutputFile(click.Path):
 
 
 class OutputPlace(OutputFile):
-    """The type of an option that names a file to write, or a folder for a file with a name of its own.
+    """The type of an option that names a file to write, or a folder in which the command chooses the file name.
 
     decides: the command itself decides whether the path is a folder, and checks it.
     """
@@ -78,7 +79,7 @@ class Place:
     is_folder: bool
 
     def file(self, name: str) -> Path:
-        """The path of the file. name: its name if the place is a folder, which is made if needed."""
+        """The path of the file. name: the file name to use if the place is a folder. The folder is made if needed."""
         if not self.is_folder:
             return self.path
         self.path.mkdir(parents=True, exist_ok=True)
@@ -130,7 +131,11 @@ OTHER_CHANNEL = click.option(
     help="Use the PSF even if it is of another telescope, channel or filter than the image",
 )
 CENTRE = click.option(
-    "--centre", nargs=2, type=float, metavar="X Y", help="Position of the flare, px [default: found]"
+    "--centre",
+    nargs=2,
+    type=float,
+    metavar="X Y",
+    help="Position of the flare, px [default: searched in IMAGE]",
 )
 BACKGROUND = "Image of the same frame before the flare (FITS)"
 SEED = click.option(
@@ -174,7 +179,7 @@ def writes_files(command: Command) -> Command:
     """Give a command the option ``--overwrite``, and check its output files before it runs.
 
     The outputs are the values of the options of type ``OUTPUT``. The inputs are the values of the other options and
-    arguments that name files. The command gets ``overwrite`` and hands it on to the code that writes.
+    arguments that name files. The command gets ``overwrite`` and passes it to the code that writes.
     """
 
     @OVERWRITE
@@ -286,7 +291,8 @@ def read_settings(data: Path | None = None) -> Settings:
 
 
 def data_settings(data: Path | None) -> Settings:
-    """The settings of a command that opens the data folder. It tells the user if this is the folder of an earlier version."""
+    """The settings of a command that opens the data folder. If this is the folder of an earlier version, a note is
+    printed."""
     from workers.data_folder import told
 
     settings = read_settings(data)

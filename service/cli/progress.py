@@ -1,4 +1,4 @@
-"""Tells on standard error how far a command is: a bar on a terminal, otherwise a line now and then."""
+"""Shows the progress of a command on standard error: a bar on a terminal, otherwise a line every 10 s."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 LINE_EVERY_S = 10.0
-STEPS_OF = {"error estimate": "realisation"}  # what the steps of a stage are; others are only steps
+STEPS_OF = {"error estimate": "realisation"}  # the name of a step, by stage; "step" in all other stages
 UNITS = (("days", 86_400), ("h", 3600), ("min", 60))
 
 Report = Callable[[str, int, int], None]
@@ -18,19 +18,19 @@ Report = Callable[[str, int, int], None]
 
 @dataclass
 class Pace:
-    """The time left until the last step of the present count, from the pace of this count alone.
+    """Estimates the time left until the last of the steps that a job counts at present.
 
-    A job counts its steps several times, for example images that it reads, then rounds of a fit. A count is new if its
-    number of steps differs, or if its step is smaller than the step before. Earlier counts say nothing about the pace of
-    the present one.
+    A job may count several times, for example first the images that it reads, then the iterations of a fit. A new count
+    begins when the number of steps changes, or when the step number decreases. Only the present count is used for the
+    estimate, because its steps may be faster or slower than those of earlier counts.
     """
 
     steps: int = -1
     first: tuple[int, float] = (0, 0.0)  # step and time of the first report of the count
-    last: tuple[int, float] = (0, 0.0)  # step and time of the first report of the last step
+    last: tuple[int, float] = (0, 0.0)  # step and time of the first report of the latest step
 
     def left_s(self, step: int, steps: int, now_s: float) -> float | None:
-        """Take a report; returns the time left, or None before the second step of a count."""
+        """Take the report of a step; returns the time left, s, or None before the second step of a count."""
         if steps != self.steps or step < self.last[0]:
             self.steps, self.first, self.last = steps, (step, now_s), (step, now_s)
         elif step > self.last[0]:
@@ -43,7 +43,7 @@ class Pace:
 
 
 def duration(seconds: float) -> str:
-    """A duration in the largest unit of which it has two or more."""
+    """A duration as text, in the largest unit in which its value is at least 2."""
     for unit, length_s in UNITS:
         if seconds >= 2 * length_s:
             return f"{seconds / length_s:.0f} {unit}"
@@ -51,7 +51,7 @@ def duration(seconds: float) -> str:
 
 
 def told(stage: str, step: int, steps: int) -> str:
-    """A stage and its step as text. A stage of one step is a stage whose steps are not known, until it ends."""
+    """A stage and its step as text; only the stage if its number of steps is unknown (then it is reported as 1)."""
     if (steps <= 1 and step < steps) or not steps:
         return stage
     return f"{stage}: {STEPS_OF.get(stage, 'step')} {step} of {steps}"
@@ -64,10 +64,12 @@ class _Teller:
         self.bar = bar
         self.started_s = self.told_s = time.monotonic()
         self.pace, self.lock = Pace(), threading.Lock()
-        self.open_line = False  # whether the cursor is behind a bar, so that other text needs a new line
+        self.open_line = (
+            False  # whether a bar is the last text on the terminal; other text then needs a new line
+        )
 
     def report(self, stage: str, step: int, steps: int) -> None:
-        """Tell that this step of a stage is done."""
+        """Show that this step of a stage is done."""
         now_s = time.monotonic()
         with self.lock:
             left_s = self.pace.left_s(step, steps, now_s)
@@ -86,7 +88,7 @@ class _Teller:
                 sys.stderr.flush()
 
     def line(self, text: str) -> None:
-        """Write a line of its own."""
+        """Write a text on a separate line."""
         with self.lock:
             self.end()
             sys.stderr.write(f"{text}\n")
@@ -99,12 +101,12 @@ class _Teller:
             self.open_line = False
 
 
-_tellers: list[_Teller] = []  # of the commands that tell their progress now, the innermost last
+_tellers: list[_Teller] = []  # of the open blocks of ``progress_bar``, the innermost last
 
 
 @contextmanager
 def progress_bar() -> Iterator[Report]:
-    """Tell the progress of the block, with the time left in its present stage: a bar on a terminal, else a line every 10 s."""
+    """Show the progress of the block and the time left in its stage: a bar on a terminal, else a line every 10 s."""
     teller = _Teller(bar=sys.stderr.isatty())
     _tellers.append(teller)
     try:
@@ -115,5 +117,5 @@ def progress_bar() -> Iterator[Report]:
 
 
 def say(text: str) -> None:
-    """Write a line to standard error, on a line of its own if a bar is shown."""
+    """Write a line to standard error. If a bar is shown, the line begins below it."""
     (_tellers[-1] if _tellers else _Teller(bar=False)).line(text)

@@ -24,14 +24,14 @@ from service.cli.options import (
 
 @click.command()
 @click.argument("transit", type=click.Path(exists=True, path_type=Path))
-@click.option("-o", "--output", type=OUTPUT, help="Write a page to read and print (HTML)")
+@click.option("-o", "--output", type=OUTPUT, help="Write the result as an HTML page")
 @JSON
 @PLOT
 @psf_option("PSF to test: an id or a file [default: fit a PSF to TRANSIT]")
 @click.option(
     "--dark-offsets/--no-dark-offsets",
     default=True,
-    help="Also fit with wrong dark levels, +-3 and ±5 DN (slow)",
+    help="Also fit with wrong dark levels, ±3 and ±5 DN (slow)",
 )
 @click.option(
     "--shapes",

@@ -19,7 +19,10 @@ from workers.contract.queues import Queue, queues_named
 @click.option("--port", default=8765, show_default=True, help="Port to listen on; 0: any free port")
 @DATA
 @click.option(
-    "-v", "--verbose", is_flag=True, help="Also show every request; without a terminal, all are logged anyway"
+    "-v",
+    "--verbose",
+    is_flag=True,
+    help="Also log every request on a terminal; elsewhere, requests are always logged",
 )
 def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
     """Start a service over HTTP, and keep it running until it is interrupted.
@@ -64,7 +67,10 @@ def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
 def browser_address(url: str) -> str:
     """The address at which a browser on this machine reaches a service that listens at ``url``."""
     parts = urlsplit(url)
-    everywhere = parts.hostname in ("0.0.0.0", "::")  # every address of the machine: no browser opens that
+    everywhere = parts.hostname in (
+        "0.0.0.0",
+        "::",
+    )  # all addresses of the machine; a browser cannot open this one
     return f"http://localhost:{parts.port}" if everywhere else url
 
 
@@ -93,7 +99,7 @@ def worker(
         except ValueError as error:
             raise click.BadParameter(str(error), param_hint="--queues") from error
     settings = data_settings(data)
-    if stop_with_parent is None:  # the server has told it of its own worker
+    if stop_with_parent is None:  # otherwise the server that started this worker has printed the folder
         click.echo(f"heliopsf worker (data in {settings.data_dir.resolve()})", err=True)
     os.environ |= environment(settings.model_copy(update=given))
     from workers.run.worker import main as run

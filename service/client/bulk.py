@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import httpx
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0
-PATIENCE_S = 600.0  # longest time without an answer after which a client still waits for a job or a bulk run
+PATIENCE_S = 600.0  # a client that waits for a job or bulk run gives up after this time without an answer
 PASSING = (None, 429, 502, 503)  # statuses after which a request is tried again; None: no answer
 QUIET_S = (
     60.0  # longest silence before the stream counts as broken; a stream sends a line at least every 15 s
@@ -28,8 +28,8 @@ class BulkClient(ABC):
     """The requests about bulk runs and events.
 
     Every method raises ``ServiceError``; its ``code`` is the reason ("path-not-allowed", "no-such-bulk", ...).
-    server: address of the service. say: is called with a sentence if the service does not answer during a wait, and when
-    it answers again.
+    server: address of the service. say: a function that is called with a sentence when the service stops answering
+    during a wait, and when it answers again.
     """
 
     server: str
@@ -150,8 +150,8 @@ class BulkClient(ABC):
     def follow(self, address: str) -> Iterator[dict[str, Any]]:
         """Yield the description of a job or bulk run (address ``/v1/jobs/...``, ``/v1/bulk/...``) now and after each change.
 
-        The iteration ends when the job or bulk run ends. If the service does not answer for some minutes, for example during a
-        restart, the client tries again.
+        The iteration ends when the job or bulk run ends or is deleted. If the service does not answer, for example
+        during a restart, the client tries again for up to 10 minutes and then raises ``ServiceError``.
         """
         with closing(self._told(f"{address}/events")) as events:
             for event in events:
@@ -166,15 +166,17 @@ class BulkClient(ABC):
     ) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield all news of your jobs and bulk runs: ("job", description), ("bulk", description), ("gone", {"kind", "id"}).
 
-        First come those that have not ended and those that are named by their ids, then each one that changes. The iteration
-        does not end by itself. It continues after the service did not answer for some minutes.
+        The first news are the jobs and bulk runs that have not ended and those in ``jobs`` and ``bulks`` (ids); then
+        comes each one that changes. The iteration does not end by itself. If the service does not answer, the client
+        tries again for up to 10 minutes and then raises ``ServiceError``.
         """
         with closing(self._told("/v1/events", params={"job": list(jobs), "bulk": list(bulks)})) as events:
             for event in events:
                 yield event["event"], json.loads(event["data"])
 
     def _told(self, address: str, **options: Any) -> Generator[dict[str, str], None, None]:
-        """The events of a stream, which is opened again after it was lost. It ends when the service has no more events (204)."""
+        """The events of a stream. If the connection is lost, the stream is opened again. The iteration ends if the
+        service has no more events (204)."""
         last_id: str | None = None
         wait_s, heard_at, lost = FIRST_WAIT_S, time.monotonic(), False
         while True:
@@ -202,13 +204,13 @@ class BulkClient(ABC):
 def still_waiting(error: ServiceError) -> str:
     """What to tell a user whose service stopped answering during a wait."""
     return (
-        f"{error}. Jobs that were submitted are kept and go on as soon as the service does; trying again for "
+        f"{error}. Submitted jobs are kept and continue when the service runs again; trying again for "
         f"{PATIENCE_S / 60:.0f} min"
     )
 
 
 def _events(lines: Iterator[str]) -> Iterator[dict[str, str]]:
-    """The events of a stream. A blank line ends an event, which has no data if it only tells its id."""
+    """The events of a stream. A blank line ends an event. An event that only states its id has no data."""
     event: dict[str, str] = {}
     for line in lines:
         if line:

@@ -29,7 +29,8 @@ class ServiceError(Exception):
 
 
 def error_lines(message: str, fields: Mapping[str, Any]) -> list[str]:
-    """An error as lines to print: the message, then the PSFs that could fit an image and the ways on, if it has them."""
+    """An error as lines to print: the message, then, if the error has them, the PSFs that could fit the image and the
+    next steps."""
     lines = [message]
     if fields.get("instruments"):
         lines.append("Instruments whose PSF can be built:")
@@ -48,7 +49,7 @@ def error_lines(message: str, fields: Mapping[str, Any]) -> list[str]:
             for one in fields["psfs"]
         ]
     if fields.get("ways"):
-        lines.append("Ways on:")
+        lines.append("What to do next:")
         lines += [f"  {number}. {one['text']}" for number, one in enumerate(fields["ways"], 1)]
     return lines
 
@@ -59,9 +60,9 @@ def _same(one: Mapping[str, Any]) -> str:
 
 
 class WaitInterrupted(KeyboardInterrupt):
-    """Control-C during a wait for a job or a bulk run, which goes on without the client.
+    """Control-C was pressed during a wait for a job or a bulk run. The job or bulk run continues without the client.
 
-    what: "job" or "bulk". identity: its id. server: address of the service. others: ids of further jobs that go on.
+    what: "job" or "bulk". identity: its id. server: address of the service. others: ids of further jobs that continue.
     """
 
     def __init__(self, what: str, identity: str, server: str, others: tuple[str, ...] = ()) -> None:

@@ -49,8 +49,9 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         transport: httpx.BaseTransport | None = None,
         say: Callable[[str], None] = _silent,
     ) -> None:
-        """server: address of the service; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY. say: is called with
-        a sentence during a wait, if the job stays in the queue or the service does not answer.
+        """server: address of the service; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY. say: a
+        function that is called with a sentence during a wait, if the job stays in the queue or the service does not
+        answer.
 
         A service of this machine needs no scheme: ``localhost:8765``. Raises ``ServiceError`` "bad-address", and "bad-key" if
         the key cannot be sent.
@@ -60,7 +61,8 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         if not (key.isascii() and key.isprintable()) or " " in key:
             # The key is checked here. Otherwise the HTTP library would print the key in its error about a bad header.
             raise ServiceError(
-                "expected a key of the form hpsf_ID_SECRET; got something else", code="bad-key"
+                "expected a key of the form hpsf_ID_SECRET; got another text: set HELIOPSF_KEY to the whole key",
+                code="bad-key",
             )
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         self.say = say
@@ -118,15 +120,16 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **series})
 
     def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        """Submit a job; returns its description. If an identical job was done before, the description is of that job, which has already ended.
+        """Submit a job; returns its description. If an identical job was submitted before, the description is of that
+        job.
 
-        queue: "bulk" runs the job after all jobs that people wait for; default: the queue of its kind.
+        queue: "bulk" runs the job after all jobs of other queues; default: the queue of its kind.
         """
         body = {"kind": kind, "queue": queue, "parameters": parameters}
         return self._json("POST", "/v1/jobs", json=body)
 
     def estimate(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        """What such a job would cost; no job is started. The arguments and the errors are those of ``submit``.
+        """Estimate a job without starting it. The arguments and the errors are those of ``submit``.
 
         "estimate" has the expected ``seconds`` and ``memory_mib``, "psf" says which PSF a deconvolution would use and why, and
         "existing" is the address of the result if there is one already.
@@ -141,7 +144,7 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return identity
 
     def image_id(self, path: str | Path, sha256: str) -> str:
-        """The id of an image. It is uploaded unless the service holds it. sha256: hash of the file."""
+        """The id of an image. The image is uploaded unless the service has it. sha256: hash of the file."""
         try:
             identity: str = self.get(f"/v1/images/{sha256}")["id"]
         except ServiceError as error:
@@ -172,7 +175,7 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
 
         If the service does not answer, for example while it is restarted, the client tries again for ten minutes. Raises
         ``ServiceError`` if the job failed or was cancelled, ``TimeoutError`` after ``timeout_s``, and ``WaitInterrupted`` on
-        Control-C; the job goes on.
+        Control-C. After the last two, the job continues.
         """
         try:
             return self._ended(self._followed(job, progress, timeout_s))

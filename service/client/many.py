@@ -3,8 +3,9 @@
 A few jobs are in flight at a time, so that the workers of a service need not wait for uploads and downloads. One thread does
 everything in the order of the images: it begins images until enough jobs are in flight, then waits for the oldest of them.
 
-The file of a product is named after the image's file and the product's identity. An image is skipped if the folder holds
-the product of its bytes with the same PSF and parameters, under any name: the cards INPSHA and PRODID of the files decide.
+The file of a product is named after the image's file and the product's identity. An image is skipped if the folder
+already contains its product, made from the same bytes with the same PSF and parameters. Products in the folder are
+recognised by their cards INPSHA and PRODID, whatever their names.
 """
 
 from __future__ import annotations
@@ -38,10 +39,10 @@ _Step = TypeVar("_Step", bound="_Begun | Outcome")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one image. output: the file of its product. existed: the folder held the product before.
+    """The outcome for one image. output: the file of its product. existed: the folder contained the product before.
 
     failure: why there is no product; None if there is one. warnings: what a user of the product must know; empty if the
-    folder held the product before.
+    folder contained the product before.
     """
 
     image: Path
@@ -60,7 +61,7 @@ def deconvolve_many(
     progress: Callable[[int, int], None] = lambda done, of: None,
     **parameters: Any,
 ) -> Iterator[Outcome]:
-    """Deconvolve images into a folder, and yield what became of each image, in their order.
+    """Deconvolve images into a folder, and yield the outcome for each image, in the order of the images.
 
     At most ``service.jobs_at_once`` jobs are in flight. parameters: as for ``Operations.deconvolve``, except the pictures. If an
     image cannot be read, deconvolved or written, its outcome has the reason, and the next image follows. overwrite: replace
@@ -69,7 +70,7 @@ def deconvolve_many(
 
     Raises ``ServiceError`` for an error that concerns every image: "output-not-writable", a refused key, a full quota, or
     no answer from the service. Images whose jobs are in flight are finished first, if the service answers. Raises
-    ``WaitInterrupted`` on Control-C; the jobs that it names go on.
+    ``WaitInterrupted`` on Control-C; the jobs that this exception names continue.
     """
     check_output_folder(folder)
     Path(folder).mkdir(parents=True, exist_ok=True)
@@ -111,7 +112,7 @@ class _Run:
         self._begun: deque[_Begun | Outcome] = deque()
 
     def outcomes(self) -> Iterator[Outcome]:
-        """What became of each image. Raises as ``deconvolve_many``."""
+        """The outcome for each image. Raises the same errors as ``deconvolve_many``."""
         try:
             for image in map(Path, self._images):
                 try:
@@ -132,14 +133,14 @@ class _Run:
         return [one.job for one in self._begun if isinstance(one, _Begun) and one.job is not None]
 
     def _finished(self, leave: int) -> Iterator[Outcome]:
-        """Finish the first images until at most so many jobs are in flight and the first image has one."""
+        """Finish images, oldest first, until at most ``leave`` jobs are in flight and the oldest image left has one."""
         while self._begun:
             first = self._begun[0]
             if isinstance(first, _Begun):
                 if first.job is not None and len(self._in_flight()) <= leave:
                     return
                 first = _told(first.image, partial(self._finish, first))
-            self._begun.popleft()  # only now, so that an interruption names its job
+            self._begun.popleft()  # only now: an interruption before this line must name its job
             yield first
 
     def _begin(self, image: Path) -> _Begun | Outcome:

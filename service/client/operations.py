@@ -1,4 +1,5 @@
-"""The requests to a service. They use a few abstract operations, which HTTP and a service in this process implement differently.
+"""The requests to a service. They use a few abstract operations. The HTTP client and the service in this process
+implement these.
 
 A method that writes files checks them before it sends anything (``service.client.outputs.check_outputs``). An existing
 file is replaced only with ``overwrite=True``, and only when the new file is complete.
@@ -54,7 +55,8 @@ class Operations(ABC):
 
     @abstractmethod
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
-        """Submit a job; returns its description. If an identical job was done before, the description is of that job, which has already ended."""
+        """Submit a job; returns its description. If an identical job was submitted before, the description is of that
+        job."""
 
     @abstractmethod
     def result_id(self, kind: str, **parameters: Any) -> str:
@@ -62,11 +64,11 @@ class Operations(ABC):
 
     @abstractmethod
     def image_id(self, path: str | Path, sha256: str) -> str:
-        """The id of an image. It is uploaded unless the service holds it. sha256: hash of the file."""
+        """The id of an image. The image is uploaded unless the service has it. sha256: hash of the file."""
 
     @abstractmethod
     def release(self, product: dict[str, Any]) -> None:
-        """Delete the files of a downloaded product if nobody else can ask for them. A service over HTTP keeps them."""
+        """Delete the files of a downloaded product if the service runs in this process; over HTTP, keep them."""
 
     @abstractmethod
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
@@ -256,7 +258,8 @@ class Operations(ABC):
         """Upload a transit, diagnose the gap between it and the fitted model, and download the report; returns its description.
 
         report, page, preview, noise: as for ``report``. parameters: ``psf_id`` of a fitted PSF to start from, ``seed``,
-        ``coverage`` of the answer set, ``correct``. If an effect was found, ``details.corrected_psf_id`` is the id of the PSF that includes it.
+        ``coverage`` of the answer set, ``correct`` (whether to make the corrected PSF). If an effect was found,
+        ``details.corrected_psf_id`` is the id of the corrected PSF.
         """
         check_outputs((report, page, preview), inputs=(transit,), overwrite=overwrite)
         found = self._on_transit("gap-diagnose", transit, progress, noise, parameters)

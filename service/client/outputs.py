@@ -45,8 +45,10 @@ def check_outputs(
 
 
 def check_output_folder(folder: Name) -> None:
-    """Raise ``ServiceError`` "output-not-writable" if files could not be written into a folder. The folder need not exist:
-    then the nearest folder above it is tried, and nothing is made."""
+    """Raise ``ServiceError`` "output-not-writable" if files cannot be written into a folder.
+
+    If the folder does not exist, the nearest existing folder above it is checked. No folder is made.
+    """
     there = Path(folder)
     with _not_writable(there):
         while not there.exists():

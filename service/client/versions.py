@@ -10,7 +10,7 @@ Progress = Callable[[str, int, int], None]
 
 
 class VersionedPsfs(ABC):
-    """The requests about PSF versions. Times are ISO 8601, UTC without a zone.
+    """The requests about PSF versions. Times are in ISO 8601; a time without a zone is UTC.
 
     Every method raises ``service.client.errors.ServiceError``; its ``code`` is the reason ("ranges-overlap", "no-psf-fits", ...).
     """

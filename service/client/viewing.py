@@ -38,8 +38,8 @@ class Viewing(ABC):
         """The pixels [y, x] of an uploaded image or of a plane of a product, in the unit of the file; NaN: no value.
 
         x, y, width, height: the window, px, counted from 0; default: the whole plane. step: n gives one number for each block of
-        n x n px: the mean of its finite pixels, of "quality" the bitwise OR. Raises ``ServiceError`` "window-outside" and
-        "no-such-plane".
+        n x n px: the mean of its finite pixels, for "quality" the bitwise OR. Raises ``ServiceError`` "window-outside"
+        and "no-such-plane".
         """
         import numpy as np  # only a caller of this method needs it
 

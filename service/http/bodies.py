@@ -1,7 +1,7 @@
 """Bounds on the body of a request: its size, its time, and the number of values in it.
 
-A body costs memory and time before anything is known about its content. Therefore its size is bounded while it arrives, a
-client that sends too slowly is answered, and the values in JSON are counted before they are made into objects.
+A body costs memory and time before its content is known. Therefore its size is bounded while it arrives, a client that
+sends too slowly gets an error, and the values in JSON are counted before Python objects are made of them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MOST_OF = {b"[": 25_000, b"{": 25_000, b":": 25_000, b",": 200_000}
 
 @dataclass(frozen=True)
 class BodyLimits:
-    """Largest bodies in bytes, and the slowest body: ``seconds``, and from then on ``bytes_per_s``."""
+    """Largest bodies, and the longest time for a body: n bytes may take ``seconds`` + n / ``bytes_per_s``."""
 
     usual_bytes: int
     bulk_bytes: int
@@ -49,8 +49,8 @@ class BodyLimits:
     def received(self, path: str, headers: Headers, receive: Receive) -> Receive:
         """The body of a request, within these limits. Uploads have their own limits on the size, in ``service.http.uploads``.
 
-        Whoever reads the body gets ``Problem`` 413 if its declared length is too large, before anything is received, or as
-        soon as it is too large; and 408 as soon as it is too slow.
+        The reader of the body gets ``Problem`` 413 at once if the declared length is too large, 413 as soon as too many
+        bytes have arrived, and 408 as soon as the client is too slow.
         """
         own = has_own_limit(path, headers.get("content-type", ""))
         most = None if own else self.bulk_bytes if path == BULK else self.usual_bytes
@@ -63,7 +63,7 @@ class BodyLimits:
                 return await receive()
             if most is not None and declared.isdecimal() and int(declared) > most:
                 raise _too_large(path, most)
-            # Only the time that the client needs counts, not the time in which this server does something with the body.
+            # Only the time in which the server waits for the client counts, not the time of processing the body.
             allowed_s = self.seconds + got / self.bytes_per_s
             started = time.monotonic()
             with anyio.move_on_after(allowed_s - waited_s) as waiting:
@@ -81,7 +81,7 @@ class BodyLimits:
 
 
 class JsonRequest(Request):
-    """A request whose JSON is counted before it is parsed, and parsed in a thread, so that other requests do not wait."""
+    """A request with JSON. Its values are counted before it is parsed; a thread parses it, so that other requests do not wait."""
 
     async def json(self) -> Any:
         """The content of the body. Raises ``Problem`` 413 for too many values, and ValueError if it is not JSON."""
@@ -102,7 +102,8 @@ def _too_large(path: str, most: int) -> Problem:
     return Problem(
         413,
         "too-large",
-        f"expected a request of at most {most} bytes; got more (the operator can raise {setting})",
+        f"expected a request of at most {most} bytes; got more: send less in one request, or ask the operator to raise "
+        f"{setting}",
     )
 
 

@@ -80,7 +80,8 @@ def _caller(
     _bearer: Annotated[None, Depends(_AS_BEARER)],
     _basic: Annotated[None, Depends(_AS_PASSWORD)],
 ) -> Caller:
-    """The caller of a request. Raises ``Problem`` if its key does not have a scope that the route needs, or if it reached its rate limit."""
+    """The caller of a request. Raises ``Problem`` if the key lacks a scope that the route needs, or if the caller
+    reached a limit."""
     let_in: Caller | None = getattr(request.state, "let_in", None)  # set by KeyFirst
     return let_in or admit(request, state, needed.scopes)
 
@@ -100,7 +101,7 @@ def admit(request: Request, state: State, scopes: Iterable[str], form_token: str
             raise Problem(
                 403,
                 "scope-missing",
-                f"expected a key with the scope '{scope}'; this key has {', '.join(sorted(caller.scopes))}",
+                f"expected a key with the scope '{scope}'; this key has {', '.join(sorted(caller.scopes))}: use another key, or ask the operator",
             )
         reading = scope in (Scope.READ, Scope.ADMIN)
         bucket = Bucket.READS if reading else Bucket.SUBMISSIONS
@@ -111,21 +112,21 @@ def admit(request: Request, state: State, scopes: Iterable[str], form_token: str
 
 
 def address_of(request: Request) -> str:
-    """The address of a client, by which the limits count requests without a valid key."""
+    """The address of a client. The limits on requests without a valid key are counted for each address."""
     return request.client.host if request.client is not None else "unknown"
 
 
 def cookie_name(request: Request) -> str:
     """The name of the cookie of a session.
 
-    Browsers accept the prefix ``__Host-`` over HTTPS alone, and then only from this host: no other host of the domain can set
-    the cookie.
+    Browsers accept a cookie with the prefix ``__Host-`` only over HTTPS and only from this host. So no other host of
+    the domain can set it.
     """
     return f"__Host-{SESSION_COOKIE}" if request.url.scheme == "https" else SESSION_COOKIE
 
 
 def still_let_in(state: State, caller: Caller) -> bool:
-    """Whether the key of a caller, and the session if there is one, are valid now. Long answers ask this again and again."""
+    """Whether a caller's key, and the session if there is one, are valid now. Event streams check this repeatedly."""
     if not state.access.keys:
         return True
     if caller.session is not None:
@@ -155,7 +156,7 @@ def _let_in(request: Request, state: State, form_token: str) -> Caller:
 
 
 def _session_and_key(request: Request, state: State) -> tuple[SessionRow | None, KeyRow]:
-    """The key that lets a request in, and the session if it came by cookie. Raises ``KeyRefused``."""
+    """The session of a request (None if the request sent a key and no cookie), and its key. Raises ``KeyRefused``."""
     token = request.cookies.get(cookie_name(request))
     if token is None or "authorization" in request.headers:
         return None, state.catalogue.keys.check(_sent_key(request))
@@ -163,7 +164,7 @@ def _session_and_key(request: Request, state: State) -> tuple[SessionRow | None,
 
 
 def names_its_site(request: Request) -> bool:
-    """Whether a request says from which site it comes, so that ``service.http.guard`` has decided about it."""
+    """Whether a request says from which site it comes. If so, ``service.http.guard`` has already checked the site."""
     return "sec-fetch-site" in request.headers or "origin" in request.headers
 
 
@@ -180,10 +181,11 @@ def _check_form_token(request: Request, session: SessionRow, sent: str) -> None:
 
 
 def _challenge(request: Request) -> dict[str, str]:
-    """The ways to send a key. Pages are not offered Basic, because the browser would ask for a password in a window of its own.
+    """The header that lists the ways to send a key. For a page it does not list Basic: the browser would open its own
+    window and ask for a password.
 
-    Browsers ask for XHTML when a person opens an address. Clients of the Virtual Observatory that are written in Java accept
-    ``text/html`` too, but not XHTML, and they need the offer.
+    Browsers accept XHTML when a person opens an address. Clients of the Virtual Observatory that are written in Java
+    accept ``text/html`` but not XHTML; for them the header must list Basic.
     """
     page = (
         request.headers.get("sec-fetch-site") == "same-origin"
@@ -211,9 +213,9 @@ def _sent_key(request: Request) -> str:
 
 
 class KeyFirst(APIRoute):
-    """A route with a JSON body. It checks the caller before it reads the body; FastAPI alone does it afterwards.
+    """A route with a JSON body. It checks the caller before it reads the body; FastAPI alone would read the body first.
 
-    An owner sends one bulk run at a time, because its body may be large.
+    The bulk runs that one owner submits are read one after the other, because their bodies may be large.
     """
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
@@ -235,7 +237,7 @@ class KeyFirst(APIRoute):
 
 
 def _scopes_of(endpoint: Callable[..., Any]) -> list[str]:
-    """The scopes that the caller of an endpoint needs, from the annotation of the parameter."""
+    """The scopes that an endpoint requires, read from the annotation of its parameter for the caller."""
     for annotation in get_type_hints(endpoint, include_extras=True).values():
         for mark in getattr(annotation, "__metadata__", ()):
             if isinstance(mark, SecurityParameter) and mark.dependency is _caller:

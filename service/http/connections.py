@@ -41,8 +41,9 @@ _FULL_BODY = (
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """most: number of connections that are open at the same time. header_s: time for the header of a request, from the
-    connection or from the last answer. stalled_s: time in which a client that reads its answer takes at least a part of it."""
+    """most: largest number of connections that are open at the same time. header_s: longest time until the header of a
+    request is complete, from the connection or from the last answer. stalled_s: longest time in which a client takes no
+    part of its answer."""
 
     most: int
     header_s: float
@@ -50,7 +51,7 @@ class ConnectionLimits:
 
     @classmethod
     def of(cls, settings: Settings) -> ConnectionLimits:
-        """The limits in the settings. Fewer connections if the system does not allow enough file descriptors."""
+        """The limits in the settings. The number of connections is smaller if the system allows too few file descriptors."""
         return cls(_most(settings.max_connections), settings.header_s, settings.stalled_s)
 
 
@@ -71,7 +72,7 @@ class BoundedConnection(H11Protocol):
         return self.cycle is not None and not self.cycle.response_complete
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Accept the connection, if need be in place of one that waits for a request."""
+        """Accept the connection. If too many are open, close one that waits for a request; if none waits, refuse this."""
         super().connection_made(transport)
         if self._open_connections() > self.limits.most and not self._close_the_longest_waiting():
             log.warning(
@@ -90,7 +91,7 @@ class BoundedConnection(H11Protocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Receive a part of a request. The time for its header ends when the header is complete, not at every part."""
+        """Receive a part of a request. The timer for the header stops only when the header is complete."""
         super().data_received(data)
         if self.answering:
             self._stop_header_timer()
@@ -102,12 +103,12 @@ class BoundedConnection(H11Protocol):
             self._await_header()
 
     def pause_writing(self) -> None:
-        """Start to wait for a client that does not take its answer."""
+        """Start the timer for a client that takes no part of its answer."""
         super().pause_writing()
         self._stalled_timer = self.loop.call_later(self.limits.stalled_s, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """The client has taken a part of its answer, or the connection ends."""
+        """Stop this timer: the client has taken a part of its answer, or the connection ends."""
         if self._stalled_timer is not None:
             self._stalled_timer.cancel()
             self._stalled_timer = None
@@ -142,7 +143,7 @@ class BoundedConnection(H11Protocol):
             return False
         min(waiting, key=lambda one: one._waits_since).transport.abort()
         log.warning(
-            "all %d connections of this server are open: each new one closes the one that has waited longest for a request",
+            "all %d connections of this server are open: each new connection closes the one that has waited longest for a request",
             self.limits.most,
         )
         return True
@@ -154,7 +155,7 @@ def bounded(limits: ConnectionLimits) -> type[BoundedConnection]:
 
 
 def _most(wanted: int) -> int:
-    """The number of connections for which there are file descriptors. Raises the process's limit as far as this is needed."""
+    """The number of connections for which there are file descriptors. If needed, it first raises the process's limit."""
     needed = OWN_DESCRIPTORS + PER_CONNECTION * wanted
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < needed:

@@ -30,7 +30,7 @@ def send(
 ) -> Response:
     """The file, or 304 if the client already has it. size: as for ``found``. Raises ``Problem`` 410.
 
-    Clients can compare what they received with the header Repr-Digest (RFC 9530).
+    Clients can check the received file against the SHA-256 in the header Repr-Digest (RFC 9530).
     """
     content = base64.b64encode(bytes.fromhex(digest)).decode()
     headers = {"ETag": f'"{digest}"', "Cache-Control": KEPT, "Repr-Digest": f"sha-256=:{content}:"}

@@ -79,7 +79,7 @@ SECURITY_HEADERS = {
 
 
 class ProblemDocument(BaseModel):
-    """The document that answers an error."""
+    """The body of the answer to a request that failed."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -92,7 +92,7 @@ class ProblemDocument(BaseModel):
 class Problem(HTTPException):
     """An error with its HTTP status. Any endpoint may raise it. The answer is then a problem document.
 
-    It is an HTTPException, because FastAPI passes on no other exception of a body that it reads.
+    It is an HTTPException: FastAPI replaces other exceptions that are raised while it reads a body.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class Problem(HTTPException):
 
 
 def problem(error: DataError, **more: Any) -> Problem:
-    """The problem for an error of the request or its data, with the error's fields; ``more``: further fields."""
+    """The problem for an error of the request or its data, with the fields of the error. more: further fields."""
     return Problem(STATUS_OF.get(error.code, 422), error.code, error.message, **{**error.fields, **more})
 
 
@@ -130,9 +130,9 @@ AsPage = Callable[[Request, int, str, str, Mapping[str, Any]], Response]
 
 
 def install(app: FastAPI, as_page: AsPage) -> None:
-    """Make the application answer every error with a problem document, or with a page if a page was asked for.
+    """Make the application answer every error with a problem document, or with a page if a browser asked for a page.
 
-    as_page(request, status, code, detail, fields): makes the page.
+    as_page: a function (request, status, code, detail, fields) that makes the page.
     """
 
     def answer(
@@ -148,7 +148,7 @@ def install(app: FastAPI, as_page: AsPage) -> None:
             return document(status, code, detail, headers=headers, **more)
         made = as_page(request, status, code, detail, more)
         for name, value in (headers or {}).items():
-            made.headers.setdefault(name, value)  # a page has a policy of its own
+            made.headers.setdefault(name, value)  # a page has its own security policy
         return made
 
     @app.exception_handler(Problem)

@@ -34,8 +34,8 @@ class Allowed:
     def keep(self, file: Path, digest: str, row: Row) -> tuple[Row, bool]:
         """Store the uploaded file, and add its row to the catalogue; returns the row, and whether it is new.
 
-        If the row is refused or fails, the file is removed again. Raises ``Problem`` 413 if other uploads have filled the
-        quota meanwhile.
+        If the row cannot be added, the file is removed again. Raises ``Problem`` 413 if other uploads have filled the
+        quota in the meantime.
         """
         with self._state.store.kept_if(file, digest):
             try:
@@ -45,7 +45,7 @@ class Allowed:
 
 
 def check_disk(state: State, more_bytes: int = 0) -> None:
-    """Raise ``Problem`` 507 if the disk of the data folder would be full after this number of bytes."""
+    """Raise ``Problem`` 507 if the data folder's disk would have less free space than the setting after ``more_bytes``."""
     free = checks.free_bytes(state.settings.data_dir)
     least = state.settings.min_free_mib * MIB
     if free - more_bytes < least:

@@ -115,16 +115,16 @@ class Rates:
 
 
 class AtOnce:
-    """Counts what each caller has open in this process, and limits it."""
+    """Counts the requests or streams that each caller has open in this process, and limits their number."""
 
     def __init__(self, most: int, code: str, what: str) -> None:
-        """most: the limit for each caller. code, what: the code of the error, and what is counted, in the plural."""
+        """most: the limit for each caller. code: the error code. what: a plural for the message, such as "requests"."""
         self._most, self._code, self._what = most, code, what
         self._open: Counter[str] = Counter()
         self._lock = threading.Lock()
 
     def open(self, who: str) -> None:
-        """Count one more. Raises ``Problem`` 429 if the caller already has the largest number open."""
+        """Count one more. Raises ``Problem`` 429 if the caller already has ``most`` open."""
         with self._lock:
             if self._open[who] >= self._most:
                 raise Problem(
@@ -137,7 +137,7 @@ class AtOnce:
             self._open[who] += 1
 
     def total(self) -> int:
-        """The number of all that is open."""
+        """The number that all callers together have open."""
         with self._lock:
             return self._open.total()
 
@@ -154,7 +154,7 @@ def _too_many(allowance: Allowance) -> Problem:
     return Problem(
         429,
         "too-many-requests",
-        f"expected at most {allowance.limit} {unit[allowance.bucket]} per minute; got more; try again in "
+        f"expected at most {allowance.limit} {unit[allowance.bucket]} per minute; got more: try again in "
         f"{allowance.reset_s} s",
         headers={"Retry-After": str(allowance.reset_s), **allowance.headers},
     )

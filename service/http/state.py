@@ -32,9 +32,9 @@ class State:
     rates: Rates
     streams: AtOnce
     requests: AtOnce
-    # Cut-outs wait here and not in the threads that all requests share: a cut-out keeps a core busy.
+    # Limits how many cut-outs are made at once, because each keeps a core busy. Others wait without using a thread.
     cutouts: anyio.CapacityLimiter
-    # The same for planes and headers that are decoded.
+    # The same for decoding planes and headers.
     decoding: anyio.CapacityLimiter
     planes: Planes
 

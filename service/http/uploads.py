@@ -1,5 +1,5 @@
-"""Receives an upload: streams it to the store, and hashes, counts and checks its bytes meanwhile. The upload is never held in
-memory as a whole."""
+"""Receives an upload: streams it to the store, and at the same time hashes, counts and checks its bytes. The whole
+upload is never in memory."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
-FORM_BYTES = 2**16  # largest number of bytes that a form may add to the file
+FORM_BYTES = 2**16  # largest size of a form without its file
 LARGE = frozenset(
     {f"{root}/{kind}" for root in ("", "/v1") for kind in ("images", "psfs", "transits")}
 )  # upload addresses; they have their own limits
@@ -122,7 +122,7 @@ async def receive_psf(
 ) -> AsyncIterator[Upload[HeaderSummary]]:
     """Stream the request's FITS file to a temporary path and check that it can be a PSF.
 
-    Raises the same ``Problem`` as ``receive``, and 422 if the file is plainly no PSF.
+    Raises the same ``Problem`` as ``receive``, and 422 if the file cannot be a PSF.
     """
     async with _receive(request, store, _PsfFile(limits), max_bytes, take) as upload:
         yield upload
@@ -166,7 +166,7 @@ async def _receive(
                 digest.update(chunk)
                 file.write(chunk)
         if size == 0:
-            raise Problem(400, "empty-upload", f"expected {expected.what}, got 0 bytes: check the file")
+            raise Problem(400, "empty-upload", f"expected {expected.what}; got 0 bytes: check the file")
         expected.recognise(start, whole=True)
         found = await run_in_threadpool(expected.inspect, path)
         yield Upload(path, digest.hexdigest(), size, body.filename, found)
@@ -183,7 +183,9 @@ class _Fits:
         """Refuse a file that is not FITS at its first bytes, before the rest is received."""
         if not any(start.startswith(known[: len(start)]) for known in FITS_STARTS):
             raise Problem(
-                415, "not-fits", f"expected a FITS file (it starts with 'SIMPLE  ='), got {start[:9]!r}"
+                415,
+                "not-fits",
+                f"expected a FITS file (it starts with 'SIMPLE  ='); got {start[:9]!r}: check the file",
             )
 
     def inspect(self, path: Path) -> HeaderSummary:
@@ -213,7 +215,9 @@ class _Archive:
     def recognise(self, start: bytes, *, whole: bool) -> None:
         """Refuse a file that is not an archive at its first bytes, before the rest is received."""
         if not (could_be_archive(start) and (not whole or archive_kind(start))):
-            raise Problem(415, "not-an-archive", f"expected {self.what}, got bytes {start[:9]!r}")
+            raise Problem(
+                415, "not-an-archive", f"expected {self.what}; got bytes {start[:9]!r}: check the file"
+            )
 
     def inspect(self, path: Path) -> ArchiveContents:
         try:
@@ -223,7 +227,7 @@ class _Archive:
 
 
 def _refuse_by_length(request: Request, max_bytes: int) -> int:
-    """The length that the request declares; 0 if it declares none."""
+    """The length that the request declares; 0 if it declares none. Raises ``Problem`` 413 if it is too large."""
     text = request.headers.get("content-length", "")
     declared = int(text) if text.isdecimal() else 0
     if declared > max_bytes + FORM_BYTES:
@@ -236,7 +240,7 @@ def check_size(size_bytes: int, max_bytes: int) -> None:
     if size_bytes > max_bytes:
         raise _too_large(max_bytes)
     if size_bytes == 0:
-        raise Problem(400, "empty-upload", "expected a file, got 0 bytes: check the file")
+        raise Problem(400, "empty-upload", "expected a file; got 0 bytes: check the file")
 
 
 def fits_summary(path: Path, limits: FitsLimits) -> HeaderSummary:
@@ -245,7 +249,7 @@ def fits_summary(path: Path, limits: FitsLimits) -> HeaderSummary:
 
 
 def psf_summary(path: Path, limits: FitsLimits) -> HeaderSummary:
-    """As ``fits_summary``, for a PSF. Raises ``Problem`` 422 if the file is plainly no PSF."""
+    """As ``fits_summary``, for a PSF. Raises ``Problem`` 422 if the file cannot be a PSF."""
     return _inspected(path, _PsfFile(limits))
 
 
@@ -304,7 +308,11 @@ class _Body:
 
     async def _form(self, options: dict[bytes, bytes]) -> AsyncIterator[bytes]:
         if not options.get(b"boundary"):
-            raise Problem(400, "bad-form", "expected a boundary in the multipart Content-Type, got none")
+            raise Problem(
+                400,
+                "bad-form",
+                "expected a boundary in the multipart Content-Type; got none: correct the request",
+            )
         callbacks: MultipartCallbacks = {
             "on_part_begin": self._part_begin,
             "on_header_field": self._header_field,
@@ -326,7 +334,11 @@ class _Body:
         except FormParserError as error:
             raise Problem(400, "bad-form", f"expected multipart/form-data: {error}") from error
         if not self._seen_file:
-            raise Problem(400, "bad-form", "expected a form with a part named 'file', got none")
+            raise Problem(
+                400,
+                "bad-form",
+                "expected a form with a part named 'file'; got none: name the part with the file 'file'",
+            )
         if not self._whole:
             raise Problem(
                 400,

@@ -1,8 +1,8 @@
 """The interactive API reference at ``/docs``: Swagger UI, served from this host.
 
-The package ``fastapi-swagger`` ships the scripts and the style sheet of Swagger UI. The page in that package starts
-them with an inline script, which our content security policy forbids. Therefore this module has a page of its own, which
-starts them from a file.
+The package ``fastapi-swagger`` contains the scripts and the style sheet of Swagger UI. The page of that package starts
+Swagger UI with an inline script, which our content security policy forbids. The page in this module starts it with a
+script file.
 """
 
 from __future__ import annotations

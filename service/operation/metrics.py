@@ -52,7 +52,8 @@ class _Catalogued(Collector):
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics of database, storage and streams. If the database does not answer, only those that need none, and the one that says so."""
+        """The metrics of database, storage and streams. If the database does not answer, its metrics are left out,
+        except ``heliopsf_database_up``, which is 0."""
         yield InfoMetricFamily("heliopsf", "The service", {"version": software_version()})
         room = GaugeMetricFamily("heliopsf_storage_free_bytes", "Free space where files are stored")
         room.add_metric([], checks.free_bytes(self._state.settings.data_dir))

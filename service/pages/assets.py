@@ -1,7 +1,7 @@
 """The files that pages load: style sheets, scripts and pictures, at ``/static/VERSION/NAME``.
 
-VERSION is a hash of all files. Scripts import each other by relative addresses, so a page and its scripts always are of one
-version, and browsers may keep them for ever.
+VERSION is a hash of all files. Scripts import each other by relative addresses, so a page and its scripts always have
+the same version, and browsers may keep them for ever.
 """
 
 from __future__ import annotations

@@ -210,7 +210,7 @@ def _told(failed: BulkItemRow) -> str:
 
 
 def _pace(line: BulkLine, caller: Caller, state: State) -> BulkView | None:
-    """The whole view of a run that is at work; the others have no pace."""
+    """The view of a run with its speed; None for a run that is not running, which has no speed."""
     return get_bulk(line.id, caller, state) if line.phase in AT_WORK else None
 
 
@@ -221,13 +221,15 @@ def _after(cursor: str | None) -> tuple[float, int] | None:
         return None
     if not parts[1].isdecimal() or len(parts[1]) > 9:
         raise Problem(
-            422, "bad-cursor", "expected the address of a page of results: go back to the first page"
+            422,
+            "bad-cursor",
+            "expected the address of a page of results; got another one: go back to the first page",
         )
     return number(parts[0]), int(parts[1])
 
 
 def _cards(rows: Sequence[BulkItemRow], caller: Caller, state: State) -> list[dict[str, Any]]:
-    """What the contact sheet shows of the images."""
+    """The entries of the images on the contact sheet."""
     results, names = [Result.of(row) for row in rows], _names(rows, caller, state)
     there = state.catalogue.bulks.progress.still_there([one.product_id for one in results], caller.owner)
     return [

@@ -15,7 +15,7 @@ TITLES = {
     404: "There is nothing here",
     410: "The file is lost",
     413: "This is too large",
-    415: "This is no file that the service reads",
+    415: "The service cannot read this file",
     421: "This host name is not served",
     429: "Too many requests",
     503: "The service cannot answer now",
@@ -28,7 +28,7 @@ TITLES_OF_CODES = {
 # Other pages of this address would be refused too.
 WITHOUT_LINKS = {421}
 # The image was stored before these errors, or its page still shows it.
-KEPT = "Nothing is lost: what you uploaded before is kept, and need not be chosen again."
+KEPT = "Nothing is lost: your earlier uploads are kept, and you need not send them again."
 
 
 def problem_page(

@@ -37,7 +37,7 @@ router = APIRouter(prefix="/images/{image_id}", include_in_schema=False)
 
 @dataclass(frozen=True)
 class Checked:
-    """What the check of the options found. lines: sentences, the most important first. button: the words on the button."""
+    """The result of a check of the options. lines: sentences, the most important first. button: the button's text."""
 
     good: bool
     lines: tuple[str, ...]
@@ -87,9 +87,9 @@ def check(image_id: Identity, request: Request, caller: PageReading, state: Shar
 async def start(
     image_id: Identity, request: Request, response: Response, caller: PageSubmitting, state: Shared
 ) -> Response:
-    """Start the deconvolution with the options of the form, and go to its job or to the product that exists already.
+    """Start the deconvolution with the options of the form, and go to its job.
 
-    Options that are refused lead back to the page of the image, which keeps them and says why.
+    If the options are refused, the page of the image is shown again, with these options and the reason.
     """
     form = await fields(request)
     try:
@@ -117,7 +117,7 @@ async def build(
 
 
 def product_line(product: ProductView) -> dict[str, Any]:
-    """What the list of the products of an image shows of one."""
+    """The entry of a product in the list of the products of an image."""
     done = product.details.get("steps_done", product.details["method"]["steps"])
     return {
         "id": product.id,
@@ -166,7 +166,7 @@ def _psf(psf: ChosenPsf) -> str:
 
 
 def _facts(row: ImageRow) -> list[tuple[str, str]]:
-    """What the header says of the image."""
+    """The properties of the image that its header states: name and value."""
     header, line = row.summary, image_line(row)
     ny, nx = header["shape"]
     scale = header.get("cdelt1")
@@ -185,5 +185,9 @@ def _facts(row: ImageRow) -> list[tuple[str, str]]:
 def _find(state: State, caller: Caller, image_id: str) -> ImageRow:
     row = state.catalogue.get(ImageRow, image_id, caller.owner)
     if row is None:
-        raise Problem(404, "no-such-image", f"expected the id of one of your images; got {image_id}")
+        raise Problem(
+            404,
+            "no-such-image",
+            f"expected the id of one of your images; got {image_id}: upload the image, or list your images",
+        )
     return row

@@ -64,7 +64,7 @@ async def take_sample(caller: PageSubmitting, state: Shared) -> Response:
 
 
 def product_card(state: State, row: ProductRow) -> dict[str, object]:
-    """What lists show of a product."""
+    """The entry of a product in a list."""
     view = ProductView.of(row)
     image = state.catalogue.get(ImageRow, row.image_id, row.owner)
     thumbnail = row.details.get("thumbnail_sha256")
@@ -78,7 +78,7 @@ def product_card(state: State, row: ProductRow) -> dict[str, object]:
 
 
 def image_line(row: ImageRow) -> dict[str, object]:
-    """What lists show of an image."""
+    """The entry of an image in a list."""
     header = row.summary
     telescope = [str(header[name]) for name in ("telescop", "detector") if header.get(name)]
     if header.get("wavelnth"):
@@ -93,7 +93,7 @@ def _add_sample(state: State, caller: Caller) -> ImageRow:
     take = Allowed(state, caller)
     with as_file(files(__package__).joinpath(SAMPLE)) as shipped, tempfile.TemporaryDirectory() as folder:
         take(shipped.stat().st_size)
-        copy = Path(shutil.copy(shipped, folder))  # the store takes the file itself
+        copy = Path(shutil.copy(shipped, folder))  # the store moves the file that it gets
         digest = hashlib.sha256(copy.read_bytes()).hexdigest()
         summary = read_summary(copy, state.limits)
         row, _ = take.keep(

@@ -89,7 +89,7 @@ def cancel(job_id: JobId, caller: PageSubmitting, state: Shared) -> Response:
 
 def _again(view: JobView) -> str | None:
     """The address where the request can be changed and started again."""
-    # The parameters of a job that was not started yet are as the client sent them.
+    # A job that was not started yet has the parameters that the client sent, and some may be missing.
     whole = {"image_id", "psf_id", "method"} <= view.parameters.keys()
     return options.address_of(view.parameters) if view.kind == "deconvolve" and whole else None
 
@@ -100,7 +100,7 @@ def result_page(result: str, image: str | None) -> str:
 
 
 def job_lines(jobs: Sequence[JobView], caller: Caller, state: State) -> list[dict[str, Any]]:
-    """What lists show of jobs: also the name of the file of the image, and the error."""
+    """The entries of jobs in a list, with the file name of the image and the error."""
     images = [str(job.parameters.get("image_id")) for job in jobs if job.parameters.get("image_id")]
     names = state.catalogue.bulks.progress.names_of_uploads(images, caller.owner)
     return [

@@ -102,7 +102,7 @@ def _page(
 
 
 def _wrong_form(error: ValidationError) -> Problem:
-    """What is wrong with the fields of the form, in words for the person who filled it in."""
+    """The problem that says which fields of the form are wrong, and what to do."""
     wrong = {str(found["loc"][0]) for found in error.errors() if found["loc"]}
     advice = {
         "scopes": "expected at least one scope of the list: go back and choose what the key allows",

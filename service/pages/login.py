@@ -35,7 +35,7 @@ def login_page(
 ) -> Response:
     """The form for the key. ended: a script found that the session has ended.
 
-    arrived: the person came by a link on another site; if the session is open, the page that was asked for follows at once.
+    arrived: the person followed a link on another site. If the session is open, the requested page is opened at once.
     """
     valid, note = _session(request, state)
     if valid and arrived:
@@ -50,7 +50,8 @@ def log_in(
     key: Annotated[str, Form()] = "",
     next_address: Annotated[str, Form(alias="next")] = "",
 ) -> Response:
-    """Begin a session, and go to the page that was asked for. Every refused key counts against the limit of the address."""
+    """Begin a session, and go to the requested page. Every refused key counts against the rate limit of the client's
+    address."""
     if not state.access.keys:
         return RedirectResponse(local_address(next_address), 303)
     try:
@@ -77,7 +78,8 @@ def log_out(request: Request, _caller: PageVisiting, state: Shared) -> Response:
 
 
 def local_address(sent: str) -> str:
-    """The address of a page of this service; "/" if the text could lead a browser anywhere else, or to the login itself."""
+    """The address of a page of this service; "/" if the text could lead a browser to another site, or to the login
+    page."""
     elsewhere = not sent.startswith("/") or sent.startswith("//") or "\\" in sent
     if elsewhere or not sent.isprintable() or len(sent) > LONGEST_ADDRESS:
         return "/"
@@ -98,7 +100,7 @@ def _form(request: Request, state: State, next_address: str, *, note: str = "", 
 
 
 def _session(request: Request, state: State) -> tuple[bool, str]:
-    """Whether the browser has an open session, and what the login page says about it; nothing without a cookie."""
+    """Whether the browser has an open session, and the note about it for the login page (empty without a cookie)."""
     token = request.cookies.get(cookie_name(request))
     if token is None or not state.access.keys:
         return False, ""

@@ -28,7 +28,7 @@ router = APIRouter(prefix="/products/{product_id}", include_in_schema=False)
 
 @router.get("")
 def product(product_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
-    """The product. It says so if its file or the uploaded image is gone."""
+    """The product. If its file or the uploaded image is lost or deleted, the page says so."""
     row = find(state, caller, product_id)
     image = state.catalogue.get(ImageRow, row.image_id, row.owner)
     psf = state.catalogue.get(PsfRow, row.psf_id, row.owner)

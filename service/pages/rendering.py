@@ -54,12 +54,12 @@ def page(
             **shown,
         )
     )
-    # A page may contain what belongs to its reader alone.
+    # A page may contain private data of its reader.
     said = {
         "Content-Security-Policy": POLICY,
         "Cache-Control": "no-store",
         "Vary": "Cookie",
-        # Without a referrer policy of their own, forms would say "Origin: null", and the guard would refuse them.
+        # Without this policy, browsers would send forms with "Origin: null", and the guard would refuse them.
         "Referrer-Policy": "same-origin",
         **(headers or {}),
     }
@@ -128,7 +128,7 @@ def duration(seconds: float | None) -> str:
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """A number with so many significant digits; below a million without a power of ten."""
+    """A number with ``digits`` significant digits; below a million without a power of ten."""
     if value is None:
         return "-"
     said = f"{value:.{digits}g}"

@@ -1,9 +1,11 @@
-"""Who looks at a page. Without a session, a page of a service with keys leads to the login page and from there back.
+"""Identifies the visitor of a page. If keys are required, a visitor without a session is sent to the login page, and
+then back.
 
-The routes of pages have a parameter ``PageReading``, ``PageSubmitting``, ``PageBulk`` or ``PageVisiting``, as those of the API
-have one of ``service.http.callers``. The difference: a missing session redirects, and the form token may also be a field of the
-form. The field is read only if no header decides, and never from a multipart form: such a form may contain a large file, and
-only the route may read it.
+The routes of pages have a parameter ``PageReading``, ``PageSubmitting``, ``PageBulk``, ``PageCertifying`` or
+``PageVisiting``. It replaces the parameter from ``service.http.callers`` that routes of the API have. There are two
+differences: without a session the visitor is redirected, and the form token may also be a field of the form. The field
+is read only if no header says from which site the request comes. It is never read from a multipart form, because such a
+form may contain a large file, which only the route may read.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ FORM = "application/x-www-form-urlencoded"
 
 
 class LoginNeeded(Exception):
-    """A page needs a session, and the request has none that is valid."""
+    """A page needs a session, and the request has no valid session."""
 
 
 def install(app: FastAPI) -> None:
@@ -61,7 +63,7 @@ PageBulk = Annotated[Caller, Security(_visitor, scopes=[Scope.BULK])]
 
 
 async def _form_token(request: Request) -> str | None:
-    """The form token in the fields of a form; None if it is not there or not needed."""
+    """The form token in the fields of a form; None if the form has no token or none is needed."""
     if request.method in SAFE_METHODS or names_its_site(request):
         return None
     if cookie_name(request) not in request.cookies:
@@ -75,7 +77,8 @@ async def _form_token(request: Request) -> str | None:
 def _came_by_link(request: Request) -> bool:
     """Whether a person followed a link on another site. The browser then withholds the cookie, because it is ``SameSite=Strict``.
 
-    Therefore the answer is a page that leads to the login page: this request comes from a page of this service and has the cookie.
+    Therefore the answer is a page that opens the login page. That second request comes from a page of this service, so
+    it has the cookie.
     """
     return request.headers.get("sec-fetch-site") == "cross-site"
 

@@ -137,6 +137,6 @@ def _add_time(parent: ElementTree.Element, name: str, seconds: float | None) -> 
 
 def _written(root: ElementTree.Element) -> bytes:
     text = ElementTree.tostring(root, encoding="unicode")
-    # A bare carriage return would be read back as a line feed.
+    # XML parsers would read a carriage return as a line feed.
     text = text.replace("\r", "&#13;")
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + text.encode()

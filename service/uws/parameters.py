@@ -1,4 +1,4 @@
-"""Reads the forms that UWS clients send, and checks the job parameters in them, which are texts, against the contract."""
+"""Reads the forms of UWS clients, and checks the job parameters, which are texts in a form, against the contract."""
 
 from __future__ import annotations
 
@@ -136,9 +136,10 @@ def resolved(
 
 
 def _understood(kind: str, given: dict[str, str]) -> tuple[dict[str, Any], list[ErrorDetails]]:
-    """The parameters, read from their texts, and the errors of the parameters that the contract does not accept.
+    """The parameters, and an error for each parameter that the contract does not accept.
 
-    If the contract accepts a text (a name, a number, true or false), it remains a text. Otherwise the text is read as JSON.
+    Each parameter is a text. If the contract accepts the text as it is (a name, a number, true or false), the text is
+    kept. Otherwise the text is read as JSON.
     """
     for name, text in given.items():
         if NO_XML.search(text):

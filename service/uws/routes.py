@@ -366,7 +366,9 @@ def _find(state: State, caller: Caller, job_id: str) -> JobRow:
     known = len(job_id) == 32 and set(job_id) <= set("0123456789abcdef")
     row = state.catalogue.jobs.get(job_id) if known else None
     if row is None or row.owner != caller.owner:
-        raise Problem(404, "no-such-job", f"expected the id of one of your jobs; got {job_id[:64]!a}")
+        raise Problem(
+            404, "no-such-job", f"expected the id of one of your jobs; got {job_id[:64]!a}: list your jobs"
+        )
     return row
 
 

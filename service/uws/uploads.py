@@ -1,9 +1,10 @@
 """Files that UWS clients send with the parameters of a job: ``UPLOAD=name,param:part`` and a part of the form with the file.
 
-Citation: IVOA DALI 1.1 (17 May 2017), standard parameter UPLOAD. The name says what the file is, and so which parameter of
-the job gets the id of the file: ``UPLOAD=image,param:f`` adds the image in the part ``f``, and sets ``image_id``. A file is
-checked and kept as by ``POST /v1/images``, ``/v1/transits`` or ``/v1/psfs``. Files at other addresses (``UPLOAD=name,http://...``)
-are refused: a service that fetches any address would reach machines that its clients cannot reach.
+Citation: IVOA DALI 1.1 (17 May 2017), standard parameter UPLOAD. The name says what the file is. It determines which
+parameter of the job gets its id: ``UPLOAD=image,param:f`` adds the image in the part ``f``, and sets ``image_id``. A
+file is checked and stored in the same way as by ``POST /v1/images``, ``/v1/transits`` or ``/v1/psfs``. Files at other
+addresses (``UPLOAD=name,http://...``) are refused: if the service fetched any address, clients could use it to reach
+machines that they cannot reach themselves.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from service.uws.parameters import MAX_FIELDS, MAX_FORM_BYTES, bad, read_form, s
 from workers.contract.kinds import KINDS
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 
-# What a file can be: the parameter that gets its id.
+# The names in UPLOAD, and for each name the parameter that gets the id of the file.
 NAMES = {"image": "image_id", "mask": "mask_id", "transit": "transit_id", "psf": "psf_id"}
 INLINE = "param:"
 MOST_FILES = len(NAMES)

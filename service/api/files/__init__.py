@@ -1,1 +1,1 @@
-"""What the files of images and products hold: pixels and headers."""
+"""The contents of the files of images and products: pixels and headers."""

@@ -20,7 +20,7 @@ from service.http.problems import RESPONSES, problem
 from service.http.state import Shared
 from workers.contract.requests import Identity
 
-# This number is part of every ETag. Increase it when a new version of the code answers differently from the same file.
+# This number is part of every ETag. Increase it when a new version of the code gives another answer for the same file.
 ANSWERS_VERSION = 1
 router = APIRouter(tags=["headers"], responses=RESPONSES)
 
@@ -61,7 +61,7 @@ async def _headers(request: Request, state: Shared, digest: str, size: int) -> R
     if files.known(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     try:
-        # Thousands of cards take a second, so they wait their turn as the pixels do.
+        # Reading thousands of cards takes a second. The limiter bounds how many requests read cards or pixels at once.
         return await anyio.to_thread.run_sync(_answer, state, digest, size, headers, limiter=state.decoding)
     except DataError as error:
         raise problem(error) from error

@@ -1,7 +1,7 @@
-"""Pixels of images and products, ``.../pixels``: raw numbers, so that a viewer shows and reads exact values.
+"""Pixels of images and products, ``.../pixels``: raw numbers, so that a viewer can show exact values.
 
-The first request for a plane decodes it; the next ones read the decoded plane (``psfcore.fits.viewing``). The numerical
-libraries are loaded by the first request for pixels.
+The first request for a plane decodes it; later requests read the decoded plane (``psfcore.fits.viewing``). The first
+request for pixels loads the numerical libraries.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from service.http.quotas import check_disk
 from service.http.state import Shared, State
 from workers.contract.requests import Identity
 
-# This number is part of every ETag. Increase it when a new version of the code answers differently from the same file.
+# This number is part of every ETag. Increase it when a new version of the code gives another answer for the same file.
 ANSWERS_VERSION = 1
 MEDIA_TYPE = "application/octet-stream"
 IMAGE, QUALITY = "image", "quality"
@@ -38,7 +38,7 @@ router = APIRouter(tags=["pixels"], responses=RESPONSES)
 
 @dataclass(frozen=True)
 class Part:
-    """The window of a request, px, and its step. None: to the end of the plane."""
+    """The window that a request asks for, px, and its step. width, height: None: up to the last column or row."""
 
     x: int
     y: int
@@ -53,18 +53,18 @@ def _part(
         int, Query(ge=0, le=LARGEST, description="first row of the window, counted from 0 as in FITS")
     ] = 0,
     width: Annotated[
-        int | None, Query(ge=1, le=LARGEST, description="columns of the window; default: all further ones")
+        int | None, Query(ge=1, le=LARGEST, description="number of columns; default: up to the last column")
     ] = None,
     height: Annotated[
-        int | None, Query(ge=1, le=LARGEST, description="rows of the window; default: all further ones")
+        int | None, Query(ge=1, le=LARGEST, description="number of rows; default: up to the last row")
     ] = None,
     step: Annotated[
         int,
         Query(
             ge=1,
             le=LARGEST,
-            description="n: each number of the answer stands for n x n pixels: the mean of the finite ones, of `quality` the "
-            "bitwise OR. Blocks at the upper edges of the window may be smaller",
+            description="n: each number of the answer stands for a block of n x n pixels. It is the mean of the finite "
+            "pixels; for `quality` it is the bitwise OR. Blocks at the last rows and columns of the window may be smaller",
         ),
     ] = 1,
 ) -> Part:
@@ -155,9 +155,9 @@ async def _pixels(request: Request, state: Shared, digest: str, name: str, asked
 
 
 async def prepare_image(state: State, digest: str) -> None:
-    """Decode the image of a stored file before it is asked for, so that its pixels are answered at once.
+    """Decode the image of a stored file in advance, so that a later request for its pixels is answered at once.
 
-    A file that cannot be decoded is told to the request for its pixels.
+    If the file cannot be decoded, this function raises no error; the later request gets the error.
     """
     if state.planes.kept((digest, IMAGE)) is None:
         with contextlib.suppress(DataError, Problem):
@@ -169,7 +169,7 @@ def _decoded(state: State, digest: str, name: str) -> Plane:
 
     def decode(target: BinaryIO) -> Decoded:
         check_disk(state)
-        # The whole file is checked: browsers keep the pixels for long.
+        # The checksum of the whole file is verified, because browsers keep the pixels for a long time.
         return decode_plane(files.found(state.store, digest), name, state.limits, target)
 
     return state.planes.decoded((digest, name), decode)

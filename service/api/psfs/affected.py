@@ -79,7 +79,8 @@ def list_affected_by_psf(
     if psf is None:
         raise problem(
             DataError(
-                "no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it"
+                "no-such-psf",
+                f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
             )
         )
     found = state.catalogue.affected.of_psf(psf, limit=limit + 1, after=paging.position(cursor))

@@ -65,7 +65,7 @@ def get_psf_for_image(
         raise Problem(
             404,
             "no-such-image",
-            f"expected the id of an uploaded image; got {image_id}, which is not in the catalogue",
+            f"expected the id of an uploaded image; got {image_id}, which is not in the catalogue: upload the image, or list your images",
         )
     return _choice(lambda: look_for_image(state.catalogue, row.summary, caller.owner, context, kind))
 

@@ -21,7 +21,9 @@ from workers.versions.validity import TIME, Validity, iso
 
 router = APIRouter(prefix="/v1/contexts", tags=["contexts"], responses=RESPONSES, route_class=KeyFirst)
 
-Time = Annotated[str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; UTC without a zone")]
+Time = Annotated[
+    str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; a time without a zone is UTC")
+]
 Reason = Annotated[
     str, Field(max_length=400, pattern=TEXT, description="the reason, stored for later readers")
 ]

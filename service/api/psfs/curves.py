@@ -27,7 +27,7 @@ from service.http.state import Shared, State
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import Identity
 
-# This number is part of every ETag. Increase it when a new version of the code answers differently from the same tables.
+# This number is part of every ETag. Increase it when a new version of the code gives other answers for the same tables.
 ANSWERS_VERSION = 1
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 
@@ -247,6 +247,8 @@ def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
     row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
         raise Problem(
-            404, "no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it"
+            404,
+            "no-such-psf",
+            f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
         )
     return row

@@ -18,7 +18,10 @@ TEXT = r"^[^\x00-\x08\x0b-\x1f\x7f]*$"  # for free text: PostgreSQL cannot store
 Text = Annotated[str | None, Query(max_length=80, pattern=PRINTABLE)]
 Time = Annotated[
     str | None,
-    Query(pattern=TIME, description="time of observation, such as 2024-03-01T12:00:00Z; UTC without a zone"),
+    Query(
+        pattern=TIME,
+        description="time of observation, such as 2024-03-01T12:00:00Z; a time without a zone is UTC",
+    ),
 ]
 InContext = Annotated[
     str | None,

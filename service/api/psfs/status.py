@@ -24,7 +24,9 @@ from workers.versions.validity import TIME, Validity, iso
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES, route_class=KeyFirst)
 
-Time = Annotated[str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; UTC without a zone")]
+Time = Annotated[
+    str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; a time without a zone is UTC")
+]
 Word = Annotated[str, Field(pattern=WORD)]
 
 
@@ -112,7 +114,8 @@ def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusVi
     if row is None:
         raise problem(
             DataError(
-                "no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it"
+                "no-such-psf",
+                f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
             )
         )
     return _view(state, caller, row)

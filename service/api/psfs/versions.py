@@ -114,15 +114,15 @@ async def upload_psf(
         str | None,
         Query(
             pattern=WORD,
-            description="`total` for a whole PSF; default: `uploaded`, which is used only by requests that name the PSF",
+            description="`total`: the whole PSF; default: `uploaded`: the PSF is used only if a request names it",
         ),
     ] = None,
 ) -> PsfView:
     """Upload a PSF: one 2-D image with its centre at [n//2, n//2] and a sum of at most 1.
 
-    Header and weights are checked at upload; compressed weights are checked by the jobs that use the PSF. Nothing is kept of a
-    file that is refused. If the file is that of a PSF of the catalogue, and no other name or version is given, the answer is
-    that PSF.
+    Header and weights are checked at upload; compressed weights are checked by the jobs that use the PSF. A refused
+    file is not stored. If a job of this service made the same file, and the request gives no name, version, instrument,
+    channel or kind, the answer is the existing PSF.
     """
     take = Allowed(state, caller)
     limit = state.settings.max_upload_bytes
@@ -154,7 +154,7 @@ async def upload_psf(
 
 def _made_here(state: Shared, caller: Caller, digest: str) -> PsfRow | None:
     """The caller's PSF that a job made and whose file has this SHA-256; None if there is none."""
-    # At most two PSFs have one file: that of the job, and an upload.
+    # At most two PSFs have the same file: the PSF that a job made, and an upload of it.
     rows = state.catalogue.page(PsfRow, owner=caller.owner, limit=2, file_sha256=digest)
     return next((row for row in rows if row.id != digest), None)
 
@@ -250,6 +250,8 @@ def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
     row = state.catalogue.get(PsfRow, psf_id, caller.owner)
     if row is None:
         raise Problem(
-            404, "no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it"
+            404,
+            "no-such-psf",
+            f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
         )
     return row

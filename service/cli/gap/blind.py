@@ -26,7 +26,7 @@ DIAGNOSE = (
     "{report}",
     "--local",
 )
-# So does the ideal observer: the blind set and the gap library share no code.
+# The ideal observer also runs in another process, because the blind set and the gap library share no code.
 IDEAL = (sys.executable, "-P", "-m", "psfcore.gap.ideal_observer", "{expected}", "{ideal}")
 
 
@@ -49,16 +49,15 @@ IDEAL = (sys.executable, "-P", "-m", "psfcore.gap.ideal_observer", "{expected}",
 )
 @click.option("--keep", is_flag=True, help="Keep the images of each case after their use")
 @click.option("--scenes", multiple=True, type=FILE, help="Take scenes from these images (FITS), in turn")
-@click.option(
-    "--only", multiple=True, metavar="EFFECT", help="Withhold only these effects, one per case, in turn"
-)
+@click.option("--only", multiple=True, metavar="EFFECT", help="Use only these effects, one per case, in turn")
 @click.option(
     "--left",
     "left_pct",
     multiple=True,
     type=click.FloatRange(0.05, 50),
     metavar="PCT",
-    help="Residual that the effect of a case leaves in the discs after a refit; repeat to vary it [default: random, 0.5 to 10]",
+    help="Residual in the discs, percent, that remains when the PSF is fitted to images with the effect; repeat to vary it "
+    "[default: random, 0.5 to 10]",
 )
 @click.option(
     "--simulator",

@@ -48,17 +48,17 @@ def gap() -> None:
 
 @gap.command(short_help="Find the effects that explain a gap.")
 @click.argument("transit", type=click.Path(exists=True, path_type=Path))
-@click.option("-o", "--output", type=OUTPUT, help="Write a page to read and print (HTML)")
+@click.option("-o", "--output", type=OUTPUT, help="Write the result as an HTML page")
 @JSON
 @PLOT
 @psf_option(
-    "PSF whose shape is fitted, starting from its parameters: an id or a file [default: fit the default shape]"
+    "PSF (an id or a file) with the shape and the start parameters of the fit [default: the default shape]"
 )
 @click.option(
     "--corrected",
     "corrected_file",
     type=OUTPUT,
-    help="Write the corrected PSF (FITS): the fit with the answer in the model; for a tie, with the best effect",
+    help="Write the corrected PSF (FITS): the PSF fitted with the answer in the model; for a tie, with the best effect",
 )
 @click.option(
     "--effects",

@@ -1,4 +1,4 @@
-"""``heliopsf gap plan``: says, before there are images, which effects a planned transit would show.
+"""``heliopsf gap plan``: computes which effects a planned transit would show, before its images are taken.
 
 The command imports numerical libraries only when it is called, so that other commands start fast.
 """
@@ -27,12 +27,12 @@ THREADS = 2
 
 @click.command(short_help="Find what a planned transit would show.")
 @click.argument("plan_file", metavar="PLAN", type=click.Path(exists=True, path_type=Path))
-@click.option("-o", "--output", type=OUTPUT, help="Write a page to read and print (HTML)")
+@click.option("-o", "--output", type=OUTPUT, help="Write the result as an HTML page")
 @JSON
 @click.option(
     "--instrument",
     metavar="NAME|FILE",
-    help="Use the diffraction PSF of this instrument [default: the one of the transit, else hri_euv]",
+    help="Use the diffraction PSF of this instrument [default: the instrument of the transit, else hri_euv]",
 )
 @click.option("--diffraction", type=FILE, help="Use this diffraction PSF (FITS, sum 1)")
 @SEED

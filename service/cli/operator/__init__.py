@@ -1,1 +1,1 @@
-"""The commands for operators: `database`, `store`, `key` and `doctor`."""
+"""The commands for operators: `cache`, `database`, `doctor`, `key` and `store`."""

@@ -37,7 +37,7 @@ State = Literal["ok", "warning", "broken"]
 SIGNS: dict[State, str] = {"ok": "green", "warning": "yellow", "broken": "red"}
 PINS = Path(__file__).parents[3] / "constraints.txt"
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
-EXTRAS = ("service", "fit", "plot")  # of which the commands need all packages
+EXTRAS = ("service", "fit", "plot")  # the commands need all packages of these extras
 LITTLE_ROOM_BYTES = 5 * 2**30
 
 
@@ -161,7 +161,7 @@ def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
     if wanted > may_use:
         fit = max(1, int(may_use // settings.worker_processes))
         more.append(
-            f"if there are more threads than cores, they slow each other down: set HELIOPSF_WORKER_THREADS={fit}, or start fewer processes"
+            f"more threads than cores slow each other down: set HELIOPSF_WORKER_THREADS={fit}, or start fewer processes"
         )
     return Finding("threads", "warning" if more else "ok", found, "; ".join(more))
 
@@ -289,7 +289,9 @@ def stuck_jobs(settings: Settings, catalogue: Catalogue) -> Finding:
     left = catalogue.census.count_unsubmitted(max(30.0, 5 * settings.reconcile_s))
     if not silent and not left:
         return Finding("stuck jobs", "ok", "none")
-    found = f"{silent} in progress without a sign of life, {left} queued but not submitted to the broker"
+    found = (
+        f"{silent} in progress whose worker does not report, {left} queued but not submitted to the broker"
+    )
     return Finding(
         "stuck jobs",
         "warning" if settings.embedded else "broken",

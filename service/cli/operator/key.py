@@ -73,7 +73,7 @@ def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: st
     click.echo(made)
     ends = "until it is revoked" if expires_at is None else f"until {_day(expires_at)}"
     click.echo(
-        f"for {owner}: {', '.join(sorted(wanted))}; {ends}. It cannot be shown again. Clients read it from "
+        f"for {owner}: {', '.join(sorted(wanted))}; {ends}. The key cannot be shown again. Clients read it from "
         f"HELIOPSF_KEY. Servers that use the database {url} accept it.",
         err=True,
     )

@@ -34,7 +34,7 @@ def store() -> None:
     show_default=True,
     help="Remove only files older than this",
 )
-@click.option("--even-most", is_flag=True, help="Remove even more than half of all files")
+@click.option("--even-most", is_flag=True, help="Allow that more than half of all files are removed")
 @DATA
 def collect_command(dry_run: bool, older_than_s: float, even_most: bool, data: Path | None) -> None:
     """Remove files that no upload, PSF, product, report or job refers to. Killed processes leave such files.

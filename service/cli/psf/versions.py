@@ -148,7 +148,7 @@ def delete_psf(psf_id: str, server: str | None) -> None:
 
 
 @click.command("best")
-@click.option("--image", type=FILE, help="Image (FITS) that the PSF is for")
+@click.option("--image", type=FILE, help="Image (FITS) for which a PSF is wanted")
 @_filter_options
 @JSON
 @SERVER
@@ -156,8 +156,9 @@ def delete_psf(psf_id: str, server: str | None) -> None:
 def best(
     image: Path | None, json_file: Path | None, server: str | None, overwrite: bool, **filters: str | None
 ) -> None:
-    """Show the PSF with which `heliopsf deconvolve` would deconvolve an image, and why; or find the PSF that has the given
-    properties. With --kind other than total, only certified PSFs and those of a context are searched for an image."""
+    """With --image, show the PSF that `heliopsf deconvolve` would use for the image, and why. Without it, find the PSF
+    with the given properties. With --image and a --kind other than total, only certified PSFs or the PSFs of a context are
+    searched."""
     given = _given(filters)
     if image is not None and set(given) - {"context", "kind"}:
         raise click.UsageError(
@@ -216,7 +217,7 @@ COMMANDS = (list_psfs, upload_psf, certify, deprecate, delete_psf, best, lineage
 
 
 def _chosen(service: Client, image: Path, context: str | None) -> dict[str, Any]:
-    """The PSF that a deconvolution of an image would use, and why. A PSF that is not built yet has no description of its own."""
+    """The PSF that a deconvolution of an image would use, and why. Of a PSF that is not built yet, only the entry of the estimate is known."""
     image_id = service.upload_image(image)["id"]
     chosen = service.estimate("deconvolve", image_id=image_id, context=context)["psf"]
     psf = chosen if chosen["status"] is None else service.psf(chosen["id"])

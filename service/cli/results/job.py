@@ -112,7 +112,8 @@ def moment(seconds: float) -> str:
 
 
 def _state(found: dict[str, Any], server: str | None) -> str:
-    """The progress, result or error of a job in one line; empty for a job that waits. server: as the command was given it."""
+    """The progress, result or error of a job in one line; empty for a job that waits. server: the value of --server, if
+    given."""
     if found["error"] is not None:
         return str(found["error"]["message"])
     if found["result"] is not None:

@@ -66,7 +66,7 @@ def get(
         raise click.UsageError("expected an output: -o FILE, --plot FILE or --changes FILE; got none of them")
     with user_errors(), remote(server) as service:
         found = service.product(identity)
-        # Products of earlier versions have no name of their own.
+        # Products of earlier versions have no stored file name.
         name = found["details"].get("filename", f"heliopsf-{short(found['id'])}.fits")
         file = None if output is None else output.file(name)
         parts = {"file": file, "preview": plot, "changes": changes}

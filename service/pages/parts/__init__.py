@@ -1,1 +1,1 @@
-"""What several pages share: curves with their tables, and forms that start jobs."""
+"""Code that several pages share: curves with their tables, and forms that start jobs."""

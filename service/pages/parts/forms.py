@@ -39,7 +39,7 @@ def ticked(form: Sent, *names: str) -> dict[str, bool]:
 
 
 def noise(form: Sent) -> dict[str, Any]:
-    """The noise figures of a form, as a parameter; none if both fields are empty.
+    """The noise figures of a form, as a parameter; no parameter if both fields are empty.
 
     Raises ``Problem`` 422 for a text that is no number; the request itself accepts only numbers.
     """
@@ -50,7 +50,7 @@ def noise(form: Sent) -> dict[str, Any]:
         raise Problem(
             422,
             "invalid-request",
-            f"expected photon gain and read noise as numbers in DN; got {', '.join(given.values())}",
+            f"expected photon gain and read noise as numbers in DN; got {', '.join(given.values())}: correct the two fields",
         ) from error
     return {"noise": figures} if figures else {}
 
@@ -85,7 +85,8 @@ async def fields(request: Request) -> Sent:
 
 
 def wrong_fields(error: ValidationError, model: Any, *, above: int = 0) -> Problem:
-    """The problem that names each wrong field. model: what was validated. above: its levels above the fields of the form."""
+    """The problem that names each wrong field. model: the validated model. above: the number of its levels above the
+    fields."""
     said = [
         f"{'.'.join(map(str, found['loc'][above:])) or 'the form'}: {told}"
         for found, told in explained(error.errors(), model)

@@ -13,7 +13,8 @@ USUAL = RichardsonLucy()
 
 
 def choices() -> dict[str, Any]:
-    """What the fields offer: the usual steps of each method, the usual method first, and the least and largest number of steps."""
+    """The default number of steps of each method (the default method first), and the smallest and the largest number of
+    steps."""
     models = get_args(get_args(Method)[0])
     limits = RichardsonLucy.model_fields["steps"].metadata
     return {
@@ -27,7 +28,7 @@ def choices() -> dict[str, Any]:
 
 
 def chosen(form: Sent) -> dict[str, str]:
-    """The parameter ``method`` of a request. A method without a number of steps has its own default."""
+    """The parameter ``method`` of a request. If the form gives no number of steps, the method's default applies."""
     method = {"name": text(form, "method") or USUAL.name}
     steps = text(form, "steps")
     return method | ({"steps": steps} if steps else {})

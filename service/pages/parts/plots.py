@@ -20,7 +20,8 @@ Draw = Literal["line", "points"]
 
 @dataclass(frozen=True)
 class Series:
-    """A curve or points. low, high: ends of the band or of the error bars; both or neither; None in them: no band there."""
+    """A curve or points. low, high: ends of the band or of the error bars (both or neither); an entry None: no band at
+    this x."""
 
     label: str
     values: Numbers
@@ -31,7 +32,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves over one quantity. x: ascending, or the table has no order that a plot needs (points). names: names of the rows.
+    """Curves over one quantity. x: ascending for lines, in any order for points. names: names of the rows of the table.
 
     Raises ValueError if a row of numbers does not have the length of x.
     """
@@ -87,7 +88,8 @@ def around(values: Sequence[float], sigma: Sequence[float] | None) -> tuple[Numb
 
 
 def shown_radii(radii: Sequence[float], least: float = 0.0) -> list[int]:
-    """The places of the radii that a table shows: all of them near the centre, farther out in equal ratios.
+    """The indices of the radii that a table shows: all radii near the centre; farther out, radii in ratios of at least
+    ``RATIO``.
 
     least: smaller radii are left out.
     """

@@ -22,7 +22,7 @@ Report = Mapping[str, Any]
 Row = tuple[str, ...]
 MAP_PX = 400  # edge length of the map of discs in the units of its picture
 DISC_PX = 9
-NOT_COMPARED = ("id", "created_at")  # always different, or always the same
+NOT_COMPARED = ("id", "created_at")  # these always differ, or are always the same
 # The ends of the scale of residuals; the middle is grey, so that it is seen on light and dark pages.
 BELOW, MIDDLE, ABOVE = (33, 102, 172), (190, 190, 190), (178, 24, 43)
 
@@ -178,7 +178,7 @@ def _banded(label: str, limits: Mapping[str, Numbers]) -> Series:
 
 @dataclass(frozen=True)
 class Disc:
-    """A disc on the map. x, y: place in the picture, its first row at the top. row: its row in the tables of the plots."""
+    """A disc on the map. x, y: position in the picture, y = 0 at the top. row: its row in the tables of the plots."""
 
     row: int
     x: float
@@ -193,7 +193,7 @@ class Disc:
 class GapMap:
     """The discs of a gap report on the detector, and their residuals against time.
 
-    width, height: of the picture. largest: the residual, percent, of the ends of the scale.
+    width, height: size of the picture. largest: the residual at the ends of the colour scale, percent.
     """
 
     width: float
@@ -255,7 +255,7 @@ def _gap_series(label: str, images: Sequence[Report], of: str, error: str) -> Se
 
 
 def _colour(part: float) -> str:
-    """The colour of a part of the largest residual, -1 to 1."""
+    """The colour of a residual. part: the residual divided by the largest one, -1 to 1."""
     end = ABOVE if part > 0 else BELOW
     mixed = (round(m + abs(part) * (e - m)) for m, e in zip(MIDDLE, end, strict=True))
     return "#" + "".join(f"{value:02x}" for value in mixed)
@@ -273,7 +273,7 @@ def rerun_arrays(report: Report) -> list[Row]:
 
 
 def rerun_makers(report: Report) -> list[Row]:
-    """What differs between the making of the first result and of the new one: name, and the value of each."""
+    """The properties in which the making of the first and of the new result differ: name, first value, new value."""
     first, again = (_flat(report[name]) for name in ("first", "again"))
     names = [*first, *(name for name in again if name not in first)]
     rows = [(name, first.get(name, "-"), again.get(name, "-")) for name in names if name not in NOT_COMPARED]

@@ -1,4 +1,4 @@
-"""Errors in sentences for people who use the pages: without the words of the command line and of the interface."""
+"""Errors as sentences for people who use the pages, without terms of the command line and of the API."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _THINGS = {
     "no-such-report": "report",
     "no-such-transit": "transit",
 }
-# The names of fields that differ from what the forms call them.
+# The labels in the forms, for fields whose label differs from their name.
 _FIELDS = {"error_draws": "Noise realisations", "psf_id": "PSF", "image_id": "Image"}
 _FIELD = re.compile(r"(?:^|(?<=; ))(?:[a-z_-]+\.)*([a-z_]+): ")
 _NO_FIELDS: Mapping[str, Any] = {}
@@ -33,7 +33,7 @@ def of_problem(problem: Problem) -> str:
 
 
 def of_error(code: str, message: str, fields: Mapping[str, Any] = _NO_FIELDS) -> str:
-    """The sentence for an error. fields: those of its ``DataError``; a stored error of a job has none."""
+    """The sentence for an error. fields: the fields of its ``DataError``; empty for the stored error of a job."""
     thing = _THINGS.get(code)
     if thing is not None and message.startswith("expected the id"):
         return f"There is no such {thing} here. It was deleted, or it belongs to another owner, or its address is not complete."
@@ -44,14 +44,14 @@ def of_error(code: str, message: str, fields: Mapping[str, Any] = _NO_FIELDS) ->
 
 
 def plain(message: str) -> str:
-    """A message as a sentence: a capital at its beginning, a full stop at its end, nothing for programs alone."""
+    """A message as a sentence: with a capital and a full stop, without the parts that only programs need."""
     text = _FOR_PROGRAMS.sub("", message).strip()
     text = text[:1].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) or not text else f"{text}."
 
 
 def _wrong_fields(message: str, _fields: Mapping[str, Any]) -> str:
-    """A message that begins with the name of a field, or several."""
+    """An error message about one or more fields, as a sentence. Each field name is replaced by its form label."""
     text = message.replace("Value error, ", "").removeprefix("the form: ")
 
     def label(found: re.Match[str]) -> str:

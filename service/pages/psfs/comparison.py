@@ -104,7 +104,7 @@ def _instrument(made: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
-    """Nested values as names, with dots between the levels, and texts."""
+    """Nested values as pairs of name and text. The name contains all levels, separated by dots."""
     for key, value in values.items():
         name = f"{before}{key}"
         if isinstance(value, Mapping):

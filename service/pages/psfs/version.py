@@ -87,7 +87,7 @@ async def cutout(
     caller: PageReading,
     state: Shared,
 ) -> Response:
-    """The central part of the PSF as FITS; an error is a page."""
+    """The central part of the PSF as FITS; an error is shown as a page."""
     return await get_cutout(psf_id, size, request, caller, state)
 
 
@@ -119,7 +119,7 @@ def delete(psf_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
 
 
 def psf_facts(psf: PsfView) -> list[tuple[str, str]]:
-    """What a page says of a PSF, by name."""
+    """The properties of a PSF that a page shows: name and value."""
     details = psf.details
     scale, total = details.get("plate_scale_arcsec"), details.get("sum")
     facts = {
@@ -192,7 +192,7 @@ def _fit(state: State, view: PsfView) -> dict[str, Any] | None:
 
 
 def _rivals(state: State, caller: Caller, view: PsfView) -> list[PsfView]:
-    """The certified PSFs of the same series, which this PSF can supersede or which can be its successor."""
+    """The other certified PSFs of the same series. This PSF can supersede them, or one of them can be its successor."""
     wanted = PsfFilter(
         instrument=view.instrument, channel=view.channel, kind=view.kind, status=PsfStatus.CERTIFIED
     )

@@ -1,8 +1,8 @@
 """Reads the stored HTML page of a report, so that the same sections are shown inside the pages of the service.
 
-The stored page stands alone: it has its own style, and its figures are inside it as data. A page of the service may have
-neither. Therefore this module takes the sections without the style, and the figures as separate files. It keeps only tags and
-attributes of a short list; all other markup is dropped, and its text is kept as text.
+The stored page is self-contained: it includes its style, and its figures as data. A page of the service may contain
+neither inline styles nor data addresses. Therefore this module takes the sections without the style, and the figures as
+separate files. It keeps only the tags and attributes of a short list. Of all other markup it keeps only the text.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ KEPT = {
 HIDDEN = {"style", "script", "title"}  # the text inside these tags is not for readers
 PICTURE = "data:image/png;base64,"
 OPEN_TABLE = Markup('<div class="scroll" tabindex="0" role="region" aria-label="Table {}"><table>')
-EMPTY_HEAD = '<th scope="col"></th>'  # a heading without a text; readers of screens take it for a mistake
+EMPTY_HEAD = '<th scope="col"></th>'  # a heading without text; screen readers would report it as an error
 MOST_KEPT = 4  # pages that stay in memory, with their figures
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a stored page. markup: what stands below its heading."""
+    """A section of a stored page. markup: the content below its heading."""
 
     title: str
     markup: Markup
@@ -75,7 +75,7 @@ class _Part:
 def read_stored(path: Path, figures_at: str) -> StoredPage:
     """The stored page of a report. figures_at: the address of its figures, without their number. Raises OSError.
 
-    A file of the store never changes, so what was read once stays valid.
+    A file of the store never changes, so its content can be kept in memory.
     """
     reader = _Reader(lambda number: f"{figures_at}/{number}")
     reader.feed(path.read_text("utf-8"))

@@ -1,4 +1,4 @@
-// Sends a form with a file only in an open session: the browser leaves the page by sending it, and forgets the file.
+// Sends a form with a file only in an open session: when a browser sends a form, it leaves the page and forgets the chosen file.
 import { forgetEndOfSession, request } from "./page.js";
 
 for (const form of document.querySelectorAll("form[enctype]")) {
@@ -14,7 +14,7 @@ for (const form of document.querySelectorAll("form[enctype]")) {
       asked = true;
       form.requestSubmit(event.submitter);
     };
-    // Other errors, such as a lost service, are told by the page that answers or by the browser.
+    // Other errors, such as a lost service, are shown by the next page or by the browser.
     request("/v1/jobs?limit=1").then(send, (error) => error.shown || send());
   });
 }

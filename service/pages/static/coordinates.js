@@ -5,7 +5,7 @@ const RADIAN = Math.PI / 180;
 const ARCSEC = { arcsec: 1, deg: 3600, arcmin: 60, rad: 3600 / RADIAN, mas: 0.001 };
 export const NONE = "The header has no coordinates.";
 
-/** The cards of the image: of the first HDU that says where its pixels are. hdus: the answer of `.../header`. Null: there is none. */
+/** The cards of the first HDU that has coordinates; null: no HDU has coordinates. hdus: the answer of `.../header`. */
 export function imageCards(hdus) {
   for (const { cards } of hdus) {
     const values = new Map(cards.map(([keyword, value]) => [keyword, value]));

@@ -35,7 +35,7 @@ function lead() {
     const open = () => {
       const source = new EventSource("/v1/events");
       source.onopen = () => {
-        // Events may have passed meanwhile, so the pages read again what they show.
+        // Events may have been missed in the meantime, so the pages read again what they show.
         if (waiting !== null) tell({ name: "found", data: {} });
         clearTimeout(waiting);
         waiting = null;
@@ -44,7 +44,7 @@ function lead() {
         source.addEventListener(name, (event) => tell({ name, data: JSON.parse(event.data) }));
       }
       source.onerror = () => {
-        // The service ends each stream after some time. That is not a loss.
+        // The service ends each stream after a set time. Therefore the end of a stream alone is not reported as lost.
         waiting ??= setTimeout(() => tell({ name: "lost", data: {} }), PATIENCE_MS);
         // The browser itself connects again after a lost connection, but not after an answer that is no stream.
         if (source.readyState === EventSource.CLOSED) setTimeout(again, AGAIN_MS);

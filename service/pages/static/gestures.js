@@ -42,7 +42,7 @@ export function follow(canvas, viewer) {
     canvas.addEventListener(name, (event) => {
       const started = touches.delete(event.pointerId);
       dividing = false;
-      // A finger has no cursor that rests: the touched pixel is read.
+      // A touch leaves no cursor on the picture, so the readout shows the touched pixel.
       if (started && event.pointerType === "touch" && viewer.source.overview) viewer.readout.show(viewer.pixelAt(event.clientX, event.clientY));
     });
   }
@@ -58,7 +58,7 @@ function divide(event, canvas, viewer) {
   viewer.set({ divider: Math.min(Math.max((event.clientX - box.left) / box.width, 0), 1) });
 }
 
-/** Keep what is under two fingers under them. */
+/** Move and zoom so that the points of the image under two fingers stay under them. */
 function pinch(before, after, viewer) {
   const span = ([a, b]) => Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
   const middle = ([a, b]) => [(a.clientX + b.clientX) / 2, (a.clientY + b.clientY) / 2];

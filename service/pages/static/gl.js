@@ -1,5 +1,6 @@
 // Draws sheets of pixels with WebGL2. All numbers that decide what is seen (which texels, which level, which colour) come as tables
-// from geometry.js, stretch.js and colours.js. The shader only looks them up. Some phones cannot filter float textures: it averages.
+// from geometry.js, stretch.js and colours.js. The shader only looks them up. It averages texels itself, because some phones cannot
+// filter float textures.
 import { NO_DATA } from "./colours.js";
 import { texelRanges } from "./geometry.js";
 import { LEVELS } from "./stretch.js";
@@ -91,7 +92,7 @@ export class Renderer {
     this.start();
   }
 
-  /** Make everything on the card; also after the card lost it. */
+  /** Create all objects on the graphics card; called again after the card has lost them. */
   start() {
     const { gl } = this;
     this.textures = new Map(); // for each sheet, its textures by plane
@@ -112,7 +113,7 @@ export class Renderer {
     return this.place.get(name);
   }
 
-  /** Have the planes of a sheet on the card, once. sheet: {x, y, step, nx, ny, planes: {before: Float32Array, ...}}. */
+  /** Copy the planes of a sheet to the graphics card, if they are not there. sheet: {x, y, step, nx, ny, planes: {before: Float32Array, ...}}. */
   hold(sheet) {
     const { gl } = this;
     if (!this.textures.has(sheet)) this.textures.set(sheet, new Map());
@@ -130,7 +131,7 @@ export class Renderer {
   }
 
   /**
-   * Draw one picture. sheets: the later ones over the earlier ones. panels: {left, width, from, to, shown}, device px: the axis of a
+   * Draw one picture. sheets: later sheets are drawn over earlier ones. panels: {left, width, from, to, shown}, device px: the axis of a
    * panel starts at `left` and has `width`; its part between `from` and `to` is drawn. shown: "before", "after" or "change".
    * look: {centre: {x, y}, zoom, limits and colours by what is shown, markQuality, markError (percent, or null)}.
    *
@@ -223,7 +224,7 @@ export class Renderer {
   texture(format, width, height, part, type, values) {
     const { gl } = this;
     const made = gl.createTexture();
-    // A new texture must not take the place of another one that the next picture needs.
+    // A separate texture unit is used, so that the new texture does not replace one that the next picture needs.
     gl.activeTexture(gl.TEXTURE0 + PLANES.length + TABLES.length);
     gl.bindTexture(gl.TEXTURE_2D, made);
     gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, part, type, values);

@@ -12,7 +12,7 @@ function show(good, lines) {
   place.replaceChildren(...lines.map((line) => element("p", {}, line)));
 }
 
-/** Ask the service what it says of the options. Of several checks the last one counts. */
+/** Let the service check the options. If several checks are open, only the answer to the last one is shown. */
 async function check() {
   const mine = ++last;
   const options = new URLSearchParams(new FormData(form));

@@ -1,4 +1,4 @@
-// What the scripts of all pages share: elements, requests and their errors.
+// Functions that the scripts of all pages share: elements, requests and their errors.
 
 /** An element. attributes: `on...` names add listeners, `class` and others are set as attributes; null ones are left out. */
 export function element(tag, attributes = {}, ...children) {
@@ -12,8 +12,8 @@ export function element(tag, attributes = {}, ...children) {
   return made;
 }
 
-/** An error that the service told: `status`, `code` (its stable short name) and `fields` of the problem document. `shown`: the
- * page says already what to do. */
+/** An error that the service reported: `status`, `code` (its stable short name) and `fields` of the problem document. `shown`:
+ * whether the page already says what to do. */
 export class ServiceError extends Error {
   constructor(status, problem) {
     super(problem.detail || `the service answered ${status}`);
@@ -37,7 +37,7 @@ export async function json(address, body = undefined, options = {}) {
   return (await request(address, { ...sent, ...options })).json();
 }
 
-/** The error of an answer that is not good. After the end of a session, the person is led to the login. */
+/** The error of an answer with an error status. After the end of a session, the login page is opened. */
 export function serviceError(status, text) {
   let problem = {};
   try {
@@ -53,7 +53,7 @@ export function serviceError(status, text) {
   return error;
 }
 
-/** Go to the login page, which comes back to this page. A page with a chosen file stays, because the file would be forgotten. */
+/** Go to the login page, which then leads back to this page. If a file is chosen, stay on the page: the browser would forget the file. */
 function leadToLogin() {
   const chosen = [...document.querySelectorAll("input[type=file]")].some((input) => input.files.length > 0);
   if (!chosen) return location.assign(`/login?ended=1&next=${encodeURIComponent(location.pathname + location.search)}`);
@@ -70,7 +70,7 @@ export function forgetEndOfSession() {
   document.getElementById("session-ended")?.remove();
 }
 
-/** What to say of an error. */
+/** The sentence that a page shows for an error. */
 export function told(error) {
   if (error instanceof TypeError) return "The service does not answer. Nothing is lost: wait a moment, then try again.";
   return sentence(error.message);

@@ -1,8 +1,8 @@
-// Gets the pixels of the two images from the service, and keeps what the viewer shows of them.
+// Gets the pixels of the two images from the service, and keeps the parts that the viewer shows.
 import { request } from "./page.js";
 import { partInView } from "./geometry.js";
 
-const LARGEST_WHOLE = 2048; // px; of larger images only the part in view is loaded. Every card has textures of this size
+const LARGEST_WHOLE = 2048; // px; of larger images only the part in view is loaded. Every graphics card supports this texture size
 const NARROW = 600; // px; windows of phones
 const BLOCK = 64; // px; exact values are read in blocks of this width
 const MOST_BLOCKS = 64;
@@ -19,7 +19,7 @@ export async function readPixels(address, asked, signal = undefined) {
 
 /** The pixels of a product and of the image before, as sheets: an overview, then all pixels or those in view. */
 export class Source {
-  /** addresses: {before, after}; before is null if the image was deleted. changed(): called when there are other sheets or planes. */
+  /** addresses: {before, after}; before is null if the image was deleted. changed(): called when sheets or planes have changed. */
   constructor(addresses, changed) {
     this.addresses = addresses;
     this.changed = changed;
@@ -39,7 +39,7 @@ export class Source {
     return this.load({ x: 0, y: 0, width: nx, height: ny, step });
   }
 
-  /** Load all pixels, unless only those in view are wanted. Returns the overview that they replace, or null. */
+  /** Load all pixels, unless only parts are loaded for this image. Returns the overview that was replaced, or null. */
   async openAll() {
     const { overview } = this;
     if (this.parts || overview.step === 1) return null;
@@ -59,7 +59,7 @@ export class Source {
   }
 
   async load(asked, signal = undefined) {
-    const names = [...this.wanted]; // more may be wanted before these are there
+    const names = [...this.wanted]; // further planes may be added while these are loaded
     const found = await Promise.all(names.map((name) => this.read(name, asked, signal)));
     for (const { shape } of found) {
       if (shape[1] !== this.nx || shape[0] !== this.ny) {
@@ -87,13 +87,13 @@ export class Source {
     this.changed();
   }
 
-  /** Load the planes that a sheet lacks, because they were wanted while it was loaded. */
+  /** Load the planes that a sheet lacks because they were requested while it was loaded. */
   async complete(sheet) {
     const lacking = this.wanted.filter((name) => !(name in sheet.planes));
     await Promise.all(lacking.map(async (name) => { sheet.planes[name] = (await this.read(name, sheet.asked)).pixels; }));
   }
 
-  /** Load the part in view at the resolution that the zoom needs, where not all pixels are loaded. Returns the sheet it replaces. */
+  /** Unless all pixels are loaded, load the part in view at the resolution of the zoom. Returns the sheet that was replaced, or null. */
   async showPart(width, height, centre, zoom) {
     const step = Math.max(1, Math.floor(1 / zoom));
     if (!this.parts || this.overview === undefined || step >= this.overview.step) return null;

@@ -1,4 +1,4 @@
-// What the viewer says of the pixel under the cursor. Values are those of the files, never means of an overview.
+// Shows the values of the pixel under the cursor: the values in the files, never means of an overview.
 import { exactText } from "./stretch.js";
 import { coordinates, imageCards } from "./coordinates.js";
 import { json } from "./page.js";
@@ -7,7 +7,7 @@ const RESTED_MS = 120;
 const WAITING = "…";
 
 export class Readout {
-  /** address: the product's. failed(error): called when values cannot be loaded. */
+  /** address: the address of the product. failed(error): called when values cannot be loaded. */
   constructor(source, address, failed) {
     this.source = source;
     this.address = address;

@@ -9,7 +9,7 @@ export function send(file, name, address, type, said, arrived) {
   const done = part("sending-done");
   const post = new XMLHttpRequest();
   const refused = (error) => error.shown || say(said, told(error), "error");
-  const lost = () => say(said, `The connection to the service ended before all of ${name} had arrived. Nothing was kept of it. The file is still chosen: send it again.`, "error");
+  const lost = () => say(said, `The connection to the service ended before all of ${name} had arrived. No part of it was stored. The file is still chosen: send it again.`, "error");
   forgetEndOfSession();
   post.open("POST", `${address}?filename=${encodeURIComponent(name)}`);
   post.setRequestHeader("Content-Type", type);
@@ -28,12 +28,12 @@ export function send(file, name, address, type, said, arrived) {
   };
   post.onerror = () => {
     sending.hidden = true;
-    // A refusal that comes before the end of a large file ends the connection, and its answer may be lost.
+    // If the service refuses a large file before its end, the connection ends, and the answer may be lost.
     request("/v1/jobs?limit=1").then(lost, (error) => error.shown || lost());
   };
   post.onabort = () => {
     sending.hidden = true;
-    say(said, `The upload of ${name} was stopped. Nothing was kept of it.`, "note");
+    say(said, `The upload of ${name} was stopped. No part of it was stored.`, "note");
   };
   part("sending-name").textContent = name;
   part("stop").onclick = () => post.abort();

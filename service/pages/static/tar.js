@@ -20,7 +20,7 @@ function header(name, size) {
   put(116, octal(0, 8));
   put(124, octal(size, 12));
   put(136, octal(0, 12));
-  put(148, "        "); // the sum is taken with spaces in its own place
+  put(148, "        "); // the checksum is computed with spaces in its field
   put(156, "0");
   put(257, "ustar\0" + "00");
   put(148, octal(block.reduce((sum, byte) => sum + byte, 0), 7) + " ");

@@ -23,7 +23,7 @@ const isA = {
   boolean: (value) => typeof value === "boolean",
   null: (value) => value === null,
 };
-// Keywords of JSON Schema that limit a value, with what they expect.
+// Keywords of JSON Schema that limit a value. Each function returns true, or a text that says what was expected.
 const LIMITS = {
   const: (limit, value) => value === limit || `expected ${JSON.stringify(limit)}`,
   enum: (limit, value) => limit.includes(value) || `expected one of ${limit.join(", ")}`,
@@ -139,7 +139,7 @@ loose.addEventListener("change", () => {
   if (loose.files[0]) check(loose.files[0], null);
 });
 folder.addEventListener("change", () => {
-  // A browser lists the files of all folders inside; a transit is one folder.
+  // A browser also lists the files of subfolders; a transit is one folder without subfolders.
   const files = [...folder.files].filter((file) => file.webkitRelativePath.split("/").length <= 2);
   const manifest = files.find((file) => file.name === form.dataset.manifest);
   show([], []);

@@ -2,14 +2,14 @@
 import { MAP_NAMES } from "./colours.js";
 import { STRETCHES } from "./stretch.js";
 
-/** The view before anything is changed. zoom null: fit; x, y null: the middle; low, high, change null: from percentiles. */
+/** The default view. zoom null: fit; x, y null: the middle; low, high, change null: from percentiles. */
 function plainView(mode) {
   return { mode, shown: "after", divider: 0.5, x: null, y: null, zoom: null, stretch: "asinh", map: "EUV", low: null, high: null, change: null, quality: false, error: null };
 }
 
 const ALLOWED = { stretch: STRETCHES, map: MAP_NAMES, shown: ["before", "after"] };
 
-/** The view of an address: what it does not say, or says wrongly, is plain. */
+/** The view that the fragment of an address describes. Missing and wrong values get their defaults. */
 export function viewOf(hash, modes) {
   const said = new URLSearchParams(hash.slice(1));
   const view = plainView(modes[0]);

@@ -29,14 +29,14 @@ class Viewer {
     this.readout = new Readout(this.source, place.dataset.after, (error) => say(part("viewer-said"), told(error), "error"));
   }
 
-  /** Throws an Error if the browser has no WebGL2, before anything is shown; errors of the service when pixels cannot be loaded. */
+  /** Show the image. Throws an Error if the browser has no WebGL2, and the errors of the service if pixels cannot be loaded. */
   async open() {
     part("viewer-body").hidden = part("keys-box").hidden = false;
     const box = this.canvas.getBoundingClientRect();
     const shape = place.dataset.shape?.split(",").map(Number);
     const ratio = devicePixelRatio || 1;
     const width = (box.width * ratio) / (this.view.mode === "side" ? 2 : 1);
-    // The service works while the browser prepares the card, which takes a second where there is none.
+    // The service reads pixels while the browser prepares WebGL, which takes a second without a graphics card.
     const [overview] = await Promise.all([this.source.open(width, box.height * ratio, shape), this.prepare()]);
     await this.source.show(overview);
     const replaced = await this.source.openAll();
@@ -60,7 +60,7 @@ class Viewer {
     this.redraw();
   }
 
-  /** Pixels came: show them, with limits from all pixels that there are. */
+  /** Show the pixels that have arrived, with limits from all pixels that are loaded. */
   arrived() {
     const { overview } = this.source;
     if (overview !== this.measured) {
@@ -154,7 +154,7 @@ class Viewer {
     this.mark();
   }
 
-  /** Note, for people who measure it, when the overview and when all pixels are on the screen: in the next frame. */
+  /** Record, for measurements, the time at which the overview, and later all pixels, are on the screen (in the next frame). */
   mark() {
     const name = this.source.overview.step === 1 ? "all pixels" : "overview";
     if (this.marked === name) return;
@@ -162,7 +162,7 @@ class Viewer {
     requestAnimationFrame(() => performance.mark(name));
   }
 
-  /** A table that is made again only if its name changes. */
+  /** The table of this name; it is made once and then kept. */
   table(name, make) {
     if (!(name in this.tables)) {
       if (Object.keys(this.tables).length > 16) this.tables = {};
@@ -171,7 +171,7 @@ class Viewer {
     return this.tables[name];
   }
 
-  /** Show around the picture what it shows. */
+  /** Update the elements around the picture: zoom, labels, divider, cross and colour bar. */
   decorate(colours) {
     const { view } = this;
     part("zoom").textContent = `${Number((100 * this.zoom).toPrecision(3))} %`;
@@ -233,7 +233,7 @@ class Viewer {
     this.settling = setTimeout(() => this.settled(), SETTLED_MS);
   }
 
-  /** The view rests: write it into the address, and load what it needs. */
+  /** Called when the view has not changed for a moment: write it into the address, and load what it needs. */
   async settled() {
     history.replaceState(history.state, "", `#${addressOf(this.view, this.limits)}`);
     try {
@@ -342,7 +342,7 @@ class Viewer {
     addEventListener("resize", () => this.resize()); // also after a change of the screen's pixels
     this.canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault(); // the browser then gives the card back
-      say(part("viewer-said"), "The graphics card was taken away. The picture comes back as soon as the browser gives it back.");
+      say(part("viewer-said"), "The browser has lost access to the graphics card. The picture comes back when the access is restored.");
     });
     this.canvas.addEventListener("webglcontextrestored", () => {
       this.renderer.start();
@@ -387,5 +387,5 @@ try {
   else if (viewer.source.overview === undefined) fallBack(told(error));
   else say(part("viewer-said"), told(error), "error");
 }
-// Last, because the service reads one file for it, and the pixels are waited for.
+// The header is loaded last, so that the pixels do not wait for it.
 await import("./header.js");

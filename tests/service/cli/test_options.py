@@ -109,7 +109,12 @@ def test_an_image_without_a_known_psf_prints_the_ways_on(tmp_path: Path, image_f
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 1 and not (tmp_path / "o.fits").exists()
     lines = result.output.splitlines()
-    for start in ("Instruments whose PSF can be built:", "  aia_171", "No PSF of the catalogue", "Ways on:"):
+    for start in (
+        "Instruments whose PSF can be built:",
+        "  aia_171",
+        "No PSF of the catalogue",
+        "What to do next:",
+    ):
         assert any(line.startswith(start) for line in lines), result.output
     assert [line[:5] for line in lines[-3:]] == ["  1. ", "  2. ", "  3. "]
     fields = {

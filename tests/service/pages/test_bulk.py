@@ -98,7 +98,7 @@ def test_a_run_of_all_images_without_a_product_is_started_followed_and_shown(
     assert page.count('loading="lazy"') == 3
     for one in re.findall(r'<a href="(/products/\w+)"><img src="(/v1/products/\w+/thumbnail)"', page):
         assert one[1] == f"/v1{one[0]}/thumbnail" and api.get(one[1]).headers["Content-Type"] == "image/png"
-    assert "No uploaded image is without a product" in api.get("/bulk").text
+    assert "There is no uploaded image without a product" in api.get("/bulk").text
     refused = api.post("/bulk/start", data={"choice": f"psf:{psf_id}"})
     assert refused.status_code == 409 and "upload other images first" in refused.text
     (newest,) = uploaded(api, tmp_path, 1, first=3)

@@ -95,7 +95,7 @@ def test_an_error_plane_needs_figures_and_the_form_takes_them(api: TestClient, t
     job = api.get(f"/v1{sent.headers['location']}").json()
     assert job["parameters"]["noise"] == {"photon_gain_dn": 4.0, "read_noise_dn": 1.5}
     assert checked(api, hri, photon_gain_dn="four") == [
-        "Expected photon gain and read noise as numbers in DN; got four."
+        "Expected photon gain and read noise as numbers in DN; got four: correct the two fields."
     ]
     assert checked(api, hri, error_draws="1") == [
         "Noise realisations: expected 0, or 2 or more; got 1: the spread cannot be estimated from one realisation."

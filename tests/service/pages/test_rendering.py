@@ -138,7 +138,7 @@ def _answer(
     [
         (404, "There is nothing here", False),
         (413, "This is too large", False),
-        (415, "This is no file that the service reads", False),
+        (415, "The service cannot read this file", False),
         (422, "The service cannot do that", False),
         (429, "Too many requests", True),
         (500, "The service failed", True),

@@ -125,7 +125,7 @@ def test_the_best_psf_for_an_image_is_the_one_that_deconvolve_uses(sun: Client, 
     assert told.startswith(certified) and "This PSF is certified" in told
     write_image(tmp_path / "aia.fits", TELESCOP="SDO/AIA", INSTRUME="AIA_3", WAVELNTH=1600)
     told = ask("psf", "best", "--image", str(tmp_path / "aia.fits"), code=1)
-    assert "Ways on:" in told and "aia_171" in told
+    assert "What to do next:" in told and "aia_171" in told
 
 
 def test_contexts(sun: Client, tmp_path: Path) -> None:

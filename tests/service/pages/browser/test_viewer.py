@@ -486,7 +486,7 @@ def test_the_picture_comes_back_after_the_card_was_lost(page: Page, looked: Look
           window.card.loseContext();
         }"""
     )
-    expect(page.locator("#viewer-said")).to_contain_text("The graphics card was taken away")
+    expect(page.locator("#viewer-said")).to_contain_text("The browser has lost access to the graphics card")
     page.evaluate("window.card.restoreContext()")
     expect(page.locator("#viewer-said")).to_be_hidden()
     np.testing.assert_array_equal(canvas(page), seen)
