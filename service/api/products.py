@@ -134,7 +134,7 @@ def get_product_changes(product_id: Identity, request: Request, caller: Reading,
     if digest is None:
         raise Problem(
             404,
-            "no-effects-picture",
+            "no-changes-picture",
             "expected a product whose job had changes_picture true; this job had it false: submit the job again with "
             "changes_picture true",
         )

@@ -39,7 +39,7 @@ from service.http.guard import SAFE_METHODS
 from service.http.problems import Problem
 from service.http.rates import Bucket
 from service.http.state import Shared, State, state_of
-from workers.catalogue.access.keys import OWNER, KeyRefused, Scope
+from workers.catalogue.access.keys import OWNER, OWNER_RULE, KeyRefused, Scope
 from workers.catalogue.access.sessions import SessionRow
 from workers.catalogue.tables import DEFAULT_OWNER, KeyRow
 
@@ -150,8 +150,12 @@ def _let_in(request: Request, state: State, form_token: str) -> Caller:
     owner = request.headers.get(ACT_FOR)
     if owner is None or owner == caller.owner:
         return caller
-    if Scope.ADMIN not in caller.scopes or not OWNER.fullmatch(owner):
+    if Scope.ADMIN not in caller.scopes:
         raise Problem(403, "scope-missing", f"{ACT_FOR}: expected a key with the scope '{Scope.ADMIN}'")
+    if not OWNER.fullmatch(owner):
+        raise Problem(
+            400, "bad-owner", f"{ACT_FOR}: expected the name of an owner ({OWNER_RULE}); got {owner[:80]!r}"
+        )
     return replace(caller, owner=owner)
 
 

@@ -9,7 +9,7 @@ import click
 from service.cli.operator.database import opened_catalogue
 from service.cli.operator.key import Duration
 from service.cli.options import DATA, read_settings, user_errors
-from workers.catalogue.access.keys import OWNER
+from workers.catalogue.access.keys import OWNER, OWNER_RULE
 from workers.catalogue.owners import MIB, Usage
 from workers.files.collection import collect
 from workers.files.examination import examine
@@ -120,7 +120,7 @@ def quota(owner: str, mib: int | None, as_all: bool, data: Path | None) -> None:
     if (mib is None) != as_all:
         raise click.UsageError("expected either a number of MiB or --default")
     if not OWNER.fullmatch(owner):
-        raise click.BadParameter("OWNER: expected lower-case letters, digits, '.', '_' and '-'")
+        raise click.BadParameter(f"OWNER: expected {OWNER_RULE}; got {owner!r}")
     with opened_catalogue(data) as catalogue:
         catalogue.owners.set_quota(owner, mib)
         click.echo(_line(catalogue.owners.usage(owner, read_settings(data).quota_mib)))

@@ -65,7 +65,8 @@ export function compare(value, schema, root, path, found) {
   for (const name of schema.required ?? []) if (!(name in value)) found.errors.push(`${inside(name)} is missing`);
   for (const [name, entry] of Object.entries(value)) {
     if (name in schema.properties) compare(entry, schema.properties[name], root, inside(name), found);
-    else (schema.additionalProperties === false ? found.errors : found.unknown).push(`${inside(name)}: unknown field; the service ignores it`);
+    else if (schema.additionalProperties === false) found.errors.push(`${inside(name)}: unknown field; remove it`);
+    else found.unknown.push(`${inside(name)}: unknown field; the service ignores it`);
   }
 }
 

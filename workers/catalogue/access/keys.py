@@ -22,6 +22,7 @@ from workers.catalogue.owners import add_bytes
 from workers.catalogue.tables import KeyRow
 
 OWNER = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
+OWNER_RULE = "1 to 64 lower-case letters, digits, '.', '_' and '-', the first a letter or digit"
 LABEL_LENGTH = 80
 _KEY = re.compile(r"hpsf_([0-9a-f]{16})_([A-Za-z0-9_-]{43})", re.ASCII)
 _USE_NOTED_EVERY_S = 60.0  # the time of use is written at most once a minute, not for every request
@@ -81,9 +82,7 @@ class Keys:
         if the owner has as many. Of the revoked and expired keys, only as many of the newest are then kept.
         """
         if not OWNER.fullmatch(owner):
-            raise ValueError(
-                f"expected an owner of lower-case letters, digits, '.', '_' and '-'; got {owner!r}"
-            )
+            raise ValueError(f"expected an owner of {OWNER_RULE}; got {owner!r}")
         if not scopes:
             raise ValueError(
                 "expected at least one scope; got none, and a key without a scope allows nothing"
