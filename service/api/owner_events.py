@@ -5,14 +5,15 @@ Browsers open at most six connections to a server over HTTP/1.1. A page with one
 The database is read every ``LOOK_EVERY_S`` seconds, with the same few queries however many jobs there are. A stream
 remembers the last state of each job that has not ended, and sends those whose state is another one. A job that is no longer
 among them has ended or was deleted: it is read by its id, so no clock decides about it. A job that the stream has not seen
-before it ended is found by the time of its end. The id of an event is the time (database clock) from which a reconnected
-client needs the ends of jobs.
+before it ended is found by the time of its end. Bulk runs can be deleted after their end:
+the stream also reads by their ids the ended ones that it has sent, and tells when they are gone. The id of an event is the
+time (database clock) from which a reconnected client needs the ends of jobs.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Generic
 
@@ -40,7 +41,8 @@ Moment = Annotated[str | None, Header(alias="Last-Event-ID", pattern=r"^[0-9]{1,
 DESCRIBED: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Events `job` and `bulk`: the data is the complete job or bulk run, which is new or has changed. Events "
-        '`gone`: the data is {"kind": "job" or "bulk", "id": ...} of one that was deleted.',
+        '`gone`: the data is {"kind": "job" or "bulk", "id": ...} of one that was deleted. A bulk run that ended before the stream '
+        "began is followed only if the request names it.",
         "content": {TYPE: {}},
     },
 }
@@ -59,7 +61,8 @@ class Watch(Generic[Followable]):
     """What a stream knows of the rows of one table: of the jobs, or of the bulk runs.
 
     kind: name of the events. named: ids that are followed in any phase. place: rows that ended after it are still to be read.
-    known: the state that was sent last, by id; None if it was sent that the row is gone.
+    known: the state that was sent last, by id; None if it was sent that the row is gone. after_end: so many of the rows that
+    were sent and have ended are followed until they are deleted, those that ended last.
     """
 
     kind: str
@@ -69,6 +72,7 @@ class Watch(Generic[Followable]):
     named: frozenset[str]
     place: Place
     known: dict[str, State | None] = field(default_factory=dict)
+    after_end: int = 0
 
     def look(self) -> tuple[list[News], Watch[Followable]]:
         """The news since the last look, and what is known then. This watch does not change, so a failed look loses nothing."""
@@ -84,15 +88,25 @@ class Watch(Generic[Followable]):
         gone = [one for one in sorted(unseen - states.keys()) if self.known.get(one, _UNKNOWN) is not None]
         news = [*(self._changed(*read[one]) for one in states if one in read), *map(self._gone, gone)]
         known = self.known | states | {one: state for one, (state, _) in read.items()}
-        kept = self.named.union(one.id for one in open_now)
+        known = {one: state for one, state in known.items() if one not in gone}
+        kept = self.named.union((one.id for one in open_now), self._ended_last(known))
         known = {one: state for one, state in known.items() if one in kept or _ended_after(state, again_from)}
         # If a page of ended rows is full, the next look continues after it.
         place = Place(again_from) if len(ended) < MOST else Place(ended[-1].ended_at or 0.0, ended[-1].id)
         return news, replace(self, place=place, known=known | dict.fromkeys(self.named.intersection(gone)))
 
     def _expected(self) -> set[str]:
-        """Ids of rows whose state must be known after each look: those that had not ended, and those that the request names."""
-        return {one for one, state in self.known.items() if state and state.ended_at is None} | self.named
+        """Ids of rows whose state must be known after each look: those that had not ended, ``after_end`` of those that had, and
+        those that the request names."""
+        not_ended = {one for one, state in self.known.items() if state and state.ended_at is None}
+        return not_ended.union(self._ended_last(self.known), self.named)
+
+    def _ended_last(self, known: Mapping[str, State | None]) -> list[str]:
+        """The ids of the ``after_end`` rows that ended last."""
+        ended = [
+            (state.ended_at, one) for one, state in known.items() if state and state.ended_at is not None
+        ]
+        return [one for _, one in sorted(ended, reverse=True)[: self.after_end]]
 
     def _changed(self, state: State, row: Followable) -> News:
         return News(
@@ -158,6 +172,7 @@ async def follow_all(
             owner,
             frozenset(bulk or ()),
             since,
+            after_end=MOST,
         ),
     ]
     first = True
