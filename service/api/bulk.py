@@ -259,6 +259,22 @@ def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
     return BulkView.of(find(state, caller, bulk_id), state)
 
 
+@router.delete("/{bulk_id}", status_code=204, summary="Delete a bulk run", response_class=Response)
+def delete_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> Response:
+    """Remove the run from the catalogue and from your quota. Its products and the files in its output folder stay.
+
+    The manifest and the reasons of failures are deleted with the run. A run that is LISTING or RUNNING answers 409: cancel it
+    first. If the service stops during the deletion, a cancelled run with fewer images may be left: delete it again. Products
+    that are only in the output folder are made again by a later run, because only the deleted run knew them.
+    """
+    row = find(state, caller, bulk_id)
+    if not state.catalogue.bulks.delete(row.id):
+        there = find(state, caller, bulk_id)  # if another request deleted it meanwhile, the answer is 404
+        _done(False, there, "PAUSED, ERROR, COMPLETED or CANCELLED", ": cancel it first")
+    bulk_turns.cancel_turns(state.catalogue, row.id)
+    return Response(status_code=204)
+
+
 def find(state: Shared, caller: Caller, bulk_id: str) -> BulkRow:
     """The row of a bulk run of the caller. Raises ``Problem`` 404."""
     row = state.catalogue.bulks.get(bulk_id)
@@ -271,12 +287,12 @@ def find(state: Shared, caller: Caller, bulk_id: str) -> BulkRow:
     return row
 
 
-def _done(changed: bool, row: BulkRow, expected: str) -> None:
+def _done(changed: bool, row: BulkRow, expected: str, advice: str = "") -> None:
     if not changed:
         raise Problem(
             409,
             "wrong-phase",
-            f"expected a bulk run in phase {expected}; this bulk run is in phase {row.phase}",
+            f"expected a bulk run in phase {expected}; this bulk run is in phase {row.phase}{advice}",
         )
 
 

@@ -6,14 +6,15 @@ them.
 A stream reads the database every ``LOOK_EVERY_S`` seconds; the number of queries does not depend on the number of jobs.
 It remembers the last state of each open job (a job that has not ended), and sends the jobs whose state has changed. A
 remembered job that is no longer open has ended or was deleted; the stream reads it by its id, without comparing times.
-A job that ended before the stream first read it is found by the time of its end. The id of an event is a time (database
+A job that ended before the stream first read it is found by the time of its end. Bulk runs can be deleted after
+their end: the stream also reads the ended runs that it has sent, and tells which of them were deleted. The id of an event is a time (database
 clock): a client that reconnects with this id gets the jobs that ended after this time.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Generic
 
@@ -41,7 +42,8 @@ Moment = Annotated[str | None, Header(alias="Last-Event-ID", pattern=r"^[0-9]{1,
 DESCRIBED: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Events `job` and `bulk` are sent for new and changed jobs and bulk runs; the data is the complete job "
-        'or bulk run. Events `gone` are sent for deleted ones; the data is {"kind": "job" or "bulk", "id": ...}.',
+        'or bulk run. Events `gone` are sent for deleted ones; the data is {"kind": "job" or "bulk", "id": ...}. '
+        "A bulk run that ended before the stream began is followed only if the request names it.",
         "content": {TYPE: {}},
     },
 }
@@ -61,7 +63,8 @@ class Watch(Generic[Followable]):
 
     kind: name of the events. named: ids that the request names; these rows are followed in any phase. place: the next
     look reads rows that ended after this place. known: the last state that was sent of each row, by id; None: the last
-    event was ``gone``.
+    event was ``gone``. after_end: the number of rows that were sent and have ended, and that the stream follows until they
+    are deleted; it follows those that ended last.
     """
 
     kind: str
@@ -71,6 +74,7 @@ class Watch(Generic[Followable]):
     named: frozenset[str]
     place: Place
     known: dict[str, State | None] = field(default_factory=dict)
+    after_end: int = 0
 
     def look(self) -> tuple[list[News], Watch[Followable]]:
         """The news since the last look, and the watch for the next look. This watch does not change, so a failed look
@@ -87,15 +91,25 @@ class Watch(Generic[Followable]):
         gone = [one for one in sorted(unseen - states.keys()) if self.known.get(one, _UNKNOWN) is not None]
         news = [*(self._changed(*read[one]) for one in states if one in read), *map(self._gone, gone)]
         known = self.known | states | {one: state for one, (state, _) in read.items()}
-        kept = self.named.union(one.id for one in open_now)
+        known = {one: state for one, state in known.items() if one not in gone}
+        kept = self.named.union((one.id for one in open_now), self._ended_last(known))
         known = {one: state for one, state in known.items() if one in kept or _ended_after(state, again_from)}
         # If a page of ended rows is full, the next look continues after it.
         place = Place(again_from) if len(ended) < MOST else Place(ended[-1].ended_at or 0.0, ended[-1].id)
         return news, replace(self, place=place, known=known | dict.fromkeys(self.named.intersection(gone)))
 
     def _expected(self) -> set[str]:
-        """Ids of rows whose state must be known after each look: those that had not ended, and those that the request names."""
-        return {one for one, state in self.known.items() if state and state.ended_at is None} | self.named
+        """Ids of rows whose state must be known after each look: those that had not ended, ``after_end`` of those that had, and
+        those that the request names."""
+        not_ended = {one for one, state in self.known.items() if state and state.ended_at is None}
+        return not_ended.union(self._ended_last(self.known), self.named)
+
+    def _ended_last(self, known: Mapping[str, State | None]) -> list[str]:
+        """The ids of the ``after_end`` rows that ended last."""
+        ended = [
+            (state.ended_at, one) for one, state in known.items() if state and state.ended_at is not None
+        ]
+        return [one for _, one in sorted(ended, reverse=True)[: self.after_end]]
 
     def _changed(self, state: State, row: Followable) -> News:
         return News(
@@ -160,6 +174,7 @@ async def follow_all(
             owner,
             frozenset(bulk or ()),
             since,
+            after_end=MOST,
         ),
     ]
     first = True

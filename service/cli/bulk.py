@@ -21,6 +21,7 @@ from service.cli.connection import (
     psf_option,
     remote,
     short,
+    whole_id,
     whole_ids,
 )
 from service.cli.deconvolve import AGAIN
@@ -231,6 +232,21 @@ def cancel(bulk_id: str, server: str | None) -> None:
     """End a bulk run permanently. Products that are done are kept."""
     with user_errors(), remote(server) as service:
         click.echo("\n".join(_said(service.cancel_bulk(bulk_id))))
+
+
+@bulk.command("delete", short_help="Delete bulk runs.")
+@id_argument("bulk_ids", several=True)
+@SERVER
+def delete(bulk_ids: tuple[str, ...], server: str | None) -> None:
+    """Delete bulk runs from the service, so that they no longer count in your quota. Their products are kept.
+
+    The manifest of a run is deleted with it; `bulk report -o FILE` saves it before. Cancel a run that is at work first.
+    """
+    with user_errors(), remote(server) as service:
+        for bulk_id in bulk_ids:
+            whole = whole_id(service, "bulk", bulk_id)
+            service.delete_bulk(whole)
+            click.echo(f"bulk run {short(whole)} is deleted")
 
 
 @bulk.command("report", short_help="Show artefact scores and failures.")

@@ -44,6 +44,10 @@ class BulkClient(ABC):
         """Write the file at an address of the service to ``path``; an existing file only if ``overwrite`` is true."""
 
     @abstractmethod
+    def _answer(self, method: str, address: str, **options: Any) -> httpx.Response:
+        """The answer to a request, as it came."""
+
+    @abstractmethod
     def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
         """The answer to a request."""
 
@@ -107,6 +111,10 @@ class BulkClient(ABC):
     def cancel_bulk(self, bulk_id: str) -> dict[str, Any]:
         """End a bulk run permanently. Products that are done are kept."""
         return self._json("POST", f"/v1/bulk/{bulk_id}/cancel")
+
+    def delete_bulk(self, bulk_id: str) -> None:
+        """Delete a bulk run that is not LISTING or RUNNING; its products are kept. Raises ``ServiceError`` "wrong-phase"."""
+        self._answer("DELETE", f"/v1/bulk/{bulk_id}")
 
     def retry_bulk(self, bulk_id: str) -> dict[str, Any]:
         """Try the failed images again. Raises ``ServiceError`` "equal-bulk-open" if another bulk run of the same request is open."""

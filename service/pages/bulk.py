@@ -17,6 +17,7 @@ from service.api.bulk import (
     BulkView,
     Failed,
     cancel_bulk,
+    delete_bulk,
     find,
     get_bulk,
     list_bulks,
@@ -41,7 +42,7 @@ from workers.catalogue.bulk_progress import MOST_EXPLAINED
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfContextRow
-from workers.contract.bulk import AT_WORK, OPEN, STOPPED, BulkPhase, BulkRequest, ItemState
+from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, BulkRequest, ItemState
 
 PER_PAGE, PER_SHEET = 20, 24
 MOST_CHOICES = 50  # PSFs and contexts that the form offers
@@ -54,6 +55,7 @@ ALLOWED_IN = {
     "resume": STOPPED,
     "retry": frozenset(BulkPhase) - {BulkPhase.CANCELLED},
     "cancel": OPEN,
+    "delete": DELETABLE,
 }
 Order = Literal["worst", "bulk"]
 router = APIRouter(prefix="/bulk", include_in_schema=False)
@@ -176,6 +178,13 @@ def reasons(bulk_id: BulkId, caller: PageReading, state: Shared) -> Response:
     """The failures by reason, for the script of the page of a run."""
     find(state, caller, bulk_id)
     return JSONResponse(_reasons(bulk_id, caller, state))
+
+
+@router.post("/{bulk_id}/delete")
+def delete_run(bulk_id: BulkId, caller: PageBulk, state: Shared) -> Response:
+    """Delete a run, and show the list of runs."""
+    delete_bulk(bulk_id, caller, state)
+    return RedirectResponse("/bulk", 303)
 
 
 @router.post("/{bulk_id}/{change}")

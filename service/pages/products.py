@@ -21,6 +21,7 @@ from service.pages.rendering import number, page, short
 from service.pages.visitors import PageReading, PageSubmitting
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow
 from workers.contract.requests import Identity
+from workers.intake import withdrawn
 
 MOST_RERUNS = 10
 router = APIRouter(prefix="/products/{product_id}", include_in_schema=False)
@@ -35,6 +36,8 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
     reruns = state.catalogue.page(ReportRow, owner=row.owner, limit=MOST_RERUNS, about_id=row.id)
     lost = _lost(state, row.file_sha256, row.bytes)
     image_lost = None if image is None else _lost(state, image.id, image.bytes)
+    deprecated = None if psf is None else withdrawn.deprecation(state.catalogue, psf)
+    better = None if deprecated is None else deprecated.redo_with
     answer = page(
         request,
         "product.html",
@@ -44,7 +47,9 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         psf=psf,
         lost=lost,
         image_lost=image_lost,
-        warnings=[one["message"] for one in row.details.get("warnings", [])],
+        warnings=_warnings(row.details, without=withdrawn.CODE if deprecated else None),
+        deprecated=deprecated,
+        redo=_again(row, psf_id="" if better is None else better.id),
         changed=_changed(row.details),
         look_at=(_score(row.details) or 0.0) >= LOOK_FROM,
         look_from=LOOK_FROM,
@@ -88,11 +93,17 @@ def _lost(state: State, digest: str, size: int) -> str | None:
     return None
 
 
-def _again(row: ProductRow) -> str:
-    """The page of the image, with the options of the product."""
+def _warnings(details: dict[str, Any], *, without: str | None) -> list[str]:
+    """The warnings of a product. without: the code of a warning that the page shows in another way."""
+    return [one["message"] for one in details.get("warnings", []) if one["code"] != without]
+
+
+def _again(row: ProductRow, *, psf_id: str | None = None) -> str:
+    """The page of the image, with the options of the product. psf_id: another PSF; empty: the one that the service chooses."""
     known = row.details.get("parameters") or {}
     made = {"image_id": row.image_id, "psf_id": row.psf_id, "method": row.details["method"]}
-    return options.address_of(made | {name: value for name, value in known.items() if name not in made})
+    other = {} if psf_id is None else {"psf_id": psf_id, "picked_for": None, "psf_recipe": None}
+    return options.address_of({**known, **made, **other})
 
 
 def _score(details: dict[str, Any]) -> float | None:

@@ -46,6 +46,11 @@ class AffectedProducts:
         with self._database.reading() as session:
             return _told(session, [psf], session.scalars(_products(psf, limit, after)).all())
 
+    def replacement(self, psf: PsfRow) -> PsfRow | None:
+        """The certified PSF at the end of a PSF's chain of successors; None if there is none."""
+        with self._database.reading() as session:
+            return _last_successor(_with_successors(session, [psf]), psf)
+
     def page(self, owner: str, *, superseded: bool, limit: int, after: Place | None = None) -> list[Affected]:
         """Products that were made with deprecated PSFs. superseded: only PSFs that have a successor.
 
@@ -102,6 +107,12 @@ def _first_products(session: Session, psfs: Sequence[PsfRow], limit: int) -> lis
 
 def _told(session: Session, psfs: Sequence[PsfRow], products: Sequence[ProductRow]) -> list[Affected]:
     """Products with their PSFs and the certified PSFs to which the chains of successors lead."""
+    known = _with_successors(session, psfs)
+    return [Affected(row, known[row.psf_id], _last_successor(known, known[row.psf_id])) for row in products]
+
+
+def _with_successors(session: Session, psfs: Sequence[PsfRow]) -> dict[str, PsfRow]:
+    """These PSFs of one owner and those of their chains of successors, by id."""
     known = {psf.id: psf for psf in psfs}
     for _ in range(MOST_SUCCESSORS):
         further = {psf.successor_id for psf in known.values() if psf.successor_id is not None} - known.keys()
@@ -112,7 +123,7 @@ def _told(session: Session, psfs: Sequence[PsfRow], products: Sequence[ProductRo
         if not rows:
             break
         known |= {row.id: row for row in rows}
-    return [Affected(row, known[row.psf_id], _last_successor(known, known[row.psf_id])) for row in products]
+    return known
 
 
 def _last_successor(known: dict[str, PsfRow], psf: PsfRow) -> PsfRow | None:

@@ -1,4 +1,4 @@
-"""Bulk runs and their images in the catalogue: create a run, list its files, take images, and store the results.
+"""Bulk runs and their images in the catalogue: create and delete a run, list its files, take images, and store the results.
 
 A worker takes an image by compare-and-set under the lease of its job (``workers.bulk.task``). If the lease is lost,
 another worker can take the image. The counts and the end of a run are written in the transaction that changes its
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
-from sqlalchemy import ColumnElement, Delete, Update, delete, insert, select, update
+from sqlalchemy import ColumnElement, Delete, Update, delete, func, insert, select, update
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
@@ -26,7 +26,7 @@ from workers.catalogue.database import Database
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import ROW_BYTES, add_bytes, add_held, check_fits, counted_bytes
 from workers.catalogue.tables import JobRow
-from workers.contract.bulk import AT_WORK, OPEN, STOPPED, BulkPhase, ItemState
+from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError, Phase
 
 # Errors of files whose paths the catalogue cannot store. Such files are not retried, because the stored path is wrong.
@@ -117,6 +117,49 @@ class Bulks:
     def cancel(self, bulk_id: str) -> bool:
         """Any open phase -> CANCELLED."""
         return self._set(bulk_id, OPEN, phase=BulkPhase.CANCELLED, ended_at=time.time())
+
+    def delete(self, bulk_id: str) -> bool:
+        """Delete a run and its images; their products stay. False if there is no such run, or if it is LISTING or RUNNING.
+
+        The run is cancelled first, so that nobody resumes it. Then its images are deleted in batches, and at last the run. Each
+        batch is one transaction, which gives its bytes back to the owner. If this process stops before the end, a cancelled
+        run with fewer images is left; it can be deleted again.
+        """
+        ended_at = func.coalesce(BulkRow.ended_at, time.time())
+        if not self._set(bulk_id, DELETABLE, phase=BulkPhase.CANCELLED, ended_at=ended_at):
+            return False
+        row = self.get(bulk_id)
+        while row is not None and self._delete_batch(bulk_id, row.owner):
+            pass
+        return True
+
+    def _delete_batch(self, bulk_id: str, owner: str) -> bool:
+        """Delete the next images of a cancelled run, or the run if it has no image. Returns whether images were deleted."""
+        here = BulkItemRow.bulk_id == bulk_id
+        next_ones = select(BulkItemRow.position).where(here).order_by(BulkItemRow.position).limit(BATCH)
+        with self._database.writing.begin() as session:
+            # The order of locks: the owner, as in all deletions; images; the run, as workers do that record a result.
+            add_bytes(session, owner, 0)
+            positions = session.scalars(next_ones).all()
+            if not positions:
+                row = session.get(BulkRow, bulk_id, with_for_update=True)
+                if row is not None:  # no other request deleted it meanwhile
+                    session.delete(row)
+                    add_bytes(session, owner, -counted_bytes(row))
+                return False
+            batch = delete(BulkItemRow).where(here, BulkItemRow.position.between(positions[0], positions[-1]))
+            told = batch.returning(BulkItemRow.state, BulkItemRow.reused)
+            deleted = session.execute(told.execution_options(synchronize_session=False)).all()
+            counts = {
+                "total": len(deleted),
+                "done": sum(state == ItemState.DONE for state, _ in deleted),
+                "reused": sum(reused for _, reused in deleted),
+                "failed": sum(state == ItemState.FAILED for state, _ in deleted),
+            }
+            fewer = {name: getattr(BulkRow, name) - count for name, count in counts.items()}
+            _changed(session, update(BulkRow).where(BulkRow.id == bulk_id).values(**fewer))
+            add_bytes(session, owner, -ROW_BYTES * len(deleted))
+            return True
 
     def stop_with(self, bulk_id: str, error: JobError) -> bool:
         """LISTING, RUNNING -> ERROR, for an error that concerns more than one image."""

@@ -4,6 +4,7 @@ LISTING --> RUNNING --> COMPLETED        retry: COMPLETED --> RUNNING, for the f
    |  ^      |  ^
    v  |      v  |                        cancel: any phase except COMPLETED and CANCELLED --> CANCELLED
   PAUSED or ERROR                        pause and resume
+                                         delete: any phase except LISTING and RUNNING
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ AT_WORK = frozenset({BulkPhase.LISTING, BulkPhase.RUNNING})
 STOPPED = frozenset({BulkPhase.PAUSED, BulkPhase.ERROR})
 OPEN = AT_WORK | STOPPED  # while a run is in one of these phases, an identical request gets this run
 BULK_ENDED = frozenset({BulkPhase.COMPLETED, BulkPhase.CANCELLED})
+DELETABLE = STOPPED | BULK_ENDED
 
 
 class ItemState(StrEnum):

@@ -5,6 +5,7 @@ A context chooses the PSFs that it pins, also if they were deprecated later: thi
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from psfcore.errors import DataError
@@ -14,6 +15,17 @@ from workers.versions.status import PsfStatus
 
 CODE = "psf-deprecated"  # of the error and of the warning
 SHOWN_DIGITS = 12
+
+
+@dataclass(frozen=True)
+class Deprecation:
+    """Why a PSF is deprecated, and what replaces it.
+
+    reason: empty if none was given. redo_with: the certified PSF at the end of the chain of successors; None if there is none.
+    """
+
+    reason: str
+    redo_with: PsfRow | None
 
 
 def check_not_withdrawn(catalogue: Catalogue, psf_id: str, owner: str, what: str, ways: str) -> None:
@@ -43,6 +55,13 @@ def withdrawn_warning(catalogue: Catalogue, psf: PsfRow) -> str | None:
     )
 
 
+def deprecation(catalogue: Catalogue, psf: PsfRow) -> Deprecation | None:
+    """The deprecation of a PSF; None if it is not deprecated."""
+    if psf.status != PsfStatus.DEPRECATED:
+        return None
+    return Deprecation(_last_reason(catalogue, psf), catalogue.affected.replacement(psf))
+
+
 def details_now(catalogue: Catalogue, product: ProductRow) -> dict[str, Any]:
     """The details of a product. If its PSF is deprecated now, its warnings say so, also if the product was made before that."""
     psf = catalogue.get(PsfRow, product.psf_id, product.owner)
@@ -54,7 +73,13 @@ def details_now(catalogue: Catalogue, product: ProductRow) -> dict[str, Any]:
 
 
 def _reason(catalogue: Catalogue, psf: PsfRow) -> str:
-    """Why a PSF was deprecated: the reason that was given last, because naming a successor later may give none."""
+    """Why a PSF was deprecated, as words for a message."""
+    reason = _last_reason(catalogue, psf)
+    return f"reason: {reason}" if reason else "no reason was given"
+
+
+def _last_reason(catalogue: Catalogue, psf: PsfRow) -> str:
+    """The reason that was given last, because naming a successor later may give none; empty if none was ever given."""
     changes = catalogue.psfs.changes(psf.id, psf.owner)
     reasons = [one.reason for one in changes if one.status == PsfStatus.DEPRECATED and one.reason]
-    return f"reason: {reasons[-1]}" if reasons else "no reason was given"
+    return reasons[-1] if reasons else ""

@@ -1,6 +1,6 @@
 // Keeps the bulk runs that a page shows up to date. Elements with data-bulk hold parts with data-part.
 import { listen } from "./events.js";
-import { duration, element, json, moment, sentence, whileThere } from "./page.js";
+import { duration, element, json, moment, say, sentence, whileThere } from "./page.js";
 
 const AT_WORK = ["LISTING", "RUNNING"];
 const OPEN = [...AT_WORK, "PAUSED", "ERROR"];
@@ -58,6 +58,15 @@ function showOne(run) {
   newer.firstElementChild.textContent = more === 1 ? "One more image is done." : `${more} more images are done.`;
 }
 
+/** A run was deleted, in this tab or elsewhere. */
+function forget(id) {
+  const place = places.get(id);
+  places.delete(id);
+  if (place !== one) return place.remove();
+  for (const change of one.querySelectorAll("[data-phases]")) change.hidden = true;
+  say(lost, "This run was deleted. Its products stay.");
+}
+
 /** Read the runs again whose events this page may have missed. */
 async function look() {
   for (const [id, place] of places) {
@@ -65,15 +74,18 @@ async function look() {
     try {
       show(place, await json(`/v1/bulk/${id}`));
     } catch (error) {
-      if (!(error instanceof TypeError)) throw error;
-      return; // the stream tells when the service answers again
+      if (error.status === 404) forget(id);
+      else if (error instanceof TypeError) return; // the stream tells when the service answers again
+      else throw error;
     }
   }
 }
 
 for (const form of document.querySelectorAll("#bulk form")) whileThere(form, lost);
 listen(({ name, data }) => {
+  if (places.size === 0) return;
   if (name === "bulk" && places.has(data.id)) show(places.get(data.id), data);
+  if (name === "gone" && data.kind === "bulk" && places.has(data.id)) forget(data.id);
   if (lost !== null && name === "lost") {
     lost.hidden = false;
     lost.textContent = "The service does not answer. When it is back, the run continues and this page updates itself.";

@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 from fastapi.testclient import TestClient
+from pydantic import BaseModel
 from sqlalchemy import event, update
 from sqlalchemy.exc import OperationalError
 
@@ -46,8 +47,19 @@ def live(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
         yield server
 
 
+class Line(BaseModel):
+    id: str
+    phase: str
+
+    @classmethod
+    def of(cls, row: BulkRow) -> Line:
+        return cls(id=row.id, phase=row.phase)
+
+
 class Looks:
     """The news of one look after the other, as (name of the event, data)."""
+
+    watch: Watch[Any]
 
     def __init__(
         self, catalogue: Catalogue, *named: str, owner: str = DEFAULT_OWNER, since: float | None = None
@@ -62,6 +74,15 @@ class Looks:
 
     def phases(self) -> list[tuple[str, str]]:
         return [(data["id"], data.get("phase", name)) for name, data in self.told()]
+
+
+class BulkLooks(Looks):
+    """The same for bulk runs."""
+
+    def __init__(self, catalogue: Catalogue, *named: str, after_end: int = 2) -> None:
+        since = Place(catalogue.followed_bulks.now() - owner_events.OVERLAP_S)
+        rows = catalogue.followed_bulks
+        self.watch = Watch("bulk", rows, Line.of, DEFAULT_OWNER, frozenset(named), since, after_end=after_end)
 
 
 def _parsed(text: str) -> tuple[str, dict[str, Any]]:
@@ -145,6 +166,41 @@ def test_a_deleted_job_is_gone_once(catalogue: Catalogue) -> None:
     looks.told()
     catalogue.uws.destroy(job_id)
     assert looks.told() == [("gone", {"kind": "job", "id": job_id})] and looks.told() == []
+
+
+@pytest.mark.parametrize("end", ["pause", "cancel"])
+def test_a_deleted_bulk_run_is_gone_once(catalogue: Catalogue, end: str) -> None:
+    run, kept = bulk_run(catalogue), bulk_run(catalogue)
+    looks = BulkLooks(catalogue)
+    looks.told()
+    for one in (run, kept):
+        assert getattr(catalogue.bulks, end)(one)
+    assert {phase for _, phase in looks.phases()} == {"PAUSED" if end == "pause" else "CANCELLED"}
+    assert catalogue.bulks.delete(run)
+    assert looks.told() == [("gone", {"kind": "bulk", "id": run})] and looks.told() == []
+
+
+def test_a_bulk_run_that_ended_some_time_ago_is_followed_until_it_is_deleted(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(owner_events, "OVERLAP_S", 0.0)
+    runs = [bulk_run(catalogue) for _ in range(3)]
+    before = bulk_run(catalogue)
+    catalogue.bulks.cancel(before)
+    time.sleep(0.01)
+    looks = BulkLooks(catalogue)
+    looks.told()
+    for run in runs:
+        catalogue.bulks.cancel(run)
+        time.sleep(0.01)
+        assert looks.phases() == [(run, "CANCELLED")]
+    assert looks.told() == []
+    assert set(looks.watch.known) == set(runs[1:]), "the two that ended last"
+    for run in (before, *runs):
+        assert catalogue.bulks.delete(run)
+    assert sorted(looks.phases()) == sorted((run, "gone") for run in runs[1:])
+    assert looks.told() == []
+    assert BulkLooks(catalogue, before).phases() == [(before, "gone")], "as a name that nothing has"
 
 
 def test_a_named_job_is_told_in_any_phase_and_when_it_is_deleted(catalogue: Catalogue) -> None:
@@ -249,7 +305,10 @@ def test_a_stream_follows_jobs_and_bulk_runs(live: Live) -> None:
     live.client.cancel_bulk(bulk_id)
     live.catalogue.jobs.complete(lease, "r" * 64)
     wait_for(lambda: len(following.said("data:")) == 5, "both ends", timeout_s=10)
-    told = [json.loads(data) for data in following.said("data:")]
+    live.client.delete_bulk(bulk_id)
+    wait_for(lambda: following.said("event:")[5:] == ["gone"], "the deletion", timeout_s=10)
+    *told, gone = [json.loads(data) for data in following.said("data:")]
+    assert gone == {"kind": "bulk", "id": bulk_id}
     assert [one["phase"] for one in told if one["id"] == bulk_id] == ["RUNNING", "PAUSED", "CANCELLED"]
     assert [one["phase"] for one in told if one["id"] == first_id] == ["EXECUTING", "COMPLETED"]
     assert following.said("event:")[:3] == ["job", "bulk", "bulk"]

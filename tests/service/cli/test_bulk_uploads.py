@@ -38,7 +38,12 @@ def test_bad_files_are_named_and_the_run_starts_with_the_others(
     [line] = command("bulk", "list").splitlines()
     assert line.startswith(f"{run['id'][:12]}  RUNNING") and "0 of 2 done, 0 failed" in line
     assert "0 of 2 done" in command("bulk", "status", run["id"][:8])
+    refused = command("bulk", "delete", run["id"][:8], code=1)
+    assert refused.endswith("this bulk run is in phase RUNNING: cancel it first\n")
     assert "CANCELLED" in command("bulk", "cancel", run["id"][:8])
+    assert command("bulk", "delete", run["id"][:8]) == f"bulk run {run['id'][:12]} is deleted\n"
+    assert "no bulk run yet" in command("bulk", "list")
+    assert "expected the id of a bulk run" in command("bulk", "delete", run["id"][:8], code=1)
 
 
 def test_a_folder_of_bad_files_starts_nothing(

@@ -201,9 +201,9 @@ def test_a_run_is_paused_resumed_retried_and_cancelled_by_its_buttons(
 
     assert buttons() == {"pause", "cancel"}
     for change, phase, then in (
-        ("pause", "PAUSED", {"resume", "cancel"}),
+        ("pause", "PAUSED", {"resume", "cancel", "delete"}),
         ("resume", "RUNNING", {"pause", "cancel"}),
-        ("cancel", "CANCELLED", set()),
+        ("cancel", "CANCELLED", {"delete"}),
     ):
         answer = api.post(f"{place}/{change}", follow_redirects=False)
         assert (answer.status_code, answer.headers["location"]) == (303, place)
@@ -211,7 +211,29 @@ def test_a_run_is_paused_resumed_retried_and_cancelled_by_its_buttons(
         assert buttons() == then
     refused = api.post(f"{place}/retry")
     assert refused.status_code == 409 and "CANCELLED" in refused.text
-    assert api.post(f"{place}/delete").status_code == 422
+    assert api.post(f"{place}/destroy").status_code == 422
+
+
+def test_a_run_is_deleted_by_its_button(
+    api: TestClient, psf_id: str, work: Callable[[], None], tmp_path: Path
+) -> None:
+    uploaded(api, tmp_path, 1)
+    place = started(api, psf_id, name="quiet Sun")
+    refused = api.post(f"{place}/delete")
+    assert (
+        refused.status_code == 409 and "this bulk run is in phase RUNNING: cancel it first." in refused.text
+    )
+    work()
+    page = api.get(place).text
+    assert "The products stay." in page
+    (product,) = re.findall(r'href="/products/(\w+)"', page)
+    answer = api.post(f"{place}/delete", follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/bulk")
+    assert "quiet Sun" not in api.get("/bulk").text and "No run yet." in api.get("/bulk").text
+    assert api.get(f"/products/{product}").status_code == 200
+    gone = api.get(place)
+    assert gone.status_code == api.post(f"{place}/delete").status_code == 404
+    assert "There is no such bulk run here. It was deleted" in gone.text
 
 
 @pytest.mark.parametrize(
@@ -253,6 +275,7 @@ def test_nobody_sees_or_changes_the_run_of_another_owner(settings: Settings, tmp
         assert place not in bob.get("/bulk").text and place in reader.get("/bulk").text
         assert 'action="/bulk' not in reader.get(place).text
         assert bob.get(place).status_code == bob.get(f"{place}/failures").status_code == 404
-        assert bob.post(f"{place}/cancel").status_code == 404
-        assert reader.post(f"{place}/cancel").status_code == 403
+        for change in ("cancel", "delete"):
+            assert bob.post(f"{place}/{change}").status_code == 404
+            assert reader.post(f"{place}/{change}").status_code == 403
         assert ann.get(f"/v1{place}").json()["phase"] == "RUNNING"

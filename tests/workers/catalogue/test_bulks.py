@@ -18,12 +18,14 @@ from tests.conftest import write_image
 from tests.whole.many_rows import plan, statements
 from workers.bulk import listing
 from workers.catalogue import bulk_progress
+from workers.catalogue import bulks as bulk_rows
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.bulks import Listed, Taken, new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
+from workers.catalogue.owners import ROW_BYTES, counted_bytes
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow
-from workers.contract.bulk import BulkPhase, BulkWork, ItemState
+from workers.contract.bulk import DELETABLE, BulkPhase, BulkWork, ItemState
 from workers.contract.phases import Fault, JobError
 from workers.files.store import Store
 from workers.settings import Settings
@@ -204,6 +206,139 @@ def test_an_identical_request_finds_only_an_open_run(catalogue: Catalogue) -> No
     assert row(catalogue, first).total == 2
     catalogue.bulks.cancel(first)
     assert made(catalogue, 2) != first
+
+
+def used(catalogue: Catalogue) -> int:
+    """What the owner's files and rows count now; a recount agrees."""
+    assert catalogue.owners.recount() == []
+    return catalogue.owners.usage("o", 0).used_bytes
+
+
+def images_of(catalogue: Catalogue, bulk_id: str) -> int:
+    query = select(func.count()).select_from(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id)
+    with catalogue._engine.connect() as connection:
+        return connection.scalar(query) or 0
+
+
+def in_phase(catalogue: Catalogue, bulk_id: str, phase: BulkPhase) -> None:
+    """Bring a run of three images into a phase; one image is done, one failed."""
+    first, second, third = all_taken(catalogue, bulk_id, turn(catalogue))
+    done(catalogue, first, reused=True), catalogue.bulks.fail(second, BAD)
+    match phase:
+        case BulkPhase.PAUSED:
+            catalogue.bulks.pause(bulk_id)
+        case BulkPhase.ERROR:
+            catalogue.bulks.stop_with(bulk_id, BAD)
+        case BulkPhase.CANCELLED:
+            catalogue.bulks.cancel(bulk_id)
+        case BulkPhase.COMPLETED:
+            done(catalogue, third)
+    assert row(catalogue, bulk_id).phase == phase
+
+
+@pytest.mark.parametrize("phase", sorted(DELETABLE))
+def test_a_deleted_run_gives_all_its_bytes_back_and_leaves_other_runs(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, phase: BulkPhase
+) -> None:
+    monkeypatch.setattr(bulk_rows, "BATCH", 2)
+    other = made(catalogue, 3, key="other")
+    before = used(catalogue)
+    bulk_id = made(catalogue, 3)
+    in_phase(catalogue, bulk_id, phase)
+    for job in catalogue.jobs.of_kind("bulk"):
+        catalogue.uws.destroy(job.id)  # turns are jobs, which count by themselves
+    assert used(catalogue) == before + counted_bytes(row(catalogue, bulk_id)) > before + 4 * ROW_BYTES
+    assert catalogue.bulks.delete(bulk_id)
+    assert catalogue.bulks.get(bulk_id) is None and images_of(catalogue, bulk_id) == 0
+    assert used(catalogue) == before
+    assert images_of(catalogue, other) == row(catalogue, other).total == 3
+    assert not catalogue.bulks.delete(bulk_id), "it is deleted once"
+    assert made(catalogue, 3) != bulk_id, "the same request makes a new run"
+
+
+@pytest.mark.parametrize("listed", [True, False], ids=["running", "listing"])
+def test_a_run_at_work_is_not_deleted(catalogue: Catalogue, listed: bool) -> None:
+    bulk_id = made(catalogue, 2, listed=listed)
+    before = used(catalogue), row(catalogue, bulk_id).phase
+    assert not catalogue.bulks.delete(bulk_id)
+    assert (used(catalogue), row(catalogue, bulk_id).phase) == before
+    assert images_of(catalogue, bulk_id) == 2
+
+
+def test_a_deletion_that_was_interrupted_leaves_a_cancelled_run_that_can_be_deleted(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bulk_rows, "BATCH", 1)
+    before = used(catalogue)
+    bulk_id, lease = made(catalogue, 4), turn(catalogue)
+    first, second, *_ = all_taken(catalogue, bulk_id, lease)
+    done(catalogue, first, reused=True), catalogue.bulks.fail(second, BAD), catalogue.bulks.pause(bulk_id)
+    with_turn, real, calls = used(catalogue) - counted_bytes(row(catalogue, bulk_id)), bulk_rows._changed, []
+
+    def killed(*statement: Any) -> int:
+        calls.append(statement)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(*statement)
+
+    monkeypatch.setattr(bulk_rows, "_changed", killed)
+    with pytest.raises(KeyboardInterrupt):
+        catalogue.bulks.delete(bulk_id)
+    left = row(catalogue, bulk_id)
+    assert (left.phase, left.total, left.done, left.reused, left.failed) == ("CANCELLED", 2, 0, 0, 0)
+    check_counts(catalogue, bulk_id)
+    assert used(catalogue) == with_turn + counted_bytes(left)
+    assert not catalogue.bulks.resume(bulk_id) and catalogue.bulks.retry(bulk_id) is None
+    assert catalogue.bulks.delete(bulk_id)
+    catalogue.uws.destroy(lease.job_id)
+    assert used(catalogue) == before
+
+
+def test_a_worker_whose_run_is_deleted_records_nothing(catalogue: Catalogue) -> None:
+    bulk_id, lease = made(catalogue, 3), turn(catalogue)
+    first, second, third = all_taken(catalogue, bulk_id, lease)
+    assert catalogue.bulks.pause(bulk_id) and catalogue.bulks.delete(bulk_id)
+    told = done(catalogue, first), catalogue.bulks.fail(second, BAD), catalogue.bulks.release(third)
+    assert told == (False, False, False)
+    assert catalogue.bulks.take(bulk_id, lease, 3) is None
+    assert not catalogue.bulks.stop_with(bulk_id, BAD)
+    assert images_of(catalogue, bulk_id) == 0
+
+
+def test_deletions_and_workers_at_the_same_moment_do_not_block_each_other(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three requests delete a paused run while workers record the images that they had taken."""
+    monkeypatch.setattr(bulk_rows, "BATCH", 7)
+    before = used(catalogue)
+    bulk_id, lease = made(catalogue, 60), turn(catalogue)
+    taken = list(all_taken(catalogue, bulk_id, lease))[::-1]
+    assert catalogue.bulks.pause(bulk_id)
+    with ThreadPoolExecutor(8) as pool:
+        recorded = [pool.submit(done, catalogue, one) for one in taken]
+        deleted = [pool.submit(catalogue.bulks.delete, bulk_id) for _ in range(3)]
+        assert any(one.result() for one in deleted)
+        assert [one.result() for one in recorded].count(True) <= 60
+    assert catalogue.bulks.get(bulk_id) is None and images_of(catalogue, bulk_id) == 0
+    catalogue.uws.destroy(lease.job_id)
+    assert used(catalogue) == before
+
+
+def test_each_transaction_deletes_a_batch_of_images(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bulk_id, left = made(catalogue, 2 * bulk_progress.BATCH + 1), []
+    catalogue.bulks.cancel(bulk_id)
+    real = catalogue.bulks._delete_batch
+
+    def counted(*asked: str) -> bool:
+        more = real(*asked)
+        left.append(images_of(catalogue, bulk_id))
+        return more
+
+    monkeypatch.setattr(catalogue.bulks, "_delete_batch", counted)
+    assert catalogue.bulks.delete(bulk_id)
+    assert left == [bulk_progress.BATCH + 1, 1, 0, 0]
 
 
 def with_a_failure(catalogue: Catalogue) -> str:
@@ -492,8 +627,9 @@ def test_every_query_of_a_run_uses_an_index(catalogue: Catalogue) -> None:
         )
         bulks.progress.done_before("o", "c" * 64, "/out/x.fits"), bulks.retry(bulk_id), bulks.pause(bulk_id)
         catalogue.page(BulkRow, owner="o", limit=51, after=(1.0, "a"))
-    asked = [one for one in sent if one[0].lstrip().startswith(("SELECT", "UPDATE"))]
-    assert len(asked) >= 18
+        assert bulks.delete(bulk_id)
+    asked = [one for one in sent if one[0].lstrip().startswith(("SELECT", "UPDATE", "DELETE"))]
+    assert len(asked) >= 24
     for statement, parameters in asked:
         steps = plan(catalogue, statement, parameters, forced=True)
         wrong = [step for step in steps if re.search(r"SCAN bulk|TEMP B-TREE|Seq Scan on bulk|Sort", step)]

@@ -104,6 +104,30 @@ def test_a_run_is_paused_resumed_and_cancelled_and_another_tab_sees_it(
     assert other.evaluate("window.notReloaded")
 
 
+def test_a_run_is_deleted_and_other_tabs_see_it(page: Page, site: Stack, psf_id: str, tmp_path: Path) -> None:
+    images = uploaded(site, tmp_path, 4, side=256, seed=760)
+    run = site.client.submit_bulk(images=images, psf_id=psf_id, name="not needed")
+    site.client.pause_bulk(run["id"])
+    line, same = page.context.new_page(), page.context.new_page()
+    line.goto("/bulk")
+    same.goto(f"/bulk/{run['id']}")
+    for other in (line, same):
+        other.evaluate(MARK)
+    row = line.locator(f"[data-bulk='{run['id']}']")
+    expect(row).to_be_visible()
+    page.goto(f"/bulk/{run['id']}")
+    page.get_by_text("Delete", exact=True).click()
+    good(page)
+    page.get_by_role("button", name="Delete the run").click()
+    expect(page).to_have_url(re.compile("/bulk$"))
+    expect(page.locator(f"[data-bulk='{run['id']}']")).to_have_count(0)
+    expect(row).to_have_count(0)
+    expect(same.locator("#lost")).to_have_text("This run was deleted. Its products stay.")
+    expect(same.get_by_role("button", name="Resume")).to_be_hidden()
+    good(same)
+    assert line.evaluate("window.notReloaded") and same.evaluate("window.notReloaded")
+
+
 def test_a_run_whose_images_fail_says_so_without_a_reload(
     page: Page, site: Stack, psf_id: str, tmp_path: Path
 ) -> None:
