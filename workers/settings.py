@@ -261,7 +261,7 @@ class Settings(BaseSettings):
         """URL of the database; by default SQLite in the data folder."""
         if self.database_url is None:
             return f"sqlite:///{self.data_dir.resolve() / 'catalogue.sqlite'}"
-        # A bare postgresql:// means psycopg2, but the project installs psycopg 3.
+        # SQLAlchemy would use psycopg2 for postgresql://, but the project installs psycopg 3.
         return self.database_url.replace("postgresql://", "postgresql+psycopg://", 1)
 
     @property
@@ -280,7 +280,7 @@ class Settings(BaseSettings):
 
     @property
     def silent_s(self) -> float:
-        """Time without a heartbeat after which a worker process is ended and replaced, s. Its job's lease was lost long before."""
+        """Time without a heartbeat after which a worker process is ended and replaced, s. The lease of its job has expired before."""
         return 2 * self.lease_s + self.cancel_s
 
     @property

@@ -36,7 +36,7 @@ FileState = Literal["good", "lost", "damaged"]
 
 
 class BadFile(DataError):
-    """A file of the store is lost, or its content is not what was stored. code: "file-lost" or "file-damaged"."""
+    """A file of the store is lost, or its content has changed. code: "file-lost" or "file-damaged"."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Blob:
 
     digest: str
     bytes: int
-    kept_at: float  # time when the file was last stored; it may have been stored earlier, too
+    kept_at: float  # time when the file was last stored; it may also have been stored before
 
 
 class Store:
@@ -167,8 +167,8 @@ class Store:
         target = self.path(digest)
         target.parent.mkdir(exist_ok=True)
         sync(temporary)
-        # To the nanosecond, so that remove() can tell this file from an equal one that is stored at the same moment. The
-        # system itself sets times only to a few milliseconds.
+        # The time is set to the nanosecond, so that remove() can distinguish this file from an identical file that is stored
+        # almost at the same moment. The system itself sets times only to a few milliseconds.
         os.utime(temporary, ns=(time.time_ns(), time.time_ns()))
         os.replace(temporary, target)
         sync(target.parent)

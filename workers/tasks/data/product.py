@@ -45,7 +45,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Warned:
-    """Something that a user of the product must know: a short code and a sentence."""
+    """A warning for users of the product: a short code and a sentence."""
 
     code: str
     message: str
