@@ -162,7 +162,7 @@ class ChirpTransform:
         n' k' = (n'^2 + k'^2 - (k' - n')^2) / 2
 
     The second line turns the sum into a convolution with a chirp, exp(i pi r n^2).
-    r: `ratio`, the phase in units of 2 pi that one step on each grid gives (1 / N for an FFT).
+    r: `ratio`, the phase for n' = k' = 1 in units of 2 pi; it is 1 / N for an FFT.
     N, K: `samples`, `out_samples`. The grids are not periodic: the sum is evaluated exactly as written.
     """
 
