@@ -75,7 +75,7 @@ class _WithoutWheel:
         self._step = FresnelStep(
             self._secondary, self.detector, wavelength_mm=path.wavelength_mm, distance_mm=length_mm
         )
-        # At x2 = 0, the integral in Eq. (1) of fresnel is a plain sum of E1 times one phase factor.
+        # At x2 = 0, the integral in Eq. (1) of fresnel is the sum of E1 times this phase factor.
         self._to_axis = np.exp(1j * np.pi / path.wavelength_mm / length_mm * self._secondary.x_mm**2)
 
     def at_primary(self, openings_mm: Vector) -> Wave:

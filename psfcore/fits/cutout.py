@@ -43,7 +43,10 @@ class Cutout:
         return len(self.header) + self.rows.length + -self.rows.length % BLOCK_BYTES
 
     def pieces(self) -> Iterator[bytes]:
-        """The bytes of the FITS file, one piece after the other. Raises OSError, and EOFError if the PSF's file has become shorter."""
+        """The bytes of the FITS file, one piece after the other.
+
+        Raises OSError, and EOFError if the PSF's file has become shorter.
+        """
         yield self.header
         with self.path.open("rb") as file:
             yield from self.rows.read(file)
