@@ -1,9 +1,11 @@
-"""`make bench-peers`: compare heliopsf's PSFs of the seven AIA channels with those of aiapy; deconvolve an image with both.
+"""`make bench-peers`: compare heliopsf's PSFs of the seven AIA channels with those of aiapy; deconvolve an image with
+both.
 
 The command writes docs/aia.md. aiapy runs in a separate process, with the interpreter that the command names. A PSF of
 aiapy has 4096 x 4096 px and takes minutes to an hour to compute, because aiapy adds every order to the whole array.
 Therefore this module evaluates aiapy's published equations only near each order, with aiapy's numbers
-(`filter_mesh_parameters`). For three orders aiapy itself is fast enough, and the process checks that both results agree.
+(`filter_mesh_parameters`). For three orders aiapy itself is fast enough, and the process checks that both results
+agree.
 
     I(x) = sum over arms and orders m of sinc^2(m w / d) exp(-k |x - m s|^2),   k = 4.5 / px^2
 

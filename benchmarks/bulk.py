@@ -7,8 +7,8 @@ service are used. For comparison, one and two plain processes do the same work w
 machine slows down the service and the plain processes equally.
 
 The kernel time is the time that a worker needs to deconvolve the images and to measure the changes. The overhead is the
-remaining time of the worker (reading, checking, writing, hashes, database rows, messages) divided by the kernel time. The
-first image of each worker is left out, because the worker then loads its kernels and the PSF.
+remaining time of the worker (reading, checking, writing, hashes, database rows, messages) divided by the kernel time.
+The first image of each worker is left out, because the worker then loads its kernels and the PSF.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ MARK = b"BENCH   =              1000000"
 
 
 def make_archive(folder: Path, images: int, size: int) -> Path:
-    """Write images of one scene that differ in one header card, so that no two files are equal; returns the PSF's file."""
+    """Write images of one scene that differ in one header card, so that no two files are equal; returns the PSF's
+    file."""
     instrument = load_instrument("hri_euv")
     psf = build_psf(instrument, threads=os.cpu_count() or 1)
     write_psf(folder / "psf.fits", psf, instrument_file=b"")
@@ -130,7 +131,10 @@ def worked_through(folder: Path, workers: int, archive: Path, psf: Path, steps: 
 
 
 def bare(archive: Path, psf: Path, steps: int, processes: int, images: int) -> float:
-    """Images per second that `processes` plain processes deconvolve without a service. Every process takes the same files."""
+    """Images per second that `processes` plain processes deconvolve without a service.
+
+    Every process takes the same files.
+    """
     command = [
         sys.executable,
         "-m",

@@ -75,7 +75,10 @@ def round_trip_s(stack: stacks.Stack, image: Path, output: Path) -> tuple[float,
 
 
 def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, folder: Path) -> None:
-    """Time the same deconvolution over HTTP: embedded, and with Redis and PostgreSQL. The PSF has already been built."""
+    """Time the same deconvolution over HTTP: embedded, and with Redis and PostgreSQL.
+
+    The PSF has already been built.
+    """
     for name, mode in (("embedded", stacks.embedded), ("Redis and PostgreSQL", stacks.served)):
         place = folder / name.split()[0]
         place.mkdir()
@@ -96,7 +99,8 @@ def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, fold
 
 
 def builds(f_s: float) -> None:
-    """Time PSF builds, and compare the far field with a plain transform of the padded pupil; each in a separate process."""
+    """Time PSF builds, and compare the far field with a plain transform of the padded pupil; each in a separate
+    process."""
     for what in ("build 2048", "build 4096", "far field 1024", "plain padded transform 1024"):
         answer = subprocess.run(
             [sys.executable, "-m", "benchmarks.deconvolution", what],

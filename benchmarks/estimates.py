@@ -3,9 +3,9 @@
     python -m benchmarks.estimates [--full] [--write]
 
 Each case runs in its own process with one thread; its processor time and peak memory are measured. --full also measures
-studies of a transit of 512 px, an image of 4096 px and an image with an ERROR plane (about twenty minutes more). --write
-multiplies the times of each kind in estimates.json by the median ratio of measured to estimated time; each method of
-deconvolution has a ratio of its own. Memory is only printed.
+studies of a transit of 512 px, an image of 4096 px and an image with an ERROR plane (about twenty minutes more).
+--write multiplies the times of each kind in estimates.json by the median ratio of measured to estimated time; each
+method of deconvolution has a ratio of its own. Memory is only printed.
 """
 
 from __future__ import annotations
@@ -99,7 +99,10 @@ def write(measured: list[dict[str, Any]]) -> None:
 
 
 def measure(case: dict[str, Any], folder: Path) -> None:
-    """Measure one case in this process. The first case that needs a file makes it in the folder; later cases use it again."""
+    """Measure one case in this process.
+
+    The first case that needs a file makes it in the folder; later cases use it again.
+    """
     from service.local import LocalService
     from workers.catalogue.tables import DEFAULT_OWNER
     from workers.intake import estimates

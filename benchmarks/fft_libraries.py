@@ -144,7 +144,8 @@ def _corner(psf: Single, field_shape: tuple[int, ...], lengths: tuple[int, int])
 
 
 def _loop(image: Single, forward: Forward, inverse: Inverse, transfer: Spectrum) -> Single:
-    """Eq. (1) of `psfcore.deconvolve.methods.richardson_lucy` without masked pixels; model values have the same floor."""
+    """Eq. (1) of `psfcore.deconvolve.methods.richardson_lucy` without masked pixels; model values have the same
+    floor."""
     scale = np.abs(image).max()
     observed = np.maximum(image / scale, 0)
     floor = np.float32(_FLOOR_OF_MAXIMUM) * observed.max()
@@ -174,7 +175,10 @@ LOOPS: dict[str, Callable[[Single, Single], Single]] = {
 
 
 def run_one(name: str, folder: Path) -> None:
-    """Time one loop in this process. The loop first runs on a small image, to load the compiled kernels and libraries."""
+    """Time one loop in this process.
+
+    The loop first runs on a small image, to load the compiled kernels and libraries.
+    """
     image, psf = np.load(folder / "image.npy"), np.load(folder / "psf.npy")
     centre = psf.shape[0] // 2
     LOOPS[name](image[:64, :64], psf[centre - 32 : centre + 32, centre - 32 : centre + 32])

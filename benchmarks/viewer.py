@@ -4,8 +4,8 @@ The benchmark needs Chromium. No other program should run on the machine. Three 
 
 - first page: the first product after the start. The service loads its numerical libraries, and the browser prepares its
   drawing.
-- first sight and all pixels: a product of 2048 px of which the service has not yet decoded a plane. The time is from the
-  begin of the navigation to the first frame after the overview, or after all pixels, were drawn.
+- first sight and all pixels: a product of 2048 px of which the service has not yet decoded a plane. The time is from
+  the begin of the navigation to the first frame after the overview, or after all pixels, were drawn.
 - a blink: the time from the key to the end of the drawing on the graphics card. Without a graphics card, Chromium draws
   with the processor.
 
@@ -58,7 +58,8 @@ def moment(page: Page, name: str) -> float:
 
 
 def own_mb(kind: str) -> float:
-    """The unshared memory, MB, of the browser's process of this kind; the largest value if there are several processes."""
+    """The unshared memory, MB, of the browser's process of this kind; the largest value if there are several
+    processes."""
     children = psutil.Process().children(recursive=True)
     found = [one for one in children if f"--type={kind}" in one.cmdline()]
     return max(one.memory_full_info().uss for one in found) / 1e6

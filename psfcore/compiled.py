@@ -71,10 +71,11 @@ def compiled(
 
 @contextmanager
 def listening(listener: Callable[[bool], None]) -> Iterator[None]:
-    """In the block, call listener(False) when this thread begins to compile a kernel, and listener(True) when it has finished.
+    """In the block, call listener(False) when this thread begins to compile a kernel, and listener(True) when it has
+    finished.
 
-    The compilation of a kernel takes some seconds, once per installation. If the listener raises an exception, the kernel
-    is not called.
+    The compilation of a kernel takes some seconds, once per installation. If the listener raises an exception, the
+    kernel is not called.
     """
     token = _LISTENER.set(listener)
     try:
@@ -93,7 +94,8 @@ def _tell(*, done: bool) -> None:
 def kernel_folder(usual: Path, home: Path | None = None) -> str:
     """The folder for kernels: `usual` if nobody else can write to it, otherwise a private folder below `home`.
 
-    home: default: the user's home. If the private folder cannot be made, `KernelFiles` neither writes nor reads kernels.
+    home: default: the user's home. If the private folder cannot be made, `KernelFiles` neither writes nor reads
+    kernels.
     """
     with suppress(OSError):  # numba would make the folder later; a folder that cannot be made is not trusted
         usual.mkdir(parents=True, exist_ok=True)
@@ -117,7 +119,8 @@ def kernel_folder(usual: Path, home: Path | None = None) -> str:
 
 
 def trusted(path: Path) -> bool:
-    """Whether nobody can change a file or folder except this user, the administrator, and users who can change this module.
+    """Whether nobody can change a file or folder except this user, the administrator, and users who can change this
+    module.
 
     The folders above it are checked too, because a user who can rename one of them can replace it by another folder.
     """
@@ -167,7 +170,8 @@ class KernelFiles(IndexDataCacheFile):
             )
 
     def load(self, key: Any) -> Any:
-        """The kernel for this key, compiled from the current sources; None if it is not on disk and must be compiled."""
+        """The kernel for this key, compiled from the current sources; None if it is not on disk and must be
+        compiled."""
         data = self._found(self._name(key))
         if data is None:
             _tell(done=False)

@@ -41,7 +41,8 @@ class MissingExtra(ImportError):
 
 
 def module_of_extra(extra: str, module: str) -> Any:
-    """Import a module that needs the packages of an extra, such as "plot". extra "": it needs only the standard packages.
+    """Import a module that needs the packages of an extra, such as "plot". extra "": it needs only the standard
+    packages.
 
     Raises MissingExtra, whose message names the missing package and the extra.
     """
@@ -59,7 +60,8 @@ def module_of_extra(extra: str, module: str) -> Any:
 
 
 def together(errors: Sequence[DataError]) -> DataError:
-    """Combine the errors of several files into one error, with all messages, and with the type and code of the first."""
+    """Combine the errors of several files into one error, with all messages, and with the type and code of the
+    first."""
     first = errors[0]
     if len(errors) == 1:
         return first

@@ -2,4 +2,6 @@
 
 from __future__ import annotations
 
-PLATE_SCALE_TOLERANCE = 0.01  # two plate scales count as the same if their ratio differs from 1 by at most this
+PLATE_SCALE_TOLERANCE = (
+    0.01  # two plate scales count as the same if their ratio differs from 1 by at most this
+)

@@ -12,7 +12,9 @@ from psfcore.errors import DataError
 REACH_GRID_PX = 2048
 LARGEST_SUM = 1 + 1e-3
 SMALLEST_SUM = 0.05
-CENTRE_TOLERANCE = 1e-3  # the central weight may be below the largest weight by this fraction, because of rounding
+CENTRE_TOLERANCE = (
+    1e-3  # the central weight may be below the largest weight by this fraction, because of rounding
+)
 
 
 def check_weights(smallest: float, largest: float, total: float) -> None:

@@ -155,5 +155,6 @@ def database_said(error: SQLAlchemyError) -> str:
 
 
 def _kind(error: BaseException) -> str:
-    """The name of the error's class; if the error has a cause, the name of the cause's class, which is more specific."""
+    """The name of the error's class; if the error has a cause, the name of the cause's class, which is more
+    specific."""
     return type(getattr(error, "orig", None) or error.__cause__ or error).__name__

@@ -16,7 +16,8 @@ EARLIER = "heliopsf-data"
 
 
 def default_data_dir() -> Path:
-    """The data folder of earlier versions if it is in the working folder and contains data; otherwise the user's data folder."""
+    """The data folder of earlier versions if it is in the working folder and contains data; otherwise the user's data
+    folder."""
     return earlier_data_dir() or users_data_dir()
 
 

@@ -34,7 +34,8 @@ def _limits(cgroups: Path, membership: Path) -> Iterator[int]:
             top, file = cgroups / "memory", "memory.limit_in_bytes"
         else:
             continue
-        # Inside a container this may be a path of the host. The container then shows only the limits of its uppermost folder.
+        # Inside a container this may be a path of the host. The container then shows only the limits of its uppermost
+        # folder.
         below = Path(path.lstrip("/"))
         for folder in (below, *below.parents):
             limit = _text(top / folder / file).strip()

@@ -280,7 +280,10 @@ class Settings(BaseSettings):
 
     @property
     def silent_s(self) -> float:
-        """Time without a heartbeat after which a worker process is ended and replaced, s. The lease of its job has expired before."""
+        """Time without a heartbeat after which a worker process is ended and replaced, s.
+
+        The lease of its job has expired before.
+        """
         return 2 * self.lease_s + self.cancel_s
 
     @property

@@ -1,8 +1,8 @@
 """A folder of built PSFs, so that a PSF is built only once.
 
-The name of a file is IDENTITY.SHA256.PART: the identity of the PSF (`psfcore.built.recipe`), the hash of the file, and the
-content of the file, such as "fits". A file is written under a temporary name and then renamed. Its hash is checked when it
-is read. If the files need more space than allowed, the files of the least recently used PSF are removed.
+The name of a file is IDENTITY.SHA256.PART: the identity of the PSF (`psfcore.built.recipe`), the hash of the file, and
+the content of the file, such as "fits". A file is written under a temporary name and then renamed. Its hash is checked
+when it is read. If the files need more space than allowed, the files of the least recently used PSF are removed.
 
 Other users have no access to the folder, because the files in it are used without any other check.
 """
@@ -74,7 +74,8 @@ class PsfCache:
         return None
 
     def keep(self, identity: str, part: str, write: Callable[[Path], object]) -> CachedFile | None:
-        """Keep a file. ``write(path)`` writes it. Returns None if the file is larger than the largest size of the cache.
+        """Keep a file. ``write(path)`` writes it. Returns None if the file is larger than the largest size of the
+        cache.
 
         Raises DataError "cache-of-another-user", and OSError if the file cannot be written.
         """
@@ -136,7 +137,10 @@ class PsfCache:
         return list(self.folder.glob(f".*{PARTIAL}"))
 
     def _shrink(self, last: str) -> None:
-        """Remove the least recently used PSFs until the others fit. The PSF with the identity ``last`` is never removed."""
+        """Remove the least recently used PSFs until the others fit.
+
+        The PSF with the identity ``last`` is never removed.
+        """
         psfs = self.psfs()
         total = sum(psf.bytes for psf in psfs)
         for psf in reversed(psfs):

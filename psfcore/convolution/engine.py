@@ -231,8 +231,8 @@ class Engine:
 
     @property
     def transfer_scale(self) -> int:
-        """The product of the lengths of the transforms. The transfer function is divided by it, so that no transform needs
-        a scale factor."""
+        """The product of the lengths of the transforms. The transfer function is divided by it, so that no transform
+        needs a scale factor."""
         return self.row_plan.length * self.column_plan.length
 
     def _transfer_function(self, kernel: NDArray[np.floating], first: tuple[int, int]) -> Single:
@@ -383,7 +383,8 @@ def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radice
 
 @compiled()
 def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
-    """As `_columns_real`, for an asymmetric PSF. sign: 1; or -1, which multiplies by the conjugate (for the adjoint)."""
+    """As `_columns_real`, for an asymmetric PSF. sign: 1; or -1, which multiplies by the conjugate (for the
+    adjoint)."""
     # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
     filled = min(spectrum.shape[1], length) * 2 * LANES
     z = buffer.reshape((-1, 2, LANES))

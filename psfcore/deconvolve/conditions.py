@@ -27,8 +27,8 @@ class Conditions:
     """Options of a deconvolution. Raises DataError "bad-margin" for a negative margin.
 
     edges: assumption about the scene beyond the field; None: the default of the method, EDGES.
-    margin_px: width of the margin beyond the field; None: the width is computed from the PSF. Edges "zero" have no margin.
-    noise: noise of the camera; required if the stopping rule is "discrepancy".
+    margin_px: width of the margin beyond the field; None: the width is computed from the PSF. Edges "zero" have no
+    margin. noise: noise of the camera; required if the stopping rule is "discrepancy".
     threads: number of threads; it does not change the result.
     progress(step, steps) is called after each step; its exceptions are not caught.
     engine_for: function that makes the engine; an `EngineCache` keeps engines between images.

@@ -63,7 +63,8 @@ def noise_amplification(
 
 
 def check_converges(sample: TransferSample, steps: int) -> None:
-    """Raise DataError "method-diverges" if `steps` steps with G = 1 can increase an error by more than LARGEST_GROWTH."""
+    """Raise DataError "method-diverges" if `steps` steps with G = 1 can increase an error by more than
+    LARGEST_GROWTH."""
     worst = float(np.abs(1 - sample.values).max())
     if worst > 1 and steps * np.log(worst) > np.log(LARGEST_GROWTH):
         advice = "use richardson-lucy or linear, or fewer steps"

@@ -24,7 +24,8 @@ from psfcore.image import Image, MaskBit
 from psfcore.psf import Psf
 from psfcore.psf_sampling import check_compatible
 
-# The first value of a missing pixel is computed from trusted neighbours if the PSF's weights on them sum to more than this.
+# The first value of a missing pixel is computed from trusted neighbours if the PSF's weights on them sum to more than
+# this.
 _ENOUGH_NEIGHBOURS = 1e-4
 
 

@@ -67,9 +67,9 @@ class Work:
     ) -> ErrorPlanes | None:
         """The error planes from `draws` noise realisations; None for 0 realisations.
 
-        possible_psfs: returns variants of the PSF within its errors, on the image's pixels; empty if the errors are not known.
-        begin(stage, steps) is called when a stage begins, and returns the progress function of the stage. Raises DataError
-        "no-noise-figures".
+        possible_psfs: returns variants of the PSF within its errors, on the image's pixels; empty if the errors are not
+        known. begin(stage, steps) is called when a stage begins, and returns the progress function of the stage. Raises
+        DataError "no-noise-figures".
         """
         if not draws:
             return None

@@ -46,7 +46,8 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Route:
-    """The decision which components of the entrance are in the transformed mask. str() gives the decision and its reason."""
+    """The decision which components of the entrance are in the transformed mask. str() gives the decision and its
+    reason."""
 
     samples: int
     mask: bool

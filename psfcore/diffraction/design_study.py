@@ -66,8 +66,8 @@ class MeshDesign:
 
 @dataclass(frozen=True)
 class DesignStudy:
-    """The computed meshes, sorted by wire width and then by pitch; and the mesh of the instrument itself ("flown"; None if
-    the instrument has no mesh)."""
+    """The computed meshes, sorted by wire width and then by pitch; and the mesh of the instrument itself ("flown"; None
+    if the instrument has no mesh)."""
 
     instrument: str
     flare_px: int

@@ -13,14 +13,14 @@ exp(-2 pi i o . i / n) and added modulo n ("folded"): along x for all rows, then
 each transform are kept. With Eq. (3) the sum over all n x n pixels equals the sum of the squares of the mask
 (Parseval).
 
-Departure from the paper: c is the open share of a cell, which is the mean of the transmission over the area of the cell.
-Therefore Eq. (1) gives E times sinc(x / n) sinc(y / n), and the pattern is divided by the square of this factor. Light
-beyond the n x n pixels wraps around to the opposite side. At the position x, the amplitude of the wrapped light is
-(x / (n - x))^2 of the correct amplitude: 11 % at n / 4, 1 % at n / 11. The pupil of HRI_EUV sends 0.13 % of its light
-beyond the inner 2048 px. With n = 4096, the wrapped light is 1e-5 of all light.
+Departure from the paper: c is the open share of a cell, which is the mean of the transmission over the area of the
+cell. Therefore Eq. (1) gives E times sinc(x / n) sinc(y / n), and the pattern is divided by the square of this factor.
+Light beyond the n x n pixels wraps around to the opposite side. At the position x, the amplitude of the wrapped light
+is (x / (n - x))^2 of the correct amplitude: 11 % at n / 4, 1 % at n / 11. The pupil of HRI_EUV sends 0.13 % of its
+light beyond the inner 2048 px. With n = 4096, the wrapped light is 1e-5 of all light.
 
-Eq. (2) is a sum, not an integral over the pixel. The sum conserves the energy, but single weights are not exact: for the
-open disc of HRI_EUV the weight of the central pixel is too low by 3e-4.
+Eq. (2) is a sum, not an integral over the pixel. The sum conserves the energy, but single weights are not exact: for
+the open disc of HRI_EUV the weight of the central pixel is too low by 3e-4.
 
 The mask is real, so P(-q) = P(q). If the mask is symmetric in x or in y, P is symmetric in both. If the mask also
 equals its transpose, an eighth of the transforms is enough. The symmetries of the mask M are tested with a random
@@ -209,14 +209,15 @@ class _Transforms:
             if t == 0 and s % together == 0:
                 self._transform_along_x(range(s, min(s + together, half)))
             self._transform_along_y(self.spectra[s % together], t)
-            # The transpose of the sum is added at the end. Positions with s = t would then count twice, so they get half
-            # the weight.
+            # The transpose of the sum is added at the end. Positions with s = t would then count twice, so they get
+            # half the weight.
             self._add(0.5 if s == t and self.symmetry == MIRROR_AND_TRANSPOSE else 1.0)
             progress(done + 1, len(places))
         return _completed(self.total, self.symmetry)
 
     def _along_y(self, s: int) -> range:
-        """The values of t that must be computed for one s: all, half of them, or only those up to s, as the symmetry allows."""
+        """The values of t that must be computed for one s: all, half of them, or only those up to s, as the symmetry
+        allows."""
         half = self.samples // 2
         return range({NO_SYMMETRY: self.samples, MIRROR: half, MIRROR_AND_TRANSPOSE: s + 1}[self.symmetry])
 
@@ -272,7 +273,8 @@ def _turns(place: int, samples: int, size: int) -> float:
 
 
 def _phases(turns: float, cells: int, size: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-    """exp(-2 pi i turns (m + k n) / n) as a product of two factors: the values of the first for each m, of the second for each k."""
+    """exp(-2 pi i turns (m + k n) / n) as a product of two factors: the values of the first for each m, of the second
+    for each k."""
     within = np.exp(-2j * np.pi * turns * np.arange(size) / size)
     of_period = np.exp(-2j * np.pi * turns * np.arange(math.ceil(cells / size)))
     return within.astype(np.complex64), of_period.astype(np.complex64)

@@ -16,8 +16,8 @@ The paper leaves some choices open; the result states each of them:
 - The number of windows of the series is the number in the instrument file (all windows that the field illuminates), or
   a number that the caller gives. The wave crosses only the few windows within the beam of one field point, but this
   small number would be wrong for the series: the image of the entrance already contains the diffraction at the edges of
-  the beam, and a series of few windows would add this diffraction a second time. With more windows the two methods agree
-  better.
+  the beam, and a series of few windows would add this diffraction a second time. With more windows the two methods
+  agree better.
 - To study another distance, the filter wheel is moved between secondary and detector. The distance from secondary to
   detector does not change.
 - Each one-dimensional image ("line") is normalised to the light within REACH_PX of the axis.
@@ -217,7 +217,8 @@ def _grids(path: LightPath, distance_mm: float) -> tuple[Grid, Grid]:
 
 
 class _AtWheel:
-    """The focused wave in front of the filter wheel, and its propagation through the mesh of the wheel to the detector."""
+    """The focused wave in front of the filter wheel, and its propagation through the mesh of the wheel to the
+    detector."""
 
     def __init__(self, path: LightPath, at_primary: Wave, separation_mm: float, distance_mm: float) -> None:
         self.path, self.distance_mm = path, distance_mm

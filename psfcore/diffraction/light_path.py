@@ -92,7 +92,10 @@ class LightPath:
         return abs(height) * self.aperture.diameter_mm
 
     def entrance_grids(self) -> tuple[Grid, Grid]:
-        """The grids of aperture and primary. Their steps are so small that light reaches the full width of the next mirror."""
+        """The grids of aperture and primary.
+
+        Their steps are so small that light reaches the full width of the next mirror.
+        """
         return self._grid(
             "aperture", self.aperture.diameter_mm, self.primary.diameter_mm, self.aperture_to_primary_mm
         ), self._grid(

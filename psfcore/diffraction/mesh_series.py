@@ -45,8 +45,8 @@ _UM_PER_ANGSTROM = 1e-4
 _UM_PER_MM = 1e3
 _LARGEST_CELL_PX = 0.4
 # The density of cells is proportional to the square root of light times width. About _CELLS_AN_ORDER cells are
-# distributed over each order, and about _CELLS_IN_ALL further cells over the whole axis. An order that contains less than
-# _FAINT_SHARE of all light gets fewer cells.
+# distributed over each order, and about _CELLS_IN_ALL further cells over the whole axis. An order that contains less
+# than _FAINT_SHARE of all light gets fewer cells.
 _CELLS_AN_ORDER = 30
 _CELLS_IN_ALL = 600
 _FAINT_SHARE = 1e-4
@@ -107,8 +107,8 @@ def rotated_mesh_kernel(
     """The pattern of a mesh, rotated by `angle_deg` (from +x towards +y) and integrated over pixels.
 
     Returns shape (size, size), centre at [size // 2, size // 2]; the weights are fractions of the light on the whole
-    plane, Eq. (5). At angle 0, the weight of each pixel differs by at most 1e-4 from the product of the exact lines. The
-    sum of all absolute differences is at most 5e-4. Misplaced light falls into a pixel next to the correct one.
+    plane, Eq. (5). At angle 0, the weight of each pixel differs by at most 1e-4 from the product of the exact lines.
+    The sum of all absolute differences is at most 5e-4. Misplaced light falls into a pixel next to the correct one.
     """
     spacing_px = order_spacing_px(
         wavelength_angstrom=wavelength_angstrom,
@@ -130,8 +130,8 @@ def rotated_mesh_kernel(
 def _cells(
     reach_px: float, *, spacing_px: float, open_share: float, windows: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Divide one axis of the pattern, from -reach_px to reach_px, into cells; return the middle (px), width (px) and light of
-    each cell.
+    """Divide one axis of the pattern, from -reach_px to reach_px, into cells; return the middle (px), width (px) and
+    light of each cell.
 
     The light of a cell is a fraction of the light on the whole axis. A cell is a part of a lobe of the grating factor, a
     whole lobe, or, where there is little light, several lobes. The middle of a cell is the centroid of its light.

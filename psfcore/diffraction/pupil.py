@@ -36,7 +36,8 @@ from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount
 
 CIRCLE_CORNERS = 4096
 _UM_PER_MM = 1e3
-# A ring that crosses the rim is a mistake in the instrument file. This small excess is allowed, because numbers are rounded.
+# A ring that crosses the rim is a mistake in the instrument file. This small excess is allowed, because numbers are
+# rounded.
 _RIM_TOLERANCE_MM = 1e-6
 _FARTHEST_CORNER = 100
 
@@ -54,9 +55,11 @@ class MaskPicture:
 
 @dataclass(frozen=True)
 class Pupil:
-    """The open area of the pupil: the opening minus the opaque outlines, the mesh wires and the opaque parts of a picture.
+    """The open area of the pupil: the opening minus the opaque outlines, the mesh wires and the opaque parts of a
+    picture.
 
-    An outline consists of one or more closed polygons with corners (x, y) in mm. A polygon may be a hole in another one.
+    An outline consists of one or more closed polygons with corners (x, y) in mm. A polygon may be a hole in another
+    one.
     """
 
     opening: Outline
@@ -80,8 +83,8 @@ def entrance_pupil(
     """The pupil of an aperture, with its mount and its meshes if they are given.
 
     mount_image: pixels [y, x] of the mount's mask image; row 0 is at the lowest y, and 0 is opaque.
-    Raises DataError "bad-mount" if the hub or a ray is as wide as the aperture, if a ring crosses the rim, if a corner is
-    far outside, or if the mask image is missing or cannot be used. The message names the key.
+    Raises DataError "bad-mount" if the hub or a ray is as wide as the aperture, if a ring crosses the rim, if a corner
+    is far outside, or if the mask image is missing or cannot be used. The message names the key.
     """
     radius_mm = aperture.diameter_mm / 2
     opening: Outline = (circle(radius_mm),)
@@ -262,7 +265,8 @@ def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
 def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]
     """Write the open share of each cell into `strip`.
 
-    It is the product of the open shares of the cell in the meshes, in the opening (outline 0) and in all other outlines.
+    It is the product of the open shares of the cell in the meshes, in the opening (outline 0) and in all other
+    outlines.
     """
     rows, cells = strip.shape
     area = np.zeros(cells + 2)

@@ -50,7 +50,8 @@ def write_png(figure: Figure, target: str | Path | IO[bytes], **options: Any) ->
     """Draw a figure and write it as PNG. options: the options of ``FigureCanvasAgg.print_png``.
 
     Matplotlib reads a text between two dollar signs as a formula, and fails if it is not a formula. Titles and labels
-    contain names from files, so they are drawn without this rule. Only the numbers at the axes are formulas, such as 10^3.
+    contain names from files, so they are drawn without this rule. Only the numbers at the axes are formulas, such as
+    10^3.
     """
     for text in _plain_texts(figure):
         text.set_parse_math(False)
@@ -188,7 +189,10 @@ def _draw_centre(figure: Figure, axes: Any, psf: Psf) -> None:
 
 
 def binned(plane: Plane, step: int) -> NDArray[np.float64]:
-    """Means of the finite values of step x step pixels; NaN if no value is finite. Incomplete last blocks are left out."""
+    """Means of the finite values of step x step pixels; NaN if no value is finite.
+
+    Incomplete last blocks are left out.
+    """
     ny, nx = plane.shape[0] // step, plane.shape[1] // step
     data = np.asarray(plane[: ny * step, : nx * step], dtype=np.float32)
     finite = np.isfinite(data)

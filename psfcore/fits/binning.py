@@ -1,4 +1,7 @@
-"""Compare the pixels of a PSF with the pixels of an image, which may be binned. This module imports no numerical library."""
+"""Compare the pixels of a PSF with the pixels of an image, which may be binned.
+
+This module imports no numerical library.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +27,9 @@ class Sampled(Protocol):
 def binning_factor(psf: Sampled, header: Cards) -> int:
     """The number of PSF pixels in one image pixel, along each axis.
 
-    The factor is 1 if the plate scales agree to 1 %, or if one of them is not known. If the plate scale of the image is a
-    whole multiple of the plate scale of the PSF, the same on both axes, the factor is this multiple. This requires that
-    the image is from the PSF's instrument, or that the PSF names no instrument. Otherwise the multiple may be a
+    The factor is 1 if the plate scales agree to 1 %, or if one of them is not known. If the plate scale of the image is
+    a whole multiple of the plate scale of the PSF, the same on both axes, the factor is this multiple. This requires
+    that the image is from the PSF's instrument, or that the PSF names no instrument. Otherwise the multiple may be a
     coincidence: for example, a pixel of FSI is as wide as nine pixels of HRI_EUV. Raises DataError
     "plate-scale-mismatch".
     """
@@ -43,7 +46,8 @@ def binning_factor(psf: Sampled, header: Cards) -> int:
 
 
 def _mismatch(psf: Sampled, psf_arcsec: float, scales: list[float | None], whole: int | None) -> DataError:
-    """The error for pixels of another size. whole: the factor by which the PSF must be rebinned; None: no factor fits."""
+    """The error for pixels of another size. whole: the factor by which the PSF must be rebinned; None: no factor
+    fits."""
     found = " x ".join("unknown" if scale is None else f"{scale:g}" for scale in scales)
     advice = (
         "use a PSF of the image's pixels"

@@ -213,7 +213,10 @@ def _no_image(kinds: list[str]) -> HeaderError:
 
 
 def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:
-    """Read the cards before END; None if no further header begins. Raises HeaderError if `most` bytes contain no END."""
+    """Read the cards before END; None if no further header begins.
+
+    Raises HeaderError if `most` bytes contain no END.
+    """
     raw = bytearray()
     while len(raw) < most:
         block = source.read(BLOCK_BYTES)

@@ -2,8 +2,8 @@
 
 This module compares the instrument that the instrument files know, the wavelength, and the cards TELESCOP, INSTRUME,
 DETECTOR and FILTER. It compares only values that both the image and the PSF give. The order of the words in a card is
-ignored, and one text may have more words than the other, as SDO and SDO/AIA. Wavelengths count as equal if they differ by
-at most 1 %, because headers round the wavelength. The channels of AIA, EUI and similar telescopes differ by more.
+ignored, and one text may have more words than the other, as SDO and SDO/AIA. Wavelengths count as equal if they differ
+by at most 1 %, because headers round the wavelength. The channels of AIA, EUI and similar telescopes differ by more.
 """
 
 from __future__ import annotations
@@ -97,7 +97,8 @@ def _other_instrument(psf: Origin, header: Cards) -> str | None:
 
 
 def _image_wavelength(header: Cards) -> float | None:
-    """Wavelength in angstrom, from the header or else from the file of the known instrument; None if neither gives it."""
+    """Wavelength in angstrom, from the header or else from the file of the known instrument; None if neither gives
+    it."""
     found = wavelength_angstrom(header)
     known = known_instrument(header)
     return load_instrument(known).wavelength_angstrom if found is None and known is not None else found

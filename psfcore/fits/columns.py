@@ -2,8 +2,8 @@
 
 Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), section 7.3. astropy makes an object for each
 column that TFIELDS declares, and reserves the memory that the cards TFORMn declare for each row, even if the file is
-shorter. Therefore this module limits TFIELDS and compares the columns with the size of a row. It reads no data, so the web
-process can import it.
+shorter. Therefore this module limits TFIELDS and compares the columns with the size of a row. It reads no data, so the
+web process can import it.
 """
 
 from __future__ import annotations

@@ -79,7 +79,8 @@ def opened_image(path: str | Path, summary: HeaderSummary) -> Iterator[Any]:
 
 @contextmanager
 def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
-    """Raise DataError "unreadable-pixels" for the errors of astropy in the block. part: the name of the part, for the message."""
+    """Raise DataError "unreadable-pixels" for the errors of astropy in the block. part: the name of the part, for the
+    message."""
     try:
         yield
     except DataError:
@@ -119,7 +120,10 @@ def _check_tiles(path: str | Path, summary: HeaderSummary) -> None:
 
 
 def _raise_if_storage(error: Exception) -> None:
-    """Raise the error again if the disk caused it. Do nothing if the content of the file caused it, such as a negative size."""
+    """Raise the error again if the disk caused it.
+
+    Do nothing if the content of the file caused it, such as a negative size.
+    """
     if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
         raise error
 
@@ -130,7 +134,8 @@ def ascii_text(text: str) -> str:
 
 
 def as_written(hdu: Any) -> bool:
-    """Whether an HDU is unchanged since `write_hdus` wrote it: its checksums are correct, and `write_hdus` computed them."""
+    """Whether an HDU is unchanged since `write_hdus` wrote it: its checksums are correct, and `write_hdus` computed
+    them."""
     sums = ("CHECKSUM", "DATASUM")
     ours = all(key in hdu.header and hdu.header.comments[key] == _CHECKSUM_COMMENT for key in sums)
     return ours and hdu.verify_datasum() == hdu.verify_checksum() == _RIGHT
@@ -151,7 +156,7 @@ def write_hdus(path: str | Path, hdus: list[Any]) -> None:
             fits.HDUList(hdus).writeto(file, output_verify="silentfix")
         except OSError as error:
             if error.errno is None:
-                # numpy and astropy say how many bytes were written, but not why writing stopped. If the disk is full, this
-                # probe fails too, with the error of the system.
+                # numpy and astropy say how many bytes were written, but not why writing stopped. If the disk is full,
+                # this probe fails too, with the error of the system.
                 probe(Path(path))
             raise

@@ -147,9 +147,11 @@ def check_not_deconvolved(content: str) -> None:
 
 
 def origin_of(header: Cards) -> tuple[str | None, dict[str, str]]:
-    """The instrument of a PSF, and the cards that say for which images it is valid. header: the header of the PSF's file.
+    """The instrument of a PSF, and the cards that say for which images it is valid. header: the header of the PSF's
+    file.
 
-    In a file that `psfcore.fits.psfs.write_psf` wrote (it has the card PSFNAME), INSTRUME is the name of an instrument file.
+    In a file that `psfcore.fits.psfs.write_psf` wrote (it has the card PSFNAME), INSTRUME is the name of an instrument
+    file.
     """
     own = optional_text(header, "PSFNAME") is not None
     texts = {key: optional_text(header, key) for key in ORIGIN_CARDS}
@@ -235,7 +237,8 @@ def optional_exposure_s(header: Cards) -> float | None:
 
 
 def seen_by(header: Cards) -> dict[str, Any]:
-    """The values of a header that describe the observation: the fields of `HeaderSummary` from instrument to gain_mode."""
+    """The values of a header that describe the observation: the fields of `HeaderSummary` from instrument to
+    gain_mode."""
     return {
         "instrument": known_instrument(header),
         "telescop": optional_text(header, "TELESCOP"),

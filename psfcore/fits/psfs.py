@@ -162,20 +162,21 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
 def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
     """The id that heliopsf gave to the PSF in a file, from its HISTORY; None if HISTORY contains no id.
 
-    Also None if the file was changed after `write_psf` wrote it (CHECKSUM and DATASUM of every HDU are checked), or if it
-    was derived from the file of another PSF. Raises HeaderError.
+    Also None if the file was changed after `write_psf` wrote it (CHECKSUM and DATASUM of every HDU are checked), or if
+    it was derived from the file of another PSF. Raises HeaderError.
     """
     check_all_headers(path, limits)
     try:
         with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
             lines = [str(line) for line in hdus[0].header.get("HISTORY", [])]
             stated = [found[1] for line in lines if (found := _STATED.fullmatch(line))]
-            # `read_psf` keeps the HISTORY of a file under this name, and `write_psf` writes it into files derived from it.
+            # `read_psf` keeps the HISTORY of a file under this name, and `write_psf` writes it into files derived from
+            # it.
             derived = any(line.startswith("history:") for line in lines)
             if len(stated) != 1 or derived:
                 return None
             same = all(as_written(hdu) for hdu in hdus)
-    except PIXEL_TROUBLE:  # write_psf did not write this file, or it is damaged; the job that uses the file says why
+    except PIXEL_TROUBLE:  # a damaged file, or a file of other software; the job that uses it raises the error
         return None
     return stated[0] if same else None
 

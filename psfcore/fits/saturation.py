@@ -5,17 +5,18 @@ the saturated pixels of an image. In 26 level 1 images of a flare of 2012-07-19,
 15000 DN (in 25 images exactly, in one it is larger by 1), so an AIA image with NSATPIX has this level. A pixel of exactly
 15000 DN counts as saturated here too.
 
-Saturation can also be found without a known level: in a saturated image many pixels have exactly the largest value, because
-the converter or the software that wrote the image cannot write a larger one. In an image that is not saturated, the
-number of pixels per value decreases towards the largest value. Let n be the number of pixels with the largest value, and m
-the mean number of pixels per occurring value among the brightest pixels below it. Without saturation, n should not exceed m:
+Saturation can also be found without a known level: in a saturated image many pixels have exactly the largest value,
+because the converter or the software that wrote the image cannot write a larger one. In an image that is not saturated,
+the number of pixels per value decreases towards the largest value. Let n be the number of pixels with the largest
+value, and m the mean number of pixels per occurring value among the brightest pixels below it. Without saturation, n
+should not exceed m:
 
     P(n) = probability of at least n events of a Poisson distribution with mean m        Eq. (1)
 
-If P is below MASKED_BELOW, the pixels with the largest value are masked as saturated. If it is only below DOUBTED_BELOW,
-they may be saturated, and the image gets a warning. The test does not depend on the unit, because values that are equal
-stay equal after a division by the exposure time. The test cannot find saturated pixels whose values a flat field or an
-interpolation made different from each other.
+If P is below MASKED_BELOW, the pixels with the largest value are masked as saturated. If it is only below
+DOUBTED_BELOW, they may be saturated, and the image gets a warning. The test does not depend on the unit, because values
+that are equal stay equal after a division by the exposure time. The test cannot find saturated pixels whose values a
+flat field or an interpolation made different from each other.
 
 | symbol | name | unit |
 |---|---|---|
@@ -73,11 +74,11 @@ def with_saturation(
 ) -> Image:
     """The image with its saturated pixels masked, and with the record of how they were found.
 
-    requested_dn, instrument_dn: the levels in DN of one exposure that the request and the instrument file give. The level
-    of the request replaces the level of the instrument file, as in `psfcore.fits.images.read_image`. If several levels
-    remain, the lowest one is used. If the request gives no level, the pixels are also tested, see Eq. (1). A level in DN
-    cannot be used for an image whose unit is neither DN nor DN/s: if the request gives one, raises DataError
-    "saturation-unit".
+    requested_dn, instrument_dn: the levels in DN of one exposure that the request and the instrument file give. The
+    level of the request replaces the level of the instrument file, as in `psfcore.fits.images.read_image`. If several
+    levels remain, the lowest one is used. If the request gives no level, the pixels are also tested, see Eq. (1). A
+    level in DN cannot be used for an image whose unit is neither DN nor DN/s: if the request gives one, raises
+    DataError "saturation-unit".
     """
     known = _levels(image, requested_dn, instrument_dn)
     found = min(known, key=lambda key: known[key], default=None)

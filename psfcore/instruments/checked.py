@@ -32,7 +32,8 @@ from typing import Any, Literal, NamedTuple, Self, dataclass_transform
 
 @dataclass(frozen=True)
 class Limit:
-    """Limits of a number (gt, ge, le, lt); limits of the number of entries or characters; a pattern for the whole text."""
+    """Limits of a number (gt, ge, le, lt); limits of the number of entries or characters; a pattern for the whole
+    text."""
 
     gt: float | None = None
     ge: float | None = None
@@ -84,7 +85,8 @@ class Checked:
             raise BadValues([Fault((), together, None)])
 
     def check(self) -> str | None:
-        """Check values together after each of them was accepted. Returns None, or a sentence with expected and given values.
+        """Check values together after each of them was accepted. Returns None, or a sentence with expected and given
+        values.
 
         May raise BadValues instead, to name the keys.
         """
@@ -158,7 +160,10 @@ def _accepted(annotation: Any, value: Any, key: tuple[str | int, ...]) -> Any:
 
 
 def _fitting(arguments: tuple[Any, ...], value: Any, key: tuple[str | int, ...]) -> Any:
-    """The member of a union that fits the type of the value. Raises BadValues if the value is neither text nor number."""
+    """The member of a union that fits the type of the value.
+
+    Raises BadValues if the value is neither text nor number.
+    """
     inner = [argument for argument in arguments if argument is not types.NoneType]
     if len(inner) == 1:
         return inner[0]

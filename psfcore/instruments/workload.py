@@ -74,17 +74,20 @@ def workload(instrument: Instrument, size: int) -> Workload:
 def windows_of(mesh: Mesh) -> int:
     """Number of windows of the series of a mesh.
 
-    For a mesh at the entrance, the pattern of the aperture gives the orders their width. The orders of the series itself must
-    then be narrow, so the number of windows is at least NARROW_WINDOWS.
+    For a mesh at the entrance, the pattern of the aperture gives the orders their width. The orders of the series
+    itself must then be narrow, so the number of windows is at least NARROW_WINDOWS.
     """
     return max(mesh.windows, NARROW_WINDOWS) if mesh.place == "entrance" else mesh.windows
 
 
 def check_workload(instrument: Instrument, label: str) -> None:
-    """Raise DataError "bad-instrument-file" if the PSF of an instrument, at its largest size, needs too large arrays."""
+    """Raise DataError "bad-instrument-file" if the PSF of an instrument, at its largest size, needs too large
+    arrays."""
     largest = workload(instrument, LARGEST_SIZE_PX)
     if largest.samples > MOST_SAMPLES:
-        wanted = f"aperture.diameter_mm: expected a pattern that needs at most {MOST_SAMPLES} samples per pixel"
+        wanted = (
+            f"aperture.diameter_mm: expected a pattern that needs at most {MOST_SAMPLES} samples per pixel"
+        )
         needs = "2 x diameter x pixel pitch / (wavelength x focal length)"
         raise DataError("bad-instrument-file", f"{label}: {wanted}; got {needs} = {largest.samples:.3g}")
     if max(largest.cells, default=0) > MOST_CELLS:

@@ -18,9 +18,9 @@ On an array larger than the full reach the weights can sum to more than 1 (E > 1
 | encircled_changes | by component: one row for each axis of the fit's covariance, with the change of E for a step of 1 sigma; {} if not fitted |
 | profile | by ring of one pixel: radius_px, pixels, mean_weight, sigma, azimuthal_rms_over_mean (of TOTAL) |
 
-To compute the 1-sigma error of a number that is linear in E, compute the same number from each row of encircled_changes,
-and take the root of the sum of the squares of these numbers. This method includes correlations. For example, the error of
-the light in an annulus is not the sum of the errors at its two radii.
+To compute the 1-sigma error of a number that is linear in E, compute the same number from each row of
+encircled_changes, and take the root of the sum of the squares of these numbers. This method includes correlations. For
+example, the error of the light in an annulus is not the sum of the errors at its two radii.
 
 This module imports only the standard library, because the web process reads tables and must not load numerical libraries.
 """

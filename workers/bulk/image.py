@@ -72,9 +72,8 @@ def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Ta
         identity = product_identity(wanted)
         target = _target(context, request, source, identity)
         if target is not None and taken.attempt > 1 and target.parent.is_dir():
-            beneath.remove_partials(
-                target, _output_roots(context)
-            )  # a killed worker may have left partial copies
+            # A killed worker may have left partial copies.
+            beneath.remove_partials(target, _output_roots(context))
         before = _done_before(context, wanted, identity, request, target)
         if before is None and target is not None:
             with _write_errors():  # checked before the deconvolution, so that no work is lost if this fails
@@ -87,7 +86,8 @@ def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Ta
 def _waited(context: Context, request: BulkWork, identity: str) -> bool:
     """Wait while another job makes this product. Returns whether there was such a job.
 
-    If the service keeps no products of the run, this function returns at once, because no other job makes the same file.
+    If the service keeps no products of the run, this function returns at once, because no other job makes the same
+    file.
     """
     waited = False
     if not request.keeps_products:

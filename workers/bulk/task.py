@@ -65,7 +65,10 @@ def _stopped_for_quota(context: Context, bulk: BulkRow) -> bool:
 
 
 def _do(context: Context, bulk: BulkRow, taken: Taken) -> None:
-    """Deconvolve one image and record its result. If the whole turn must stop, the image is released for another turn."""
+    """Deconvolve one image and record its result.
+
+    If the whole turn must stop, the image is released for another turn.
+    """
     bulks, done = context.catalogue.bulks, bulk.done + bulk.failed
 
     told_s = told_at = 0.0
@@ -96,8 +99,6 @@ def _do(context: Context, bulk: BulkRow, taken: Taken) -> None:
         return
     values = vars(found[0])
     statistics = {**values["statistics"], "seconds": round(time.perf_counter() - started, 3)}
-    if (
-        "kernel_seconds" in statistics
-    ):  # the time spent on reports of progress is not part of the image's time
+    if "kernel_seconds" in statistics:  # without the time that was spent on reports of progress
         statistics["kernel_seconds"] = round(statistics["kernel_seconds"] - told_s, 3)
     bulks.finish(taken, **{**values, "statistics": statistics})

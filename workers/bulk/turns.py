@@ -1,9 +1,9 @@
 """Turns of bulk runs: jobs in the queue ``bulk`` in which a worker deconvolves one image after the other.
 
 A bulk run has as many turns as there are worker processes, but never more turns than images that are left. Turns are
-ordinary jobs: one worker runs each turn, a lost turn is queued again, and a worker that stops hands its turn back. After
-each image, a turn ends if jobs of other kinds wait. After a minute it ends in any case, so that turns of other bulk runs
-can follow. When the run has no work left, its turns are deleted.
+ordinary jobs: one worker runs each turn, a lost turn is queued again, and a worker that stops hands its turn back.
+After each image, a turn ends if jobs of other kinds wait. After a minute it ends in any case, so that turns of other
+bulk runs can follow. When the run has no work left, its turns are deleted.
 """
 
 from __future__ import annotations

@@ -67,8 +67,8 @@ class Jobs:
 
         queue: the queue of the new job; None: the default queue of the job's kind. A shared job that waits in a less
         urgent queue moves to ``queue``. A cancelled job or a job with UWS terms is not shared: the new job then gets a
-        different key. It waits while the other job executes, and then uses the result of the other job, if there is one.
-        quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
+        different key. It waits while the other job executes, and then uses the result of the other job, if there is
+        one. quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
         """
         queue = queue or queue_of(kind)
         for _ in range(3):  # between the two statements, the identical job may fail
@@ -188,8 +188,8 @@ class Jobs:
         """Store the job's progress and a heartbeat; False if the lease is lost or the job was cancelled.
 
         A job counts its steps several times. A new count begins when the number of steps changes, or when the step is
-        smaller than the step before. The row stores the time and the step at which the current count began; the remaining
-        time of the job is estimated from them.
+        smaller than the step before. The row stores the time and the step at which the current count began; the
+        remaining time of the job is estimated from them.
         """
         new_count = or_(JobRow.count_at.is_(None), JobRow.steps != steps, JobRow.step > step)
         return self._set(
@@ -303,9 +303,8 @@ class Jobs:
             else_=resubmit_s * 2**8,
         )
         now = self._database.now
-        ahead = (
-            JobRow.submitted_at > now + resubmit_s
-        )  # after the submission, the database's clock was set back
+        # If a submission lies in the future, the database's clock was set back after it.
+        ahead = JobRow.submitted_at > now + resubmit_s
         due = or_(JobRow.submitted_at.is_(None), JobRow.submitted_at < now - wait_s, ahead)
         query = select(JobRow.id, JobRow.queue).where(JobRow.phase == Phase.QUEUED, due, no_equal_at_work())
         found: list[Waiting] = []

@@ -67,7 +67,10 @@ class NamedFiles:
         return frozenset(named)
 
     def kept(self, table: type[Row]) -> Iterator[Row]:
-        """All rows of a table whose rows refer to files. They are read in batches, so that no transaction stays open for long."""
+        """All rows of a table whose rows refer to files.
+
+        They are read in batches, so that no transaction stays open for long.
+        """
         last: tuple[str, str] | None = None
         while True:
             query = select(table).order_by(table.owner, table.id).limit(BATCH)

@@ -1,15 +1,15 @@
 """The number of bytes that each owner keeps, and the owner's quota.
 
-The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The database rows
-count too, because a small file takes less room than its row. Rows without files also count: jobs, bulk runs and their images,
-contexts, and changes of a PSF's status. The count changes in the transaction that adds, changes or removes the row. Rows of
-which an owner has only a few (keys, turns) do not count.
+The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The database
+rows count too, because a small file takes less room than its row. Rows without files also count: jobs, bulk runs and
+their images, contexts, and changes of a PSF's status. The count changes in the transaction that adds, changes or
+removes the row. Rows of which an owner has only a few (keys, turns) do not count.
 
-A transaction that changes jobs or PSFs first locks the owner's row, and then the rows of the jobs or PSFs. To lock the owner's
-row, it calls ``add_bytes``, with 0 bytes if nothing is added. So two transactions cannot wait for each other.
+A transaction that changes jobs or PSFs first locks the owner's row, and then the rows of the jobs or PSFs. To lock the
+owner's row, it calls ``add_bytes``, with 0 bytes if nothing is added. So two transactions cannot wait for each other.
 
-A kept solution can be made again, so it takes no room from other things: the oldest solutions are removed if an upload, a
-result or another solution needs their room.
+A kept solution can be made again, so it takes no room from other things: the oldest solutions are removed if an upload,
+a result or another solution needs their room.
 """
 
 from __future__ import annotations
@@ -165,7 +165,8 @@ class Owners:
 
 
 def counted_bytes(row: CountedRow) -> int:
-    """The bytes that a row adds to the count of its owner: the file and the row itself; for a kept solution only the file.
+    """The bytes that a row adds to the count of its owner: the file and the row itself; for a kept solution only the
+    file.
 
     A bulk run counts together with its images, a context with its pins, and a job with its UWS terms. The progress, the
     estimate and the error of a job are short: they are part of ROW_BYTES.
@@ -204,7 +205,10 @@ COUNTED: dict[type[Any], ColumnElement[int]] = {
 
 
 def add_bytes(session: Session, owner: str, count: int) -> None:
-    """Add bytes to an owner's count, and lock the count. Call this in the transaction that adds, changes or removes the row."""
+    """Add bytes to an owner's count, and lock the count.
+
+    Call this in the transaction that adds, changes or removes the row.
+    """
     insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
     row = insert(OwnerRow).values(owner=owner, bytes=count)
     session.execute(

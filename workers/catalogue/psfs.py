@@ -172,7 +172,8 @@ def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
     """A query for the PSFs that meet the filters, unsorted.
 
     A context has few PSFs, and few PSFs are valid at one time. Therefore a subquery finds these PSFs first. The subquery
-    is DISTINCT, because otherwise SQLite reads all PSFs in the order of the list until it finds the PSFs of the context.
+    is DISTINCT, because otherwise SQLite reads all PSFs in the order of the list until it finds the PSFs of the
+    context.
     """
     query = select(PsfRow).where(PsfRow.owner == owner)
     if wanted.context_id is not None:

@@ -326,7 +326,10 @@ class ReportRow(Base):
 
 
 class SolutionRow(Base):
-    """The kept solution of a transit. It is removed when it is old or its room is needed, because it can be made again."""
+    """The kept solution of a transit.
+
+    It is removed when it is old or its room is needed, because it can be made again.
+    """
 
     __tablename__ = "solutions"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)

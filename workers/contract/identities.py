@@ -61,7 +61,8 @@ PRODUCT_FORMAT = 2
 def product_identity(request: ResolvedDeconvolve) -> str:
     """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, versions of algorithm and file."""
     # The id of the PSF determines the PSF. The recipe only says how to build the PSF, and the context where it was found.
-    # `again` only permits a second deconvolution; the image itself determines whether this deconvolution is a second one.
+    # `again` only permits a second deconvolution; the image itself determines whether this deconvolution is a second
+    # one.
     excluded = {"psf_recipe", "context_id", "again"} | (
         {"picked_for"} if request.picked_for is None else set()
     )
@@ -100,7 +101,8 @@ def gap_identity(request: ResolvedGapDiagnose) -> str:
 
 
 def diffraction_identity(request: ResolvedOnTransit) -> str | None:
-    """Identity of the diffraction PSF that the job has to build; None if the transit contains a known PSF or the request names a PSF."""
+    """Identity of the diffraction PSF that the job has to build; None if the transit contains a known PSF or the
+    request names a PSF."""
     return None if request.diffraction_recipe is None else psf_identity(request.diffraction_recipe)
 
 

@@ -83,7 +83,10 @@ def put(source: Path, target: Path, allowed: Sequence[Path]) -> None:
 
 
 def remove_partials(target: Path, allowed: Sequence[Path]) -> None:
-    """Remove the partial copies of a file that a killed process left. Raises the same DataErrors as ``opened``, and OSError."""
+    """Remove the partial copies of a file that a killed process left.
+
+    Raises the same DataErrors as ``opened``, and OSError.
+    """
     with _folder(target.parent, allowed, make=False) as folder:
         for name in os.listdir(folder):
             if name.startswith(f".{target.name}.") and fnmatchcase(name, f"*{PARTIAL}"):

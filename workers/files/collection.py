@@ -1,8 +1,8 @@
 """Remove files to which no row of the catalogue refers. A job leaves such files if it is killed before it adds its row.
 
 Recent files are not removed, because an upload first stores its file and then adds the row that refers to it. An upload
-may also store a file again while the collection removes it, and add the row a little later. Therefore the rows are read a
-second time before a file is deleted for good.
+may also store a file again while the collection removes it, and add the row a little later. Therefore the rows are read
+a second time before a file is deleted for good.
 
 Kept solutions of transits can be made again, so old ones are removed too, with their rows. The same age limit applies.
 """
@@ -94,7 +94,10 @@ def remove_unnamed(catalogue: Catalogue, store: Store, digests: Iterable[str]) -
 def _removed(
     old: list[Blob], catalogue: Catalogue, store: Store, kept_before: float, second_look_after_s: float
 ) -> list[Blob]:
-    """Remove the files ``old``; returns the removed files. A file to which a row refers after the removal is restored."""
+    """Remove the files ``old``; returns the removed files.
+
+    A file to which a row refers after the removal is restored.
+    """
     # First restore files that an earlier, killed collection moved aside, if a row refers to them.
     store.settle(catalogue.named_files.all())
     gone = [blob for blob in old if store.remove(blob.digest, kept_before)]

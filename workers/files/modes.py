@@ -1,4 +1,5 @@
-"""Permissions of files. Only the user of the service can read the data folder; output folders follow the operator's umask.
+"""Permissions of files. Only the user of the service can read the data folder; output folders follow the operator's
+umask.
 
 The data folder contains the files of all owners and the hashes of their keys. A user of the machine who has no key must
 not be able to read these files from the disk.

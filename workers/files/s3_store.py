@@ -59,7 +59,10 @@ class RemoteStore(Store):
                 return None
 
     def _content_sha256(self, digest: str) -> str:
-        """SHA-256 of the object itself. Its copy in the local folder is not used, because it may be good although the object is damaged."""
+        """SHA-256 of the object itself.
+
+        Its copy in the local folder is not used, because it may be good although the object is damaged.
+        """
         with self.temporary() as copy:
             with _answering():
                 self._s3.get_file(self._key(digest), str(copy))
@@ -141,7 +144,10 @@ class RemoteStore(Store):
         return True
 
     def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
-        """As ``Store.settle``, also for copies that were moved aside by a process that was then killed. Raises ``StoreAway``."""
+        """As ``Store.settle``, also for copies that were moved aside by a process that was then killed.
+
+        Raises ``StoreAway``.
+        """
         with _answering():
             aside = {name.rsplit("/", 1)[1] for name in self._s3.find(f"{self._root}/aside")}
         if not aside:

@@ -167,8 +167,8 @@ class Store:
         target = self.path(digest)
         target.parent.mkdir(exist_ok=True)
         sync(temporary)
-        # The time is set to the nanosecond, so that remove() can distinguish this file from an identical file that is stored
-        # almost at the same moment. The system itself sets times only to a few milliseconds.
+        # The time is set to the nanosecond, so that remove() can distinguish this file from an identical file that is
+        # stored almost at the same moment. The system itself sets times only to a few milliseconds.
         os.utime(temporary, ns=(time.time_ns(), time.time_ns()))
         os.replace(temporary, target)
         sync(target.parent)

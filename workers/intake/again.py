@@ -1,4 +1,5 @@
-"""Results that were deleted, or whose files were lost or damaged: find the jobs that make them again, and queue these jobs."""
+"""Results that were deleted, or whose files were lost or damaged: find the jobs that make them again, and queue these
+jobs."""
 
 from __future__ import annotations
 
@@ -91,8 +92,8 @@ def make_again(row: ProductRow | PsfRow | ReportRow, catalogue: Catalogue, store
 
     For an uploaded PSF, the job makes only the tables and the picture again.
 
-    Raises DataError "not-made-here" for an upload. Raises DataError "parameters-unknown" or "parameters-outdated" if the
-    job was deleted and the catalogue does not contain parameters with which this version can repeat it.
+    Raises DataError "not-made-here" for an upload. Raises DataError "parameters-unknown" or "parameters-outdated" if
+    the job was deleted and the catalogue does not contain parameters with which this version can repeat it.
     """
     if isinstance(row, PsfRow) and row.origin == "uploaded" and store.size(row.file_sha256) == row.bytes:
         tables = PsfTables(psf_id=row.id)

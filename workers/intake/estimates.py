@@ -104,7 +104,8 @@ def estimate(
 
 
 def factor(kind: str, catalogue: Catalogue) -> float:
-    """The median ratio of measured to estimated time of the completed jobs of this kind; 1 if there are too few jobs."""
+    """The median ratio of measured to estimated time of the completed jobs of this kind; 1 if there are too few
+    jobs."""
     known = _factors.setdefault(catalogue, {})
     value, until = known.get(kind, (1.0, -math.inf))
     if time.monotonic() < until:
@@ -215,7 +216,10 @@ def _linear(
 
 
 def _pixels(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> float:
-    """Number of pixels of the job's transit. If it has no transit: of its image; if it has no image either: of its PSF."""
+    """Number of pixels of the job's transit.
+
+    If it has no transit: of its image; if it has no image either: of its PSF.
+    """
     if parameters.get("transit_id"):
         transit = catalogue.get(TransitRow, parameters["transit_id"], owner)
         return 0.0 if transit is None else transit.summary["unpacked_bytes"] / BYTES_A_PIXEL

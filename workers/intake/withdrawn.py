@@ -19,7 +19,8 @@ SHOWN_DIGITS = 12
 def check_not_withdrawn(catalogue: Catalogue, psf_id: str, owner: str, what: str, ways: str) -> None:
     """Raise ``DataError`` "psf-deprecated" if the PSF that the service would choose is deprecated.
 
-    what: the name of the PSF in the message. ways: advice for the user; it may contain {psf}, which stands for the PSF's id.
+    what: the name of the PSF in the message. ways: advice for the user; it may contain {psf}, which stands for the
+    PSF's id.
     """
     row = catalogue.get(PsfRow, psf_id, owner)
     if row is None or row.status != PsfStatus.DEPRECATED:
@@ -44,7 +45,10 @@ def withdrawn_warning(catalogue: Catalogue, psf: PsfRow) -> str | None:
 
 
 def details_now(catalogue: Catalogue, product: ProductRow) -> dict[str, Any]:
-    """The details of a product. If its PSF is deprecated now, the details contain a warning, even if the product is older."""
+    """The details of a product.
+
+    If its PSF is deprecated now, the details contain a warning, even if the product is older.
+    """
     psf = catalogue.get(PsfRow, product.psf_id, product.owner)
     message = None if psf is None else withdrawn_warning(catalogue, psf)
     if message is None:
@@ -54,7 +58,10 @@ def details_now(catalogue: Catalogue, product: ProductRow) -> dict[str, Any]:
 
 
 def _reason(catalogue: Catalogue, psf: PsfRow) -> str:
-    """Why a PSF was deprecated: the last reason that was given. A later change that only names a successor may have no reason."""
+    """Why a PSF was deprecated: the last reason that was given.
+
+    A later change that only names a successor may have no reason.
+    """
     changes = catalogue.psfs.changes(psf.id, psf.owner)
     reasons = [one.reason for one in changes if one.status == PsfStatus.DEPRECATED and one.reason]
     return f"reason: {reasons[-1]}" if reasons else "no reason was given"

@@ -50,11 +50,11 @@ class Cancelled(Exception):
 class Attempt:
     """A claimed job while it runs. The first report of progress later than ``limit_s`` after ``started`` stops the job.
 
-    child: this process; None if it must not be ended. The process is ended if the job must stop but still runs ``cancel_s``
-    later, or if the thread of the heartbeats cannot run for ``silent_s``.
+    child: this process; None if it must not be ended. The process is ended if the job must stop but still runs
+    ``cancel_s`` later, or if the thread of the heartbeats cannot run for ``silent_s``.
     run_short(seconds): while this job pauses, runs one waiting job whose estimated time is at most ``seconds`` in this
-    process; returns False if no such job waits. A job pauses only in its main thread, and only for a job that is expected
-    to take no longer than this job has worked since its last pause.
+    process; returns False if no such job waits. A job pauses only in its main thread, and only for a job that is
+    expected to take no longer than this job has worked since its last pause.
     """
 
     catalogue: Catalogue
@@ -109,7 +109,8 @@ class Attempt:
                 log.warning("job %s: could not write the heartbeat: %s", self.lease.job_id, error)
                 continue
             except MemoryError as error:
-                # The job has reached its memory limit. Its task gets the error. The next heartbeat may have memory again.
+                # The job has reached its memory limit. Its task gets the error. The next heartbeat may have memory
+                # again.
                 log.warning("job %s: no memory for the heartbeat: %s", self.lease.job_id, error)
                 continue
             if not alive:
@@ -183,8 +184,8 @@ class Attempt:
     def _let_short_jobs_run(self) -> None:
         """Run waiting jobs that need no longer than this job has worked since its last pause.
 
-        Therefore a short job waits for a long job at most about as long as the short job itself takes. Short jobs at most
-        double the time that the long job takes.
+        Therefore a short job waits for a long job at most about as long as the short job itself takes. Short jobs at
+        most double the time that the long job takes.
         """
         if self.run_short is None or threading.current_thread() is not threading.main_thread():
             return

@@ -5,7 +5,8 @@ does not count memory that is only reserved, or files that are mapped for readin
 LLVM and the memory allocator reserve much more than they use. An allocation beyond the limit raises MemoryError. On
 systems other than Linux, memory is not limited.
 
-When a worker process has ended, its parent starts a new one (Celery's prefork pool). Other processes of the worker continue.
+When a worker process has ended, its parent starts a new one (Celery's prefork pool). Other processes of the worker
+continue.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ log = logging.getLogger(__name__)
 
 MIB = 2**20
 MARGIN = 1.5  # estimates of memory are correct within this factor
-# Each thread of a library has a stack, and the limit counts the whole stack. OpenBLAS, numba, the Fourier transforms and
-# the tasks each have the number of threads that the settings give.
+# Each thread of a library has a stack, and the limit counts the whole stack. OpenBLAS, numba, the Fourier transforms
+# and the tasks each have the number of threads that the settings give.
 _POOLS = 4
 _EXIT_STATUS = 1
 

@@ -244,7 +244,10 @@ class Runner:
             raise DataError("quota-exceeded", usage.no_room(NOT_KEPT))
 
     def _is_there(self, job: JobRow) -> bool:
-        """Whether the result already exists. An identical job, or an earlier attempt that could not record its end, may have made it."""
+        """Whether the result already exists.
+
+        An identical job, or an earlier attempt that could not record its end, may have made it.
+        """
         made, find = job.work_key, self._catalogue.get
         if made is None:
             return False
@@ -296,8 +299,8 @@ class Runner:
         return int((job.estimate or {}).get("memory_mib", self._settings.max_job_memory_mib))
 
     def _unexpected(self, job: JobRow, error: Exception) -> JobError:
-        """The error of a job whose task raised an exception that the user did not cause: a full disk, too little memory, or
-        a fault of the software."""
+        """The error of a job whose task raised an exception that the user did not cause: a full disk, too little
+        memory, or a fault of the software."""
         if is_disk_full(error):
             return JobError(fault=Fault.TRANSIENT, code=STORAGE_FULL, message=NO_ROOM)
         if not is_out_of_memory(error):

@@ -42,7 +42,10 @@ stopping = Stopping()  # made before the fork, so that the children share it wit
 
 @app.task(name=queue.RUN_JOB, bind=True)
 def run_job(task: Task, job_id: str) -> None:
-    """Run one job of the queue from which the message came. The message names a job of this queue, but another job may run."""
+    """Run one job of the queue from which the message came.
+
+    The message names a job of this queue, but another job may run.
+    """
     _runner().run_next(job_id, queue_of_broker(task.request.delivery_info["routing_key"]))
 
 

@@ -22,8 +22,8 @@ Result = TypeVar("Result", ProductRow, PsfRow, ReportRow)
 
 
 class TurnOver(Exception):
-    """A turn of a bulk run ends although images are left, so that other jobs can run. The job of the turn is queued again
-    as if it had not started."""
+    """A turn of a bulk run ends although images are left, so that other jobs can run. The job of the turn is queued
+    again as if it had not started."""
 
 
 def _not_alone(_work: Callable[[], None]) -> JobError | None:
@@ -63,7 +63,10 @@ class Context:
         return FitsLimits(max_pixels=self.settings.max_pixels)
 
     def made(self, table: type[Result], identity: str) -> Result | None:
-        """The result of an earlier job; None if there is no such result or if a file of it is lost. The task then makes it."""
+        """The result of an earlier job; None if there is no such result or if a file of it is lost.
+
+        The task then makes it.
+        """
         row = self.catalogue.get(table, identity, self.owner)
         return row if row is not None and intact(self.store, row) else None
 

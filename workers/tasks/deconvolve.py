@@ -128,7 +128,8 @@ class _Asked:
         return None if figures is None else figures.noise()
 
     def possible_psfs(self) -> list[Psf]:
-        """Variants of the PSF within its errors, on the image's pixels; empty if the file of the PSF contains no errors."""
+        """Variants of the PSF within its errors, on the image's pixels; empty if the file of the PSF contains no
+        errors."""
         psf = read_psf(self.context.store.verified(self.inputs.psf_row.file_sha256), self.context.limits)
         if psf.fitted is None:
             return []

@@ -157,7 +157,10 @@ def counted_pixels(image: Image, result: Plane, edge_px: int) -> Flags:
 
 
 def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
-    """Means of blocks of block_px x block_px pixels, shape (n_blocks,). Only blocks whose pixels are all counted are used."""
+    """Means of blocks of block_px x block_px pixels, shape (n_blocks,).
+
+    Only blocks whose pixels are all counted are used.
+    """
     if block_px == 1:
         return np.asarray(plane[counted])
     ny, nx = plane.shape[0] // block_px, plane.shape[1] // block_px

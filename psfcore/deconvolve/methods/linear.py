@@ -4,8 +4,8 @@
 
 H is the convolution with the PSF, cut to the field. T is the PSF's Fourier transform on the padded, periodic plane.
 Where abs(T) is at least t (LEAST_TRANSFER), G = 1 / T, which inverts H except for light that crosses the edge of the
-field; a few steps correct for this light. Where abs(T) is below t, Eq. (1) is a Landweber step: frequencies at which the
-PSF has little power are restored slowly, and the noise at these frequencies is amplified slowly.
+field; a few steps correct for this light. Where abs(T) is below t, Eq. (1) is a Landweber step: frequencies at which
+the PSF has little power are restored slowly, and the noise at these frequencies is amplified slowly.
 
 The method does not force the scene to be positive, so faint pixels have no bias. For one PSF, the method amplifies the
 noise of every image by the same factor, `noise_amplification` (2 to 2.4 for HRI_EUV). Negative pixels are used

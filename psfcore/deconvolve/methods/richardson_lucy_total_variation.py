@@ -76,7 +76,8 @@ def deconvolve(
 
 
 class _TotalVariation(Iteration):
-    """The iteration of Eq. (1). x is a plane [y, x], because the differences connect pixels of different blocks of the engine."""
+    """The iteration of Eq. (1). x is a plane [y, x], because the differences connect pixels of different blocks of the
+    engine."""
 
     def __init__(self, problem: Problem, smoothing: float) -> None:
         self.x = light_above_floor(problem)

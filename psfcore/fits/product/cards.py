@@ -33,7 +33,8 @@ Cards = dict[str, tuple[str | int, str]]
 
 @dataclass(frozen=True)
 class Described:
-    """header: the header of the input, without the cards that are not valid for the product. cards: the product's own cards.
+    """header: the header of the input, without the cards that are not valid for the product. cards: the product's own
+    cards.
 
     history: lines of HISTORY with the values of the input.
     """

@@ -2,10 +2,10 @@
 
 Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sections 7.3 and 10.1. The decoders of
 astropy are C functions that trust the header. With BYTEPIX = 8, the decoder of RICE_1 returns twice the number of bytes
-that it has written; the second half is arbitrary memory of the process. With a large BLOCKSIZE, it reads and writes past
-its buffers. With dithering and an invalid ZDITHER0, astropy reads outside the table of random numbers. Therefore every
-card on which a decoder depends must have a value that the standard allows. This module reads no pixels, so the web
-process can import it.
+that it has written; the second half is arbitrary memory of the process. With a large BLOCKSIZE, it reads and writes
+past its buffers. With dithering and an invalid ZDITHER0, astropy reads outside the table of random numbers. Therefore
+every card on which a decoder depends must have a value that the standard allows. This module reads no pixels, so the
+web process can import it.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class Compression:
 
     shape: pixels (ny, nx). tile: pixels (ny, nx) of a tile that is not cut off at the edge of the image. items: bytes of
     an item of the heap, by column. first, heap_bytes: position of the heap, counted from the start of the table's data,
-    and its size, bytes. bytepix, blocksize: bytes of a pixel and pixels of a block for RICE_1. quantised: whether pixels
-    are stored as integers, with a scale and a zero point for each tile.
+    and its size, bytes. bytepix, blocksize: bytes of a pixel and pixels of a block for RICE_1. quantised: whether
+    pixels are stored as integers, with a scale and a zero point for each tile.
     """
 
     codec: str

@@ -1,9 +1,9 @@
 """Check that a stream of RICE_1 holds all pixels of its tile, without decoding their values.
 
 Sources: FITS standard 4.0, section 10.4.1; R. L. White, fits_rdecomp in cfitsio (ricecomp.c), which astropy uses as its
-decoder. The decoder compares its position with the end of the stream only once per block. Within a block it may read past
-the end, and it skips zero bytes until it finds a byte that is not zero, even beyond the stream. If this module accepts a
-stream, the decoder never reads past its end.
+decoder. The decoder compares its position with the end of the stream only once per block. Within a block it may read
+past the end, and it skips zero bytes until it finds a byte that is not zero, even beyond the stream. If this module
+accepts a stream, the decoder never reads past its end.
 
     stream = first pixel (B bytes), then blocks of N pixels: FS (3, 4 or 5 bits for B = 1, 2, 4), then
         FS = 0: all differences are 0, no bits                                                            Eq. (1)

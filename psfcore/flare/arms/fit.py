@@ -271,8 +271,8 @@ def _solve(columns: Plane, target: NDArray[np.float64]) -> tuple[NDArray[np.floa
     """Solve the least-squares problem with the smallest norm; return solution, covariance and rank.
 
     Some combinations of parameters are undetermined: the planes can compensate for a constant and for slopes of S, and
-    the amplitudes can compensate for a factor of S. The solution is 0 along these combinations. Neither the angles nor the
-    spacing depend on them.
+    the amplitudes can compensate for a factor of S. The solution is 0 along these combinations. Neither the angles nor
+    the spacing depend on them.
     """
     scale = np.sqrt((columns**2).sum(axis=0))
     scale[scale == 0] = 1.0

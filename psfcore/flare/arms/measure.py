@@ -114,8 +114,8 @@ def measure_arms(
     centre_xy: position of the source; default: the middle of the largest saturated patch, else the brightest pixel.
     noise: (DN per photon, rms of the read noise in DN); default: estimated from the residuals.
     saturated: True where pixels must not be used; pixels that are not finite are never used.
-    angles_near_deg: one arm is searched within 3 degrees of each of these angles. spacing_range_px: the search is limited
-    to spacings between these two.
+    angles_near_deg: one arm is searched within 3 degrees of each of these angles. spacing_range_px: the search is
+    limited to spacings between these two.
     source_radius_px: half size of S; default: from the saturated patch. reach_px: largest radius at which orders are used.
 
     Raises DataError "arms-bad-input", "all-masked", "no-flare", "too-few-peaks".

@@ -39,7 +39,10 @@ class Sessions:
         self._database, self._keys = database, keys
 
     def open(self, key: KeyRow, lasts_s: float) -> str:
-        """Begin a session of a valid key; returns the token. The session lasts ``lasts_s`` seconds, but not longer than the key."""
+        """Begin a session of a valid key; returns the token.
+
+        The session lasts ``lasts_s`` seconds, but not longer than the key.
+        """
         token, now = secrets.token_urlsafe(32), time.time()
         until = now + lasts_s
         row = SessionRow(

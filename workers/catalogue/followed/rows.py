@@ -27,7 +27,10 @@ Followable = TypeVar("Followable", bound=JobRow | BulkRow)
 
 @dataclass(frozen=True)
 class State:
-    """The state of a row. A row has changed if its state is not equal to the earlier state. ended_at: None until it ends."""
+    """The state of a row.
+
+    A row has changed if its state is not equal to the earlier state. ended_at: None until it ends.
+    """
 
     id: str
     ended_at: float | None
@@ -54,8 +57,8 @@ class Followed(Generic[Followable]):
         open_phases: Sequence[Collection[str]],
         only: ColumnElement[bool] | None = None,
     ) -> None:
-        """columns: the columns whose values form the state. open_phases: groups of phases; the newest ``MOST`` rows of each
-        group are followed.
+        """columns: the columns whose values form the state. open_phases: groups of phases; the newest ``MOST`` rows of
+        each group are followed.
 
         only: a condition on the rows; None: all rows.
         """

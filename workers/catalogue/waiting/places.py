@@ -1,8 +1,9 @@
 """Places: the number of waiting jobs that are expected to start before a given waiting job.
 
-More urgent queues come first. In a queue the owners take turns (``workers.catalogue.waiting.turns``). Before an owner's k-th
-job starts, every owner whose turn is earlier starts up to k jobs, and every other owner starts up to k - 1 jobs. The place
-is only an estimate: a worker may serve only some of the queues, and jobs that other owners submit later may start first.
+More urgent queues come first. In a queue the owners take turns (``workers.catalogue.waiting.turns``). Before an owner's
+k-th job starts, every owner whose turn is earlier starts up to k jobs, and every other owner starts up to k - 1 jobs.
+The place is only an estimate: a worker may serve only some of the queues, and jobs that other owners submit later may
+start first.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Keeps the built PSFs of a temporary catalogue in the user's cache, for later commands.
 
-For each PSF, the cache contains the FITS file, the provenance, and the row of the catalogue with the tables and the picture.
-If the Python functions built the PSF, the cache does not contain its row; the row is then made from the FITS file.
+For each PSF, the cache contains the FITS file, the provenance, and the row of the catalogue with the tables and the
+picture. If the Python functions built the PSF, the cache does not contain its row; the row is then made from the FITS
+file.
 """
 
 from __future__ import annotations
@@ -63,7 +64,10 @@ class CachedPsfs:
         self.catalogue.add(self._kept_row(identity, fits) or self._new_row(identity, build, fits))
 
     def remember(self, build: PsfBuild) -> None:
-        """Keep the PSF of a recipe in the cache, if the catalogue contains it. A failure to write the cache is only logged."""
+        """Keep the PSF of a recipe in the cache, if the catalogue contains it.
+
+        A failure to write the cache is only logged.
+        """
         identity = psf_identity(build)
         row = self.catalogue.get(PsfRow, identity, self.owner)
         if row is None or self.cache.find(identity, _ROW) is not None:
@@ -133,7 +137,8 @@ class CachedPsfs:
 
 
 def recipes_in(kind: str, resolved: Mapping[str, Any]) -> list[PsfBuild]:
-    """The recipes of the PSFs that a job builds unless the catalogue contains them. resolved: the job's resolved parameters."""
+    """The recipes of the PSFs that a job builds unless the catalogue contains them. resolved: the job's resolved
+    parameters."""
     if kind == "psf-build":
         return [PsfBuild.model_validate(resolved)]
     named = (resolved.get(name) for name in ("psf_recipe", "diffraction_recipe"))

@@ -35,8 +35,8 @@ class PreparedPsfs:
     ) -> Psf:
         """The PSF of a file on the pixels of an image with this header; repeated calls return the same object.
 
-        name: a key that identifies the content of the file. find: returns the path of the file; it is called only if the
-        PSF is not kept.
+        name: a key that identifies the content of the file. find: returns the path of the file; it is called only if
+        the PSF is not kept.
         """
         whole = self._once((name, limits), lambda: read_psf(find(), limits, parts=False), _kernel_bytes)
         factor = binning_factor(whole, header)
