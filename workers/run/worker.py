@@ -74,9 +74,7 @@ def _watch(**_: object) -> None:
     except SchemaError as error:
         raise SystemExit(f"Error: {error}") from error
     except SQLAlchemyError as error:
-        raise SystemExit(
-            f"Error: expected a working database; it answered: {checks.database_said(error)}"
-        ) from error
+        raise SystemExit(f"Error: expected a working database; got: {checks.database_said(error)}") from error
     threading.Thread(target=_end_at_the_latest, name="end at the latest", daemon=True).start()
 
 
