@@ -57,7 +57,10 @@ class PsfCache:
         self.max_bytes = max_bytes
 
     def find(self, identity: str, part: str) -> CachedFile | None:
-        """A file of a PSF, after its content was checked; None if there is none. A damaged file is removed."""
+        """A file of a PSF, after its content was checked; None if the cache has no such file.
+
+        A damaged file is removed.
+        """
         for path in self._files():
             of, sha256, found_part = path.name.split(".", 2)
             if (of, found_part) != (identity, part):

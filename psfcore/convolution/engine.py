@@ -291,7 +291,7 @@ def _numbers(plan: Plan) -> tuple[Any, ...]:
 def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
     """Separate a transformed block of rows into the spectra of its 32 rows.
 
-    Each complex signal of the block holds two real rows. With Z the transform of a + i b for real a and b:
+    Each complex signal of the block contains two real rows. If Z is the transform of a + i b with real a and b, then
     A[k] = (Z[k] + Z*[L-k]) / 2, B[k] = (Z[k] - Z*[L-k]) / (2 i).
     """
     z = buffer.reshape((-1, 2, LANES))

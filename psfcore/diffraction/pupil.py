@@ -296,7 +296,7 @@ def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries)
                     area[i] = 0.0
                     _apply(strip[k], line, line[row], i, i + 1, inside, outline)
                 done = max(ends[j] + 2, done if j else 0)
-            # The cells after the last edge may be covered too, because an outline may extend beyond the mask.
+            # The cells after the last edge may lie inside the outline too, because it may extend beyond the mask.
             _apply(strip[k], line, line[row], done, cells, inside, outline)
             area[cells:] = 0.0
 

@@ -62,7 +62,7 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> Cutout:
     """Prepare the cut-out of the central (size, size) px of a PSF. The pixels are read once, for their sum.
 
     Raises DataError "cutout-too-large" if the PSF is smaller, and "cutout-not-plain" if the file is compressed or does not
-    hold plain floats.
+    store the weights as plain floats.
     """
     summary = read_summary(path, limits)
     ny, nx = summary.shape

@@ -176,9 +176,7 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
             if len(stated) != 1 or derived:
                 return None
             same = all(as_written(hdu) for hdu in hdus)
-    except (
-        PIXEL_TROUBLE
-    ):  # a damaged file, or a file of other software; the job that uses it raises the error
+    except PIXEL_TROUBLE:  # a damaged file, or one of other software; the job that uses it raises the error
         return None
     return stated[0] if same else None
 

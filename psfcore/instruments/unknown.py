@@ -45,7 +45,7 @@ _NAMES = {"telescope": "telescope", "channel": "channel", "plate_scale": "pixel 
 def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str | None:
     """The channel: the wavelength in whole angstrom, such as 174.
 
-    If the wavelength is not given, the wavelength of the instrument description is used. None if there is none.
+    If the wavelength is not given, the wavelength of the instrument description is used. None if neither is known.
     """
     if wavelength_angstrom is None and instrument in instrument_names():
         wavelength_angstrom = load_instrument(instrument).wavelength_angstrom

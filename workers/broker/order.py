@@ -38,7 +38,7 @@ class _InOrder(FairCycle):
     """For the folder broker: reads the first queue that has a message."""
 
     def get(self, callback: Callable[..., Any], **options: Any) -> Any:
-        """Pass one message to the callback. Raises ``predicate`` if there is none."""
+        """Pass one message to the callback. Raises ``predicate`` if there is no message."""
         for queue in by_urgency(self.resources):
             try:
                 return self.fun(queue, callback, **options)

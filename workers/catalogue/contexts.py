@@ -159,7 +159,8 @@ class Contexts:
     def asked_for(self, context: str | None, owner: str) -> PsfContextRow | None:
         """The context for a request that gives an id, a name, NOW or None.
 
-        NOW: no context; the function returns None. None: the owner's default context.
+        For NOW, which means no context, returns None. For None, returns the owner's default context, or None if there
+        is no default.
         """
         if context is None:
             return self.default(owner)

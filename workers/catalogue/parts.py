@@ -1,4 +1,4 @@
-"""Parts of jobs that several workers share. A worker takes a part by compare-and-set; it then holds a lease of it."""
+"""Parts of jobs that several workers share. A worker takes a part by compare-and-set, and then has a lease for it."""
 
 from __future__ import annotations
 

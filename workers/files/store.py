@@ -70,7 +70,7 @@ class Store:
                         path.unlink()
 
     def path(self, digest: str) -> Path:
-        """The path of the file with this SHA-256. Open the file soon, because it may be removed. It need not exist."""
+        """The path of the file with this SHA-256. The file may not exist. Open it soon, because it may be removed."""
         return self._blobs / digest[:2] / digest
 
     def size(self, digest: str) -> int | None:
@@ -113,7 +113,8 @@ class Store:
     def set_aside(self, digest: str) -> bool:
         """Move a damaged file out of the store, into the folder ``damaged``, where nothing reads it.
 
-        False if the file does not exist, or if its content is good. A file that is stored at the same moment stays.
+        False if the file does not exist, or if its content is good. A good file that is stored at the same moment is
+        kept.
         """
         self._damaged.mkdir(exist_ok=True)
         target, aside = self.path(digest), self._damaged / f"{digest}.{uuid.uuid4().hex}"
@@ -185,7 +186,8 @@ class Store:
     def kept_if(self, temporary: Path, digest: str) -> Iterator[None]:
         """Keep a complete file while the block adds its row to the catalogue. If the block fails, the file is removed again.
 
-        The file stays if it was there before, or if it is stored again meanwhile: then another row may need it.
+        The file is not removed if it existed before, or if it is stored again during the block: another row may need
+        it.
         """
         known = self.kept_at(digest) is not None
         self.keep(temporary, digest)

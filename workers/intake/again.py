@@ -46,7 +46,7 @@ def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
 
 
 def without_results(jobs: Sequence[JobRow], catalogue: Catalogue) -> frozenset[str]:
-    """The ids of those of these jobs that are completed and whose result was deleted later. All jobs have one owner."""
+    """The ids of completed jobs among ``jobs`` whose result was deleted later. All jobs must have the same owner."""
     gone: set[str] = set()
     for result, table in TABLES.items():
         done = {
@@ -68,8 +68,10 @@ def there(result: Result, identity: str, owner: str, catalogue: Catalogue, store
 
 
 def repair(fault: Fault, catalogue: Catalogue, store: Store) -> str:
-    """Set damaged files aside, and queue the job that makes the result again; returns a text that says what was done,
-    or what somebody has to do."""
+    """Set damaged files aside, and queue the job that makes the result again.
+
+    Returns a text that says what was done, or what somebody has to do.
+    """
     row = fault.row
     for digest, state in fault.files:
         if state == "damaged":

@@ -30,7 +30,10 @@ def no_psf(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> DataE
 
 
 def _candidates(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> Iterator[dict[str, Any]]:
-    """PSFs of the same telescope or plate scale, newest first, without those of another channel: at most MOST_NAMED."""
+    """At most MOST_NAMED PSFs of the same telescope or plate scale, newest first.
+
+    PSFs of other channels are left out.
+    """
     wanted = channel_of(None, header["wavelnth"])
     found = 0
     for row in catalogue.psfs.page(PsfFilter(), owner, limit=MOST_SEARCHED):

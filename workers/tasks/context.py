@@ -39,9 +39,9 @@ class Context:
     guarded(work): runs one piece of a job that has many pieces; returns the error of the piece, or None.
     others_wait(): True if other jobs wait, so that a job of many pieces should raise ``TurnOver``.
     lease: the lease under which a job takes its pieces.
-    times: measures the time of the reported stages. If the pieces of a job report stages of their own, the time of these
+    times: measures the time of the reported stages. If the pieces of a job report their own stages, the time of these
     stages is measured instead.
-    anew: compute everything anew, as a rerun must: use no solution that an earlier job kept.
+    anew: True for a rerun: compute everything anew, and use no solution that an earlier job kept.
     """
 
     catalogue: Catalogue

@@ -167,7 +167,7 @@ class _Asked:
 def make(
     context: Context, request: ResolvedDeconvolve, psf_row: PsfRow, image: Image, *, preview: bool = True
 ) -> Made:
-    """Deconvolve an image and measure what changed in it. ``preview``: also draw the preview picture."""
+    """Deconvolve an image and measure the changes. ``preview``: also draw the preview picture."""
     inputs = Inputs(context, request, psf_row, image)
     asked = _Asked(inputs)
     work = asked.work

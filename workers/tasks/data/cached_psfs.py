@@ -91,7 +91,7 @@ class CachedPsfs:
             self.cache.keep(row.id, part, partial(_write_json, content))
 
     def _kept_row(self, identity: str, fits: CachedFile) -> PsfRow | None:
-        """The row that an earlier command kept; None if there is none, or if a file of it is missing."""
+        """The row that an earlier command kept; None if there is no such row, or if one of its files is missing."""
         kept = self.cache.find(identity, _ROW)
         if kept is None:
             return None

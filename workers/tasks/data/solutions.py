@@ -94,7 +94,7 @@ def solution_identity(
 
 
 def _kept(context: Context, identity: str, transit: Transit) -> Solution | None:
-    """The owner's solution with this identity; None if there is none that can be read."""
+    """The owner's kept solution with this identity; None if it does not exist or cannot be read."""
     row = context.catalogue.get(SolutionRow, identity, context.owner)
     if row is None:
         return None
