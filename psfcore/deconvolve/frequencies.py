@@ -70,6 +70,6 @@ def check_converges(sample: TransferSample, steps: int) -> None:
         advice = "use richardson-lucy or linear, or fewer steps"
         raise DataError(
             "method-diverges",
-            "expected a PSF whose Fourier transform T has abs(1 - T) <= 1 at all frequencies; the largest value is "
-            f"{worst:.3g}, and each of the {steps} steps multiplies an error by it: {advice}",
+            "expected a PSF whose Fourier transform T has abs(1 - T) <= 1 at all frequencies; got up to "
+            f"{worst:.3g}, and each of the {steps} steps multiplies an error by this number: {advice}",
         )
