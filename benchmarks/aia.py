@@ -1,9 +1,11 @@
-"""`make bench-peers`: the PSFs of the seven AIA channels beside those of aiapy, and one image deconvolved by both.
+"""`make bench-peers`: compare heliopsf's PSFs of the seven AIA channels with those of aiapy; deconvolve an image with
+both.
 
-Writes docs/aia.md. aiapy runs in a process of its own, with the interpreter that the command names. Its PSF has
-4096 x 4096 px and takes minutes to an hour to compute, because every order is added to the whole array. Here its
-published equations are evaluated near each order only, with aiapy's own numbers (`filter_mesh_parameters`). With three
-orders, aiapy itself is fast enough: the process checks that both agree.
+The command writes docs/aia.md. aiapy runs in a separate process, with the interpreter that the command names. A PSF of
+aiapy has 4096 x 4096 px and takes minutes to an hour to compute, because aiapy adds every order to the whole array.
+Therefore this module evaluates aiapy's published equations only near each order, with aiapy's numbers
+(`filter_mesh_parameters`). For three orders aiapy itself is fast enough, and the process checks that both results
+agree.
 
     I(x) = sum over arms and orders m of sinc^2(m w / d) exp(-k |x - m s|^2),   k = 4.5 / px^2
 
@@ -64,13 +66,16 @@ def light_beyond(kernel: Kernel, radius_px: float) -> float:
     return float(100 * kernel[np.hypot(x, y) > radius_px].sum())
 
 
-# In the process of aiapy.
+# The functions from here on run in the process of aiapy.
 
 
 def peer_mesh(
     spacing_px: float, ratio: float, k: float, angles: Kernel, orders: Sequence[int], line: Any
 ) -> Kernel:
-    """82 % of the light in the core, 18 % in the orders, as in aiapy. line(centre, k, places): the profile of an order."""
+    """The PSF of a mesh as in aiapy: 82 % of the light in the core and 18 % in the orders.
+
+    line(centre, k, places): function that returns the profile of an order.
+    """
     spikes, middle = np.zeros((PEER_PX, PEER_PX)), PEER_PX // 2
     for angle in angles:
         for order in (m for m in orders if m):
@@ -88,7 +93,7 @@ def peer_mesh(
 
 
 def at_pixel_centres(centre: float, k: float, places: NDArray[np.int_]) -> Kernel:
-    """The profile of an order as aiapy has it."""
+    """The profile of an order as aiapy computes it: a Gaussian, evaluated at the centres of the pixels."""
     return np.asarray(np.exp(-k * (places - centre) ** 2))
 
 
@@ -112,7 +117,7 @@ def peer_psf(mesh: dict[str, Any], orders: Sequence[int], line: Any = at_pixel_c
 
 
 def cut(kernel: Kernel) -> Kernel:
-    """The inner SIZE_PX pixels, with sum 1."""
+    """The inner SIZE_PX x SIZE_PX pixels, normalised to sum 1."""
     first = (PEER_PX - SIZE_PX) // 2
     inner = kernel[first : first + SIZE_PX, first : first + SIZE_PX]
     return inner / inner.sum()
@@ -156,7 +161,7 @@ def run_peer(folder: Path) -> None:
     (folder / "peer.json").write_text(json.dumps(found))
 
 
-# In the process of heliopsf.
+# The functions from here on run in the process of heliopsf.
 
 
 def own_psf(channel: int, folder: Path) -> dict[str, Any]:
@@ -324,7 +329,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.image.exists():
         print(
-            f"{arguments.output} is left as it is: no image {arguments.image}; name one with AIA_IMAGE=FILE"
+            f"expected a level 1 image of AIA; {arguments.image} does not exist, so {arguments.output} was not changed: name an "
+            "image with AIA_IMAGE=FILE"
         )
         return
     from psfcore.fits.header import FitsLimits

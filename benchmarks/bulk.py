@@ -1,12 +1,14 @@
-"""How fast an archive is worked through: two workers against one, what the service adds to the work, and what a kill costs.
+"""Measure how fast a bulk run deconvolves an archive with one and two workers, its overhead, and the cost of a kill.
 
     python -m benchmarks.bulk [--images 200] [--size 2048] [--steps 5]
 
-Workers of one thread each on Redis and PostgreSQL (where this machine has none, the processes of a service's own
-worker). Beside it the same work by bare processes without any service, as this machine lets one and two of them run:
-what else it does slows both alike. Overhead is all that a worker's time holds beside deconvolving and looking at what
-that did (reading, checking, writing, hashes, rows, messages), over that; each worker's first image, for which it loads
-its kernels and the PSF, is left out.
+Each worker has one thread and uses Redis and PostgreSQL. If this machine lacks them, the worker processes of a local
+service are used. For comparison, one and two plain processes do the same work without a service. Other work on the
+machine slows down the service and the plain processes equally.
+
+The kernel time is the time that a worker needs to deconvolve the images and to measure the changes. The overhead is the
+remaining time of the worker (reading, checking, writing, hashes, database rows, messages) divided by the kernel time.
+The first image of each worker is left out, because the worker then loads its kernels and the PSF.
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ MARK = b"BENCH   =              1000000"
 
 
 def make_archive(folder: Path, images: int, size: int) -> Path:
-    """Images of one scene that differ in a card, so that each is a file of its own; returns the PSF's file."""
+    """Write images of one scene that differ in one header card, so that no two files are equal; returns the PSF's
+    file."""
     instrument = load_instrument("hri_euv")
     psf = build_psf(instrument, threads=os.cpu_count() or 1)
     write_psf(folder / "psf.fits", psf, instrument_file=b"")
@@ -60,7 +63,7 @@ def make_archive(folder: Path, images: int, size: int) -> Path:
 
 @contextmanager
 def running(folder: Path, workers: int, archive: Path) -> Iterator[Stack]:
-    """A service with so many workers of one thread each."""
+    """Run a service with `workers` workers of one thread each."""
     folder.mkdir()
     os.environ |= {
         "HELIOPSF_WORKER_THREADS": "1",
@@ -72,7 +75,7 @@ def running(folder: Path, workers: int, archive: Path) -> Iterator[Stack]:
             os.environ["HELIOPSF_WORKER_PROCESSES"] = "1"
             stack = resources.enter_context(stacks.served(folder, workers=workers))
         except Missing as missing:
-            print(f"{missing}: a service with processes of its own worker instead", flush=True)
+            print(f"{missing}: using a local service with {workers} worker processes instead", flush=True)
             os.environ["HELIOPSF_WORKER_PROCESSES"] = str(workers)
             stack = resources.enter_context(stacks.embedded(folder))
         yield stack
@@ -86,7 +89,7 @@ def submit(stack: Stack, archive: Path, psf: Path, steps: int) -> dict[str, Any]
 
 
 def by_worker(rows: Sequence[Any]) -> list[list[Any]]:
-    """Images by the turn that did them, in the order of time."""
+    """The images of each turn, in the order in which the turn took them."""
     found: dict[str, list[Any]] = {}
     for row in sorted(rows, key=lambda row: row.taken_at):
         found.setdefault(row.job_id, []).append(row)
@@ -94,14 +97,14 @@ def by_worker(rows: Sequence[Any]) -> list[list[Any]]:
 
 
 def pace(rows: Sequence[Any]) -> float:
-    """Images a second, from when each worker had done its first one."""
+    """Images per second, counted from the time when every worker had finished its first image."""
     warm = max(of_worker[0].ended_at for of_worker in by_worker(rows))
     done = [row.ended_at for row in rows if row.ended_at > warm]
     return len(done) / (max(done) - warm)
 
 
 def overhead(rows: Sequence[Any]) -> tuple[float, float]:
-    """What a worker's time holds beside the kernels, over them, and of it what lies between two images."""
+    """The overhead of the workers, and the part of it between two images, both divided by the kernel time."""
     span = kernel = between = 0.0
     for of_worker in by_worker(rows):
         for before, row in pairwise(of_worker):
@@ -112,7 +115,7 @@ def overhead(rows: Sequence[Any]) -> tuple[float, float]:
 
 
 def worked_through(folder: Path, workers: int, archive: Path, psf: Path, steps: int) -> float:
-    """Images a second by the service."""
+    """Images per second that the service deconvolves."""
     with running(folder, workers, archive) as stack:
         bulk = submit(stack, archive, psf, steps)
         end = stack.client.wait_for_bulk(bulk["id"])
@@ -120,15 +123,18 @@ def worked_through(folder: Path, workers: int, archive: Path, psf: Path, steps: 
         rows = items(stack)
     found, (all_of_it, between) = pace(rows), overhead(rows)
     print(
-        f"{workers} worker{'s' if workers > 1 else ' '}: {3600 * found:8.0f} images an hour, {1 / found:6.2f} s an image; "
-        f"overhead {100 * all_of_it:.1f} % of the kernels' time, {100 * between:.2f} % of it between images",
+        f"{workers} worker{'s' if workers > 1 else ' '}: {3600 * found:8.0f} images per hour, {1 / found:6.2f} s per image; "
+        f"overhead {100 * all_of_it:.1f} % of the kernel time (between images: {100 * between:.2f} % of the kernel time)",
         flush=True,
     )
     return found
 
 
 def bare(archive: Path, psf: Path, steps: int, processes: int, images: int) -> float:
-    """Images a second by processes that do nothing else, each on images of its own."""
+    """Images per second that `processes` plain processes deconvolve without a service.
+
+    Every process takes the same files.
+    """
     command = [
         sys.executable,
         "-m",
@@ -145,20 +151,20 @@ def bare(archive: Path, psf: Path, steps: int, processes: int, images: int) -> f
 
 
 def bare_process(archive: str, psf_file: str, steps: int, images: int) -> None:
-    """What a worker does of an image that is psfcore's: read, deconvolve, look at what that did."""
+    """Do the part of a worker's task that psfcore does: read an image, deconvolve it and measure the changes."""
     psf = read_psf(psf_file, LIMITS, parts=False)
     conditions = Conditions(threads=1, engine_for=EngineCache())
     paths = sorted(Path(archive).iterdir())[: images + 1]
     started = 0.0
     for number, path in enumerate(paths):
-        if number == 1:  # the first loads the kernels and the PSF
+        if number == 1:  # for image 0, the process loads its kernels and the PSF
             started = time.perf_counter()
         treat(path.name, read_image(path, LIMITS), psf, conditions=conditions, steps=steps)
     print(time.perf_counter() - started)
 
 
 def killed(folder: Path, archive: Path, psf: Path, steps: int) -> None:
-    """Everything killed twice; what was done is not done again."""
+    """Kill the server and all workers twice during a run. No finished image may be deconvolved again."""
     with running(folder, 2, archive) as stack:
         bulk = submit(stack, archive, psf, steps)
         images, own_workers = len(list(archive.iterdir())), len(stack.workers)
@@ -182,8 +188,8 @@ def killed(folder: Path, archive: Path, psf: Path, steps: int) -> None:
         products = len(list(stack.client.products()))
     assert not again and products == len(rows) == images
     print(
-        f"workers and server killed twice: {images} images, {products} products, none done twice, "
-        f"{begun - images} begun again",
+        f"workers and server killed twice: {images} images, {products} products; no finished image was deconvolved again, "
+        f"{begun - images} unfinished images were started again",
         flush=True,
     )
 
@@ -207,7 +213,7 @@ def main() -> None:
         few = max(2, min(asked.images // 4, 20))
         alone, together = (bare(archive, psf, asked.steps, processes, few) for processes in (1, 2))
         print(
-            f"bare processes: {1 / alone:.2f} s an image, two are {together / alone:.2f} times as fast",
+            f"plain processes: {1 / alone:.2f} s per image; two processes are {together / alone:.2f} times as fast as one",
             flush=True,
         )
         one, two = (

@@ -130,7 +130,7 @@ def compared(exactly: tuple[FoldFit, ...], quickly: tuple[FoldFit, ...]) -> None
 
 
 def with_one_killed(stack: Stack, transit_id: str, undisturbed: tuple[FoldFit, ...], f_s: float) -> None:
-    """Compute other folds, and kill the helping worker half-way. No fold may be lost or computed twice."""
+    """Compute further folds, and kill the helping worker half-way. No fold may be lost or computed twice."""
     if not stack.workers:
         print("one worker killed half-way: not measured, because it requires Redis and PostgreSQL")
         return

@@ -63,11 +63,11 @@ def row(what: str, took_s: float, f_s: float, note: str = "") -> None:
 
 
 def round_trip_s(stack: stacks.Stack, image: Path, output: Path) -> tuple[float, float]:
-    """Time of upload, job and download in s: for a new product, and for one that exists already."""
+    """Time of upload, job and download in s: for a new product, and for a product that already exists."""
     stack.client.build_psf("hri_euv")
     # With another number of steps, the worker loads its kernels but the product does not exist yet.
     stack.client.deconvolve(image, steps=1)
-    # No pixel reaches these saturation levels: the work is the same, but each level is another product.
+    # No pixel reaches these saturation levels. So the work is always the same, but each level gives another product.
     levels = iter((1e9, 2e9, 3e9))
     again = {"output": output, "overwrite": True}
     new = seconds(lambda: stack.client.deconvolve(image, saturation_dn=next(levels), **again), 3)
@@ -75,7 +75,10 @@ def round_trip_s(stack: stacks.Stack, image: Path, output: Path) -> tuple[float,
 
 
 def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, folder: Path) -> None:
-    """The same deconvolution over HTTP: embedded, and with Redis and PostgreSQL. The PSF is built before."""
+    """Time the same deconvolution over HTTP: embedded, and with Redis and PostgreSQL.
+
+    The PSF has already been built.
+    """
     for name, mode in (("embedded", stacks.embedded), ("Redis and PostgreSQL", stacks.served)):
         place = folder / name.split()[0]
         place.mkdir()
@@ -96,7 +99,8 @@ def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, fold
 
 
 def builds(f_s: float) -> None:
-    """PSF builds, and the far field compared with a plain transform of its padded pupil; one process each."""
+    """Time PSF builds, and compare the far field with a plain transform of the padded pupil; each in a separate
+    process."""
     for what in ("build 2048", "build 4096", "far field 1024", "plain padded transform 1024"):
         answer = subprocess.run(
             [sys.executable, "-m", "benchmarks.deconvolution", what],

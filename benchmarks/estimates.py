@@ -1,11 +1,11 @@
-"""Measures what jobs need, and compares it with the estimates of workers/intake/estimates.py.
+"""Measures the time and memory of jobs, and compares them with the estimates of workers/intake/estimates.py.
 
     python -m benchmarks.estimates [--full] [--write]
 
-Each case runs in its own process with one thread; its processor time and peak memory are measured. --full: also
-studies of a transit of 512 px, an image of 4096 px and one with an ERROR plane (about twenty minutes more). --write:
-multiply the times of each kind in estimates.json by the median of measured over estimated time, and each method of
-deconvolution by its own. Memory is only printed.
+Each case runs in its own process with one thread; its processor time and peak memory are measured. --full also measures
+studies of a transit of 512 px, an image of 4096 px and an image with an ERROR plane (about twenty minutes more).
+--write multiplies the times of each kind in estimates.json by the median ratio of measured to estimated time; each
+method of deconvolution has a ratio of its own. Memory is only printed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Any
 
 from psfcore.deconvolve.methods.registry import method_names
 
-# psf: edge length of a PSF with little scattered light, or "hri" for the PSF of HRI_EUV, which has most.
+# psf: edge length of a PSF with little scattered light, or "hri" for the PSF of HRI_EUV, which scatters the most light.
 QUICK: list[dict[str, Any]] = [
     *(
         {"kind": "deconvolve", "px": 1024, "psf": "hri", "method": {"name": name, "steps": 20}}
@@ -99,7 +99,10 @@ def write(measured: list[dict[str, Any]]) -> None:
 
 
 def measure(case: dict[str, Any], folder: Path) -> None:
-    """One case in this process. The files it needs are made in the folder by the first case that needs them."""
+    """Measure one case in this process.
+
+    The first case that needs a file makes it in the folder; later cases use it again.
+    """
     from service.local import LocalService
     from workers.catalogue.tables import DEFAULT_OWNER
     from workers.intake import estimates
@@ -129,7 +132,7 @@ def measure(case: dict[str, Any], folder: Path) -> None:
 
 
 def asked(case: dict[str, Any], folder: Path, service: Any) -> dict[str, Any]:
-    """The parameters of a job, after the upload of its inputs."""
+    """Upload the inputs of a job; returns the parameters of the job."""
     from tests.conftest import write_image
 
     if case["kind"] == "psf-build":
@@ -150,7 +153,7 @@ def asked(case: dict[str, Any], folder: Path, service: Any) -> dict[str, Any]:
 
 
 def psf_file(which: int | str, folder: Path) -> Path:
-    """The file of a PSF; made if it does not exist."""
+    """The file of a PSF. It is made if it does not exist."""
     from tests.conftest import write_psf
 
     path = folder / f"psf-{which}.fits"
@@ -166,7 +169,7 @@ def psf_file(which: int | str, folder: Path) -> Path:
 
 
 def transit(case: dict[str, Any], folder: Path) -> Path:
-    """The folder of a simulated transit; made if it does not exist."""
+    """The folder of a simulated transit. It is made if it does not exist."""
     path = folder / f"transit-{case['px']}"
     if not path.exists():
         sizes = ["--size", str(case["px"]), "--images", str(case["images"])]

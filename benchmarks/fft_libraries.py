@@ -1,10 +1,10 @@
-"""The same Richardson-Lucy loop by heliopsf's engine, SciPy's transforms and ducc0's, timed side by side.
+"""Compare the times of one Richardson-Lucy loop with three FFTs: heliopsf's engine, SciPy and ducc0.
 
-The comparison decides whether the 876 lines of `psfcore.convolution.engine`,
-`psfcore.convolution.fft_kernels` and `psfcore.compiled` pay. All three do the published method: 20 steps,
-float32, a scene that is zero beyond the field, the same padded lengths, the same number of threads. The two
-references also transform only the field's rows along x, as a version of heliopsf without its own engine
-would. Each runs in a process of its own, in turn, and the shortest of three times counts.
+The comparison shows whether `psfcore.convolution.engine`, `psfcore.convolution.fft_kernels` and `psfcore.compiled` are
+worth their code. All three loops run the published method: 20 steps in float32 with a scene that is zero beyond the
+field, the same padded lengths, and the same number of threads. A heliopsf without its own engine would transform only
+the rows of the field along x, so the loops with SciPy and ducc0 do the same. The loops run in turn, each in a separate
+process; the shortest of three times is printed.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _in_a_process(name: str, folder: Path) -> float:
 
 
 def heliopsf(image: Single, psf: Single) -> Single:
-    """The loop as heliopsf ships it, from preparing the PSF to the result."""
+    """The loop of heliopsf, from the preparation of the PSF to the result."""
     from astropy.io.fits import Header
 
     from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
@@ -136,7 +136,7 @@ def _lengths(image: Single, psf: Single) -> tuple[int, int]:
 
 
 def _corner(psf: Single, field_shape: tuple[int, ...], lengths: tuple[int, int]) -> Single:
-    """The PSF on the padded plane, its centre at [0, 0]."""
+    """Put the PSF on the padded plane, with its centre at [0, 0]."""
     kernel, first = needed_kernel(psf, (field_shape[0], field_shape[1]))
     plane = np.zeros(lengths, np.float32)
     plane[: kernel.shape[0], : kernel.shape[1]] = kernel
@@ -144,7 +144,8 @@ def _corner(psf: Single, field_shape: tuple[int, ...], lengths: tuple[int, int])
 
 
 def _loop(image: Single, forward: Forward, inverse: Inverse, transfer: Spectrum) -> Single:
-    """`psfcore.deconvolve.methods.richardson_lucy`, Eq. (1), without masked pixels and with its floors."""
+    """Eq. (1) of `psfcore.deconvolve.methods.richardson_lucy` without masked pixels; model values have the same
+    floor."""
     scale = np.abs(image).max()
     observed = np.maximum(image / scale, 0)
     floor = np.float32(_FLOOR_OF_MAXIMUM) * observed.max()
@@ -174,7 +175,10 @@ LOOPS: dict[str, Callable[[Single, Single], Single]] = {
 
 
 def run_one(name: str, folder: Path) -> None:
-    """Time one loop in this process; a small image first loads compiled kernels and libraries."""
+    """Time one loop in this process.
+
+    The loop first runs on a small image, to load the compiled kernels and libraries.
+    """
     image, psf = np.load(folder / "image.npy"), np.load(folder / "psf.npy")
     centre = psf.shape[0] // 2
     LOOPS[name](image[:64, :64], psf[centre - 32 : centre + 32, centre - 32 : centre + 32])

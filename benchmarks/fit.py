@@ -3,9 +3,10 @@
     python -m benchmarks.fit [--full] [--folder DIR]
 
 By default it fits 30 images of 512 px and prints the time as a ratio to 1 F (see benchmarks/deconvolution.py). It also
-fits nine images of 256 px a second time with the reference solver: SciPy transforms in float64, every scene from the
-start in thirty steps, slopes by finite differences of the whole model, and all images in every round. --full also fits
-126 images of 2048 px and prints the peak memory. Its first run writes 4 GB into DIR (default: the temporary folder).
+fits nine images of 256 px with both solvers. The reference solver uses SciPy transforms in float64 and all images in
+every round. It computes every scene from the beginning in thirty steps, and the derivatives by finite differences of
+the whole model. --full also fits 126 images of 2048 px and prints the peak memory. The first run with --full writes 4
+GB into DIR (default: the temporary folder).
 """
 
 from __future__ import annotations

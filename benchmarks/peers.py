@@ -1,4 +1,4 @@
-"""`make bench-peers`: twenty Richardson-Lucy steps by heliopsf and by other packages, in turn on the same data.
+"""`make bench-peers`: time twenty Richardson-Lucy steps of heliopsf and of other packages, in turn on the same data.
 
 The image has 2048 x 2048 px, the PSF 4096 x 4096 px. Each package runs in a process of its own, so that its peak memory
 can be measured. The unit 1 F is one 4096 x 4096 float32 rfft2 + irfft2 by SciPy with two workers, in the same run. The
@@ -38,7 +38,7 @@ def heliopsf(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
 
 
 def scipy_fft(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
-    """The simplest loop: float32, two workers, image and PSF on the plane of the PSF."""
+    """The simplest loop: float32, two workers; the image is padded to the shape of the PSF."""
     import scipy.fft
 
     image, psf = image.astype(np.float32), psf.astype(np.float32)
@@ -65,7 +65,7 @@ def scikit_image(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
 
 
 def aiapy(image: np.ndarray, psf: np.ndarray) -> np.ndarray:
-    """Its loop uses double precision and periodic convolution, so the image is padded first."""
+    """The loop of aiapy. It uses double precision and periodic convolution, so the image is padded first."""
     from aiapy.psf import deconvolve
 
     padded = np.zeros(psf.shape)

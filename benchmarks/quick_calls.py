@@ -1,4 +1,4 @@
-"""Times of calls that a person waits for, beside their goals; part of `make bench`.
+"""Compare the times of calls for which a person waits with their goals; part of `make bench`.
 
 Times and goals are ratios to 1 F (see benchmarks/deconvolution.py), so that they hold on another machine too. Each goal
 is about twice the ratio measured when it was set.
@@ -30,7 +30,7 @@ ENTRANCE_MESH = {
 
 
 def calls(folder: Path) -> dict[str, tuple[Callable[[], object], float]]:
-    """Calls, each with its goal in F."""
+    """The timed calls by name, each with its goal in units of F."""
     hri = load_instrument("hri_euv")
     plane = np.random.default_rng(0).random((2048, 2048)) * 1000
     pitches_um = [300.0 + 300 * step for step in range(8)]

@@ -1,8 +1,9 @@
-"""Time to import the packages and to start the command, beside the goals; part of `make bench`.
+"""Compare the times to import the packages and to start the command with their goals; part of `make bench`.
 
-Prints the processor time of each (user and system), and its ratio to the start of a bare Python interpreter. Both are
-the minimum of several runs, taken in turn, because another program on the machine can only make a run slower. The first
-run of each is not counted: it reads the files from disk and compiles the modules, as after an installation.
+For each case, the processor time (user and system) is printed, and its ratio to the start of a bare Python interpreter.
+The cases run in turn, several times, and the minimum of each is used, because another program on the machine can only
+make a run slower. The first run of each case is not counted: it reads the files from disk and compiles the modules, as
+after an installation.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from tempfile import TemporaryDirectory
 
 RUNS = 7
 BARE = "pass"
-# Code, and its goal in seconds on a machine that is idle.
+# The code of each case, and its goal in seconds on an idle machine.
 GOALS_S = {
     "import heliopsf": 0.3,
     "import service.app": 1.5,
@@ -27,7 +28,7 @@ CODE = {
 
 
 def processor_s(code: str, compiled: str) -> float:
-    """Seconds of processor time of a new interpreter that runs this code; `compiled`: folder of compiled modules."""
+    """The processor time, s, of a new interpreter that runs `code`. compiled: folder of the compiled modules."""
     environment = {**os.environ, "PYTHONPYCACHEPREFIX": compiled, "PYTHONDONTWRITEBYTECODE": ""}
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, env=environment)
     _, status, usage = os.wait4(process.pid, 0)

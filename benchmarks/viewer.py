@@ -1,10 +1,17 @@
-"""Times of the viewer in a browser, beside their goals. It needs Chromium, and no other program on the machine.
+"""Compare the times of the viewer in a browser with their goals.
 
-The first sight of a product of 2048 px and all of its pixels are timed from the begin of the navigation to the first frame after
-they were drawn; the service has decoded no plane of it before. The first page of all is timed as well: the service then loads its
-numerical libraries, and the browser prepares its drawing. A blink is timed from the key to the end of the drawing on the card. Without a
-graphics card Chromium draws with the processor. The memory of a product of 4096 px in a window of 390 px is the resident memory
-that the tab's process does not share with others (USS), after zooming to 100 % and moving; the graphics process is listed beside it.
+The benchmark needs Chromium. No other program should run on the machine. Three times are measured:
+
+- first page: the first product after the start. The service loads its numerical libraries, and the browser prepares its
+  drawing.
+- first sight and all pixels: a product of 2048 px of which the service has not yet decoded a plane. The time is from
+  the begin of the navigation to the first frame after the overview, or after all pixels, were drawn.
+- a blink: the time from the key to the end of the drawing on the graphics card. Without a graphics card, Chromium draws
+  with the processor.
+
+The memory is measured for a product of 4096 px in a window of 390 px, after zooming to 100 % and moving: the resident
+memory that the tab's process does not share with other processes (USS). The memory of the graphics process is also
+printed.
 """
 
 from __future__ import annotations
@@ -41,7 +48,7 @@ BLINK_MS = """async () => {
 
 
 def moment(page: Page, name: str) -> float:
-    """When the page noted this, seconds after the begin of the navigation."""
+    """The time at which the page recorded the event `name`, in seconds after the begin of the navigation."""
     for _ in range(600):
         found = page.evaluate(TIME_OF, name)
         if found is not None:
@@ -51,7 +58,8 @@ def moment(page: Page, name: str) -> float:
 
 
 def own_mb(kind: str) -> float:
-    """The largest unshared memory, MB, of a process of this kind that the browser started."""
+    """The unshared memory, MB, of the browser's process of this kind; the largest value if there are several
+    processes."""
     children = psutil.Process().children(recursive=True)
     found = [one for one in children if f"--type={kind}" in one.cmdline()]
     return max(one.memory_full_info().uss for one in found) / 1e6
@@ -69,7 +77,7 @@ def main() -> None:
     chromium = os.environ.get(VARIABLE) or next(filter(None, map(shutil.which, CANDIDATES)), None)
     if chromium is None:
         raise SystemExit(
-            f"expected Chromium on this machine; found none: install it, or name one in {VARIABLE}"
+            f"expected Chromium on this machine; found none: install it, or set {VARIABLE} to the path of its program"
         )
     with TemporaryDirectory(prefix="heliopsf-viewer-") as folder, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=list(SOFTWARE_GL))

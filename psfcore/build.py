@@ -5,10 +5,10 @@ the diffraction patterns of the pupil and of the meshes are convolved with each 
 the diffuse scatter.
 
 Light is counted over the full reach, a grid of 2048 px, on which every kernel sums to 1. Each kernel is computed on
-that grid and cut to the requested size. A kernel of a larger size, up to 4096 px, is computed on a grid of that
-size. It is scaled so that its inner 2048 px sum to 1. Its outer pixels then hold the light beyond the full reach, and its sum
-exceeds 1. The inner 2048 px equal the PSF of 2048 px, except for one difference: on the larger grid, a convolution
-also moves light from beyond the reach into the reach. For the diffraction of HRI_EUV this is 1e-5 of all light.
+this grid and cut to the requested size. A larger kernel, up to 4096 px, is computed on a grid of its own size and
+scaled so that its inner 2048 px sum to 1. Its outer pixels then contain the light beyond the full reach, and its sum
+exceeds 1. The inner 2048 px equal the PSF of 2048 px, except for one difference: on the larger grid, a convolution also
+moves light from beyond the reach into the reach. For the diffraction of HRI_EUV this is 1e-5 of all light.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ def build_psf(
     component: build only this component, one of component_names(); the result is then a PSF without components.
     mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see fits.mask_file).
     progress: called with (step, steps); it may raise to stop the work.
-    Raises DataError "bad-size", "unknown-component", "bad-mount", "bad-instrument-file" if its arrays are too large.
+    Raises DataError "bad-size", "unknown-component", "bad-mount", or "bad-instrument-file" if the file describes an
+    instrument that needs too large arrays.
     """
     _check_size(size)
     check_workload(instrument, instrument.name)
@@ -147,8 +148,10 @@ def _nine_tenths_of(progress: Progress | None) -> Progress:
 
 
 def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
-    """Scale the weights, so that they sum to 1 on the full reach; also return the share of light beyond the reach."""
-    positive = np.maximum(kernel, 0.0)  # Fourier transforms leave +-1e-17 where there is no light
+    """Scale the weights so that they sum to 1 on the full reach; also return the share of the light beyond the
+    reach."""
+    # Where there is no light, a Fourier transform gives values of about +-1e-17.
+    positive = np.maximum(kernel, 0.0)
     inner = float(crop_centred(positive, (REACH_GRID_PX, REACH_GRID_PX)).sum())
     return positive / inner, 1 - inner
 

@@ -1,4 +1,5 @@
-"""Compares two arrays that should be equal: are they the same bit for bit, and how large is the difference?"""
+"""Compares two arrays that should be equal: tells whether they are equal bit for bit, and how large the difference
+is."""
 
 from __future__ import annotations
 

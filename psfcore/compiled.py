@@ -32,7 +32,8 @@ from numba import njit
 from numba.core.caching import IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
-# Called when a thread compiles a kernel. A new thread has none: a kernel that another thread of a job compiles is not told.
+# The function that is called when this thread compiles a kernel. A new thread has no listener, so a kernel that another
+# thread of a job compiles is not reported.
 _LISTENER: ContextVar[Callable[[bool], None] | None] = ContextVar("listener", default=None)
 SEAL_BYTES = 2 * hashlib.sha256().digest_size
 MARK = b"@compiled("
@@ -70,9 +71,11 @@ def compiled(
 
 @contextmanager
 def listening(listener: Callable[[bool], None]) -> Iterator[None]:
-    """Call listener(False) when this thread begins to compile a kernel in the block, and listener(True) when it is compiled.
+    """In the block, call listener(False) when this thread begins to compile a kernel, and listener(True) when it has
+    finished.
 
-    Compilation takes some seconds, once per installation. An exception of the listener stops the call of the kernel.
+    The compilation of a kernel takes some seconds, once per installation. If the listener raises an exception, the
+    kernel is not called.
     """
     token = _LISTENER.set(listener)
     try:
@@ -89,18 +92,20 @@ def _tell(*, done: bool) -> None:
 
 @cache
 def kernel_folder(usual: Path, home: Path | None = None) -> str:
-    """The folder for kernels: the usual one if nobody else can write to it, else a private one below the user's home.
+    """The folder for kernels: `usual` if nobody else can write to it, otherwise a private folder below `home`.
 
-    home: default: the home of the user. If the private folder cannot be made, `KernelFiles` neither writes nor reads there.
+    home: default: the user's home. If the private folder cannot be made, `KernelFiles` neither writes nor reads
+    kernels.
     """
-    with suppress(OSError):  # numba makes it only later; a folder that cannot be made is not trusted
+    with suppress(OSError):  # numba would make the folder later; a folder that cannot be made is not trusted
         usual.mkdir(parents=True, exist_ok=True)
     if trusted(usual):
         return str(usual)
     source = hashlib.sha256(str(SOURCE).encode()).hexdigest()[:12]
     private = (home or Path.home()) / ".cache" / "heliopsf" / f"kernels-{source}"
     log.warning(
-        "expected a folder for compiled kernels to which nobody else can write; %s is another one: the kernels are kept in %s",
+        "expected a folder for compiled kernels to which nobody else can write; other users can write to %s, or it cannot be "
+        "made: the kernels are kept in %s",
         usual,
         private,
     )
@@ -114,9 +119,10 @@ def kernel_folder(usual: Path, home: Path | None = None) -> str:
 
 
 def trusted(path: Path) -> bool:
-    """Whether only this user, the owner of the system and those who can change this source file can change a file or folder.
+    """Whether nobody can change a file or folder except this user, the administrator, and users who can change this
+    module.
 
-    The folders above it are checked too: whoever can rename one of them can put another folder in its place.
+    The folders above it are checked too, because a user who can rename one of them can replace it by another folder.
     """
     if not hasattr(os, "geteuid"):  # a system without the owners and modes of POSIX
         return True
@@ -126,13 +132,13 @@ def trusted(path: Path) -> bool:
     try:
         path = path.resolve(strict=True)
         found = [one.stat() for one in (path, *path.parents)]
-    except OSError:  # it does not exist, or this user may not see it
+    except OSError:  # the path does not exist, or this user may not read it
         return False
     for place, one in enumerate(found):
         if one.st_uid not in owners:
             return False
         others = one.st_mode & stat.S_IWOTH or (one.st_mode & stat.S_IWGRP and one.st_gid != shared_group)
-        # In a folder with the sticky bit, such as /tmp, nobody can rename the folders of others.
+        # In a folder with the sticky bit, such as /tmp, nobody can rename the folders of other users.
         if others and not (place > 0 and one.st_mode & stat.S_ISVTX):
             return False
     return True
@@ -164,7 +170,8 @@ class KernelFiles(IndexDataCacheFile):
             )
 
     def load(self, key: Any) -> Any:
-        """The kernel for this key, compiled from the present sources; None if it is not on disk yet, and must be compiled."""
+        """The kernel for this key, compiled from the current sources; None if it is not on disk and must be
+        compiled."""
         data = self._found(self._name(key))
         if data is None:
             _tell(done=False)
@@ -174,7 +181,7 @@ class KernelFiles(IndexDataCacheFile):
         if not (self._is_good(name) and self._is_ours(name)):
             return None
         data = self._load_data(name)
-        # Meanwhile, a process of another version may have replaced the file.
+        # A process of another version may have replaced the file in the meantime.
         return data if self._is_good(name) else None
 
     def _is_good(self, name: str) -> bool:

@@ -11,8 +11,8 @@ _OWN = {
     "psfcore",
     "workers",
     "service",
-}  # a missing module of ours is a fault of the installation
-MOST_TOLD = 20  # errors of which the text is given, if one request has many
+}  # if a module of heliopsf itself is missing, the installation is faulty
+MOST_TOLD = 20  # if a request has many errors, only the texts of the first ones are given
 
 
 class DataError(ValueError):
@@ -41,7 +41,11 @@ class MissingExtra(ImportError):
 
 
 def module_of_extra(extra: str, module: str) -> Any:
-    """Import a module that needs packages of an extra, such as "plot"; "": of none. Raises MissingExtra, which names the extra."""
+    """Import a module that needs the packages of an extra, such as "plot". extra "": it needs only the standard
+    packages.
+
+    Raises MissingExtra, whose message names the missing package and the extra.
+    """
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
@@ -56,7 +60,8 @@ def module_of_extra(extra: str, module: str) -> Any:
 
 
 def together(errors: Sequence[DataError]) -> DataError:
-    """One error for several files: their messages in one message, with the type and code of the first error."""
+    """Combine the errors of several files into one error, with all messages, and with the type and code of the
+    first."""
     first = errors[0]
     if len(errors) == 1:
         return first

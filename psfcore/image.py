@@ -25,8 +25,8 @@ class MaskBit(IntFlag):
 class Saturation:
     """How the saturated pixels of an image were found, see `psfcore.fits.saturation`.
 
-    level: pixels at or above it are saturated, in the unit of the image; None: unknown. found: the source of the level,
-    such as a card, "request", "instrument file" or "pixels". warning: a sentence if pixels may be marked wrongly.
+    level: the saturation level in the unit of the image; None: unknown. found: the source of the level: a card,
+    "request", "instrument file" or "pixels". warning: a sentence for the user if pixels may be marked wrongly.
     """
 
     level: float | None

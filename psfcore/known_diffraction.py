@@ -1,4 +1,4 @@
-"""The diffraction PSF for a transit whose transit.json does not name a file with a diffraction PSF."""
+"""The diffraction PSF for a transit whose transit.json does not name a file with this PSF."""
 
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
     var(D) = g D + r^2            Eq. (1)    D in DN
     var(R) = (g R t + r^2) / t^2  Eq. (2)    rate R = D / t in DN/s
 
-The variance is computed from the expected value of a pixel. A variance from the observed value would be too small for
-a pixel whose noise happens to be negative, and it would be negative for a negative pixel.
+The variance is computed from the expected value of a pixel. If it were computed from the observed value, it would be
+too small for a pixel whose noise happens to be negative, and it could be negative for a negative pixel.
 
 | symbol | name | unit |
 |---|---|---|

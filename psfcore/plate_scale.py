@@ -2,4 +2,6 @@
 
 from __future__ import annotations
 
-PLATE_SCALE_TOLERANCE = 0.01  # largest deviation from 1 of the ratio of two plate scales
+PLATE_SCALE_TOLERANCE = (
+    0.01  # two plate scales count as the same if their ratio differs from 1 by at most this
+)

@@ -5,7 +5,7 @@ away. A smaller array holds the part of the light that falls on it; its sum is b
 
 | symbol | name | unit |
 |---|---|---|
-| r | radius_px, pixel centre to pixel centre | px |
+| r | radius_px: distance of a pixel's centre from the centre of the central pixel | px |
 | C(R) | cumulative_curve: 100 (1 - sum of weights with r <= R) | % |
 """
 
@@ -47,9 +47,9 @@ class Psf:
 
     kernel: a weight is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx // 2].
     components: kernels with the same centre ("DIFFRACTION", "SCATTER"). provenance: texts and numbers for JSON.
-    fitted: the fitted formula of SCATTER. cards: texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER that
-    say which images the PSF is for. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative", "psf-sum",
-    "psf-not-centred".
+    fitted: the fitted formula of SCATTER. cards: texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER,
+    which say for which images the PSF is valid. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative",
+    "psf-sum", "psf-not-centred".
     """
 
     kernel: Kernel
@@ -100,7 +100,10 @@ def _within_reach(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def _check_centre(kernel: Kernel) -> None:
-    """Check that the centre holds the largest weight. Otherwise every deconvolved image would be shifted."""
+    """Check that the central pixel has the largest weight.
+
+    A PSF with another centre would shift every deconvolved image.
+    """
     centre = (kernel.shape[0] // 2, kernel.shape[1] // 2)
     if not is_peak(float(kernel[centre]), float(kernel.max())):
         peak = np.unravel_index(int(kernel.argmax()), kernel.shape)

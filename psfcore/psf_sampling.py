@@ -4,15 +4,16 @@ A binned pixel is the mean of n x n pixels. For a scene that is constant within 
 
     K[M] = sum over d of t(d) h[n M + d],   t(d) = (1 - |d| / n) for |d| < n       Eq. (1), on each axis
 
-t is the convolution of two boxes of n pixels: one box is the binned pixel in the scene, the other is the binned pixel
-in the image. For even n, the boxes are shifted by half a pixel in opposite directions, so the shifts cancel. Therefore
-K is centred at [size // 2, size // 2] for even and odd factors. K is h averaged over a box, and then averaged over all
-positions of a source within a binned pixel. The values t(n M + d) sum to 1 over M, so no light is lost. A delta function
-stays a delta function.
+t is the convolution of two boxes of n pixels: one box is a binned pixel of the scene, the other is a binned pixel of
+the image. If n is even, the centre of a box lies half a pixel beside the centre of a pixel. The two boxes are shifted
+in opposite directions, so the shifts cancel, and K is centred at [size // 2, size // 2] for even and odd factors. In
+other words, K is the share of a point source's light that a binned pixel of the image receives, averaged over all
+positions of the source within a binned pixel of the scene. The sum of t(n M + d) over M is 1 for each d, so no light is
+lost. A delta function stays a delta function.
 
-A cut-out, or a window that starts at another pixel of the detector (PXBEG), has the same PSF as the whole image. The
-reason is that one PSF is used for the whole field, so only the difference of two positions matters. Near the edges of
-a window, light from outside the window enters the image; no choice of PSF corrects this.
+A cut-out, or a window that starts at another pixel of the detector (PXBEG), has the same PSF as the whole image,
+because one PSF is used for the whole field: only the difference of two positions matters. Near the edges of a window,
+light from outside the window enters the image; no choice of the PSF can correct this.
 
 | symbol | name | unit |
 |---|---|---|

@@ -1,6 +1,6 @@
-"""What the weights of a PSF must fulfil, as conditions on a few numbers. No numerical library is needed.
+"""The conditions that the weights of a PSF must fulfil. This module imports no numerical library.
 
-The sum is that of the central 2048 x 2048 px (the reach), or of the whole array if it is smaller.
+"Sum" means the sum over the central 2048 x 2048 px (the reach), or over the whole array if it is smaller.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from psfcore.errors import DataError
 REACH_GRID_PX = 2048
 LARGEST_SUM = 1 + 1e-3
 SMALLEST_SUM = 0.05
-CENTRE_TOLERANCE = 1e-3  # share of the largest weight: pixels that share the peak may differ by rounding
+CENTRE_TOLERANCE = (
+    1e-3  # the central weight may be below the largest weight by this fraction, because of rounding
+)
 
 
 def check_weights(smallest: float, largest: float, total: float) -> None:
@@ -33,5 +35,5 @@ def check_finite(total: float) -> None:
 
 
 def is_peak(centre: float, largest: float) -> bool:
-    """Whether the weight of the central pixel is the largest weight. Otherwise every deconvolved image would be shifted."""
+    """Whether the central pixel has the largest weight, up to CENTRE_TOLERANCE. Other PSFs would shift every image."""
     return centre >= largest * (1 - CENTRE_TOLERANCE)

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 PARTIAL = ".part"
-PROBE_BYTES = 4096  # a block of most file systems, so that a full disk refuses the probe
+PROBE_BYTES = 4096  # the block size of most file systems: if the disk is full, the probe cannot be written
 
 
 @contextmanager
 def whole_path(target: Path) -> Iterator[Path]:
-    """A path beside `target` for code that opens its file itself. The file replaces `target` when it is on the disk.
+    """A temporary path beside `target`, for code that opens the file itself. At the end of the block the file replaces
+    `target`.
 
     A killed process leaves its temporary file behind; `partials` finds it. Raises OSError.
     """

@@ -15,13 +15,13 @@ from psfcore.errors import DataError
 
 FOLDER, LARGEST = "HELIOPSF_CACHE_DIR", "HELIOPSF_CACHE_MIB"
 DEFAULT_MIB = 2048  # about 15 PSFs of 2048 px with their components
-_PSFS = "psfs"  # a folder of its own, because the cache closes its folder to other users
+_PSFS = "psfs"  # a separate subfolder, because the cache makes its folder inaccessible to other users
 
 
 def psf_cache() -> PsfCache:
     """The cache in the folder that HELIOPSF_CACHE_DIR names, or in the user's cache folder, such as ``~/.cache/heliopsf``.
 
-    Raises DataError "bad-setting" if HELIOPSF_CACHE_MIB is no whole number.
+    Raises DataError "bad-setting" if HELIOPSF_CACHE_MIB is not a whole number.
     """
     named = os.environ.get(FOLDER)
     folder = Path(named).expanduser() if named else user_cache_path("heliopsf", appauthor=False)

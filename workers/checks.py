@@ -24,7 +24,7 @@ class Unusable(Exception):
     """Something that the service needs does not work."""
 
 
-# For each catalogue: the time until which the last check of its pages counts.
+# For each catalogue: the time until which the result of its last check of the pages is used again.
 _pages_good_until: WeakKeyDictionary[Catalogue, float] = WeakKeyDictionary()
 PAGES_SHARE = 0.01  # largest share of the time that is spent on checking the pages
 
@@ -32,7 +32,7 @@ PAGES_SHARE = 0.01  # largest share of the time that is spent on checking the pa
 def database(catalogue: Catalogue) -> None:
     """Check that the database answers and that its file is not damaged.
 
-    The check reads the whole file. In a large database it takes long; it is then made less often.
+    The check reads the whole file of an SQLite database. The longer this takes, the less often it is done.
     """
     try:
         catalogue.ping()
@@ -155,5 +155,6 @@ def database_said(error: SQLAlchemyError) -> str:
 
 
 def _kind(error: BaseException) -> str:
-    """The name of the error's class. If the error has a cause, the name of the cause's class, because it is more specific."""
+    """The name of the error's class; if the error has a cause, the name of the cause's class, which is more
+    specific."""
     return type(getattr(error, "orig", None) or error.__cause__ or error).__name__

@@ -1,7 +1,7 @@
-"""The data folder that is used if nobody names one: the user's data folder, the same from every working folder.
+"""The default data folder: a folder of the user that does not depend on the working folder.
 
-Earlier versions used ``heliopsf-data`` in the working folder. Where this folder still holds data, it goes on being used,
-and commands say so: otherwise a service that is started as before would begin with an empty catalogue.
+Earlier versions used ``heliopsf-data`` in the working folder. If this folder still contains data, it is used, and
+commands tell the user so. Otherwise a service that is started as before would begin with an empty catalogue.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ EARLIER = "heliopsf-data"
 
 
 def default_data_dir() -> Path:
-    """The data folder of earlier versions if it is in the working folder and holds data, else the user's data folder."""
+    """The data folder of earlier versions if it is in the working folder and contains data; otherwise the user's data
+    folder."""
     return earlier_data_dir() or users_data_dir()
 
 
@@ -26,9 +27,9 @@ def users_data_dir() -> Path:
 
 
 def earlier_data_dir() -> Path | None:
-    """The data folder of earlier versions in the working folder; None if there is none, or it is empty.
+    """The data folder of earlier versions in the working folder; None if it does not exist or is empty.
 
-    A folder of another user does not count: in a shared folder such as /tmp anybody could put one in the way.
+    A folder of another user is ignored, because in a shared folder such as /tmp any user could create one.
     """
     folder = Path.cwd() / EARLIER
     if not folder.is_dir():
@@ -40,7 +41,7 @@ def earlier_data_dir() -> Path | None:
 
 
 def told() -> str | None:
-    """What to tell the user of the default data folder if it is the folder of earlier versions; None otherwise."""
+    """A message for the user if the default data folder is the folder of earlier versions; None otherwise."""
     earlier, users = earlier_data_dir(), users_data_dir()
     if earlier is None:
         return None

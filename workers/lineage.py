@@ -1,6 +1,6 @@
 """Lineage of a product or a PSF: inputs, parameters, versions and jobs, back to the uploads.
 
-The lineage repeats the record from the time when each thing was made. A thing that was deleted later is still listed, by its id.
+The lineage of a thing was recorded when the thing was made. A parent that was deleted later is still listed, by its id.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _provenance(row: PsfRow) -> dict[str, Any]:
 
 
 class _Walk:
-    """One walk through a lineage. A thing that occurs twice is listed twice, but its parents only once."""
+    """One walk through a lineage. A thing that occurs twice is listed twice, but its parents are listed only once."""
 
     def __init__(self, catalogue: Catalogue, owner: str) -> None:
         self._catalogue, self._owner = catalogue, owner

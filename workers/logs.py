@@ -90,16 +90,17 @@ def _one_line(text: str) -> str:
 
 
 class Seldom(logging.Filter):
-    """Lets one record of each kind pass in ``every_s`` seconds, and adds to the next one how many were left out.
+    """Writes at most one record of each kind in ``every_s`` seconds. The next record says how many were left out.
 
-    Records are of one kind if their messages have the same first line before values are filled in. It is meant for messages
-    that clients can cause without a key: they would fill the disk.
+    Two records are of the same kind if they come from the same logger and the first lines of their message templates
+    are equal. The filter is for messages that clients without a key can cause; without it, these messages could fill
+    the disk.
     """
 
     def __init__(
         self, about: Callable[[logging.LogRecord], bool] = lambda _record: True, every_s: float = 60.0
     ) -> None:
-        """about: the records that are meant; all others pass."""
+        """about: selects the records to which the limit applies; all other records are written."""
         super().__init__()
         self._about, self._every_s = about, every_s
         self._said: dict[tuple[str, str], tuple[float, int]] = {}
@@ -128,7 +129,8 @@ _SELDOM_ACCEPTS = Seldom(lambda record: record.getMessage().startswith("socket.a
 
 
 def _no_request(record: logging.LogRecord) -> bool:
-    """Whether a record is not about an answered request, or about one at which the service failed."""
+    """True unless the record is about a request that was answered without a failure of the service (status below
+    500)."""
     return record.name != REQUESTS or getattr(record, "fields", {}).get("status", 500) >= 500
 
 
@@ -145,8 +147,8 @@ def configure(settings: Settings, *, verbose: bool = False) -> None:
         handler.addFilter(_no_request)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
-    # These libraries log every request, connection and plug-in. Our own log lines say the same, with the request id.
-    # An upgrade of the database is logged in one line, see ``Schema.upgrade``.
+    # These libraries log every request, connection and plug-in. Our own log lines contain the same, with the request
+    # id. An upgrade of the database is logged in one line, see ``Schema.upgrade``.
     for chatty in ("httpx", "httpcore", "uvicorn.access", "alembic.runtime"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     # Clients without a key can cause these: requests that are not HTTP, and more connections than the system allows.

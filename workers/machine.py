@@ -1,4 +1,4 @@
-"""The memory and the cores that this process may use: those of the machine, or of its container."""
+"""The memory and the cores that this process may use. A container may limit them to a part of the machine."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ def _limits(cgroups: Path, membership: Path) -> Iterator[int]:
             top, file = cgroups / "memory", "memory.limit_in_bytes"
         else:
             continue
-        # Inside a container the path may be that of the host, of which only the uppermost folder is shown here.
+        # Inside a container this may be a path of the host. The container then shows only the limits of its uppermost
+        # folder.
         below = Path(path.lstrip("/"))
         for folder in (below, *below.parents):
             limit = _text(top / folder / file).strip()

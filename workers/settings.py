@@ -94,7 +94,7 @@ class Settings(BaseSettings):
     cancel_s: float = Field(
         10.0,
         gt=0,
-        description="time after which a worker process is ended and replaced if its job does not stop after it was cancelled or took too long, s",
+        description="if a job was cancelled or took too long but does not stop, its worker process is ended and replaced after this time, s",
     )
     max_attempts: int = Field(3, ge=1, description="number of attempts after which a job fails")
     stop_s: float = Field(
@@ -132,7 +132,7 @@ class Settings(BaseSettings):
         30.0,
         gt=0,
         le=400,
-        description="longest time after which a person must log in again in a browser, days; a login never lasts longer than its key",
+        description="longest duration of a login in a browser, days; a login never lasts longer than its key",
     )
     allowed_hosts: str = Field(
         "",
@@ -154,7 +154,7 @@ class Settings(BaseSettings):
     stalled_s: float = Field(
         60.0,
         gt=0,
-        description="time after which a connection is closed whose client takes nothing of its answer, s",
+        description="time after which a connection is closed if its client reads nothing of the answer, s",
     )
     max_body_kib: int = Field(
         256, ge=16, le=1_048_576, description="largest request that is neither an upload nor a bulk run, KiB"
@@ -163,7 +163,7 @@ class Settings(BaseSettings):
     body_s: float = Field(
         30.0,
         gt=0,
-        description="time that a client has for the body of a request, s; the time that the smallest speed needs is added",
+        description="longest time in which a client may send the body of a request, s; a large body gets the additional time that it needs at the smallest allowed speed",
     )
     body_kib_per_s: int = Field(
         16, ge=1, description="smallest speed of the body of a request after the first body_s seconds, KiB/s"
@@ -261,7 +261,7 @@ class Settings(BaseSettings):
         """URL of the database; by default SQLite in the data folder."""
         if self.database_url is None:
             return f"sqlite:///{self.data_dir.resolve() / 'catalogue.sqlite'}"
-        # A bare postgresql:// means psycopg2, but the project installs psycopg 3.
+        # SQLAlchemy would use psycopg2 for postgresql://, but the project installs psycopg 3.
         return self.database_url.replace("postgresql://", "postgresql+psycopg://", 1)
 
     @property
@@ -280,7 +280,10 @@ class Settings(BaseSettings):
 
     @property
     def silent_s(self) -> float:
-        """Time without a heartbeat after which a worker process is ended and replaced, s. Its job's lease was lost long before."""
+        """Time without a heartbeat after which a worker process is ended and replaced, s.
+
+        The lease of its job has expired before.
+        """
         return 2 * self.lease_s + self.cancel_s
 
     @property

@@ -1,10 +1,10 @@
 """A folder of built PSFs, so that a PSF is built only once.
 
-A file is named IDENTITY.SHA256.PART: the identity of the PSF (`psfcore.built.recipe`), the hash of the file, and what the file
-holds, such as "fits". A file is written under a temporary name and renamed, and its hash is checked when it is read. If the
-files need more space than allowed, the files of the PSF that was not used for the longest time are removed.
+The name of a file is IDENTITY.SHA256.PART: the identity of the PSF (`psfcore.built.recipe`), the hash of the file, and
+the content of the file, such as "fits". A file is written under a temporary name and then renamed. Its hash is checked
+when it is read. If the files need more space than allowed, the files of the least recently used PSF are removed.
 
-The folder is closed to other users: files in it are used without a further question.
+Other users have no access to the folder, because the files in it are used without any other check.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class CachedFile:
 
 @dataclass(frozen=True)
 class CachedPsf:
-    """All files of one PSF. used_at: when the PSF was used last, in seconds since 1970."""
+    """All files of one PSF. used_at: the time when the PSF was last used, in seconds since 1970."""
 
     identity: str
     files: tuple[Path, ...]
@@ -57,15 +57,18 @@ class PsfCache:
         self.max_bytes = max_bytes
 
     def find(self, identity: str, part: str) -> CachedFile | None:
-        """A file of a PSF, after its content was checked; None if there is none. A damaged file is removed."""
+        """A file of a PSF, after its content was checked; None if the cache has no such file.
+
+        A damaged file is removed.
+        """
         for path in self._files():
             of, sha256, found_part = path.name.split(".", 2)
             if (of, found_part) != (identity, part):
                 continue
             try:
                 if sha256_of_file(path) == sha256:
-                    # The time of access is the time of the last use. The time of change stays: commands that run now
-                    # notice by it whether a file was replaced.
+                    # The access time of the file is set to now: it records the last use. The modification time is not
+                    # changed, because other running commands use it to notice that a file was replaced.
                     os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
                     return CachedFile(path, sha256)
                 path.unlink()
@@ -74,7 +77,8 @@ class PsfCache:
         return None
 
     def keep(self, identity: str, part: str, write: Callable[[Path], object]) -> CachedFile | None:
-        """Keep a file, which ``write`` writes to the path that it gets; None if it is larger than the cache may be.
+        """Keep a file. ``write(path)`` writes it. Returns None if the file is larger than the largest size of the
+        cache.
 
         Raises DataError "cache-of-another-user", and OSError if the file cannot be written.
         """
@@ -99,7 +103,7 @@ class PsfCache:
         return CachedFile(kept, sha256)
 
     def psfs(self) -> list[CachedPsf]:
-        """The PSFs in the cache, the last used first."""
+        """The PSFs in the cache; the most recently used PSF comes first."""
         files: dict[str, list[tuple[Path, os.stat_result]]] = {}
         for path in self._files():
             with suppress(FileNotFoundError):  # another process removed it
@@ -136,7 +140,10 @@ class PsfCache:
         return list(self.folder.glob(f".*{PARTIAL}"))
 
     def _shrink(self, last: str) -> None:
-        """Remove PSFs until the rest fits, those that were not used for the longest time first; never the last one."""
+        """Remove the least recently used PSFs until the others fit.
+
+        The PSF with the identity ``last`` is never removed.
+        """
         psfs = self.psfs()
         total = sum(psf.bytes for psf in psfs)
         for psf in reversed(psfs):

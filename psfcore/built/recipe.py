@@ -13,7 +13,7 @@ from typing import Any
 
 from psfcore.weight_rules import REACH_GRID_PX
 
-BUILD_VERSION = 2  # raise it when the same recipe gives another PSF
+BUILD_VERSION = 2  # raise this number when a change of the code changes the PSF of a recipe
 
 
 def canonical_hash(content: dict[str, Any]) -> str:
@@ -26,7 +26,7 @@ def canonical_hash(content: dict[str, Any]) -> str:
 class Recipe:
     """How a PSF is built.
 
-    text: the text of the instrument file. name: the name of a shipped instrument file; None: the file is the user's.
+    text: the text of the instrument file. name: the name of the shipped instrument file; None: the user wrote the file.
     mask_id: SHA-256 of the file with the mask image of the mount. size: px. component: the only component to build, in
     lower case; None: the total PSF.
     """

@@ -7,9 +7,9 @@ The scene is zero outside the field, and the result is cut to the field:
 
 A Fourier transform is periodic: light that leaves the plane on one side enters it again on the other side ("wraps").
 The paper (Hofmeister et al. 2024) pads image and PSF by half the image's width on all sides, so that no light wraps.
-Wrapped light does no harm, however, in pixels that are cut off afterwards. The length of the transform can therefore
-be the sum of the field and the largest offset. This gives the same numbers (the tests compare both) with a shorter
-transform: 3072 px for a field and a PSF of 2048 px.
+However, wrapped light does no harm if it falls only into pixels that are cut off afterwards. Therefore the size of the
+field plus the largest offset is enough as the length of the transform. The result is the same (the tests compare both),
+and the transform is shorter: 3072 px for a field and a PSF of 2048 px.
 
 | symbol | name |
 |---|---|
@@ -162,7 +162,7 @@ class ChirpTransform:
         n' k' = (n'^2 + k'^2 - (k' - n')^2) / 2
 
     The second line turns the sum into a convolution with a chirp, exp(i pi r n^2).
-    r: `ratio`, the product of the two grid steps in units of one period (1 / N for an FFT).
+    r: `ratio`, the phase for n' = k' = 1 in units of 2 pi; it is 1 / N for an FFT.
     N, K: `samples`, `out_samples`. The grids are not periodic: the sum is evaluated exactly as written.
     """
 

@@ -4,9 +4,9 @@ The engine computes the same operators as `psfcore.convolution.convolver.Convolv
 that module. The engine is several times faster than SciPy (`python -m benchmarks.deconvolution` prints the ratios to
 SciPy and ducc0). There are three reasons:
 
-- Transforms of zeros are left out. Along x, only the rows of the field are transformed, not the padding rows. Along y,
-  a block of sixteen columns is padded, transformed, multiplied by the transfer function and transformed back while it
-  is in the cache. Only the rows of the field are written back.
+- Zeros are not transformed. Along x, only the rows of the field are transformed, not the padding rows. Along y, a block
+  of sixteen columns is padded, transformed, multiplied by the transfer function and transformed back while it is in the
+  cache. Only the rows of the field are written back.
 - Steps are combined. Between two convolutions of an iteration, a block of rows is transformed back, changed by the
   method and transformed again while it is in the cache. H x is never written to memory.
 - The transfer function is real if the PSF is symmetric about its centre.
@@ -38,7 +38,8 @@ BLOCK_ROWS = 2 * LANES
 # Largest imaginary part of the transfer function of a symmetric PSF, as a share of the sum of weights. It is smaller
 # than the float32 rounding of the transfer function.
 SYMMETRIC_TO = 1e-7
-# Chunks per thread for small and for large images. To start a chunk takes about as long as one or two small blocks.
+# Chunks per thread for small and for large images. To start a chunk takes about as long as to process one or two small
+# blocks.
 _CHUNKS_A_THREAD = (2, 4)
 _BLOCKS_A_CHUNK = 8
 
@@ -57,9 +58,9 @@ class Engine:
     """Convolution with one PSF, cut to one field, and the adjoint of this operator, in float32.
 
     psf_kernel: weights [y, x] of any shape, even or odd; centre at [ny // 2, nx // 2]. field_shape: (ny, nx).
-    span: (ny, nx); the convolution is exact between two pixels that are closer than this. Default: the shape of the
-    field, so that the convolution is exact between all pixels. If the field includes a margin, a smaller span keeps the
-    transforms short: pixels that are farther apart lie in opposite margins, and light may wrap between them.
+    span: (ny, nx); the convolution is exact for every pair of pixels that are closer to each other than this. Default:
+    the shape of the field, so that it is exact for all pairs. If the field includes a margin, a smaller span makes the
+    transforms shorter. Pixels farther apart then lie in opposite margins, and light may wrap from one to the other.
     threads: number of threads; it does not change the result.
     Raises DataError "field-shape" if an array has another shape.
     """
@@ -162,7 +163,7 @@ class Engine:
         self.multiply_columns(self.transfer, conjugate=adjoint)
 
     def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
-        """As ``columns``, with any filter in the layout of the transfer function, or with the conjugate of the filter."""
+        """As ``columns``, but multiply by a given filter, or its conjugate, in the layout of the transfer function."""
         kernel = _columns_real if transfer.shape[2] == 1 else _columns_complex
         sign = np.float32(-1.0 if conjugate else 1.0)
 
@@ -172,10 +173,10 @@ class Engine:
         self.run(work, self.column_blocks)
 
     def row_stage(self, work: Callable[..., Any], *fields: Any) -> list[Any]:
-        """Run `work`, the compiled function of a method for the rows, on all blocks; returns one result per chunk.
+        """Run `work`, the compiled row function of a method, on all blocks; returns one result per chunk.
 
-        The arguments of `work` are the spectrum, the fields, buffer and corner of the scratch memory, the range of
-        blocks, and the numbers of the row plan.
+        `work` gets the spectrum, the fields, `buffer` and `corner` of the thread's `Scratch`, the range of blocks, and
+        `row_numbers`.
         """
 
         def part(start: int, stop: int, scratch: Scratch) -> Any:
@@ -210,7 +211,8 @@ class Engine:
     def _shared_out(self, one: Callable[[int], Any], chunks: int) -> list[Any]:
         """Process all chunks and return their results. The calling thread works too; each thread takes the next free chunk.
 
-        For a small image, it would take longer to wake a thread for each chunk than to process the chunk.
+        The chunks are not handed to a thread one by one: for a small image, it takes longer to wake a thread than to
+        process a chunk.
         """
         results: list[Any] = [None] * chunks
         taken = itertools.count()
@@ -223,13 +225,14 @@ class Engine:
         try:
             work()
         finally:
-            for other in others:  # wait, because they write to the same spectrum
+            for other in others:  # wait, because the other threads write to the same spectrum
                 other.result()
         return results
 
     @property
     def transfer_scale(self) -> int:
-        """The transfer function is divided by this number, so that a forward and an inverse transform need no scaling."""
+        """The product of the lengths of the transforms. The transfer function is divided by it, so that no transform
+        needs a scale factor."""
         return self.row_plan.length * self.column_plan.length
 
     def _transfer_function(self, kernel: NDArray[np.floating], first: tuple[int, int]) -> Single:
@@ -265,7 +268,7 @@ class Engine:
 def _wrapped_rows(
     kernel: NDArray[np.floating], first: tuple[int, int], shape: tuple[int, int], rows: slice
 ) -> Single:
-    """Some rows of a periodic plane. The plane holds the kernel, with its centre at [0, 0], and zeros elsewhere."""
+    """The given rows of a periodic plane that contains the kernel, with its centre at [0, 0], and zeros elsewhere."""
     (ky, kx), (fy, fx), (ly, lx) = kernel.shape, first, shape
     out = np.zeros((rows.stop - rows.start, lx), np.float32)
     split = min(kx, max(0, -fx))
@@ -288,7 +291,7 @@ def _numbers(plan: Plan) -> tuple[Any, ...]:
 def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
     """Separate a transformed block of rows into the spectra of its 32 rows.
 
-    Each complex signal of the block holds two real rows. With Z the transform of a + i b for real a and b:
+    Each complex signal of the block contains two real rows. If Z is the transform of a + i b with real a and b, then
     A[k] = (Z[k] + Z*[L-k]) / 2, B[k] = (Z[k] - Z*[L-k]) / (2 i).
     """
     z = buffer.reshape((-1, 2, LANES))
@@ -380,7 +383,8 @@ def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radice
 
 @compiled()
 def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
-    """As `_columns_real`, for an asymmetric PSF. sign: -1 multiplies by the conjugate, for the adjoint; otherwise 1."""
+    """As `_columns_real`, for an asymmetric PSF. sign: 1; or -1, which multiplies by the conjugate (for the
+    adjoint)."""
     # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
     filled = min(spectrum.shape[1], length) * 2 * LANES
     z = buffer.reshape((-1, 2, LANES))

@@ -1,8 +1,9 @@
 """Fast Fourier transforms of sixteen signals at a time, in single precision, with all data in the cache.
 
-These are mixed-radix Cooley-Tukey transforms in place. The forward transform decimates in frequency, from natural to
-digit-reversed order. The inverse decimates in time, from digit-reversed back to natural order. A convolution
-multiplies between the two, so the frequencies need not be sorted. `Plan.frequency` gives the frequency of each index.
+These are mixed-radix Cooley-Tukey transforms in place. The forward transform decimates in frequency; its input is in
+natural order and its output in digit-reversed order. The inverse decimates in time, from digit-reversed back to natural
+order. A convolution multiplies the two spectra between these transforms, so the frequencies need not be sorted.
+`Plan.frequency` gives the frequency of each index.
 
 Sixteen signals ("lanes") are stored side by side, so each butterfly is one operation on sixteen neighbours. A buffer is
 a flat float32 array, [index][re, im][lane]. The compiler turns the innermost loop, which runs over the lanes, into
@@ -36,7 +37,8 @@ _ODD_FACTORS = (1, 3, 9)
 _HALF_ROOT = np.float32(np.sqrt(0.5))
 _HALF_ROOT_3 = np.float32(np.sqrt(0.75))
 _W = np.uint64(LANES)
-# Allow only fused multiply-add. Options that assume finite numbers or change the order of sums are not allowed.
+# Of the compiler's options for fast arithmetic, only fused multiply-add is used. Options that assume finite numbers or
+# change the order of sums are not used.
 _FAST: Any = {"contract"}
 
 Flat = NDArray[np.float32]

@@ -27,7 +27,7 @@ from psfcore.deconvolve.stopping import Iteration
 
 
 class Additive(Iteration):
-    """Eq. (1).
+    """The iteration of Eq. (1).
 
     step_filter: G, divided by `engine.transfer_scale`, in the layout of `engine.transfer`. A constant G is
     `np.full_like(engine.transfer[:, :, :1], G / engine.transfer_scale)`.

@@ -23,8 +23,11 @@ class UsedPsf:
 def deconvolution_cards(
     psf: UsedPsf, result: Deconvolved, *, saturation: Saturation | None, amplification: float | None
 ) -> dict[str, tuple[str | int | float, str]]:
-    """The cards that say how an image was deconvolved. saturation: of the input. amplification: of the noise, if known."""
-    # A hash fills its card, so cards with a hash have no comment.
+    """The cards that say how an image was deconvolved.
+
+    saturation: the saturation of the input. amplification: the noise amplification, if known.
+    """
+    # A hash fills the whole card, so cards with a hash have no comment.
     cards: dict[str, tuple[str | int | float, str]] = {
         "PSFID": (psf.id, ""),
         "PSFVERS": (psf.version, "PSF version"),

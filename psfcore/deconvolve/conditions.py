@@ -27,8 +27,8 @@ class Conditions:
     """Options of a deconvolution. Raises DataError "bad-margin" for a negative margin.
 
     edges: assumption about the scene beyond the field; None: the default of the method, EDGES.
-    margin_px: width of the margin beyond the field; it is not used with zero edges. None: it is chosen from the PSF.
-    noise: noise of the camera; required if the stopping rule is "discrepancy".
+    margin_px: width of the margin beyond the field; None: the width is computed from the PSF. Edges "zero" have no
+    margin. noise: noise of the camera; required if the stopping rule is "discrepancy".
     threads: number of threads; it does not change the result.
     progress(step, steps) is called after each step; its exceptions are not caught.
     engine_for: function that makes the engine; an `EngineCache` keeps engines between images.
@@ -49,8 +49,8 @@ class Conditions:
 class EngineCache:
     """A cache of engines by PSF, shape, span and threads. If it is full, it drops the least recently used engine.
 
-    An engine handles one image at a time, so threads must not share a cache. An engine is reused only if the same `Psf`
-    object is passed again; an equal copy does not count.
+    An engine processes one image at a time, so threads must not share a cache. An engine is used again only if the same
+    `Psf` object is passed again; an equal copy of the object gets a new engine.
     """
 
     def __init__(self, capacity: int = 2) -> None:

@@ -36,8 +36,7 @@ from psfcore.psf import Psf
 Edges = Literal["zero", "symmetric", "extended"]
 EDGES: tuple[Edges, ...] = ("zero", "symmetric", "extended")
 
-# If more than this share of a pixel's light may come from beyond the field, the pixel is flagged, and chi2 does
-# not include it.
+# If more than this share of a pixel's light may come from beyond the field, the pixel is flagged and left out of chi2.
 FLAGGED_SHARE = 0.05
 
 Plane = NDArray[np.float32]
@@ -50,8 +49,8 @@ class Domain:
 
     pixels [y, x]: the image divided by `scale`, and 0 where it is not finite; the margin holds its mirror image.
     trusted: pixels to which the estimate is fitted. finite: pixels whose values can start the estimate.
-    field: position of the field in the plane. scale: the largest absolute pixel value. The division lets float32 hold
-    any image.
+    field: position of the field in the plane. scale: the largest absolute pixel value. After the division, float32 can
+    represent any image.
     """
 
     pixels: Plane
@@ -115,7 +114,7 @@ def band_px(shares: NDArray[np.float64], fraction: float) -> int:
 
 
 def margin_for(shares: NDArray[np.float64], field_shape: tuple[int, int], *, share: float) -> int:
-    """Width of the margin in px. Beyond it, the scene gives a pixel at the edge at most `share` of its light.
+    """Width of the margin, px: a pixel at the edge gets at most `share` of its light from beyond the margin.
 
     shares: b of Eq. (1). The width is rounded up to a multiple of 16 px, half a block of the engine. It is at most half
     the width of the field.

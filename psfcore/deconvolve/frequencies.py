@@ -1,7 +1,7 @@
 """Noise amplification of a linear method, computed frequency by frequency.
 
 Consider a method x <- x + G (y - H x) that starts from x_0 = y. T is the PSF's Fourier transform at one frequency.
-After n steps, the method has multiplied this frequency by
+After n steps, the method has multiplied the amplitude of the image at this frequency by
 
     A_n = A_(n-1) + G (1 - T A_(n-1)),   A_0 = 1        Eq. (1)
 
@@ -63,11 +63,13 @@ def noise_amplification(
 
 
 def check_converges(sample: TransferSample, steps: int) -> None:
-    """Raise DataError "method-diverges" if an error grows by more than LARGEST_GROWTH in `steps` steps with G = 1."""
+    """Raise DataError "method-diverges" if `steps` steps with G = 1 can increase an error by more than
+    LARGEST_GROWTH."""
     worst = float(np.abs(1 - sample.values).max())
     if worst > 1 and steps * np.log(worst) > np.log(LARGEST_GROWTH):
         advice = "use richardson-lucy or linear, or fewer steps"
         raise DataError(
             "method-diverges",
-            f"expected a PSF whose Fourier transform T has abs(1 - T) <= 1; got {worst:.3g}, which {steps} steps raise to the power {steps}: {advice}",
+            "expected a PSF whose Fourier transform T has abs(1 - T) <= 1 at all frequencies; got up to "
+            f"{worst:.3g}, and each of the {steps} steps multiplies an error by this number: {advice}",
         )

@@ -3,7 +3,7 @@
     w y / (H x) + (1 - w) a        Eq. (1)
 
 a is the ratio of a masked pixel. Its value is chosen so that the pixel has no influence on the estimate. One plane
-stores both cases: the light (at least 0) of a trusted pixel, or -a of a masked pixel. Negative pixels are due to noise
+stores the light (at least 0) of the trusted pixels, and -a for the masked pixels. Negative pixels are due to noise
 around zero. They count as 0, because these methods cannot represent negative light.
 
 | symbol | name | unit |

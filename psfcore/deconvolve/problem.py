@@ -24,7 +24,8 @@ from psfcore.image import Image, MaskBit
 from psfcore.psf import Psf
 from psfcore.psf_sampling import check_compatible
 
-# The first value of a missing pixel is computed from trusted neighbours if the PSF's weights on them sum to this.
+# The first value of a missing pixel is computed from trusted neighbours if the PSF's weights on them sum to more than
+# this.
 _ENOUGH_NEIGHBOURS = 1e-4
 
 
@@ -84,8 +85,8 @@ def pose(
 def first_estimate(problem: Problem) -> NDArray[np.float32]:
     """The first estimate [y, x]: the observation, on the field and its margin (the domain).
 
-    A pixel without a finite value starts from the mean of the trusted pixels around it, weighted by the PSF; if there
-    are too few, from the mean of all trusted pixels.
+    The first value of a pixel that is not finite is the mean of the trusted pixels around it, weighted by the PSF. If
+    there are too few of them, it is the mean of all trusted pixels.
     """
     domain, engine = problem.domain, problem.engine
     estimate = domain.pixels.copy()

@@ -7,7 +7,7 @@ is computed from the model image H x, so that the noise of a faint pixel does no
 
 The first estimate with chi2 <= 1 is the result, because further steps would fit the noise. Chi2 is computed from the n
 judged pixels: the trusted pixels that are not near an edge. In a band along the edges (`edge_band_px`), more than 5 %
-of the light may come from beyond the field; the model does not know that light.
+of the light may come from beyond the field, which the model does not contain.
 
 | symbol | name | unit |
 |---|---|---|

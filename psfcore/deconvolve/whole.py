@@ -1,4 +1,4 @@
-"""A whole deconvolution: the estimate, its errors, what changed, and the quality plane.
+"""A whole deconvolution: the estimate, its errors, the measured changes, and the quality plane.
 
 The service and the Python functions both run `Work`, so that they give the same result for the same image and PSF.
 """
@@ -26,12 +26,12 @@ from psfcore.instruments.model import load_instrument
 from psfcore.noise import Noise
 from psfcore.psf import Psf
 
-ERROR_ESTIMATE = "error estimate"  # its steps are noise realisations
+ERROR_ESTIMATE = "error estimate"  # a stage whose steps are noise realisations
 
 
 @dataclass(frozen=True)
 class Assessed:
-    """What a deconvolution changed, and the quality plane [y, x] (bits of `QualityBit`)."""
+    """The measured changes of a deconvolution, and the quality plane [y, x] (bits of `QualityBit`)."""
 
     found: Changes
     quality: NDArray[np.uint8]
@@ -39,9 +39,9 @@ class Assessed:
 
 @dataclass(frozen=True)
 class Work:
-    """One deconvolution. It runs once for the image, and again for each noise realisation and each possible PSF.
+    """One deconvolution. The method runs for the image, and again for each noise realisation and each possible PSF.
 
-    psf: the PSF on the image's pixels. method: the name of a method. parameters: of this method.
+    psf: the PSF on the image's pixels. method: the name of a method. parameters: the parameters of this method.
     """
 
     image: Image
@@ -53,7 +53,7 @@ class Work:
     def run(
         self, image: Image | None = None, psf: Psf | None = None, progress: Progress | None = None
     ) -> Deconvolved:
-        """Run the method on the image, or on another image of its shape, with the PSF or with another one."""
+        """Run the method. image: None, or another image of the same shape. psf: None, or another PSF."""
         conditions = replace(self.conditions, progress=progress)
         return method_named(self.method)(image or self.image, psf or self.psf, conditions, **self.parameters)
 
@@ -67,8 +67,9 @@ class Work:
     ) -> ErrorPlanes | None:
         """The error planes from `draws` noise realisations; None for 0 realisations.
 
-        possible_psfs: makes PSFs on the image's pixels that differ from the PSF by its errors; empty if the errors are not known.
-        begin(stage, steps) is called at the begin of each stage, and returns its progress function. Raises DataError "no-noise-figures".
+        possible_psfs: returns variants of the PSF within its errors, on the image's pixels; empty if the errors are not
+        known. begin(stage, steps) is called when a stage begins, and returns the progress function of the stage. Raises
+        DataError "no-noise-figures".
         """
         if not draws:
             return None
@@ -85,7 +86,7 @@ class Work:
             draws=draws,
             edge_px=result.edge_band_px,
             threads=self.conditions.threads,
-            # The first run is that of the image without noise.
+            # The first run deconvolves the model image without noise.
             progress=None if told is None else lambda done, of: told(done - 1, of - 1),
         )
         psfs = possible_psfs()
@@ -100,7 +101,7 @@ class Work:
         return with_psf_error(planes, from_psf)
 
     def assess(self, result: Deconvolved, errors: ErrorPlanes | None) -> Assessed:
-        """Measure what changed, and make the quality plane."""
+        """Measure the changes, and make the quality plane."""
         edge_px = counted_edge_px(result)
         found = measure_changes(
             self.image, result.pixels, self.psf, noise=self.conditions.noise, edge_px=edge_px
@@ -121,9 +122,10 @@ def counted_edge_px(result: Deconvolved) -> int:
 
 
 def input_warnings(psf: Psf, image: Image, *, other_channel: bool) -> dict[str, str]:
-    """What the user must know about the inputs: sentences by their codes, "channel" and "saturation".
+    """Warnings about the inputs: sentences by their codes, "channel" and "saturation".
 
-    Raises DataError "channel-mismatch" if the PSF is of another channel and may not be.
+    other_channel: whether the PSF may be of another channel than the image. If it is of another channel and this is not
+    allowed, raises DataError "channel-mismatch".
     """
     found = {"channel": check_channel(psf, image.header, other_channel=other_channel)}
     if image.saturation is not None:

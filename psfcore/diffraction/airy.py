@@ -64,7 +64,7 @@ def airy_kernel(
 ) -> NDArray[np.float64]:
     """The share of all light in each pixel, shape (size, size), centre at [size // 2, size // 2]; size must be even.
 
-    The kernel is not normalised: its sum lacks the light beyond the array.
+    The kernel is not normalised: its sum is below 1, because light falls outside the array.
     """
     resolved_px = (
         wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm / diameter_mm * _UM_PER_MM / pixel_pitch_um

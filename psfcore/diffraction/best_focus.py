@@ -2,8 +2,8 @@
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "The instrument", prints radii and distances that
 are not consistent: with them the detector is far out of focus. This module solves for the separation of the mirrors.
-The focus is most sensitive to this length, because the secondary magnifies its error. All other values stay as printed,
-and the result states the shift of the separation.
+The focus is most sensitive to this length, because the secondary magnifies an error of it. All other lengths keep their
+printed values, and the result states by how much the separation was shifted.
 
 Rays near the axis meet on the detector where y(L) = 0 in Eq. (1) of light_path:
 
@@ -42,7 +42,8 @@ class BestFocus:
 
     printed_blur_px: width of the geometric image of a point at the printed separation.
     beyond_central_pixel_*: share of the light outside the central pixel, at the printed separation and in focus. This
-    share is computed in one dimension, for the open aperture without meshes. nominal_focal_length_mm: the focal length of the instrument file.
+    share is computed in one dimension, for the open aperture without meshes.
+    nominal_focal_length_mm: the focal length of the instrument file.
     order_spacing_px: spacing of the orders of the entrance mesh, measured in the focused image. The distance from order
     -`orders` to order +`orders` is divided by 2 x `orders`.
     """
@@ -74,7 +75,7 @@ class _WithoutWheel:
         self._step = FresnelStep(
             self._secondary, self.detector, wavelength_mm=path.wavelength_mm, distance_mm=length_mm
         )
-        # at x2 = 0, Eq. (1) of fresnel is a plain sum
+        # At x2 = 0, the integral in Eq. (1) of fresnel is the sum of E1 times this phase factor.
         self._to_axis = np.exp(1j * np.pi / path.wavelength_mm / length_mm * self._secondary.x_mm**2)
 
     def at_primary(self, openings_mm: Vector) -> Wave:
@@ -157,7 +158,7 @@ def _sharpest(waves: _WithoutWheel, at_primary: Wave, paraxial_mm: float) -> flo
 
 
 def _order_spacing_px(waves: _WithoutWheel, separation_mm: float) -> tuple[float, int]:
-    """Mean spacing (px) of the orders of the entrance mesh, and the order n: the spacing is measured from -n to +n."""
+    """Mean spacing (px) of the orders of the entrance mesh, measured between the orders -n and +n; and n."""
     path = waves.path
     field = waves.at_detector(waves.at_primary(path.entrance_mm), separation_mm)
     pitch_mm = path.entrance_mesh.pitch_um * MM_PER_UM

@@ -46,7 +46,8 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Route:
-    """The components of the entrance that are in the transformed mask. As a text: this decision and its reason."""
+    """The decision which components of the entrance are in the transformed mask. str() gives the decision and its
+    reason."""
 
     samples: int
     mask: bool
@@ -70,7 +71,7 @@ class Patterns:
 
 
 def route_of(instrument: Instrument) -> Route:
-    """Apply the rule of this module, with the largest number of samples that a line of the bandpass needs."""
+    """Apply the rule of this module. The number of samples is the largest number that a line of the bandpass needs."""
     samples = max(
         samples_per_pixel(
             instrument.aperture.diameter_mm,

@@ -48,8 +48,8 @@ class MeshDesign:
 
     peak_visibility: the contrast (high - low) / (high + low) of the orders along the axis, for a flare of `flare_px` px
     per side. It is 1 if the orders are separate, and 0 if they merge.
-    peak_over_scatter: the light of an order in a pixel, divided by the diffuse scatter of the same flare in this pixel.
-    The field holds the largest ratio of all orders on the axis from 50 to 150 px; None if the instrument has no scatter.
+    peak_over_scatter: the light of an order in a pixel, divided by the diffuse scatter of the same flare in this pixel;
+    the largest value for the orders on the axis from 50 to 150 px. None if the instrument has no scatter.
     """
 
     pitch_um: float
@@ -66,7 +66,8 @@ class MeshDesign:
 
 @dataclass(frozen=True)
 class DesignStudy:
-    """The computed meshes, sorted by wire and then by pitch, and the flown mesh (None if the instrument has no mesh)."""
+    """The computed meshes, sorted by wire width and then by pitch; and the mesh of the instrument itself ("flown"; None
+    if the instrument has no mesh)."""
 
     instrument: str
     flare_px: int

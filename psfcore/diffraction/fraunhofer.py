@@ -13,14 +13,14 @@ exp(-2 pi i o . i / n) and added modulo n ("folded"): along x for all rows, then
 each transform are kept. With Eq. (3) the sum over all n x n pixels equals the sum of the squares of the mask
 (Parseval).
 
-Departure from the paper: the open share of a cell is a mean over the cell. This mean multiplies E by
-sinc(x / n) sinc(y / n), so the pattern is divided by the square of this factor. Light beyond the n x n pixels wraps
-around to the opposite side. At the position x, its amplitude is (x / (n - x))^2 of the correct amplitude: 11 % at n / 4,
-1 % at n / 11. The pupil of HRI_EUV puts 0.13 % of its light beyond the inner 2048 px. With n = 4096 the wrapped light
-is then 1e-5 of all light.
+Departure from the paper: c is the open share of a cell, which is the mean of the transmission over the area of the
+cell. Therefore Eq. (1) gives E times sinc(x / n) sinc(y / n), and the pattern is divided by the square of this factor.
+Light beyond the n x n pixels wraps around to the opposite side. At the position x, the amplitude of the wrapped light
+is (x / (n - x))^2 of the correct amplitude: 11 % at n / 4, 1 % at n / 11. The pupil of HRI_EUV sends 0.13 % of its
+light beyond the inner 2048 px. With n = 4096, the wrapped light is 1e-5 of all light.
 
-Eq. (2) uses a sum instead of an integral. The sum conserves the energy, but single weights are not exact: for the open
-disc of HRI_EUV the central pixel is 3e-4 too low.
+Eq. (2) is a sum, not an integral over the pixel. The sum conserves the energy, but single weights are not exact: for
+the open disc of HRI_EUV the weight of the central pixel is too low by 3e-4.
 
 The mask is real, so P(-q) = P(q). If the mask is symmetric in x or in y, P is symmetric in both. If the mask also
 equals its transpose, an eighth of the transforms is enough. The symmetries of the mask M are tested with a random
@@ -195,7 +195,7 @@ class _Transforms:
         self.pool, self.threads = pool, threads
         # If the mask is symmetric in y, half of its rows are enough.
         rows = mask.cells // 2 if survey.mirror_y else mask.cells
-        # One pass over the mask serves several s, as many as fit into SPECTRA_BYTES.
+        # One pass over the mask computes the spectra of several s. SPECTRA_BYTES limits their number.
         together = max(1, min(samples // 2, SPECTRA_BYTES // (8 * rows * size)))
         self.spectra = np.empty((together, rows, size), dtype=np.complex64)
         self.field = np.empty((period, size), dtype=np.complex64)
@@ -209,13 +209,15 @@ class _Transforms:
             if t == 0 and s % together == 0:
                 self._transform_along_x(range(s, min(s + together, half)))
             self._transform_along_y(self.spectra[s % together], t)
-            # The transpose is added at the end. It would count positions with s = t twice, so these get half the weight.
+            # The transpose of the sum is added at the end. Positions with s = t would then count twice, so they get
+            # half the weight.
             self._add(0.5 if s == t and self.symmetry == MIRROR_AND_TRANSPOSE else 1.0)
             progress(done + 1, len(places))
         return _completed(self.total, self.symmetry)
 
     def _along_y(self, s: int) -> range:
-        """The values of t that must be computed for one s. Depending on the symmetry: all, half of them, or those up to s."""
+        """The values of t that must be computed for one s: all, half of them, or only those up to s, as the symmetry
+        allows."""
         half = self.samples // 2
         return range({NO_SYMMETRY: self.samples, MIRROR: half, MIRROR_AND_TRANSPOSE: s + 1}[self.symmetry])
 
@@ -266,12 +268,13 @@ def _completed(total: NDArray[np.float64], symmetry: str) -> NDArray[np.float64]
 
 
 def _turns(place: int, samples: int, size: int) -> float:
-    """o_s - n // 2. With the term n // 2 the origin of j is at [n // 2], so the result needs no shift."""
+    """o_s - n // 2. Because of the term n // 2, the centre of the pattern is at [n // 2], and no shift is needed."""
     return (place + 0.5) / samples - 0.5 - size // 2
 
 
 def _phases(turns: float, cells: int, size: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-    """exp(-2 pi i turns (m + k n) / n) as a factor for each m and one for each k."""
+    """exp(-2 pi i turns (m + k n) / n) as a product of two factors: the values of the first for each m, of the second
+    for each k."""
     within = np.exp(-2j * np.pi * turns * np.arange(size) / size)
     of_period = np.exp(-2j * np.pi * turns * np.arange(math.ceil(cells / size)))
     return within.astype(np.complex64), of_period.astype(np.complex64)
@@ -303,7 +306,10 @@ def _fold_strip(strip, within, of_period, folded):  # type: ignore[no-untyped-de
 
 @compiled(fastmath=True)
 def _fold_block(spectra, cells, within, of_period, field, start, stop):  # type: ignore[no-untyped-def]
-    """field[m] = sum over k of spectra[m + k n] exp(-2 pi i turns (m + k n) / n); rows that were not computed are mirror images."""
+    """field[m] = sum over k of spectra[m + k n] exp(-2 pi i turns (m + k n) / n).
+
+    Rows of spectra that were not computed are mirror images of computed rows.
+    """
     rows, columns = spectra.shape
     period = len(field)
     for m in range(start, stop):

@@ -15,10 +15,10 @@ Departures from the paper, with reasons:
 - Eq. (4): the paper prints 1 / (lambda z)^2. This is correct for the product of the counts of two axes; the count of
   one axis has 1 / (lambda z). dx1 is divided by SAMPLING_MARGIN, because otherwise light that would land outside X2
   would fold back into X2.
-- Each plane has the step that Eq. (4) requires. A plain FFT would couple the steps of successive planes, and its field
-  would be too small for short distances. A chirp transform computes the same sum without this coupling.
-- If a wire or a rim covers a sample partly, the sample counts with the open share of its length. So the positions of
-  wires and rims are not rounded to the grid.
+- Each plane has the step that Eq. (4) requires. With a plain FFT, the step of one plane would determine the step of the
+  next, and the planes would be too narrow for short distances. A chirp transform computes the same sum with any steps.
+- If a wire or a rim covers a part of a sample, the field of the sample is multiplied by the open share of its length.
+  So the positions of wires and rims are not rounded to the grid.
 
 Eq. (1) is paraxial, and in this approximation a pair of parabolas (K = -1) focuses perfectly. The conic constant of the
 secondary differs from -1. This leaves about 0.1 wave of spherical aberration at the rim of the beam; refocusing
@@ -82,7 +82,9 @@ class Grid:
 def grid_for(
     plane: str, *, width_mm: float, next_width_mm: float, wavelength_mm: float, distance_mm: float
 ) -> Grid:
-    """The grid of a plane, fine enough that its light reaches the full `next_width_mm` of the plane at `distance_mm`.
+    """The grid of a plane. Its step is so small that the light reaches the full width of the next plane.
+
+    next_width_mm, distance_mm: width of the next plane and its distance.
 
     Raises DataError "too-many-samples" if the distance is too short.
     """

@@ -1,8 +1,8 @@
 """How well the simplified-combined method approximates Fresnel propagation, in one dimension.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation" and the discussion of the
-positions that diffracting components may have. Two images of a point, both binned to pixels, are compared by the
-light beyond a distance from the centre (1 - encircled energy):
+positions that diffracting components may have. Each method computes an image of a point, binned to pixels. The two
+images are compared by their light beyond a distance from the centre (1 - encircled energy):
 
 - Fresnel: entrance aperture and mesh -> primary -> secondary -> filter-wheel mesh -> detector;
 - simplified-combined: Fraunhofer image of the entrance aperture and mesh, convolved with the analytic series
@@ -13,10 +13,11 @@ The paper leaves some choices open; the result states each of them:
 - The mirrors have the separation of best focus. Both methods use the focal length that follows from this separation.
 - The position of the filter-wheel wires across the beam is unknown. Results are means over equally spaced phases of
   the mesh. The range of the single phases is given with the means.
-- The series has the number of windows of the instrument file (all windows that the field illuminates), or a number that
-  the caller gives. The wave crosses only the few windows within the beam of one field point. This small number would
-  be wrong for the series. The image of the entrance already contains the diffraction at the edges of the beam; a series
-  of few windows would add this diffraction a second time. With more windows the two methods agree better.
+- The number of windows of the series is the number in the instrument file (all windows that the field illuminates), or
+  a number that the caller gives. The wave crosses only the few windows within the beam of one field point, but this
+  small number would be wrong for the series: the image of the entrance already contains the diffraction at the edges of
+  the beam, and a series of few windows would add this diffraction a second time. With more windows the two methods
+  agree better.
 - To study another distance, the filter wheel is moved between secondary and detector. The distance from secondary to
   detector does not change.
 - Each one-dimensional image ("line") is normalised to the light within REACH_PX of the axis.
@@ -67,14 +68,17 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Sampling:
-    """The sampling of a plane: width X, step dx and count N = X / dx. least_samples: X1 X2 / (lambda z), None for the detector."""
+    """The sampling of a plane: width X, step dx and count N = X / dx.
+
+    least_samples: the smallest allowed count, X1 X2 / (lambda z); None for the detector.
+    """
 
     plane: str
     width_mm: float
     step_um: float
     samples: int
     least_samples: int | None
-    # Fraction of the entering light that is left behind the mask of this plane; mean over phases.
+    # Fraction of the entering light that passes the mask of this plane; mean over phases.
     light: float
 
 
@@ -213,7 +217,8 @@ def _grids(path: LightPath, distance_mm: float) -> tuple[Grid, Grid]:
 
 
 class _AtWheel:
-    """The focused wave in front of a filter wheel, and its propagation through the mesh there."""
+    """The focused wave in front of the filter wheel, and its propagation through the mesh of the wheel to the
+    detector."""
 
     def __init__(self, path: LightPath, at_primary: Wave, separation_mm: float, distance_mm: float) -> None:
         self.path, self.distance_mm = path, distance_mm
@@ -302,7 +307,7 @@ def _compared(wheel: _AtWheel, lines: Vector, combined: Vector) -> DistanceResul
     path = wheel.path
     radii_px = np.arange(REACH_PX)
     combined_beyond = 100 * line_light_beyond(combined, radii_px)
-    # Each line is divided by its sum. So the mean of the curves equals the curve of the mean line.
+    # Each line is divided by its sum. Therefore the mean of the curves equals the curve of the mean line.
     shares = lines / lines.sum(axis=1, keepdims=True)
     single = np.array([100 * line_light_beyond(line, radii_px) for line in shares]) - combined_beyond
     mean_line = shares.mean(axis=0)

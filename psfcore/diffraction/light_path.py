@@ -71,7 +71,7 @@ class LightPath:
     @property
     def entrance_mm(self) -> Vector:
         """The openings of the entrance with its mesh, rows of (begin, end)."""
-        # If the number of windows is odd, a window is on the axis; if it is even, a wire is.
+        # If the number of windows is odd, a window lies on the axis; if it is even, a wire lies on the axis.
         phase = 0.0 if self.entrance_mesh.windows % 2 else 0.5
         windows_mm = mesh_windows_mm(self.entrance_mesh, phase, self.aperture.diameter_mm)
         return common_openings_mm(self.aperture_mm, windows_mm)
@@ -92,7 +92,10 @@ class LightPath:
         return abs(height) * self.aperture.diameter_mm
 
     def entrance_grids(self) -> tuple[Grid, Grid]:
-        """The grids of aperture and primary, so fine that light from each reaches the full width of the next mirror."""
+        """The grids of aperture and primary.
+
+        Their steps are so small that light reaches the full width of the next mirror.
+        """
         return self._grid(
             "aperture", self.aperture.diameter_mm, self.primary.diameter_mm, self.aperture_to_primary_mm
         ), self._grid(
@@ -100,7 +103,10 @@ class LightPath:
         )
 
     def secondary_grid(self, *, next_width_mm: float, distance_mm: float) -> Grid:
-        """The grid of the secondary, so fine that its light reaches the full width of a plane of `next_width_mm`."""
+        """The grid of the secondary. Its step is so small that light reaches the full width of the next plane.
+
+        next_width_mm, distance_mm: width of the next plane and its distance.
+        """
         return self._grid("secondary", self.secondary.diameter_mm, next_width_mm, distance_mm)
 
     def wheel_grid(self, distance_mm: float) -> Grid:
@@ -167,7 +173,7 @@ def mesh_windows_mm(mesh: Mesh, phase: float, width_mm: float) -> Vector:
 def light_path(instrument: Instrument) -> LightPath:
     """The optical path of an instrument.
 
-    Raises DataError "bad-instrument-file", with the name of the key that the instrument lacks.
+    Raises DataError "bad-instrument-file"; the message names the missing or unsuitable key.
     """
     if len(instrument.mirrors) != 2:
         raise _lacking(

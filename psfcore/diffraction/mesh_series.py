@@ -44,8 +44,9 @@ from psfcore.instruments.workload import FINEST_CELL_PX
 _UM_PER_ANGSTROM = 1e-4
 _UM_PER_MM = 1e3
 _LARGEST_CELL_PX = 0.4
-# The density of cells is proportional to the square root of light times width. _CELLS_AN_ORDER sets how many cells
-# are distributed over the light of one order, _CELLS_IN_ALL how many more over the light of the whole axis. An order that holds less than _FAINT_SHARE of all light gets fewer cells.
+# The density of cells is proportional to the square root of light times width. About _CELLS_AN_ORDER cells are
+# distributed over each order, and about _CELLS_IN_ALL further cells over the whole axis. An order that contains less
+# than _FAINT_SHARE of all light gets fewer cells.
 _CELLS_AN_ORDER = 30
 _CELLS_IN_ALL = 600
 _FAINT_SHARE = 1e-4
@@ -83,7 +84,7 @@ def mesh_line(
     alpha = np.pi * (pitch_um - wire_um) / pitch_um / spacing_px
     edges_px = np.arange(size + 1, dtype=np.float64) - size // 2 - 0.5
     light = np.diff(_integral(edges_px, alpha=alpha, spacing_px=spacing_px, windows=windows))
-    line = np.maximum(light, 0.0)  # the integral of a square is negative only by rounding
+    line = np.maximum(light, 0.0)  # the integral of a square can be negative only because of rounding
     return np.asarray(line / line.sum())
 
 
@@ -106,8 +107,8 @@ def rotated_mesh_kernel(
     """The pattern of a mesh, rotated by `angle_deg` (from +x towards +y) and integrated over pixels.
 
     Returns shape (size, size), centre at [size // 2, size // 2]; the weights are fractions of the light on the whole
-    plane, Eq. (5). At angle 0 each pixel differs from the product of the exact lines by at most 1e-4 of the light. The
-    sum of all absolute differences is at most 5e-4. Light that falls into a wrong pixel falls into a neighbour.
+    plane, Eq. (5). At angle 0, the weight of each pixel differs by at most 1e-4 from the product of the exact lines.
+    The sum of all absolute differences is at most 5e-4. Misplaced light falls into a pixel next to the correct one.
     """
     spacing_px = order_spacing_px(
         wavelength_angstrom=wavelength_angstrom,
@@ -129,7 +130,8 @@ def rotated_mesh_kernel(
 def _cells(
     reach_px: float, *, spacing_px: float, open_share: float, windows: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Divide one axis of the pattern, from -reach_px to reach_px, into cells; return their middles (px), widths (px), light.
+    """Divide one axis of the pattern, from -reach_px to reach_px, into cells; return the middle (px), width (px) and
+    light of each cell.
 
     The light of a cell is a fraction of the light on the whole axis. A cell is a part of a lobe of the grating factor, a
     whole lobe, or, where there is little light, several lobes. The middle of a cell is the centroid of its light.

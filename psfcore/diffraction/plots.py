@@ -1,6 +1,6 @@
 """Plots of the Fresnel study.
 
-Each plot has its own figure on the Agg canvas, so threads and processes share no state. With pyplot they would share it.
+Each plot has its own figure on the Agg canvas, so threads share no state. pyplot would keep a state that they share.
 """
 
 from __future__ import annotations

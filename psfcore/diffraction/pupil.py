@@ -1,14 +1,14 @@
 """The entrance pupil as a transmission mask, computed in strips of rows.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Implementation": amplitude masks of the aperture,
-its mount and its mesh. A cell of the mask holds the open share of its area. This share is exact: every outline
-is a polygon, and in a cell the area under an edge of a polygon is a trapezoid. A circle is replaced by a polygon
-of the same area with 4096 corners.
+its mount and its mesh. The value of a cell of the mask is its open share: the fraction of its area that lets light
+through. This fraction is exact: every outline is a polygon, and in a cell the area under an edge of a polygon is a
+trapezoid. A circle is replaced by a polygon of the same area with 4096 corners.
 
     open area of cell i = sum over edges of dy (i + 1 - x), with x the mean x of the edge in the cell   Eq. (1)
     circle of radius R: corners at the radius R sqrt((2 pi / m) / sin(2 pi / m))                        Eq. (2)
 
-If outlines of different components cross in one cell, their open shares are multiplied.
+If outlines of different components cross in one cell, the open shares of the cell in these components are multiplied.
 
 | symbol | name | unit |
 |---|---|---|
@@ -36,7 +36,8 @@ from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount
 
 CIRCLE_CORNERS = 4096
 _UM_PER_MM = 1e3
-# A ring that crosses the rim is a mistake in the instrument file; by rounding a ring may exceed the rim by this length.
+# A ring that crosses the rim is a mistake in the instrument file. This small excess is allowed, because numbers are
+# rounded.
 _RIM_TOLERANCE_MM = 1e-6
 _FARTHEST_CORNER = 100
 
@@ -54,9 +55,11 @@ class MaskPicture:
 
 @dataclass(frozen=True)
 class Pupil:
-    """The open area: the opening without the opaque outlines, the wires of the meshes and the opaque parts of a picture.
+    """The open area of the pupil: the opening minus the opaque outlines, the mesh wires and the opaque parts of a
+    picture.
 
-    An outline is one or more closed polygons with corners (x, y) in mm; its polygons may cut holes into each other.
+    An outline consists of one or more closed polygons with corners (x, y) in mm. A polygon may be a hole in another
+    one.
     """
 
     opening: Outline
@@ -80,8 +83,8 @@ def entrance_pupil(
     """The pupil of an aperture, with its mount and its meshes if they are given.
 
     mount_image: pixels [y, x] of the mount's mask image; row 0 is at the lowest y, and 0 is opaque.
-    Raises DataError "bad-mount", with the name of the key: if the hub or a ray is as wide as the aperture, if a ring
-    crosses the rim, if a corner is far outside, or if the mask image is missing or cannot be used.
+    Raises DataError "bad-mount" if the hub or a ray is as wide as the aperture, if a ring crosses the rim, if a corner
+    is far outside, or if the mask image is missing or cannot be used. The message names the key.
     """
     radius_mm = aperture.diameter_mm / 2
     opening: Outline = (circle(radius_mm),)
@@ -226,7 +229,7 @@ def _open_length_um(x_um: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float6
 
 
 def _wires(mesh: Mesh, width_mm: float) -> list[Outline]:
-    """The wires of a tilted mesh, as bars that extend beyond the pupil; all wires of one direction are one outline."""
+    """The wires of a tilted mesh, as bars that extend beyond the pupil. All wires of one direction form one outline."""
     reach_mm = width_mm  # longer than half the diagonal, width / sqrt(2)
     pitch_mm, wire_mm = mesh.pitch_um / _UM_PER_MM, mesh.wire_um / _UM_PER_MM
     count = math.ceil(reach_mm / pitch_mm)
@@ -260,9 +263,10 @@ def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]
-    """Write open shares into `strip`.
+    """Write the open share of each cell into `strip`.
 
-    A share is the product of the open shares of the meshes, of the opening (outline 0) and of all other outlines.
+    It is the product of the open shares of the cell in the meshes, in the opening (outline 0) and in all other
+    outlines.
     """
     rows, cells = strip.shape
     area = np.zeros(cells + 2)
@@ -292,7 +296,7 @@ def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries)
                     area[i] = 0.0
                     _apply(strip[k], line, line[row], i, i + 1, inside, outline)
                 done = max(ends[j] + 2, done if j else 0)
-            # The cells after the last edge may be covered too, because an outline may extend beyond the mask.
+            # The cells after the last edge may lie inside the outline too, because it may extend beyond the mask.
             _apply(strip[k], line, line[row], done, cells, inside, outline)
             area[cells:] = 0.0
 
@@ -309,7 +313,10 @@ def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-untyped-def]
-    """Open (outline 0) or close (other outlines) the cells from start to stop by the share of their area inside an outline."""
+    """Apply one outline to the cells from `start` to `stop` - 1. inside: the share of their area inside the outline.
+
+    Outline 0, the opening, sets their open share; every other outline is opaque and reduces it.
+    """
     covered = np.float32(min(abs(inside), 1.0))
     if outline == 0:
         covered *= line_y

@@ -1,6 +1,7 @@
 """The colours of EUV images: black, deep gold, yellow, white, as images at 174 angstrom are often shown.
 
-A map of its own, with its lightness (CIELAB L*) rising from level to level, so that brighter pixels never look darker.
+heliopsf defines its own colour map. The lightness (CIELAB L*) increases from level to level, so brighter pixels never
+look darker.
 """
 
 from __future__ import annotations
@@ -8,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-# Control points: a share of the range, and its colour. Colours between them are interpolated linearly in sRGB.
+# Control points: a position in the range (0 to 1), and its colour. Between them, colours are interpolated linearly in
+# sRGB.
 EUV_POINTS = (
     (0.0, "#000000"),
     (0.18, "#2e1500"),

@@ -25,7 +25,7 @@ from psfcore.errors import DataError
 PNG_START = b"\x89PNG\r\n\x1a\n"
 DASH = "\N{EN DASH}"
 PLOT_DPI = 160  # resolution of the figures on a page: sharp on screens of high resolution and on paper
-CSS_DPI = 96  # CSS pixels per inch: a figure is shown in the size in inches in which it was drawn
+CSS_DPI = 96  # CSS pixels per inch: a figure is shown at the size (in inches) at which it was drawn
 
 _NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?[\d.]+(e[-+]?\d+)?( ?%)?( (±|to) [-+]?[\d.]+(e[-+]?\d+)?)?")
 

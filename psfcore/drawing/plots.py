@@ -1,6 +1,6 @@
 """Plots: an image before and after deconvolution, and a PSF.
 
-Each plot has its own figure on the Agg canvas, so threads and processes share no state. With pyplot they would share it.
+Each plot has its own figure on the Agg canvas, so threads share no state. pyplot would keep a state that they share.
 """
 
 from __future__ import annotations
@@ -47,10 +47,11 @@ Plane = NDArray[np.floating]
 
 
 def write_png(figure: Figure, target: str | Path | IO[bytes], **options: Any) -> None:
-    """Draw a figure and write it as PNG. options: of ``FigureCanvasAgg.print_png``.
+    """Draw a figure and write it as PNG. options: the options of ``FigureCanvasAgg.print_png``.
 
-    Matplotlib reads texts between two dollar signs as formulas, and fails if they are none. Titles and labels contain names from
-    files, so they are drawn as they are. Only the numbers at the axes are formulas, such as 10^3.
+    Matplotlib reads a text between two dollar signs as a formula, and fails if it is not a formula. Titles and labels
+    contain names from files, so they are drawn without this rule. Only the numbers at the axes are formulas, such as
+    10^3.
     """
     for text in _plain_texts(figure):
         text.set_parse_math(False)
@@ -155,7 +156,7 @@ def psf_figure(psf: Psf) -> Figure:
 
 
 def _smoothed_profile(kernel: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The radius (px) and the mean weight of rings. Up to 17 px rings are 1 px wide, farther out 1/17 of the radius.
+    """The radius (px) and the mean weight of rings. Up to 17 px a ring is 1 px wide, farther out 1/17 of its radius.
 
     The centre is drawn at half a pixel, because a logarithmic axis has no zero. Rings without light are left out.
     """
@@ -188,7 +189,10 @@ def _draw_centre(figure: Figure, axes: Any, psf: Psf) -> None:
 
 
 def binned(plane: Plane, step: int) -> NDArray[np.float64]:
-    """Means of the finite values of step x step pixels; NaN if there are none. Incomplete last rows or columns are dropped."""
+    """Means of the finite values of step x step pixels; NaN if no value is finite.
+
+    Incomplete last blocks are left out.
+    """
     ny, nx = plane.shape[0] // step, plane.shape[1] // step
     data = np.asarray(plane[: ny * step, : nx * step], dtype=np.float32)
     finite = np.isfinite(data)

@@ -9,14 +9,14 @@ from psfcore.image import Image
 
 _UNKNOWN = "unit unknown"
 _LONGEST = 30
-# Counts: their number depends on the exposure time.
+# Units of counts. The number of counts depends on the exposure time.
 _COUNTS = re.compile(r"(dn|adu|ct|counts?|electrons?|photons?|ph)(/?pix(el)?)?", re.IGNORECASE)
 
 
 def unit_label(image: Image) -> str:
     """The unit of the pixels, such as "DN/s" or "DN in 2 s"; for counts with the exposure time.
 
-    The unit is BUNIT, or else PIXLUNIT, which AIA uses. Without them it is "unit unknown".
+    The unit is the card BUNIT, or else the card PIXLUNIT, which AIA uses. Without these cards it is "unit unknown".
     """
     unit = _unit(image)
     if not _COUNTS.fullmatch(unit):

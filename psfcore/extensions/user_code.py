@@ -1,4 +1,5 @@
-"""Code that a user names: a Python file, or a module that can be imported. Find it, hash it, import it, and name its errors.
+"""Code that a user names, in a Python file or in a module that can be imported: find it, hash it, import it, and report
+its errors.
 
 This module imports no numerical library.
 """
@@ -16,7 +17,7 @@ from types import ModuleType
 
 from psfcore.errors import DataError
 
-# A function that makes the error about a source from what is wrong with it.
+# A function that makes an error from the name of a source and a description of the fault.
 Bad = Callable[[str, str], DataError]
 
 

@@ -1,4 +1,7 @@
-"""How many pixels of a PSF are one pixel of an image, which may be binned. This module imports no numerical library."""
+"""Compare the pixels of a PSF with the pixels of an image, which may be binned.
+
+This module imports no numerical library.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
 
 
 class Sampled(Protocol):
-    """The properties of a PSF that say which pixels it is for. `psfcore.psf.Psf` has them."""
+    """The properties of a PSF that determine for which pixels it is valid. `psfcore.psf.Psf` has them."""
 
     @property
     def name(self) -> str: ...
@@ -22,12 +25,13 @@ class Sampled(Protocol):
 
 
 def binning_factor(psf: Sampled, header: Cards) -> int:
-    """Number of the PSF's pixels per image pixel, along each axis.
+    """The number of PSF pixels in one image pixel, along each axis.
 
-    The factor is 1 if the plate scales agree to 1 %, or if one of them is not known. If the image's plate scale is the
-    same whole multiple of the PSF's on both axes, the factor is that multiple. This requires that the image is from the
-    PSF's instrument, or that the PSF names no instrument. Otherwise the multiple may be a coincidence: a pixel of FSI,
-    for example, is as wide as nine pixels of HRI_EUV. Raises DataError "plate-scale-mismatch".
+    The factor is 1 if the plate scales agree to 1 %, or if one of them is not known. If the plate scale of the image is
+    a whole multiple of the plate scale of the PSF, the same on both axes, the factor is this multiple. This requires
+    that the image is from the PSF's instrument, or that the PSF names no instrument. Otherwise the multiple may be a
+    coincidence: for example, a pixel of FSI is as wide as nine pixels of HRI_EUV. Raises DataError
+    "plate-scale-mismatch".
     """
     if psf.plate_scale_arcsec is None:
         return 1
@@ -42,7 +46,8 @@ def binning_factor(psf: Sampled, header: Cards) -> int:
 
 
 def _mismatch(psf: Sampled, psf_arcsec: float, scales: list[float | None], whole: int | None) -> DataError:
-    """The error for pixels of another size. whole: the factor with which a rebinned PSF would fit; None: there is none."""
+    """The error for pixels of another size. whole: the factor by which the PSF must be rebinned; None: no factor
+    fits."""
     found = " x ".join("unknown" if scale is None else f"{scale:g}" for scale in scales)
     advice = (
         "use a PSF of the image's pixels"

@@ -35,9 +35,9 @@ BLOCK_BYTES = 2880
 CARD_BYTES = 80
 _BITPIX = (8, 16, 32, 64, -32, -64)
 _SKIP_BYTES = 1 << 20
-_MANY_AXES = 10  # of so many, a message does not write the indices
+_MANY_AXES = 10  # if an image has this number of axes or more, the message does not write out their indices
 END_CARD = b"END" + b" " * 77
-# astropy ends a header at a card such as "END x" too, and would then see another file than this module.
+# astropy also ends a header at a card such as "END x". It would then read the file in another way than this module.
 _DAMAGED_END = re.compile(rb"END[^A-Z0-9_-]")
 _KNOWN_STARTS = (
     (b"\x00\x00\x00\x0cjP", "a JPEG 2000 file"),
@@ -56,7 +56,7 @@ _KNOWN_STARTS = (
 
 @dataclass(frozen=True)
 class FitsLimits:
-    """Upper limits for reading a FITS file.
+    """Upper limits for a FITS file that is read.
 
     max_pixels: largest number of pixels of an image. max_header_bytes: largest size of all headers together. max_hdus:
     largest number of HDUs.
@@ -151,8 +151,10 @@ def first_image(source: Source, limits: FitsLimits) -> tuple[Header, int]:
 
 
 def enter_data(source: Source, hdu: int, limits: FitsLimits) -> Header:
-    """Header of an HDU that `first_image` found. The next byte of ``source``, which is at its start, is then the first
-    byte of the data of this HDU. Raises HeaderError."""
+    """Read up to the data of an HDU that `first_image` found; returns its header. ``source`` must be at its start.
+
+    Afterwards, the next byte of ``source`` is the first byte of the data of this HDU. Raises HeaderError.
+    """
     for number in range(hdu + 1):
         raw = _read_header(source, limits.max_header_bytes, limits, first=number == 0)
         if raw is None:
@@ -211,7 +213,10 @@ def _no_image(kinds: list[str]) -> HeaderError:
 
 
 def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:
-    """Read the cards before END; None if no further header starts. Raises HeaderError after `most` bytes without END."""
+    """Read the cards before END; None if no further header begins.
+
+    Raises HeaderError if `most` bytes contain no END.
+    """
     raw = bytearray()
     while len(raw) < most:
         block = source.read(BLOCK_BYTES)

@@ -18,7 +18,7 @@ LARGEST_COUNT = 2**63 - 1
 
 
 class Cards(Protocol):
-    """Header cards by their keywords: the header of a file, or the cards that the catalogue keeps of it."""
+    """Header cards by keyword: the header of a file, or the cards of it that the catalogue stores."""
 
     def __getitem__(self, key: str, /) -> Any:
         """The value of a card. Raises KeyError if there is no such card."""
@@ -27,7 +27,7 @@ class Cards(Protocol):
 
 @cache
 def card_trouble() -> tuple[type[Exception], ...]:
-    """Exceptions that astropy raises for a damaged card. Which one depends on the damage."""
+    """Exceptions that astropy raises for a damaged card. The kind of damage determines which of them it raises."""
     from astropy.io.fits.verify import VerifyError
 
     return VerifyError, ValueError, TypeError, IndexError, OverflowError

@@ -1,9 +1,9 @@
 """Compare the telescope, the channel and the filter of an image with those of a PSF.
 
-Compared are the instrument that the instrument files know, the wavelength, and the cards TELESCOP, INSTRUME, DETECTOR
-and FILTER, each where both the image and the PSF give it. The words of a card are compared without regard to their
-order; one text may have more words than the other, as SDO and SDO/AIA. Wavelengths are equal if they differ by at most 1 %:
-the channels of AIA, EUI and similar telescopes differ by more, and headers round the wavelength.
+This module compares the instrument that the instrument files know, the wavelength, and the cards TELESCOP, INSTRUME,
+DETECTOR and FILTER. It compares only values that both the image and the PSF give. The order of the words in a card is
+ignored, and one text may have more words than the other, as SDO and SDO/AIA. Wavelengths count as equal if they differ
+by at most 1 %, because headers round the wavelength. The channels of AIA, EUI and similar telescopes differ by more.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _TO_ALLOW = "set other_channel (--other-channel)"
 
 
 class Origin(Protocol):
-    """The properties of a PSF that say which images it is for. `psfcore.psf.Psf` has them."""
+    """The properties of a PSF that determine for which images it is valid. `psfcore.psf.Psf` has them."""
 
     @property
     def name(self) -> str: ...
@@ -35,12 +35,12 @@ class Origin(Protocol):
 
 
 def check_channel(psf: Origin, header: Cards, *, other_channel: bool = False) -> str | None:
-    """Compare a PSF with an image of this header. Returns a warning, or None if they are of one channel.
+    """Compare a PSF with an image that has this header. Returns a warning, or None if both are of the same channel.
 
     The warning does not name the PSF: it becomes a part of the product, which must not depend on the name of a file.
 
-    other_channel: whether the PSF may be of another telescope, channel or filter than the image. Raises DataError
-    "channel-mismatch" if it is and may not.
+    other_channel: whether the PSF may be of another telescope, channel or filter than the image. If it is, and
+    ``other_channel`` is False, raises DataError "channel-mismatch".
     """
     differences = channel_differences(psf, header)
     if differences and not other_channel:
@@ -63,7 +63,7 @@ def check_channel(psf: Origin, header: Cards, *, other_channel: bool = False) ->
 
 
 def channel_differences(psf: Origin, header: Cards) -> list[str]:
-    """In what the PSF and an image of this header differ, one text for each difference."""
+    """The differences between the PSF and an image with this header; one text for each difference."""
     differences = []
     instrument = _other_instrument(psf, header)
     if instrument is not None:
@@ -81,7 +81,7 @@ def channel_differences(psf: Origin, header: Cards) -> list[str]:
 
 
 def _other_instrument(psf: Origin, header: Cards) -> str | None:
-    """The image's instrument, if it is known not to be that of the PSF; otherwise None."""
+    """The instrument of the image if it is certainly not the instrument of the PSF; otherwise None."""
     if psf.instrument not in instrument_names():
         return None
     known = known_instrument(header)
@@ -97,7 +97,8 @@ def _other_instrument(psf: Origin, header: Cards) -> str | None:
 
 
 def _image_wavelength(header: Cards) -> float | None:
-    """Wavelength in angstrom from the header, else from the file of the known instrument; None if there is neither."""
+    """Wavelength in angstrom, from the header or else from the file of the known instrument; None if neither gives
+    it."""
     found = wavelength_angstrom(header)
     known = known_instrument(header)
     return load_instrument(known).wavelength_angstrom if found is None and known is not None else found

@@ -1,8 +1,9 @@
 """Read the columns of a binary table from its header, before the table is read.
 
 Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), section 7.3. astropy makes an object for each
-column that TFIELDS declares, and reserves the memory that TFORMn declare for each row, whatever the length of the file.
-Therefore both are compared with the size of the table. This module reads no data, so the web process can import it.
+column that TFIELDS declares, and reserves the memory that the cards TFORMn declare for each row, even if the file is
+shorter. Therefore this module limits TFIELDS and compares the columns with the size of a row. It reads no data, so the
+web process can import it.
 """
 
 from __future__ import annotations

@@ -43,7 +43,10 @@ class Cutout:
         return len(self.header) + self.rows.length + -self.rows.length % BLOCK_BYTES
 
     def pieces(self) -> Iterator[bytes]:
-        """The bytes of the FITS file, one piece after the other. Raises OSError, and EOFError if the PSF's file has become shorter."""
+        """The bytes of the FITS file, one piece after the other.
+
+        Raises OSError, and EOFError if the PSF's file has become shorter.
+        """
         yield self.header
         with self.path.open("rb") as file:
             yield from self.rows.read(file)
@@ -59,7 +62,7 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> Cutout:
     """Prepare the cut-out of the central (size, size) px of a PSF. The pixels are read once, for their sum.
 
     Raises DataError "cutout-too-large" if the PSF is smaller, and "cutout-not-plain" if the file is compressed or does not
-    hold plain floats.
+    store the weights as plain floats.
     """
     summary = read_summary(path, limits)
     ny, nx = summary.shape

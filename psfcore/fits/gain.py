@@ -43,7 +43,7 @@ def noise_figures_for(instrument: Instrument, header: Cards) -> tuple[float, flo
 
 
 def noise_for(instrument: Instrument, header: Cards) -> Noise | None:
-    """The noise model with the figures of `noise_figures_for`; None if there are none."""
+    """The noise model with the figures of `noise_figures_for`; None if the figures are not known."""
     figures = noise_figures_for(instrument, header)
     if figures is None:
         return None
@@ -53,7 +53,7 @@ def noise_for(instrument: Instrument, header: Cards) -> Noise | None:
 
 
 def no_noise_figures() -> DataError:
-    """The error for noise realisations of a camera whose noise is not known."""
+    """The error if noise realisations are requested but the noise of the camera is not known."""
     return DataError(
         "no-noise-figures",
         "expected noise (photon_gain_dn and read_noise_dn) to simulate noise realisations; got none, and the instrument's "

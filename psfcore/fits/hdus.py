@@ -27,7 +27,7 @@ from psfcore.fits.tiled.tiles import check_tiles
 from psfcore.whole_files import probe
 
 _CHECKSUM_COMMENT = "computed when the file was written"
-_RIGHT = 1  # answer of astropy: the card is there, and its value is right
+_RIGHT = 1  # astropy returns this value if the checksum card exists and its value is correct
 # Exceptions that astropy raises for a damaged data unit. The position of the damage decides which one it raises.
 PIXEL_TROUBLE = (
     CfitsioException,  # raised when RICE decoding fails; astropy has no public name for it
@@ -67,7 +67,8 @@ def opened_image(path: str | Path, summary: HeaderSummary) -> Iterator[Any]:
         if summary.codec is not None:
             _check_tiles(path, summary)
         # uint=False: otherwise astropy converts unsigned integers (BZERO 32768) before it applies BLANK.
-        # astropy also looks at the HDU after a first one, which is not checked. It must not prepare it for decompression.
+        # If an HDU is the first, astropy also inspects the next HDU, which was not checked. For a plain image, astropy
+        # must not prepare that HDU for decompression.
         options = {"uint": False, "disable_image_compression": summary.codec is None}
         with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True, **options) as hdus:
             hdu = hdus[summary.hdu]
@@ -78,7 +79,8 @@ def opened_image(path: str | Path, summary: HeaderSummary) -> Iterator[Any]:
 
 @contextmanager
 def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
-    """Raise DataError "unreadable-pixels" for the errors of astropy in the block. part: what is read, for the message."""
+    """Raise DataError "unreadable-pixels" for the errors of astropy in the block. part: the name of the part, for the
+    message."""
     try:
         yield
     except DataError:
@@ -118,7 +120,10 @@ def _check_tiles(path: str | Path, summary: HeaderSummary) -> None:
 
 
 def _raise_if_storage(error: Exception) -> None:
-    """Raise the error again if the disk caused it, and not the content of the file, such as a negative size."""
+    """Raise the error again if the disk caused it.
+
+    Do nothing if the content of the file caused it, such as a negative size.
+    """
     if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
         raise error
 
@@ -129,15 +134,18 @@ def ascii_text(text: str) -> str:
 
 
 def as_written(hdu: Any) -> bool:
-    """Whether an HDU is as `write_hdus` wrote it: its checksums are right, and no other program computed them again."""
+    """Whether an HDU is unchanged since `write_hdus` wrote it: its checksums are correct, and `write_hdus` computed
+    them."""
     sums = ("CHECKSUM", "DATASUM")
     ours = all(key in hdu.header and hdu.header.comments[key] == _CHECKSUM_COMMENT for key in sums)
     return ours and hdu.verify_datasum() == hdu.verify_checksum() == _RIGHT
 
 
 def write_hdus(path: str | Path, hdus: list[Any]) -> None:
-    """Write HDUs with checksums, but without a date of writing. Raises OSError, with the number of the system's error if there is
-    one now."""
+    """Write HDUs with checksums, but without a date of writing.
+
+    Raises OSError, with the system's error number if the file still cannot be written after the failure.
+    """
     hdus[0].header["EXTEND"] = True
     for hdu in hdus:
         hdu.verify("silentfix")
@@ -148,6 +156,7 @@ def write_hdus(path: str | Path, hdus: list[Any]) -> None:
             fits.HDUList(hdus).writeto(file, output_verify="silentfix")
         except OSError as error:
             if error.errno is None:
-                # numpy and astropy say how many bytes were written, not why no more were. A full disk is still full.
+                # numpy and astropy say how many bytes were written, but not why writing stopped. If the disk is full,
+                # this probe fails too, with the error of the system.
                 probe(Path(path))
             raise

@@ -39,7 +39,7 @@ __all__ = [
     "wavelength_angstrom",
 ]
 
-# WAVEUNIT is the name of a unit, or the power of ten of a metre.
+# WAVEUNIT is the name of a unit, or an exponent: -10 means 1e-10 m.
 _ANGSTROM_PER_UNIT = {
     "angstrom": 1.0,
     "a": 1.0,
@@ -52,7 +52,7 @@ _ANGSTROM_PER_UNIT = {
 }
 # The content of a file, see `content_of`.
 IMAGE, PRODUCT, PSF = "image", "product", "psf"
-# The cards that say which PSF and which image fit together.
+# The cards that are compared to find out whether a PSF and an image fit together.
 ORIGIN_CARDS = ("TELESCOP", "INSTRUME", "DETECTOR", "FILTER")
 _FIT_CARDS = (
     *ORIGIN_CARDS,
@@ -67,7 +67,7 @@ class HeaderSummary:
     """The first 2-D image of a file: its HDU, its shape (ny, nx) and values of its header.
 
     A value is None if its card is missing or unusable. content: IMAGE, PRODUCT or PSF, see `content_of`. cards: the usable
-    cards that say which PSF and which image fit together.
+    cards that are compared to find out whether a PSF and an image fit together.
     """
 
     hdu: int
@@ -118,9 +118,9 @@ def check_all_headers(path: str | os.PathLike[str], limits: FitsLimits) -> None:
 
 
 def content_of(header: Header) -> str:
-    """What heliopsf wrote into a file, by the cards in its header: PRODUCT or PSF; otherwise IMAGE.
+    """The content of a file: PRODUCT or PSF if the cards show that heliopsf wrote such a file; otherwise IMAGE.
 
-    A product has the card PSFID or PRODID, a PSF the card PSFSUM.
+    A product has the card PSFID or PRODID. A PSF has the card PSFSUM.
     """
     if "PSFID" in header or "PRODID" in header:
         return PRODUCT
@@ -128,7 +128,7 @@ def content_of(header: Header) -> str:
 
 
 def check_not_deconvolved(content: str) -> None:
-    """Raise DataError if the content of a file, as `content_of` tells it, is not an image that can be deconvolved.
+    """Raise DataError if the content of a file is not IMAGE. content: the result of `content_of`.
 
     Codes: "already-deconvolved" for a product, "psf-as-image" for a PSF.
     """
@@ -147,9 +147,11 @@ def check_not_deconvolved(content: str) -> None:
 
 
 def origin_of(header: Cards) -> tuple[str | None, dict[str, str]]:
-    """The instrument of a PSF, and the cards that say which images it is for. header: of the file of the PSF.
+    """The instrument of a PSF, and the cards that say for which images it is valid. header: the header of the PSF's
+    file.
 
-    INSTRUME of a file of `psfcore.fits.psfs.write_psf`, which has the card PSFNAME, is the name of an instrument file.
+    In a file that `psfcore.fits.psfs.write_psf` wrote (it has the card PSFNAME), INSTRUME is the name of an instrument
+    file.
     """
     own = optional_text(header, "PSFNAME") is not None
     texts = {key: optional_text(header, key) for key in ORIGIN_CARDS}
@@ -235,7 +237,8 @@ def optional_exposure_s(header: Cards) -> float | None:
 
 
 def seen_by(header: Cards) -> dict[str, Any]:
-    """What a header says about the observation: the fields of `HeaderSummary` from instrument to gain_mode, by name."""
+    """The values of a header that describe the observation: the fields of `HeaderSummary` from instrument to
+    gain_mode."""
     return {
         "instrument": known_instrument(header),
         "telescop": optional_text(header, "TELESCOP"),

@@ -61,14 +61,14 @@ def image_of(
 ) -> Image:
     """The image of pixels [y, x] and a header, with its unusable pixels masked as in `read_image`.
 
-    stored_as_integer: whether the numbers come from a converter, without a calibration. Raises DataError "no-exposure",
-    "all-nan", "all-saturated", "no-signal", "too-small", "not-2d".
+    stored_as_integer: whether the pixels are the numbers of an A/D converter, without a calibration. Raises DataError
+    "no-exposure", "all-nan", "all-saturated", "no-signal", "too-small", "not-2d".
     """
     unit, exposure_s = optional_text(header, "BUNIT"), optional_exposure_s(header)
     level = _saturation_level(header, unit, exposure_s, saturation_dn)
     mask = np.where(np.isfinite(pixels), 0, int(MaskBit.NONFINITE)).astype(np.uint8)
     if level is not None:
-        mask[pixels >= level] |= int(MaskBit.SATURATED)  # False for NaN
+        mask[pixels >= level] |= int(MaskBit.SATURATED)  # for NaN the comparison is False
     image = Image(pixels=pixels, mask=mask, header=header, unit=unit, exposure_s=exposure_s)
     _check_signal(image, stored_as_integer=stored_as_integer)
     return image
@@ -130,7 +130,7 @@ def write_image(
     Cards that say how the input file stores its pixels are removed. DATAMIN, DATAMAX and DATAMEAN are computed again;
     the cards with median, rms and percentiles of the input are removed.
     planes: planes [y, x] by name (QUALITY, ERROR, PSF_ERROR), see `psfcore.fits.product.planes`. The image is the first HDU, and
-    each plane is an image extension after it. plane_bits: for each plane of bits, what its bits mean.
+    each plane is an image extension after it. plane_bits: for each plane of bits, the meaning of its bits.
     Raises DataError "bad-plane" for a wrong shape, a wrong type or a name that is used twice.
     """
     header = _kept_header(image.header)

@@ -1,4 +1,5 @@
-"""Read an image that is to be deconvolved, with its saturated pixels masked by everything that is known about them."""
+"""Read an image for deconvolution, and mask its saturated pixels with all known saturation levels and a test of the
+pixels."""
 
 from __future__ import annotations
 
@@ -17,10 +18,12 @@ from psfcore.instruments.model import load_instrument
 
 
 def read_observation(path: str | Path, limits: FitsLimits, *, saturation_dn: float | None = None) -> Image:
-    """Read the first 2-D image of a file; ``saturation`` of the image says how its saturated pixels were found.
+    """Read the first 2-D image of a file. The field ``saturation`` of the image says how its saturated pixels were
+    found.
 
-    saturation_dn: the level in DN of one exposure; None: the level of the header or of the instrument file, or what the
-    pixels show. Raises the errors of `psfcore.fits.images.read_image`.
+    saturation_dn: the saturation level in DN of one exposure; None: the level is taken from the header or the
+    instrument file, and the pixels are tested, see `psfcore.fits.saturation`. Raises the errors of
+    `psfcore.fits.images.read_image`.
     """
     known = _instrument_level_dn(first_image_header(path, limits))
     image = read_image(path, limits, saturation_dn=saturation_dn or known)
@@ -34,7 +37,8 @@ def observation_of(
     saturation_dn: float | None = None,
     stored_as_integer: bool = False,
 ) -> Image:
-    """The image of pixels [y, x] and a header that are in memory, with its saturated pixels masked as in `read_observation`.
+    """Make an image from pixels [y, x] and a header in memory. Its saturated pixels are masked as in
+    `read_observation`.
 
     Raises the errors of `psfcore.fits.images.image_of`.
     """

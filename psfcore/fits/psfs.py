@@ -160,22 +160,23 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
 
 
 def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
-    """The id that heliopsf gave to the PSF in a file, as its HISTORY states it; None if the file states none.
+    """The id that heliopsf gave to the PSF in a file, from its HISTORY; None if HISTORY contains no id.
 
-    None also if the file was changed since `write_psf` wrote it (CHECKSUM and DATASUM of every HDU), or if it was derived
-    from the file of another PSF. Raises HeaderError.
+    Also None if the file was changed after `write_psf` wrote it (CHECKSUM and DATASUM of every HDU are checked), or if
+    it was derived from the file of another PSF. Raises HeaderError.
     """
     check_all_headers(path, limits)
     try:
         with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
             lines = [str(line) for line in hdus[0].header.get("HISTORY", [])]
             stated = [found[1] for line in lines if (found := _STATED.fullmatch(line))]
-            # `read_psf` keeps the history of a file under this name, and `write_psf` then writes it into the derived file.
+            # `read_psf` keeps the HISTORY of a file under this name, and `write_psf` writes it into files derived from
+            # it.
             derived = any(line.startswith("history:") for line in lines)
             if len(stated) != 1 or derived:
                 return None
             same = all(as_written(hdu) for hdu in hdus)
-    except PIXEL_TROUBLE:  # the file cannot be read as one of write_psf; the job that uses it says why
+    except PIXEL_TROUBLE:  # a damaged file, or one of other software; the job that uses it raises the error
         return None
     return stated[0] if same else None
 
@@ -210,7 +211,7 @@ def _read_extras(
 
 
 def _is_plain_table(hdu: Any) -> bool:
-    """Whether an HDU is a table whose columns need exactly its rows, as in the files of write_psf."""
+    """Whether an HDU is a table whose columns fill its rows exactly, as in the files of write_psf."""
     if not isinstance(hdu, fits.BinTableHDU):
         return False
     return not any(column.in_heap for column in read_columns(hdu.header))

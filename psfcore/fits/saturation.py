@@ -5,16 +5,18 @@ the saturated pixels of an image. In 26 level 1 images of a flare of 2012-07-19,
 15000 DN (in 25 images exactly, in one it is larger by 1), so an AIA image with NSATPIX has this level. A pixel of exactly
 15000 DN counts as saturated here too.
 
-If no level is known, a saturated image still shows it: many pixels have exactly the largest value, because the
-converter or the software that wrote the image cannot give more. In an image that is not saturated, the number of pixels
-per value falls towards the largest value. So the number n of pixels with the largest value should not exceed the mean
-number of pixels per occupied value, m, among the brightest pixels below it:
+Saturation can also be found without a known level: in a saturated image many pixels have exactly the largest value,
+because the converter or the software that wrote the image cannot write a larger one. In an image that is not saturated,
+the number of pixels per value decreases towards the largest value. Let n be the number of pixels with the largest
+value, and m the mean number of pixels per occurring value among the brightest pixels below it. Without saturation, n
+should not exceed m:
 
     P(n) = probability of at least n events of a Poisson distribution with mean m        Eq. (1)
 
-If P is below MASKED_BELOW, the pixels with the largest value are saturated. If it is below DOUBTED_BELOW, they may be,
-and the image gets a warning. The test does not depend on the unit: a division by the exposure time keeps equal values
-equal. It cannot find saturated pixels that a flat field or an interpolation made different from each other.
+If P is below MASKED_BELOW, the pixels with the largest value are masked as saturated. If it is only below
+DOUBTED_BELOW, they may be saturated, and the image gets a warning. The test does not depend on the unit, because values
+that are equal stay equal after a division by the exposure time. The test cannot find saturated pixels whose values a
+flat field or an interpolation made different from each other.
 
 | symbol | name | unit |
 |---|---|---|
@@ -52,7 +54,7 @@ def per_second(unit: str | None) -> bool:
     return (unit or "").replace(" ", "").lower() in ("dn/s", "dn/s/pixel", "dn/s/pix")
 
 
-# Counts and rates of counts; a level in DN cannot be compared with pixels in another unit, such as photons or kelvin.
+# The units of counts and of count rates. A level in DN cannot be compared with pixels in another unit, such as photons.
 _COUNTS = re.compile(r"(dn|adu|ct|counts?)(/?pix(el)?)?(/s(/pix(el)?)?)?", re.IGNORECASE)
 
 
@@ -62,7 +64,7 @@ def in_other_unit(unit: str | None) -> bool:
 
 
 def card_levels(header: Header) -> dict[str, float]:
-    """Levels in the unit of the image, by the cards that give them."""
+    """The saturation levels that cards give, in the unit of the image, by the name of the card."""
     levels = {key: optional_number(header, key) for key in _LEVEL_CARDS}
     return {key: level for key, level in levels.items() if level is not None and level > 0}
 
@@ -72,10 +74,11 @@ def with_saturation(
 ) -> Image:
     """The image with its saturated pixels masked, and with the record of how they were found.
 
-    requested_dn, instrument_dn: the level in DN of one exposure that the request and the instrument file give. As in
-    `psfcore.fits.images.read_image`, the level of the request replaces that of the instrument file, and the lowest
-    level of all is used. Unless the request gives a level, the pixels are tested too, see Eq. (1). For an image in another unit
-    than DN or DN/s, levels in DN are not used. Raises DataError "saturation-unit" if the request gives one.
+    requested_dn, instrument_dn: the levels in DN of one exposure that the request and the instrument file give. The
+    level of the request replaces the level of the instrument file, as in `psfcore.fits.images.read_image`. If several
+    levels remain, the lowest one is used. If the request gives no level, the pixels are also tested, see Eq. (1). A
+    level in DN cannot be used for an image whose unit is neither DN nor DN/s: if the request gives one, raises
+    DataError "saturation-unit".
     """
     known = _levels(image, requested_dn, instrument_dn)
     found = min(known, key=lambda key: known[key], default=None)
@@ -105,7 +108,7 @@ def with_saturation(
 def largest_value(pixels: NDArray[np.float64], valid: NDArray[np.bool_]) -> tuple[float, int, float]:
     """The largest valid value, the number n of pixels that have it, and the probability P(n) of Eq. (1).
 
-    pixels: [y, x]. valid: True for the pixels to look at. P is 1 if no valid pixel is below the largest value.
+    pixels: [y, x]. valid: True for the pixels that are tested. P is 1 if no valid pixel is below the largest value.
     """
     top = float(np.max(pixels, initial=-np.inf, where=valid))
     count = int(np.count_nonzero((pixels == top) & valid))
@@ -158,7 +161,7 @@ def _aia_level_dn(header: Header) -> float | None:
 
 def _masked(image: Image, level: float) -> NDArray[np.uint8]:
     mask = image.mask.copy()
-    mask[image.pixels >= level] |= int(MaskBit.SATURATED)  # False for NaN
+    mask[image.pixels >= level] |= int(MaskBit.SATURATED)  # for NaN the comparison is False
     return mask
 
 

@@ -22,7 +22,7 @@ _TYPES = {8: "B", 16: "h", 32: "i", 64: "q", -32: "f", -64: "d"}
 
 
 def check_is_psf(path: str | os.PathLike[str], summary: HeaderSummary, limits: FitsLimits) -> None:
-    """Raise DataError if a file is plainly no PSF.
+    """Raise DataError if a file is certainly not a PSF.
 
     summary: the summary of the file's header. Codes: "image-as-psf" for a product, or for a compressed image with an
     exposure time; "psf-nonfinite", "psf-negative", "psf-sum", "psf-not-centred" for weights that no PSF can have; and the
@@ -78,7 +78,7 @@ def _reach(size: int) -> range:
 
 
 def _rows(source: Source, summary: HeaderSummary) -> Iterator[array[float]]:
-    """The rows of an image as stored numbers, one after the other."""
+    """The rows of an image, one after the other, as the numbers that the file stores (before BSCALE and BZERO)."""
     ny, nx = summary.shape
     for _ in range(ny):
         stored: array[float] = array(_TYPES[summary.bitpix])

@@ -9,9 +9,9 @@ around the centre are free:
 
 d is the flare image minus an image from before the flare. s_u and d_u are means over the pixels of a strip along the
 arm, one mean for each distance u in steps of 1 px. If the noise of the camera is known, e_u is the noise of d_u, and the
-sum is chi^2. If not, e_u = d_u, and the root mean square is the percentage error that the paper minimises. Non-negative
-least squares (Lawson and Hanson 1974, chapter 23) finds the minimum; the constraint is an additional row with a large
-weight (their chapter 22).
+sum is chi^2. Otherwise e_u = d_u, and the root of the mean of the terms is the percentage error that the paper
+minimises. Non-negative least squares (Lawson and Hanson 1974, chapter 23) finds the minimum. The constraint is an
+additional row with a large weight (their chapter 22).
 
 Departure from the paper: the paper iterates "until the percentage root mean square error was minimized" and does not
 say how. Here chi^2 is minimised if the noise is known, because beyond 60 px the percentage error of single pixels is
@@ -88,7 +88,7 @@ class FlareFit:
     with d_u > 0. chi2_per_distance: the sum in Eq. (2) divided by the number of distances; None if the noise is unknown.
     reduced_chi2: the same sum divided by the degrees of freedom (number of distances - number of used pixels of the box
     + 1 for the constraint). matched: mean s divided by mean d at 60 to 70 px. matched_noise_pct: the noise of this mean
-    d in percent; the constraint treats the mean d as exact.
+    d, in percent of it; the constraint treats this mean as exact.
     """
 
     box: Plane
@@ -119,7 +119,8 @@ class FlareComparison:
     """The fits of the total PSF and of its diffraction PSF alone along one arm of one flare.
 
     diffraction: None if the file of the PSF does not separate diffraction from scatter.
-    explained: the share of the changes off the arm that the total PSF and its fitted box explain, see `explained_share`.
+    explained: the share of the changes beside the arm that the total PSF and its fitted box explain, see
+    `explained_share`.
     """
 
     profile: ArmProfile
@@ -162,9 +163,10 @@ class FlareComparison:
 def flare_centre(difference: Plane, usable: Flags, usable_before: Flags) -> tuple[int, int]:
     """Position (x, y) of the flare, px.
 
-    It is the middle of the largest patch of pixels that became unusable since the image before. If there is no such
-    patch, it is the brightest pixel of the smoothed difference. usable, usable_before: True for the usable pixels of the
-    image and of the image before. Raises DataError "flare-no-light" if no pixel became brighter.
+    It is the middle of the largest patch of pixels that are unusable in the flare image but usable in the image before.
+    If there is no such patch, it is the brightest pixel of the smoothed difference. usable, usable_before: True for the
+    usable pixels of the flare image and of the image before. Raises DataError "flare-no-light" if no pixel became
+    brighter.
     """
     labels, count = ndimage.label(~usable & usable_before, structure=np.ones((3, 3)))
     if count:
@@ -250,7 +252,8 @@ def fit_flare(
     error = profile.sigma if profile.sigma is not None else _percent_error(observed, level)
     constraint = design[matched].mean(axis=0)
     weight = _CONSTRAINT_WEIGHT * np.sqrt(observed.size) / level
-    # The solver needs columns of similar size. Before scaling they differ, and the light is about 1e7.
+    # The solver needs columns of similar size. Without scaling, the light of the box is about 1e7, and the columns
+    # differ.
     scale = np.linalg.norm(design / error[:, None], axis=0)
     rows = np.vstack((design / error[:, None], weight * constraint)) / np.where(scale > 0, scale, 1.0)
     found, _ = nnls(rows, np.append(observed / error, weight * level))
@@ -296,12 +299,12 @@ def explained_share(
     *,
     variance: Plane | None = None,
 ) -> float:
-    """The share of the changes around the flare that its stray light explains:
+    """The share of the changes around the flare that the stray light of the flare explains:
 
         1 - (sum (s - d)^2 - sum e^2) / (sum d^2 - sum e^2)
 
-    The sums are over pixels at the same distances as the profile, without the strip along the arm. The share is 1 if all
-    changes are stray light of the flare. It is 0 or less if the changes are not smaller after the simulated stray light
+    The sums are over the pixels at the distances of the profile, without the strip along the arm. The share is 1 if all
+    changes are stray light of the flare. It is 0 or less if the changes do not decrease when the simulated stray light
     is subtracted.
     """
     x0, y0 = profile.centre_xy
@@ -324,7 +327,7 @@ def explained_share(
 
 
 def _judged(profile: ArmProfile, design: Plane, box: Plane, matched: Flags) -> FlareFit:
-    """The result of the fit for this fitted box."""
+    """Make the result of the fit from the fitted box."""
     simulated, observed = design @ box.ravel(), profile.observed
     used = int(np.count_nonzero(box > _USED_SHARE * box.sum()))
     chi2 = None if profile.sigma is None else float((((simulated - observed) / profile.sigma) ** 2).sum())

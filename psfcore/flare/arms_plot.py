@@ -1,4 +1,4 @@
-"""A plot of measured arms: the image with the fitted orders, and cuts along the arms through image and fit."""
+"""A plot of measured arms: the image with the fitted orders, and cuts through the image and the fit along each arm."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _COLOURS = ("#c2402f", "#1b4f8a", "#2b8a6e", "#e0a100", "#7b3fa0", "#1b1b1b")
 
 
 def arms_png(image: NDArray[np.float64], found: ArmMeasurement, path: str | Path, *, unit: str) -> None:
-    """Plot the image [y, x] in `unit`, the fitted orders, and cuts along each arm."""
+    """Draw the image [y, x] in `unit` with the fitted orders, and a cut along each arm, into a PNG file."""
     layout = ConstrainedLayoutEngine(w_pad=0.08)
     figure = Figure(figsize=(15.6, 6.2), dpi=100, facecolor="white", layout=layout)
     spacing = f"{found.spacing_px:.4f} ± {found.spacing_sigma_px:.4f} px"
@@ -54,7 +54,7 @@ def _draw_image(
 
 
 def _draw_cuts(axes: Any, image: NDArray[np.float64], found: ArmMeasurement) -> None:
-    """Draw image and fit along each arm, where pixels were fitted. The curves of the arms are stacked."""
+    """Draw image and fit along each arm at the fitted pixels. The curves of the arms are drawn one above the other."""
     reach = max((abs(peak.order) for peak in found.peaks), default=1) * found.spacing_px + 5
     along = np.arange(-reach, reach, 0.25)
     clean = np.nan_to_num(image)

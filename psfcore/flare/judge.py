@@ -47,8 +47,9 @@ def judge_on_flare(
 ) -> FlareTest:
     """Simulate the stray light of a flare with ``psf``, and compare it with the observed light along a diffraction arm.
 
-    centre_xy: position of the flare, px; default: found in the images. arm_deg: direction of the arm, from +x towards +y;
-    default: measured, the arm nearest to +x. noise: the noise of the camera; chi2 is computed only if it is given.
+    centre_xy: position of the flare, px; default: it is found in the images. arm_deg: direction of the arm, from +x
+    towards +y; default: it is measured, and the arm nearest to +x is used. noise: the noise of the camera; chi2 is
+    computed only if it is given.
     Raises DataError "plate-scale-mismatch", "flare-shapes", "flare-units", and the errors of ``compare_on_flare`` and
     ``measure_arms``.
     """

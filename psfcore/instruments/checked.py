@@ -1,6 +1,6 @@
-"""Frozen classes that check their values when they are made, for files that people write by hand.
+"""Immutable classes for the content of files that people write by hand. An object checks its values when it is made.
 
-A subclass of `Checked` lists its keys like a dataclass; the annotation of a key says which values it accepts:
+A subclass of `Checked` lists its keys like a dataclass. The annotation of a key says which values the key accepts:
 
 | annotation | value |
 |---|---|
@@ -10,7 +10,7 @@ A subclass of `Checked` lists its keys like a dataclass; the annotation of a key
 | dict[str, X] | a table with keys of any name |
 | dict[Literal[...], X] | a table with some of the listed keys |
 | X, a subclass of `Checked` | a table with the keys of X |
-| X | None | the same as X; None only if the key is left out |
+| X | None | the same as X; the value is None if the key is left out |
 | X | Y, a text and a number | a text as X accepts it, or a number as Y accepts it |
 | Annotated[X, Limit(...)] | the same as X, within limits |
 
@@ -32,7 +32,8 @@ from typing import Any, Literal, NamedTuple, Self, dataclass_transform
 
 @dataclass(frozen=True)
 class Limit:
-    """Limits of a number (gt, ge, le, lt), of a number of entries or characters, and the pattern of a whole text."""
+    """Limits of a number (gt, ge, le, lt); limits of the number of entries or characters; a pattern for the whole
+    text."""
 
     gt: float | None = None
     ge: float | None = None
@@ -44,7 +45,8 @@ class Limit:
 
 
 class Fault(NamedTuple):
-    """A value that is not accepted: its place in the file, such as ("meshes", 0, "wire_um"), what was expected, and the value."""
+    """A value that is not accepted: its position in the file, such as ("meshes", 0, "wire_um"), the expected value, and
+    the given value."""
 
     key: tuple[str | int, ...]
     expected: str
@@ -83,7 +85,8 @@ class Checked:
             raise BadValues([Fault((), together, None)])
 
     def check(self) -> str | None:
-        """What is wrong with values that are accepted one by one, as one sentence with expected and given values; else None.
+        """Check values together after each of them was accepted. Returns None, or a sentence with expected and given
+        values.
 
         May raise BadValues instead, to name the keys.
         """
@@ -157,7 +160,10 @@ def _accepted(annotation: Any, value: Any, key: tuple[str | int, ...]) -> Any:
 
 
 def _fitting(arguments: tuple[Any, ...], value: Any, key: tuple[str | int, ...]) -> Any:
-    """The annotation of a union whose type is that of the value. Raises BadValues if a text or a number was expected."""
+    """The member of a union that fits the type of the value.
+
+    Raises BadValues if the value is neither text nor number.
+    """
     inner = [argument for argument in arguments if argument is not types.NoneType]
     if len(inner) == 1:
         return inner[0]
@@ -218,7 +224,7 @@ def _table(cls: type[Checked], value: Any, key: tuple[str | int, ...]) -> Checke
     try:
         return cls.read(value)
     except BadValues as error:
-        # A fault without a key concerns the whole table.
+        # If a fault has no key, it concerns the whole table.
         told = [Fault((*key, *one.key), one.expected, one.got if one.key else value) for one in error.faults]
         raise BadValues(told) from None
 
@@ -236,7 +242,7 @@ def _collect(parts: Iterator[tuple[Any, Any, tuple[str | int, ...]]]) -> list[An
 
 
 def _check_length(limit: Limit, value: Any, key: tuple[str | int, ...]) -> None:
-    """Check the length before the entries, so that a long list costs no time."""
+    """Check the length before the entries are checked, so that a very long list costs no time."""
     if not isinstance(value, str | list | tuple | Mapping):
         return
     parts = "characters" if isinstance(value, str) else "entries"

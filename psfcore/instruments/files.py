@@ -12,7 +12,9 @@ from pathlib import Path
 
 from psfcore.errors import DataError
 
-WAVELENGTH_TOLERANCE = 0.01  # largest deviation from 1 of the ratio of two wavelengths of one channel
+WAVELENGTH_TOLERANCE = (
+    0.01  # two wavelengths count as the same channel if their ratio differs from 1 by at most this
+)
 _FOLDER = Path(__file__).parent
 
 

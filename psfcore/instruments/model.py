@@ -15,11 +15,11 @@ from psfcore.errors import DataError
 from psfcore.instruments.checked import BadValues, Checked, Fault, Limit
 from psfcore.instruments.files import instrument_path
 
-_MOST_DOTS = 64  # largest number of dots in a part of the file without brackets, commas or line ends
+_MOST_DOTS = 64  # a part of the file without brackets, commas or line ends may contain this number of dots
 
 Positive = Annotated[float, Limit(gt=0)]
-# The software multiplies lengths and divides them by each other. Within these limits no result overflows or becomes 0.
-# In the units of the keys, all telescopes from X-rays to the far infrared are far inside these limits.
+# The software multiplies and divides lengths. Within these limits no product or quotient overflows or becomes 0. All
+# telescopes from X-rays to the far infrared are well within these limits, in the units of the keys.
 _LEAST, _MOST = 1e-9, 1e9
 Size = Annotated[float, Limit(ge=_LEAST, le=_MOST)]
 SizeOrNone = Annotated[float, Limit(ge=0, le=_MOST)]
@@ -164,7 +164,7 @@ class Mount(Checked):
     mask_image: MaskImage | None = None
 
     def check(self) -> str | None:
-        """All groups together must be few."""
+        """The total number of rays, and of corners of polygons, is limited."""
         for most, got, parts in (
             (MOST_RAYS, self.ray_count, "rays"),
             (MOST_CORNERS, self.corner_count, "corners of polygons"),
@@ -254,7 +254,10 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
 
 
 def read_instrument_text(path: Path) -> str:
-    """The text of an instrument file, at most one character more than is allowed. Raises DataError "bad-instrument-file"."""
+    """Read an instrument file, but at most one character more than the limit, so that `parse_instrument` can refuse it.
+
+    Raises DataError "bad-instrument-file".
+    """
     try:
         with path.open("rb") as file:
             return file.read(MOST_BYTES + 1).decode("utf-8")
@@ -285,7 +288,7 @@ def _said(error: BadValues) -> str:
     """The first fault in one line, and the number of the others."""
     first, more = error.faults[0], len(error.faults) - 1
     key = ".".join(map(str, first.key)) or "file"
-    # The fault of a table as a whole says itself what it got; a missing key has no value.
+    # If the fault concerns a whole table, its text already says what was given. A missing key has no value.
     if "; got " in first.expected:
         got = ""
     elif first.got is None:

@@ -1,4 +1,5 @@
-"""The error for an image whose PSF is not known. It tells what can be done: which PSFs could fit, and the ways on.
+"""The error for an image whose PSF is not known. It names the PSFs that could fit, and the possible next steps
+("ways").
 
 This module imports no numerical library, so that the web process can import it.
 """
@@ -31,8 +32,8 @@ WAYS = (
         "the Sun): `heliopsf psf fit TRANSIT`",
     },
 )
-# What is published for telescopes without an instrument file (docs/instruments.md): a word of the header's TELESCOP,
-# INSTRUME or DETECTOR, the way on, and a sentence.
+# Publications that help with telescopes without an instrument file (docs/instruments.md). Each entry: a word of the
+# cards TELESCOP, INSTRUME or DETECTOR, the way that the publication makes possible, and a sentence.
 PUBLISHED = (
     ("xrt", "upload", "SolarSoft has PSFs of XRT as FITS files (hinode/xrt/idl/util/XRT*.PSF560.fits)"),
     ("trace", "fit", "DeForest et al. (2009) used the transit of Venus of 2004 for TRACE 171"),
@@ -44,7 +45,7 @@ _NAMES = {"telescope": "telescope", "channel": "channel", "plate_scale": "pixel 
 def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str | None:
     """The channel: the wavelength in whole angstrom, such as 174.
 
-    If the wavelength is not given, the wavelength of the instrument description is used. None if there is none.
+    If the wavelength is not given, the wavelength of the instrument description is used. None if neither is known.
     """
     if wavelength_angstrom is None and instrument in instrument_names():
         wavelength_angstrom = load_instrument(instrument).wavelength_angstrom
@@ -57,9 +58,10 @@ def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str
 def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, Any]] = ()) -> DataError:
     """The error "no-psf-for-instrument" for an image with this header summary (`psfcore.fits.header.HeaderSummary` as a table).
 
-    Its fields: `image`, the name of the telescope; `instruments` that can be built, those first that agree most with the image;
-    the given `psfs` that could fit; and `ways` on. `same` of an instrument says what agrees with the image, and `told` also
-    what does not.
+    Its fields: `image` is the name of the telescope. `instruments` are the instruments whose PSF can be built, sorted
+    by how well they agree with the image. `psfs` are the given PSFs, which could fit. `ways` are the possible next
+    steps. For an instrument, `same` names the properties that agree with the image; `told` also says which properties
+    differ.
     """
     named = " ".join(str(header[key]) for key in ("telescop", "instrume", "detector") if header[key])
     channel = channel_of(None, header["wavelnth"])
@@ -84,7 +86,10 @@ def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, An
 
 
 def _ways(header: Mapping[str, Any]) -> list[dict[str, str]]:
-    """The ways on; a way that a publication makes possible for this telescope says so."""
+    """The possible next steps.
+
+    If a publication makes a step possible for this telescope, the text of the step names it.
+    """
     seen = _words_of(header)
     published = {way: sentence for word, way, sentence in PUBLISHED if word in seen}
     return [
@@ -110,7 +115,7 @@ def _instrument(name: str, header: Mapping[str, Any]) -> dict[str, Any]:
 def same_as_image(
     instrument: str | None, channel: str | None, plate_scale_arcsec: float | None, header: Mapping[str, Any]
 ) -> list[str]:
-    """What a PSF shares with an image: "telescope", "channel", "plate_scale"."""
+    """The properties that a PSF and an image have in common, of "telescope", "channel" and "plate_scale"."""
     words = _words_of(header)
     wanted = channel_of(None, header["wavelnth"])
     image_scale = header["cdelt1"]
@@ -129,9 +134,9 @@ def same_as_image(
 def agreement_with_image(
     same: Sequence[str], channel: str | None, plate_scale_arcsec: float | None, header: Mapping[str, Any]
 ) -> str:
-    """In what a PSF agrees with an image and in what it does not, such as "same telescope, but another channel".
+    """A text that says in which properties a PSF and an image agree and differ: "same telescope, but another channel".
 
-    same: the answer of `same_as_image`.
+    same: the result of `same_as_image`.
     """
     wanted, image_scale = channel_of(None, header["wavelnth"]), header["cdelt1"]
     other = []

@@ -1,8 +1,8 @@
-"""The sizes of the arrays that the diffraction of an instrument needs, computed from its file before any array exists.
+"""The sizes of the arrays that the diffraction of an instrument needs, computed from the instrument file alone.
 
-An instrument file of a kilobyte can describe a mesh of so many orders, or an aperture so wide, that its pattern needs
-terabytes. `check_workload` refuses such a file; estimates of memory and time use the same sizes. This module imports no
-numerical library, so that the web process can import it.
+A small instrument file can describe a mesh with so many orders, or an aperture so wide, that the pattern would need
+terabytes of memory. `check_workload` refuses such a file. Estimates of memory and time use the same sizes. This module
+imports no numerical library, so that the web process can import it.
 
 | symbol | name | unit |
 |---|---|---|
@@ -21,7 +21,7 @@ from psfcore.instruments.model import Instrument, Mesh
 LARGEST_SIZE_PX = 4096
 PERIOD_PX = 4096  # size of the transform: light wraps around at 4096 px, not at the 2048 px that are kept
 MOST_MASK_SAMPLES = 32  # a mask that needs more samples per pixel is replaced by an analytic pattern
-NARROW_WINDOWS = 400  # a series of at least 400 windows has narrow orders
+NARROW_WINDOWS = 400  # a series of at least this number of windows has narrow orders
 FINEST_CELL_PX = 0.02  # cells of the pattern of a rotated mesh are at most this wide before they are combined
 AIRY_STEP = 0.02  # step in v of the table of the analytic pattern
 MOST_SAMPLES = 256
@@ -31,7 +31,7 @@ _MM_PER_ANGSTROM, _MM_PER_UM = 1e-7, 1e-3
 
 @dataclass(frozen=True)
 class Workload:
-    """Sizes of the arrays for one spectral line, the shortest wavelength.
+    """Sizes of the arrays for one spectral line: the line with the shortest wavelength, which needs the largest arrays.
 
     airy_points: points of the table of the analytic pattern. cells: cells of one axis of each rotated mesh. windows:
     terms of the series of each mesh that is parallel to the pixels. mask: whether the mask of the pupil is transformed.
@@ -48,7 +48,7 @@ class Workload:
 
 
 def workload(instrument: Instrument, size: int) -> Workload:
-    """The sizes for a PSF of `size` px; the grid is at least that large."""
+    """The sizes for a PSF of `size` px."""
     shortest_mm = min(line.wavelength_angstrom for line in instrument.spectral_lines) * _MM_PER_ANGSTROM
     pixel_mm = instrument.detector.pixel_pitch_um * _MM_PER_UM
     samples = 2 * instrument.aperture.diameter_mm * pixel_mm / (shortest_mm * instrument.focal_length_mm)
@@ -74,16 +74,20 @@ def workload(instrument: Instrument, size: int) -> Workload:
 def windows_of(mesh: Mesh) -> int:
     """Number of windows of the series of a mesh.
 
-    At the entrance, the orders get their width from the pattern of the aperture, so the orders of the series must be narrow.
+    For a mesh at the entrance, the pattern of the aperture gives the orders their width. The orders of the series
+    itself must then be narrow, so the number of windows is at least NARROW_WINDOWS.
     """
     return max(mesh.windows, NARROW_WINDOWS) if mesh.place == "entrance" else mesh.windows
 
 
 def check_workload(instrument: Instrument, label: str) -> None:
-    """Raise DataError "bad-instrument-file" if the largest PSF of an instrument needs too large arrays."""
+    """Raise DataError "bad-instrument-file" if the PSF of an instrument, at its largest size, needs too large
+    arrays."""
     largest = workload(instrument, LARGEST_SIZE_PX)
     if largest.samples > MOST_SAMPLES:
-        wanted = f"aperture.diameter_mm: expected a pattern that {MOST_SAMPLES} samples a pixel resolve"
+        wanted = (
+            f"aperture.diameter_mm: expected a pattern that needs at most {MOST_SAMPLES} samples per pixel"
+        )
         needs = "2 x diameter x pixel pitch / (wavelength x focal length)"
         raise DataError("bad-instrument-file", f"{label}: {wanted}; got {needs} = {largest.samples:.3g}")
     if max(largest.cells, default=0) > MOST_CELLS:

@@ -15,12 +15,12 @@ On an array larger than the full reach the weights can sum to more than 1 (E > 1
 | exact_to_px | up to this radius E is a staircase, and the tables hold every step |
 | interpolation_error | by component: the largest error of an interpolated E, found at test radii |
 | encircled | by component, TOTAL included: E at radii_px |
-| encircled_changes | by component: rows with the change of E for 1 sigma along each axis of the fit's covariance; {} if not fitted |
+| encircled_changes | by component: one row for each axis of the fit's covariance, with the change of E for a step of 1 sigma; {} if not fitted |
 | profile | by ring of one pixel: radius_px, pixels, mean_weight, sigma, azimuthal_rms_over_mean (of TOTAL) |
 
-The 1-sigma error of a number that is linear in E: compute the same number from each row of encircled_changes, and take
-the root of the sum of their squares. This includes correlations. The error of the light in an annulus, for example, is
-not the sum of the errors at its two radii.
+To compute the 1-sigma error of a number that is linear in E, compute the same number from each row of
+encircled_changes, and take the root of the sum of the squares of these numbers. This method includes correlations. For
+example, the error of the light in an annulus is not the sum of the errors at its two radii.
 
 This module imports only the standard library, because the web process reads tables and must not load numerical libraries.
 """
@@ -30,8 +30,8 @@ from __future__ import annotations
 SCHEMA = "psf-tables/1"
 TOTAL = "TOTAL"
 EXACT_TO_PX = 50
-WHOLE_TO_PX = 100  # up to this radius every whole number of pixels is a radius of the tables
-STEP = 1.02  # farther out: the ratio of two successive radii of the tables
+WHOLE_TO_PX = 100  # up to this radius, the tables contain every radius that is a whole number of pixels
+STEP = 1.02  # beyond this radius: the ratio of two successive radii of the tables
 FIELDS = (
     "schema",
     "name",

@@ -164,7 +164,8 @@ def _about(tables: Tables) -> dict[str, Any]:
 
 
 def _resolution(tables: Tables) -> str:
-    """A sentence on where the answer is exact, and how large the interpolation error is elsewhere."""
+    """A sentence that says at which radii the answer is exact, and how large the interpolation error is at other
+    radii."""
     worst = 100 * max(tables["interpolation_error"].values())
     near = f"exact to {min(tables['exact_to_px'], tables['reach_px']):g} px and at whole pixels up to {WHOLE_TO_PX} px"
     if worst < NEGLIGIBLE_POINTS:
@@ -189,7 +190,8 @@ def _reader_at(tables: Tables, radii: Sequence[float]) -> Callable[[Numbers], Nu
                 "radius-beyond-reach",
                 f"expected radii up to the reach of the PSF, {reach:.1f} px; got {radius:g}",
             )
-    # Allow for rounding: stored radii are rounded, and a caller may give a radius such as sqrt(2) with fewer digits.
+    # The stored radii are rounded, and a caller may give a radius such as sqrt(2) with fewer digits. Therefore radii
+    # that differ only by rounding count as equal.
     places = [min(bisect_right(grid, radius * (1 + 1e-9)) - 1, len(grid) - 1) for radius in radii]
 
     def find(row: Numbers) -> Numbers:

@@ -36,8 +36,8 @@ def make_app(settings: Settings) -> Celery:
         # crashes when it loses its broker (kombu 5.7).
         task_acks_late=False,
         worker_prefetch_multiplier=1,
-        # Celery waits for a result of a process that has ended before it gives the next job to the process that replaces
-        # it. Jobs have no results in Celery.
+        # If a process has ended, Celery waits for its result before it gives a job to the process that replaces it. Our
+        # jobs have no results in Celery.
         worker_lost_wait=0.1,
         task_queues=[BrokerQueue(broker_name(queue), routing_key=broker_name(queue)) for queue in Queue],
         task_default_queue=broker_name(Queue.INTERACTIVE),

@@ -38,7 +38,7 @@ class _InOrder(FairCycle):
     """For the folder broker: reads the first queue that has a message."""
 
     def get(self, callback: Callable[..., Any], **options: Any) -> Any:
-        """Pass one message to the callback. Raises ``predicate`` if there is none."""
+        """Pass one message to the callback. Raises ``predicate`` if there is no message."""
         for queue in by_urgency(self.resources):
             try:
                 return self.fun(queue, callback, **options)
@@ -83,15 +83,15 @@ def _write_whole(file: Path, content: Any) -> None:
 
 
 class FolderTransport(filesystem.Transport):
-    """The broker of the embedded mode: kombu's folder of messages, with our priorities of queues."""
+    """The broker of the embedded mode: kombu's folder of messages, read in the order of our queue priorities."""
 
     Channel = _FolderChannel
 
     def drain_events(self, connection: Any, timeout: float | None = None, **_: Any) -> None:
         """Deliver one message. Raises ``TimeoutError`` if no message arrives in time, or at once if the worker must stop.
 
-        Celery checks only between two calls whether the worker must stop. Kombu's own version would delay a stop, because it
-        sleeps for seconds, twice.
+        Only between two calls of this method does Celery check whether the worker must stop. Kombu's own version sleeps
+        twice for some seconds, which would delay the stop.
         """
         until = None if timeout is None else time.monotonic() + timeout
         channels: Any = self.cycle
@@ -117,7 +117,7 @@ class TakeWhatCanStart(bootsteps.StartStopStep):
     requires = ("celery.worker.consumer.tasks:Tasks",)
 
     def start(self, consumer: Any) -> None:
-        """Make the channel check first whether the pool has an idle process, and then its own limit of messages."""
+        """Make the channel check whether the pool has an idle process, before it checks its own limit of messages."""
         qos = consumer.task_consumer.channel.qos
         within_limit = qos.can_consume
         qos.can_consume = lambda: (

@@ -14,7 +14,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
-# Few, so that an urgent job that arrives during a pass does not wait for many other jobs.
+# This number is small, so that an urgent job that arrives during a pass does not wait for many other jobs.
 AT_ONCE = 50
 
 

@@ -72,10 +72,11 @@ def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Ta
         identity = product_identity(wanted)
         target = _target(context, request, source, identity)
         if target is not None and taken.attempt > 1 and target.parent.is_dir():
-            beneath.remove_partials(target, _output_roots(context))  # which a killed worker left
+            # A killed worker may have left partial copies.
+            beneath.remove_partials(target, _output_roots(context))
         before = _done_before(context, wanted, identity, request, target)
         if before is None and target is not None:
-            with _write_errors():  # before the image is deconvolved, so that no work is lost if this fails
+            with _write_errors():  # checked before the deconvolution, so that no work is lost if this fails
                 beneath.make_folder(target.parent, _output_roots(context))
         if before is None and _waited(context, request, identity):
             before = _done_before(context, wanted, identity, request, target)
@@ -85,7 +86,8 @@ def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Ta
 def _waited(context: Context, request: BulkWork, identity: str) -> bool:
     """Wait while another job makes this product. Returns whether there was such a job.
 
-    If the service keeps no products of the run, it never waits, because no other job makes the same file.
+    If the service keeps no products of the run, this function returns at once, because no other job makes the same
+    file.
     """
     waited = False
     if not request.keeps_products:
@@ -119,7 +121,7 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
             with beneath.opened(path, allowed) as file:
                 sha256 = archive_files.copy_hashed(file, copy, context.settings.max_upload_bytes)
         except OSError as error:
-            if is_disk_full(error):  # the copy cannot be written; this concerns every image
+            if is_disk_full(error):  # the copy cannot be written; the same error would occur for every image
                 raise
             reason = archive_files.reason_of(error)
             raise DataError(
@@ -270,7 +272,7 @@ def _write_errors() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if is_disk_full(error):  # this concerns every image
+        if is_disk_full(error):  # the same error would occur for every image
             raise
         reason = archive_files.reason_of(error)
         raise DataError(

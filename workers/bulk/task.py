@@ -21,7 +21,9 @@ from workers.tasks.context import Context, TurnOver
 from workers.tasks.stage_timer import STARTING
 
 BETWEEN = "between images"  # the stage between two images: record the result of one, take the next
-TURN_S = 60.0  # a turn ends after this time, so that other bulk runs get turns; far below the time limit of an attempt
+TURN_S = (
+    60.0  # a turn ends after this time, so that other bulk runs get turns; an attempt may take much longer
+)
 
 
 def bulk_turn(context: Context, parameters: Mapping[str, Any]) -> str:
@@ -63,7 +65,10 @@ def _stopped_for_quota(context: Context, bulk: BulkRow) -> bool:
 
 
 def _do(context: Context, bulk: BulkRow, taken: Taken) -> None:
-    """Deconvolve one image and record its result. If the turn itself must stop, the image is released for another turn."""
+    """Deconvolve one image and record its result.
+
+    If the whole turn must stop, the image is released for another turn.
+    """
     bulks, done = context.catalogue.bulks, bulk.done + bulk.failed
 
     told_s = told_at = 0.0
@@ -94,6 +99,6 @@ def _do(context: Context, bulk: BulkRow, taken: Taken) -> None:
         return
     values = vars(found[0])
     statistics = {**values["statistics"], "seconds": round(time.perf_counter() - started, 3)}
-    if "kernel_seconds" in statistics:  # the time of reporting does not count as time of the image
+    if "kernel_seconds" in statistics:  # without the time that was spent on reports of progress
         statistics["kernel_seconds"] = round(statistics["kernel_seconds"] - told_s, 3)
     bulks.finish(taken, **{**values, "statistics": statistics})

@@ -1,9 +1,9 @@
 """Turns of bulk runs: jobs in the queue ``bulk`` in which a worker deconvolves one image after the other.
 
-A bulk run has as many turns as there are worker processes, but never more than images left. Turns are ordinary jobs:
-each turn is run by one worker, a lost turn is queued again, and a worker that stops hands its turn back. After each image a turn
-ends if jobs of other kinds wait; after a minute it ends so that turns of other bulk runs can follow. When the run has
-no work left, its turns are deleted.
+A bulk run has as many turns as there are worker processes, but never more turns than images that are left. Turns are
+ordinary jobs: one worker runs each turn, a lost turn is queued again, and a worker that stops hands its turn back.
+After each image, a turn ends if jobs of other kinds wait. After a minute it ends in any case, so that turns of other
+bulk runs can follow. When the run has no work left, its turns are deleted.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def _wanted(bulk: BulkRow, processes: int) -> int:
 def _forget(catalogue: Catalogue, turn: JobRow) -> None:
     """Delete an ended turn. If it failed with an error that the next turn would also meet, stop the bulk run.
 
-    A full disk passes only when somebody makes room, and until then each turn would deconvolve an image for nothing.
+    For example, if the disk is full, every turn would deconvolve an image in vain until somebody makes room.
     """
     error = JobError.model_validate(turn.error) if turn.error else None
     stops = error is not None and (error.fault != Fault.TRANSIENT or error.code == STORAGE_FULL)

@@ -30,7 +30,7 @@ class Pace:
 
 @dataclass(frozen=True)
 class Reason:
-    """Failed images of a run whose errors have the same code. example: the first of them in the order of the run."""
+    """Failed images of a run whose errors have the same code. example: the first such image in the order of the run."""
 
     code: str
     images: int
@@ -106,7 +106,7 @@ class BulkProgress:
                 *failed, BulkItemRow.position.in_([first for *_, first in found])
             )
             examples = {row.position: row for row in session.scalars(query)}
-        # A retry between the two queries may have taken an example away.
+        # If the run was retried between the two queries, an example may no longer be a failed image.
         reasons = [Reason(code, count, examples[first]) for code, count, first in found if first in examples]
         return sorted(reasons, key=lambda reason: (-reason.images, reason.code))
 
@@ -131,7 +131,7 @@ class BulkProgress:
             return session.scalars(query).all()
 
     def names_of_uploads(self, ids: Sequence[str], owner: str) -> dict[str, str]:
-        """The file names of those of these uploaded images that have one, by id."""
+        """The file names of these uploaded images, by id. Images without a file name are left out."""
         query = select(ImageRow.id, ImageRow.filename).where(ImageRow.owner == owner, ImageRow.id.in_(ids))
         with self._database.reading() as session:
             return {one: name for one, name in session.execute(query) if name}

@@ -75,7 +75,7 @@ class BulkItemRow(Base):
     image_sha256: Mapped[str | None] = mapped_column(String(64))
     psf_id: Mapped[str | None] = mapped_column(String(64))
     product_id: Mapped[str | None] = mapped_column(String(64))
-    kept: Mapped[bool] = mapped_column(default=False)  # whether the service keeps the product
+    kept: Mapped[bool] = mapped_column(default=False)  # whether the product is in the service's store
     output: Mapped[str | None] = mapped_column(String(1200))  # the file in the output folder
     sha256: Mapped[str | None] = mapped_column(String(64))
     bytes: Mapped[int | None] = mapped_column(BigInteger)

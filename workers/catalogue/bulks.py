@@ -94,7 +94,7 @@ class Bulks:
                     session.add(row)
                     session.flush()
                     _add(session, row.id, 0, (Listed(one, True) for one in uploaded))
-                    # Only now, so that the owner's count is not locked while many images are added.
+                    # The bytes are added last, so that the owner's count is not locked while many images are added.
                     add_held(session, row.owner, counted_bytes(row), quota_mib)
                 return row, True
             except IntegrityError:
@@ -162,7 +162,7 @@ class Bulks:
             return True
 
     def stop_with(self, bulk_id: str, error: JobError) -> bool:
-        """LISTING, RUNNING -> ERROR, for an error that concerns more than one image."""
+        """LISTING, RUNNING -> ERROR, for an error that concerns the whole run and not only one image."""
         return self._set(bulk_id, AT_WORK, phase=BulkPhase.ERROR, error=error.model_dump(mode="json"))
 
     def retry(self, bulk_id: str) -> int | None:

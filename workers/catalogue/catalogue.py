@@ -108,9 +108,9 @@ class Catalogue:
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
         """Insert a content-addressed row; returns the row with this identity, and whether it is new.
 
-        quota_mib: the limit for owners without one of their own; None: no limit applies. Raises
-        ``workers.catalogue.owners.OverQuota`` and adds nothing if the row exceeds the limit even without the owner's
-        kept solutions. If it exceeds the limit with them, the oldest solutions are removed.
+        quota_mib: the limit for owners who have no individual limit; None: no limit applies. If the row does not fit,
+        the owner's oldest kept solutions are removed until it fits. If it would not fit even without any kept solution,
+        nothing is added or removed, and ``workers.catalogue.owners.OverQuota`` is raised.
         """
         try:
             with self._database.writing.begin() as session:
@@ -126,7 +126,10 @@ class Catalogue:
             return existing, False
 
     def refile(self, row: Made) -> Made:
-        """Let the existing row of this identity refer to the files of ``row``; returns the existing row."""
+        """Let the existing row with this identity refer to the files of ``row``; returns the existing row.
+
+        If there is no such row any more, ``row`` is added and returned.
+        """
         with self._database.writing.begin() as session:
             add_bytes(session, row.owner, 0)  # locks the owner first: no deadlock with a deletion
             there = session.get(type(row), (row.owner, row.id), with_for_update=True)
@@ -228,7 +231,7 @@ class Catalogue:
             return session.scalars(query).all()
 
 
-# What to do before a PSF can be deleted, by what uses it.
+# Advice in the error "psf-in-use": what to do first, by the type of the thing that uses the PSF.
 _FIRST = {
     "product": "delete that product first: `heliopsf product delete {id}`",
     "context": "a context never changes, so its PSFs are kept",
@@ -236,7 +239,9 @@ _FIRST = {
     "job": "wait until the job has ended, or cancel it: `heliopsf job cancel {id}`",
     "PSF": "that PSF was made from this one; delete it first: `heliopsf psf delete {id}`",
 }
-SHOWN_DIGITS = 12  # of ids in messages; every command accepts ids that are cut like this
+SHOWN_DIGITS = (
+    12  # messages show this many digits of an id; every command accepts ids that are shortened in this way
+)
 
 
 def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:
@@ -252,7 +257,7 @@ def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:
 
 
 def _user_of(session: Session, psf: PsfRow) -> tuple[str, str] | None:
-    """A thing that uses a PSF: what it is, a key of _FIRST, and its id; None if nothing uses the PSF."""
+    """One thing that uses a PSF: its type (a key of _FIRST) and its id; None if nothing uses the PSF."""
     found: str | None
     owner = psf.owner
     products = select(ProductRow.id).where(ProductRow.owner == owner, ProductRow.psf_id == psf.id)

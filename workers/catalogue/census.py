@@ -70,7 +70,7 @@ class Census:
     def workers(self, lease_s: float) -> Sequence[WorkerRow]:
         """Worker processes whose last heartbeat is at most ``lease_s`` seconds old.
 
-        A heartbeat in the future is one from before the database's clock was set back; it does not count.
+        A heartbeat in the future was sent before the database's clock was set back; such a worker is left out.
         """
         now = self._database.now
         query = select(WorkerRow).where(WorkerRow.heartbeat_at.between(now - lease_s, now + lease_s))

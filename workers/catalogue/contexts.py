@@ -22,7 +22,7 @@ from workers.contract.short_ids import SHORT_ID
 from workers.versions.status import PsfStatus
 from workers.versions.validity import Validity, iso
 
-NOW = "now"  # used instead of a context's name: the PSFs that are certified now, whatever the owner's default context is
+NOW = "now"  # in place of a context's name: use the PSFs that are certified now, not the owner's default context
 RESERVED = (NOW, "default")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$"  # shorter than an id, so a name is never read as an id
 _ID = re.compile(r"[0-9a-f]{64}")
@@ -159,7 +159,8 @@ class Contexts:
     def asked_for(self, context: str | None, owner: str) -> PsfContextRow | None:
         """The context for a request that gives an id, a name, NOW or None.
 
-        NOW: no context; the function returns None. None: the owner's default context.
+        For NOW, which means no context, returns None. For None, returns the owner's default context, or None if there
+        is no default.
         """
         if context is None:
             return self.default(owner)

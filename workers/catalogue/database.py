@@ -50,7 +50,7 @@ class Database:
     def now(self) -> ColumnElement[float]:
         """An SQL expression for the time of the database's clock, in seconds since 1970. All machines share this clock.
 
-        The time is that at which the statement began. On SQLite it is rounded to milliseconds.
+        It is the time at which the SQL statement began. On SQLite it is rounded to milliseconds.
         """
         # PostgreSQL can use an index with this clock, because it is constant within a statement.
         now = (

@@ -65,10 +65,10 @@ class Jobs:
     ) -> tuple[JobRow, bool]:
         """Queue a new job, or share the live job of an identical request; also returns whether the job is new.
 
-        queue: None: the queue of the job's kind. A shared job that waits in a less urgent queue moves to ``queue``.
-        A cancelled job and a job with UWS terms are not shared. In this case the new job gets a different key. It waits
-        while the other job executes, and then uses the result of the other job, if there is one. quota_mib: as for
-        ``Catalogue.add``; raises ``OverQuota``.
+        queue: the queue of the new job; None: the default queue of the job's kind. A shared job that waits in a less
+        urgent queue moves to ``queue``. A cancelled job or a job with UWS terms is not shared: the new job then gets a
+        different key. It waits while the other job executes, and then uses the result of the other job, if there is
+        one. quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
         """
         queue = queue or queue_of(kind)
         for _ in range(3):  # between the two statements, the identical job may fail
@@ -135,7 +135,7 @@ class Jobs:
         self._set([JobRow.id.in_(job_ids)], submitted_at=self._database.now, **counted)
 
     def forget_submission(self, job_id: str) -> None:
-        """Record that a worker took a queued job's message from the broker but did not claim the job."""
+        """Record that a worker took the message of a queued job from the broker, but did not claim the job."""
         self._set([JobRow.id == job_id, JobRow.phase == Phase.QUEUED], submitted_at=None)
 
     def claim(self, job_id: str, worker: str) -> Lease | None:
@@ -187,8 +187,9 @@ class Jobs:
     def progress(self, lease: Lease, stage: str, step: int, steps: int) -> bool:
         """Store the job's progress and a heartbeat; False if the lease is lost or the job was cancelled.
 
-        A job counts its steps several times. A count is new if its number of steps differs, or if its step is smaller than the
-        step before. The row keeps the beginning of the present count, so that its pace can be computed.
+        A job counts its steps several times. A new count begins when the number of steps changes, or when the step is
+        smaller than the step before. The row stores the time and the step at which the current count began; the
+        remaining time of the job is estimated from them.
         """
         new_count = or_(JobRow.count_at.is_(None), JobRow.steps != steps, JobRow.step > step)
         return self._set(
@@ -284,7 +285,7 @@ class Jobs:
             for job_id in session.scalars(lost.returning(JobRow.id)):
                 log.error("job %s: %s (%s)", job_id, error.message, error.code)
         with self._database.writing.begin() as session:
-            # Since the previous statement, further jobs may have been cancelled or lost for the last allowed time.
+            # After the previous statement, further jobs may have been cancelled, or lost in their last allowed attempt.
             back = update(JobRow).where(*silent, ~too_often).values(**self._again(), submitted_at=None)
             taken = session.execute(back.returning(JobRow.id, JobRow.phase))
             return [job_id for job_id, phase in taken if phase == Phase.QUEUED]
@@ -302,7 +303,8 @@ class Jobs:
             else_=resubmit_s * 2**8,
         )
         now = self._database.now
-        ahead = JobRow.submitted_at > now + resubmit_s  # the database's clock was set back since
+        # If a submission lies in the future, the database's clock was set back after it.
+        ahead = JobRow.submitted_at > now + resubmit_s
         due = or_(JobRow.submitted_at.is_(None), JobRow.submitted_at < now - wait_s, ahead)
         query = select(JobRow.id, JobRow.queue).where(JobRow.phase == Phase.QUEUED, due, no_equal_at_work())
         found: list[Waiting] = []

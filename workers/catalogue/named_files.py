@@ -43,16 +43,16 @@ class NamedFiles:
     def all(self, *, solutions_from: float = -math.inf) -> Iterator[str]:
         """Every hash in the database, some of them more than once; rows are read in batches.
 
-        solutions_from: without the kept solutions that were made before this time.
+        solutions_from: kept solutions that were made before this time are left out.
         """
         for table in Base.metadata.sorted_tables:
             if table.name not in _SKIPPED:
                 yield from self._in(table, solutions_from)
 
     def among(self, digests: frozenset[str]) -> frozenset[str]:
-        """Those of a few hashes that a row with files names: an upload, a PSF, a product, a report or a solution.
+        """Those of a few hashes to which the row of an upload, a PSF, a product, a report or a solution refers.
 
-        Jobs and bulk runs are not searched: they name things by their ids, and such a thing has a row while it exists.
+        Jobs and bulk runs are not searched. They refer to things by id, and every existing thing has a row of its own.
         """
         named: set[str] = set()
         with self._database.reading() as session:
@@ -67,7 +67,10 @@ class NamedFiles:
         return frozenset(named)
 
     def kept(self, table: type[Row]) -> Iterator[Row]:
-        """All rows of a table of things that have files; read in batches, so that no transaction stays open meanwhile."""
+        """All rows of a table whose rows refer to files.
+
+        They are read in batches, so that no transaction stays open for long.
+        """
         last: tuple[str, str] | None = None
         while True:
             query = select(table).order_by(table.owner, table.id).limit(BATCH)

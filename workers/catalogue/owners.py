@@ -1,15 +1,15 @@
 """The number of bytes that each owner keeps, and the owner's quota.
 
-The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The rows count too,
-because many small files take more room in the database than on the disk: also the rows of jobs, bulk runs and their images,
-contexts, and changes of a PSF's status, which have no files. The count changes in the transaction that adds, changes or removes
-the row. Rows of which an owner has only a few (keys, turns) do not count.
+The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The database
+rows count too, because a small file takes less room than its row. Rows without files also count: jobs, bulk runs and
+their images, contexts, and changes of a PSF's status. The count changes in the transaction that adds, changes or
+removes the row. Rows of which an owner has only a few (keys, turns) do not count.
 
-A transaction that changes jobs or PSFs locks the owner's row before it locks theirs (``add_bytes``, if need be of 0 bytes), so
-that two of them cannot wait for each other.
+A transaction that changes jobs or PSFs first locks the owner's row, and then the rows of the jobs or PSFs. To lock the
+owner's row, it calls ``add_bytes``, with 0 bytes if nothing is added. So two transactions cannot wait for each other.
 
-A solution can be made again, so it never takes room from anything else: the oldest solutions are removed if an upload or
-another solution needs their room.
+A kept solution can be made again, so it takes no room from other things: the oldest solutions are removed if an upload,
+a result or another solution needs their room.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Usage:
     removable_bytes: int = 0
 
     def allows(self, more_bytes: int = 0) -> bool:
-        """Whether this many more bytes fit, if need be without the kept solutions."""
+        """Whether ``more_bytes`` more bytes fit if the kept solutions are removed as needed."""
         if self.limit_bytes is None:
             return True
         return self.used_bytes - self.removable_bytes + more_bytes <= self.limit_bytes
@@ -87,7 +87,7 @@ class Usage:
         return not self.allows(1)
 
     def no_room(self, why: str) -> str:
-        """The message for a full quota. why: a clause that gives the reason for the message."""
+        """The message for a full quota. why: a clause that says what could not be done."""
         assert self.limit_bytes is not None
         return (
             f"expected free room in your quota; {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are used, and "
@@ -96,7 +96,7 @@ class Usage:
 
 
 class OverQuota(Exception):
-    """A file or a row does not fit into the owner's quota. usage: the owner's usage without it."""
+    """A file or a row does not fit into the owner's quota. usage: the owner's usage without this file or row."""
 
     def __init__(self, usage: Usage) -> None:
         super().__init__(usage.owner)
@@ -130,7 +130,7 @@ class Owners:
         """Count the bytes of all files and rows again and correct the counts; returns the owners whose count was wrong."""
         wrong = []
         with self._database.writing.begin() as session:
-            # If another transaction adds a row now, it waits for these locks before it changes the count.
+            # Another transaction that adds a row now waits for these locks before it changes the count.
             rows = session.scalars(select(OwnerRow).with_for_update()).all()
             truth: dict[str, int] = {}
             for table, counted in COUNTED.items():
@@ -165,10 +165,11 @@ class Owners:
 
 
 def counted_bytes(row: CountedRow) -> int:
-    """What a row counts: its file and the row itself. A solution counts its file alone: it can be removed at any time.
+    """The bytes that a row adds to the count of its owner: the file and the row itself; for a kept solution only the
+    file.
 
-    A bulk run counts with its images, a context with its pins, a job with its UWS terms. The progress, the estimate and the
-    error of a job are short and count as part of the row.
+    A bulk run counts together with its images, a context with its pins, and a job with its UWS terms. The progress, the
+    estimate and the error of a job are short: they are part of ROW_BYTES.
     """
     match row:
         case SolutionRow():
@@ -204,7 +205,10 @@ COUNTED: dict[type[Any], ColumnElement[int]] = {
 
 
 def add_bytes(session: Session, owner: str, count: int) -> None:
-    """Add bytes to an owner's count, and lock it. Call it in the transaction that adds, changes or removes the row."""
+    """Add bytes to an owner's count, and lock the count.
+
+    Call this in the transaction that adds, changes or removes the row.
+    """
     insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
     row = insert(OwnerRow).values(owner=owner, bytes=count)
     session.execute(
@@ -217,7 +221,7 @@ def add_held(
 ) -> None:
     """Add bytes to an owner's count, and raise OverQuota if they do not fit. quota_mib, removable: as for ``hold_to_quota``.
 
-    quota_mib None: no limit applies. Fewer bytes than before are never refused.
+    quota_mib None: no limit applies. A change that adds no bytes is never refused.
     """
     add_bytes(session, owner, count)
     if quota_mib is not None and count > 0:
@@ -225,7 +229,10 @@ def add_held(
 
 
 def check_fits(session: Session, owner: str, count: int, quota_mib: int | None) -> None:
-    """Raise OverQuota if so many bytes do not fit now. Nothing is locked: ``add_held`` decides when the bytes are added."""
+    """Raise OverQuota if ``count`` more bytes would exceed the quota now, even without the kept solutions.
+
+    Nothing is locked, so the quota may fill up later: ``add_held`` decides when the bytes are added.
+    """
     if quota_mib is None:
         return
     usage = _usage(session, owner, quota_mib)
@@ -234,10 +241,12 @@ def check_fits(session: Session, owner: str, count: int, quota_mib: int | None) 
 
 
 def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int, *, removable: bool) -> None:
-    """Raise OverQuota if ``count`` bytes, which are counted already, did not fit; remove solutions that are in the way.
+    """Check ``count`` bytes that this transaction has just added to the count.
 
-    removable: whether they are the bytes of a solution. Other transactions of the owner wait until this one ends. If
-    several uploads fit one by one but not together, the last ones are refused.
+    If they fit after the oldest kept solutions are removed, these solutions are removed. If they would not fit even
+    without any kept solution, raises OverQuota. removable: whether the bytes are those of a solution. Other
+    transactions of the owner wait until this one ends. If several uploads fit one by one but not together, the last
+    ones are refused.
     """
     counted = _usage(session, owner, quota_mib)
     before = replace(
@@ -277,7 +286,7 @@ def _forget(session: Session, row: SolutionRow) -> None:
 
 
 def _usage(session: Session, owner: str, quota_mib: int) -> Usage:
-    # The statements of `add_bytes` do not change an object that this session has read before.
+    # populate_existing: an object that this session read earlier does not contain the changes that `add_bytes` made.
     row = session.get(OwnerRow, owner, populate_existing=True)
     own = None if row is None else row.quota_mib
     limit_mib = quota_mib if own is None else own

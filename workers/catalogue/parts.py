@@ -1,4 +1,4 @@
-"""Parts of jobs that several workers share. A worker takes a part by compare-and-set; it then holds a lease of it."""
+"""Parts of jobs that several workers share. A worker takes a part by compare-and-set, and then has a lease for it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Parts:
 
     def take(self, owner: str, request_key: str, lease_s: float) -> Part | None:
         """Take an open part, or a part whose worker has been silent for ``lease_s`` seconds; None if there is no such part."""
-        # As for jobs: a heartbeat in the future, from before the database's clock was set back, counts as one of now.
+        # A heartbeat in the future was sent before the database's clock was set back; it counts as a heartbeat of now.
         now = self._database.now
         self._set(
             [

@@ -35,7 +35,7 @@ class StatusAsked:
     validity: Validity | None = None
     successor_id: str | None = None
     supersedes: tuple[str, ...] = ()  # certified PSFs of the series to deprecate in the same step
-    # The next three are only for a draft whose file does not give them.
+    # The next three fields are only for a draft whose file does not contain them.
     instrument: str | None = None
     channel: str | None = None
     kind: str | None = None
@@ -91,7 +91,7 @@ class Psfs:
             return session.scalars(query.order_by(*_NEWEST_FIRST).limit(limit)).all()
 
     def emptied_by(self, wanted: PsfFilter, owner: str) -> str | None:
-        """Apply the filters one by one; return the name of the first after which no PSF is left, or None."""
+        """Apply the filters one by one; return the name of the first filter after which no PSF is left, or None."""
         met = PsfFilter()
         with self._database.reading() as session:
             for name in (field.name for field in fields(PsfFilter)):
@@ -172,7 +172,8 @@ def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
     """A query for the PSFs that meet the filters, unsorted.
 
     A context has few PSFs, and few PSFs are valid at one time. Therefore a subquery finds these PSFs first. The subquery
-    is DISTINCT, because otherwise SQLite reads all PSFs in the order of the list until it finds some of them.
+    is DISTINCT, because otherwise SQLite reads all PSFs in the order of the list until it finds the PSFs of the
+    context.
     """
     query = select(PsfRow).where(PsfRow.owner == owner)
     if wanted.context_id is not None:

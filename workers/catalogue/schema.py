@@ -47,7 +47,7 @@ class SchemaStatus:
 
 @dataclass(frozen=True)
 class SchemaFaults:
-    """Tables, columns and indexes of this version that the database lacks."""
+    """The tables, columns and indexes of this version that are missing in the database."""
 
     tables: tuple[str, ...]
     columns: tuple[str, ...]

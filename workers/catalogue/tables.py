@@ -249,7 +249,8 @@ class JobRow(Base):
     step: Mapped[int] = mapped_column(default=0)
     steps: Mapped[int] = mapped_column(default=0)
     stage: Mapped[str] = mapped_column(default="")
-    # The time and the step at which the job began its present count of steps.
+    # A job counts its steps several times. These are the time and the step at which the current count began; the
+    # remaining time of the job is estimated from them.
     count_at: Mapped[float | None]
     count_step: Mapped[int] = mapped_column(default=0, server_default="0")
     result_id: Mapped[str | None] = mapped_column(String(64))
@@ -277,7 +278,7 @@ class JobRow(Base):
             postgresql_where=_EXECUTING,
         ),
         Index("jobs_by_phase", "phase", "heartbeat_at", "submitted_at"),
-        # The owner is in it so that the owners of many waiting jobs are found without reading the rows.
+        # This index contains the owner, so that the owners of many waiting jobs are found without reading the rows.
         Index("jobs_waiting", "phase", "queue", "created_at", "submitted_at", "owner"),
         _listed("jobs"),
         _listed("jobs", "phase"),
@@ -288,7 +289,7 @@ class JobRow(Base):
 
 
 class TermsRow(Base):
-    """The UWS terms of a job: run id, time limit and destruction time. Without this row, a job has none of them."""
+    """The UWS terms of a job: run id, time limit and destruction time. A job without such a row has no UWS terms."""
 
     __tablename__ = "job_terms"
     job_id: Mapped[str] = mapped_column(String(32), primary_key=True)
@@ -325,7 +326,10 @@ class ReportRow(Base):
 
 
 class SolutionRow(Base):
-    """The kept solution of a transit. It can be made again: it is removed when it is old or its room is needed."""
+    """The kept solution of a transit.
+
+    It is removed when it is old or its room is needed, because it can be made again.
+    """
 
     __tablename__ = "solutions"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)

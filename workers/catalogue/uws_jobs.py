@@ -183,7 +183,10 @@ class UwsJobs:
 
 
 def _locked(session: Session, job_id: str) -> JobRow | None:
-    """The row of a job, locked until the transaction ends, after the count of its owner; None if there is no such job."""
+    """Lock the count of a job's owner, then the row of the job; returns the row. None if there is no such job.
+
+    Both stay locked until the transaction ends.
+    """
     owner = session.scalar(select(JobRow.owner).where(JobRow.id == job_id))
     if owner is None:
         return None

@@ -61,7 +61,8 @@ PRODUCT_FORMAT = 2
 def product_identity(request: ResolvedDeconvolve) -> str:
     """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, versions of algorithm and file."""
     # The id of the PSF determines the PSF. The recipe only says how to build the PSF, and the context where it was found.
-    # `again` only allows the deconvolution; the header of the image determines whether it is a second one.
+    # `again` only permits a second deconvolution; the image itself determines whether this deconvolution is a second
+    # one.
     excluded = {"psf_recipe", "context_id", "again"} | (
         {"picked_for"} if request.picked_for is None else set()
     )
@@ -100,14 +101,15 @@ def gap_identity(request: ResolvedGapDiagnose) -> str:
 
 
 def diffraction_identity(request: ResolvedOnTransit) -> str | None:
-    """Identity of the diffraction PSF to build for a request; None if the transit contains a known PSF or the request names a PSF."""
+    """Identity of the diffraction PSF that the job has to build; None if the transit contains a known PSF or the
+    request names a PSF."""
     return None if request.diffraction_recipe is None else psf_identity(request.diffraction_recipe)
 
 
 def _transit_identity(
     kind: str, request: ResolvedOnTransit, excluded: tuple[str, ...] = (), **more: str
 ) -> str:
-    """excluded: fields of the request that do not change the result. more: what else determines the result."""
+    """excluded: fields of the request that do not change the result. more: further values that determine the result."""
     return canonical_hash(
         {
             "kind": kind,

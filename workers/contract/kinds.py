@@ -79,7 +79,7 @@ class Kind:
     | resolver | dotted name of the function that resolves the parameters; the default checks the ids and adds the recipe of the diffraction PSF |
     | queue | the queue in which jobs of this kind wait by default |
     | origin | the origin of the PSFs or products that this kind makes; from the origin a rerun finds the kind to run |
-    | needs_room | whether the owner's quota must have room before the job starts |
+    | needs_room | whether the job starts only if the owner's quota is not full |
     | counted_whole | whether the reported steps count the whole job, so that the time left can be estimated from them |
     | time_advice, memory_advice | advice for a request that needs more than the operator's limits |
     """
@@ -242,7 +242,7 @@ def queue_of(kind: str) -> Queue:
 
 
 def kind_of_origin(origin: str) -> Kind:
-    """The kind of job that makes things of this origin."""
+    """The kind of job that makes PSFs or products of this origin."""
     return next(kind for kind in _ROWS if kind.origin == origin)
 
 

@@ -25,7 +25,7 @@ def queues_named(names: str) -> tuple[Queue, ...]:
 
 
 def by_urgency(names: Iterable[str]) -> list[str]:
-    """Names of the broker's queues, highest priority first; Celery's own control queues come before all others."""
+    """Sort names of the broker's queues, highest priority first; Celery's own control queues come before all others."""
     order = {broker_name(queue): place for place, queue in enumerate(Queue)}
     return sorted(names, key=lambda name: order.get(name, -1))
 

@@ -1,7 +1,8 @@
 """Files of an archive of images: allowed folders, patterns that match files, and names of output files.
 
-The path in a request is resolved first, with its symbolic links. The resolved path must lie below a folder that the
-operator allows. Every file that a pattern matches is checked in the same way, and checked again when it is read (``workers.files.beneath``).
+The symbolic links in the path of a request are resolved first. The resolved path must lie below a folder that the
+operator allows. Every file that a pattern matches is checked in the same way, and checked again when it is read
+(``workers.files.beneath``).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _CHUNK = 2**20
 
 @dataclass(frozen=True)
 class Found:
-    """A file that a pattern matches; or an entry of a folder that could not be inspected, with the error."""
+    """A file that a pattern matches; or an entry of a folder that could not be inspected, together with the error."""
 
     path: Path
     error: DataError | None = None
@@ -136,7 +137,7 @@ def _split(glob: str) -> tuple[Path, tuple[str, ...]]:
 def _walk(
     top: Path, parts: tuple[str, ...], allowed: Sequence[Path], tick: Callable[[], None]
 ) -> Iterator[Found]:
-    """Read each folder only once, and match all parts of the pattern that can apply there.
+    """Read each folder only once, and compare its entries with all parts of the pattern that can match at this depth.
 
     Several ** in a pattern therefore cost no additional time.
     """
@@ -167,7 +168,7 @@ def _walk(
 def _meant(
     entry: os.DirEntry[str], parts: tuple[str, ...], places: frozenset[int], allowed: Sequence[Path]
 ) -> tuple[bool, frozenset[int]]:
-    """Whether an entry is a matching file; and the parts of the pattern that may match inside it.
+    """Whether an entry is a matching file; and the parts of the pattern that may match entries inside it.
 
     The second result is empty if the entry is not a folder. Raises OSError if the entry cannot be inspected.
     """

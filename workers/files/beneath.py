@@ -1,8 +1,9 @@
-"""Open and write files below allowed folders, although links may change between a check of a path and its use.
+"""Open and write files safely below allowed folders, even if somebody changes a link after a path was checked.
 
-A path is resolved and checked first, with its links (``workers.files.archive.check_under``). Then it is opened part by
-part, from the allowed folder downwards, and no part may be a link: if somebody replaces a part by a link after the
-check, the system refuses to open it. A file is written and renamed inside the opened folder, not by its path.
+First the links in a path are resolved and the path is checked (``workers.files.archive.check_under``). Then the path is
+opened part by part, from the allowed folder downwards, and no part may be a link. If somebody replaces a part by a link
+after the check, the operating system refuses to open it. A file is written and renamed inside the opened folder, not by
+its path.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from workers.files.archive import check_under
 from workers.files.modes import open_file, open_folder, open_made_folder
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-# O_NONBLOCK: to open a pipe would otherwise wait for its other end.
+# O_NONBLOCK: without this flag, opening a pipe would wait until another process opens the other end of the pipe.
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _CHUNK = 2**20
@@ -52,7 +53,10 @@ def reopened(file: BinaryIO) -> Path:
 
 
 def make_folder(folder: Path, allowed: Sequence[Path]) -> None:
-    """Make a folder below an allowed one, and check that files can be written into it. Raises DataError as ``opened``, OSError."""
+    """Make a folder below an allowed one, and check that files can be written into it.
+
+    Raises the same DataErrors as ``opened``, and OSError.
+    """
     with _folder(folder, allowed, make=True) as handle:
         if not os.access(".", os.W_OK | os.X_OK, dir_fd=handle):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
@@ -61,7 +65,7 @@ def make_folder(folder: Path, allowed: Sequence[Path]) -> None:
 def put(source: Path, target: Path, allowed: Sequence[Path]) -> None:
     """Copy a file to a path below an allowed folder in one step: a reader sees either the whole file or no file.
 
-    Raises DataError as ``opened``, and OSError.
+    Raises the same DataErrors as ``opened``, and OSError.
     """
     with source.open("rb") as file, _folder(target.parent, allowed, make=True) as folder:
         partial = f".{target.name}.{uuid.uuid4().hex}{PARTIAL}"
@@ -79,7 +83,10 @@ def put(source: Path, target: Path, allowed: Sequence[Path]) -> None:
 
 
 def remove_partials(target: Path, allowed: Sequence[Path]) -> None:
-    """Remove partial copies of a file that a killed process left. Raises DataError as ``opened``, and OSError."""
+    """Remove the partial copies of a file that a killed process left.
+
+    Raises the same DataErrors as ``opened``, and OSError.
+    """
     with _folder(target.parent, allowed, make=False) as folder:
         for name in os.listdir(folder):
             if name.startswith(f".{target.name}.") and fnmatchcase(name, f"*{PARTIAL}"):

@@ -1,9 +1,10 @@
 """Remove files to which no row of the catalogue refers. A job leaves such files if it is killed before it adds its row.
 
-Recent files stay, because an upload stores its file before its row. If a file is stored again at the moment of its
-removal, its row appears a little later: the rows are therefore read a second time before the file is deleted for good.
+Recent files are not removed, because an upload first stores its file and then adds the row that refers to it. An upload
+may also store a file again while the collection removes it, and add the row a little later. Therefore the rows are read
+a second time before a file is deleted for good.
 
-Kept solutions of transits can be made again. Those that were made before the same time are removed with their rows.
+Kept solutions of transits can be made again, so old ones are removed too, with their rows. The same age limit applies.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Blob, Store
 
-# An upload adds its row directly after it stored its file; a job adds its row within seconds.
+# An upload adds its row directly after it has stored its file; a job adds its row within seconds.
 SECOND_LOOK_AFTER_S = 10.0
 
 
@@ -82,7 +83,7 @@ def collect(
 
 
 def remove_unnamed(catalogue: Catalogue, store: Store, digests: Iterable[str]) -> None:
-    """Remove these files now, except those that a row with files of any owner names."""
+    """Remove these files now, except the files to which a row of any owner refers (``NamedFiles.among``)."""
     wanted = frozenset(digests)
     before = time.time()
     for digest in wanted - catalogue.named_files.among(wanted):
@@ -93,7 +94,10 @@ def remove_unnamed(catalogue: Catalogue, store: Store, digests: Iterable[str]) -
 def _removed(
     old: list[Blob], catalogue: Catalogue, store: Store, kept_before: float, second_look_after_s: float
 ) -> list[Blob]:
-    """Remove the files ``old``; returns the files to which no row refers after the removal either."""
+    """Remove the files ``old``; returns the removed files.
+
+    A file to which a row refers after the removal is restored.
+    """
     # First restore files that an earlier, killed collection moved aside, if a row refers to them.
     store.settle(catalogue.named_files.all())
     gone = [blob for blob in old if store.remove(blob.digest, kept_before)]

@@ -38,8 +38,8 @@ class Fault:
 def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iterator[Fault]:
     """Find the rows whose files are lost or damaged.
 
-    content: read each file and compare its SHA-256; otherwise only compare sizes, as far as they are recorded. A file to
-    which several rows refer is read once. Raises ``workers.files.store.StoreAway``.
+    content: read each file and compare its SHA-256. Otherwise only compare the size of each file with its recorded
+    size, if any. A file to which several rows refer is read once. Raises ``workers.files.store.StoreAway``.
     """
     states: dict[str, FileState] = {}
     for table in NAMES:

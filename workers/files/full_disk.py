@@ -1,4 +1,4 @@
-"""Recognises errors that say that a disk is full, of the files or of the database."""
+"""Recognises errors that say that the disk of the files or of the database is full."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 def is_disk_full(error: BaseException) -> bool:
     """Whether an exception says that a disk is full, or that a quota of the file system is used up.
 
-    A library may raise an OSError of its own while it handles that of the system; then the latter is the context of the former.
-    Databases have their own codes: SQLITE_FULL of SQLite, 53100 of PostgreSQL.
+    While a library handles the OSError of the system, it may raise another OSError; the error of the system is then the
+    context of the new error. Databases have codes of their own: SQLITE_FULL of SQLite, 53100 of PostgreSQL.
     """
     if isinstance(error, SQLAlchemyError):
         original = getattr(error, "orig", None)

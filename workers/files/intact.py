@@ -29,7 +29,7 @@ def files_of(row: ProductRow | PsfRow | ReportRow) -> Iterator[tuple[str, int | 
 
 
 def intact(store: Store, row: ProductRow | PsfRow | ReportRow) -> bool:
-    """Whether the store has all files of a result, in their recorded size. Their content is not read.
+    """Whether the store has all files of a result, each with its recorded size. The content of the files is not read.
 
     Raises ``workers.files.store.StoreAway``.
     """

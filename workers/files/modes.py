@@ -1,7 +1,8 @@
-"""Permissions of files: the data folder is for the user of the service alone; output folders follow the operator's umask.
+"""Permissions of files. Only the user of the service can read the data folder; output folders follow the operator's
+umask.
 
-The data folder holds the files of all owners and the hashes of their keys. Other users of the machine have no key, so they
-must not read these files from the disk either.
+The data folder contains the files of all owners and the hashes of their keys. A user of the machine who has no key must
+not be able to read these files from the disk.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ _operators_umask: int | None = None  # set once, when the process becomes privat
 
 
 def keep_private() -> None:
-    """Make every new file and folder of this process readable only for the user of the process.
+    """Set the umask so that only the user of this process can read the files and folders that the process makes.
 
-    Commands that work with the data folder call it first. It applies to files that libraries make, too.
+    Commands that work with the data folder call this function first. It also applies to files that libraries make.
     """
     global _operators_umask
     before = os.umask(OTHERS)
@@ -28,7 +29,7 @@ def keep_private() -> None:
 
 
 def private_folder(folder: Path) -> None:
-    """Make a folder that only its user can read. If it exists and belongs to this user, others lose their access.
+    """Make a folder that only its user can read. If it exists and belongs to this user, other users lose their access.
 
     Raises OSError if the folder cannot be made.
     """
@@ -49,7 +50,7 @@ def private_folder(folder: Path) -> None:
 
 
 def _opened_mode(mode: int) -> int:
-    """The permissions that the operator's umask leaves of ``mode``."""
+    """``mode`` without the permissions that the operator's umask removes."""
     return mode if _operators_umask is None else mode & ~_operators_umask
 
 

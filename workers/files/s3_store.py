@@ -22,7 +22,7 @@ from workers.files.store import DAMAGED, BadFile, Blob, Store, StoreAway, sha256
 
 LOOK_AFTER_S = 10.0  # shortest time between two measurements of the size of the copies
 IN_USE_S = 60.0  # a copy that was requested in the last minute is not removed: it may be opened soon
-FILL = 0.8  # fraction of the allowed size: copies are removed until they are smaller than this
+FILL = 0.8  # copies are removed until all copies together are smaller than this fraction of the allowed size
 RETRIES = 3  # number of times that a request is repeated after a transient failure, about once a second
 
 
@@ -59,14 +59,17 @@ class RemoteStore(Store):
                 return None
 
     def _content_sha256(self, digest: str) -> str:
-        """SHA-256 of the object itself: a copy in the local folder may be good although the object is damaged."""
+        """SHA-256 of the object itself.
+
+        Its copy in the local folder is not used, because it may be good although the object is damaged.
+        """
         with self.temporary() as copy:
             with _answering():
                 self._s3.get_file(self._key(digest), str(copy))
             return sha256_of(copy)
 
     def verified(self, digest: str) -> Path:
-        """As ``Store.verified``. A damaged copy is downloaded again. Raises ``StoreAway``, too."""
+        """As ``Store.verified``. A damaged local copy is downloaded again. Also raises ``StoreAway``."""
         try:
             return super().verified(digest)
         except BadFile as error:
@@ -141,7 +144,10 @@ class RemoteStore(Store):
         return True
 
     def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
-        """As ``Store.settle``. It also treats copies that a killed process left aside. Raises ``StoreAway``."""
+        """As ``Store.settle``, also for copies that were moved aside by a process that was then killed.
+
+        Raises ``StoreAway``.
+        """
         with _answering():
             aside = {name.rsplit("/", 1)[1] for name in self._s3.find(f"{self._root}/aside")}
         if not aside:
@@ -182,7 +188,7 @@ class RemoteStore(Store):
     def _keep_copy(self, temporary: Path, copy: Path) -> None:
         copy.parent.mkdir(exist_ok=True)
         os.utime(temporary)
-        sync(temporary)  # force it to the disk, because the content of a copy is not checked again
+        sync(temporary)  # force the copy to the disk, because its content is not checked again
         os.replace(temporary, copy)
         if time.monotonic() - self._counted_at > LOOK_AFTER_S:
             self._make_room()
@@ -216,7 +222,7 @@ def _answering() -> Iterator[None]:
     except FileNotFoundError:
         raise
     except (BotoCoreError, aiohttp.ClientError, OSError) as error:
-        if is_disk_full(error):  # that of the local copies
+        if is_disk_full(error):  # the disk of the local copies is full
             raise
         raise StoreAway(
             f"the object store does not answer ({type(error).__name__}): try again later"

@@ -36,7 +36,7 @@ FileState = Literal["good", "lost", "damaged"]
 
 
 class BadFile(DataError):
-    """A file of the store is lost, or its content is not what was stored. code: "file-lost" or "file-damaged"."""
+    """A file of the store is lost, or its content has changed. code: "file-lost" or "file-damaged"."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Blob:
 
     digest: str
     bytes: int
-    kept_at: float  # time when the file was last stored; it may have been stored earlier, too
+    kept_at: float  # time when the file was last stored; it may also have been stored before
 
 
 class Store:
@@ -70,7 +70,7 @@ class Store:
                         path.unlink()
 
     def path(self, digest: str) -> Path:
-        """The path of the file with this SHA-256. Open the file soon, because it may be removed. It need not exist."""
+        """The path of the file with this SHA-256. The file may not exist. Open it soon, because it may be removed."""
         return self._blobs / digest[:2] / digest
 
     def size(self, digest: str) -> int | None:
@@ -113,7 +113,8 @@ class Store:
     def set_aside(self, digest: str) -> bool:
         """Move a damaged file out of the store, into the folder ``damaged``, where nothing reads it.
 
-        False if the file does not exist, or if its content is good. A file that is stored at the same moment stays.
+        False if the file does not exist, or if its content is good. A good file that is stored at the same moment is
+        kept.
         """
         self._damaged.mkdir(exist_ok=True)
         target, aside = self.path(digest), self._damaged / f"{digest}.{uuid.uuid4().hex}"
@@ -167,8 +168,8 @@ class Store:
         target = self.path(digest)
         target.parent.mkdir(exist_ok=True)
         sync(temporary)
-        # To the nanosecond, so that remove() can tell this file from an equal one that is stored at the same moment. The
-        # system itself sets times only to a few milliseconds.
+        # The time is set to the nanosecond, so that remove() can distinguish this file from an identical file that is
+        # stored almost at the same moment. The system itself sets times only to a few milliseconds.
         os.utime(temporary, ns=(time.time_ns(), time.time_ns()))
         os.replace(temporary, target)
         sync(target.parent)
@@ -185,7 +186,8 @@ class Store:
     def kept_if(self, temporary: Path, digest: str) -> Iterator[None]:
         """Keep a complete file while the block adds its row to the catalogue. If the block fails, the file is removed again.
 
-        The file stays if it was there before, or if it is stored again meanwhile: then another row may need it.
+        The file is not removed if it existed before, or if it is stored again during the block: another row may need
+        it.
         """
         known = self.kept_at(digest) is not None
         self.keep(temporary, digest)

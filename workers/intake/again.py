@@ -1,4 +1,5 @@
-"""Results whose files were lost or damaged: which jobs make them again."""
+"""Results that were deleted, or whose files were lost or damaged: find the jobs that make them again, and queue these
+jobs."""
 
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
 
 
 def without_results(jobs: Sequence[JobRow], catalogue: Catalogue) -> frozenset[str]:
-    """The ids of those completed jobs of one owner whose result was deleted since."""
+    """The ids of completed jobs among ``jobs`` whose result was deleted later. All jobs must have the same owner."""
     gone: set[str] = set()
     for result, table in TABLES.items():
         done = {
@@ -67,7 +68,10 @@ def there(result: Result, identity: str, owner: str, catalogue: Catalogue, store
 
 
 def repair(fault: Fault, catalogue: Catalogue, store: Store) -> str:
-    """Set damaged files aside, and queue the job that makes a result again; returns what was done or has to be done."""
+    """Set damaged files aside, and queue the job that makes the result again.
+
+    Returns a text that says what was done, or what somebody has to do.
+    """
     row = fault.row
     for digest, state in fault.files:
         if state == "damaged":
@@ -86,12 +90,12 @@ def repair(fault: Fault, catalogue: Catalogue, store: Store) -> str:
 
 
 def make_again(row: ProductRow | PsfRow | ReportRow, catalogue: Catalogue, store: Store) -> str:
-    """Queue the job that makes a result again; returns the job's id. A file of the result must be missing.
+    """Queue the job that makes a result again; returns the job's id. Call this only if a file of the result is missing.
 
-    Of an uploaded PSF, a job makes only the tables and the picture again.
+    For an uploaded PSF, the job makes only the tables and the picture again.
 
-    Raises DataError "not-made-here" for an upload, and "parameters-unknown" or "parameters-outdated" if the job of a
-    result was deleted and cannot be repeated from what the catalogue records.
+    Raises DataError "not-made-here" for an upload. Raises DataError "parameters-unknown" or "parameters-outdated" if
+    the job was deleted and the catalogue does not contain parameters with which this version can repeat it.
     """
     if isinstance(row, PsfRow) and row.origin == "uploaded" and store.size(row.file_sha256) == row.bytes:
         tables = PsfTables(psf_id=row.id)
@@ -110,7 +114,7 @@ def make_again(row: ProductRow | PsfRow | ReportRow, catalogue: Catalogue, store
     assert kind.resolved is not None and kind.identity is not None
     try:
         identity = kind.identity(kind.resolved.model_validate(made.parameters))
-    except ValidationError:  # the text of an instrument file is only in the lost file of the PSF
+    except ValidationError:  # the text of the instrument file was only in the PSF's file, which is lost
         raise _unknown(row) from None
     if identity != row.id:
         raise _unknown(row)

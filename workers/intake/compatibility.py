@@ -1,7 +1,7 @@
-"""Checks an image, a PSF and the options of a deconvolution against each other, by what the catalogue keeps of their headers.
+"""Checks whether an image, a PSF and the options of a deconvolution fit each other, before the job is queued.
 
-The job makes the same checks, with the same functions, on the headers of the files. Uploads of versions that did not keep
-these cards are checked by the job alone.
+These checks use the header cards that the catalogue stores. The job repeats them, with the same functions, on the
+headers of the files. For uploads to earlier versions, which did not store these cards, only the job makes the checks.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from workers.contract.resolved import ResolvedDeconvolve
 
 @dataclass(frozen=True)
 class PsfOrigin:
-    """What is known of a PSF without its weights. cards: see `psfcore.psf.Psf`."""
+    """The properties of a PSF that are known without its file. cards: see `psfcore.psf.Psf`."""
 
     name: str
     instrument: str | None
@@ -58,14 +58,17 @@ def noise_of(request: ResolvedDeconvolve, header: Cards) -> NoiseFigures | None:
 
 
 def of_upload(row: PsfRow, instrument: str | None, angstrom: float | None) -> tuple[str | None, float | None]:
-    """The instrument and the wavelength of a PSF. What its file does not give, the request of the upload may have given."""
+    """The instrument and the wavelength of a PSF.
+
+    If its file does not give them, the request of the upload may have given them.
+    """
     if angstrom is None and row.channel is not None and row.channel.isdecimal():
         angstrom = float(row.channel)
     return instrument or row.instrument, angstrom
 
 
 def _origin(request: ResolvedDeconvolve, psf: PsfRow | None) -> PsfOrigin | None:
-    """What is known of the PSF of a request; None if the catalogue keeps too little of it."""
+    """The known properties of the PSF of a request; None if the catalogue does not store enough of them."""
     if psf is None:
         recipe = request.psf_recipe
         return None if recipe is None or recipe.instrument is None else _origin_of(recipe.instrument)

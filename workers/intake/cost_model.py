@@ -17,7 +17,7 @@ class _Frozen(BaseModel):
 class Linear(_Frozen):
     """Time and memory as a constant plus a part that is proportional to the number of pixels that the job reads.
 
-    as_published, shapes: factors of the time, if the request sets the parameter with this name.
+    as_published, shapes: if the request sets the parameter of this name, the time is multiplied by this factor.
     """
 
     base_s: float
@@ -51,10 +51,10 @@ class Deconvolution(_Frozen):
 
 
 class Build(_Frozen):
-    """Time of a PSF build for each spectral line of the bandpass, and its memory. A mask is sampled at S^2 points per pixel.
+    """The time that a PSF build takes for each spectral line of the bandpass, and the memory that it needs.
 
-    The sizes are those of ``psfcore.instruments.workload``. Suffix _ns: time for each point, cell, window or entry;
-    _bytes: memory.
+    A mask is sampled at S^2 points per pixel. ``psfcore.instruments.workload`` counts the points, cells, windows and
+    entries. Suffix _ns: the time for each of them; suffix _bytes: the memory for each of them.
     """
 
     disc_s: float
@@ -72,7 +72,7 @@ class Build(_Frozen):
     cell_bytes: float
     window_ns: float  # for each window and pixel of an edge of the grid
     outlines: int  # outlines of a mount that ``mask_s`` includes
-    entry_ns: float  # for each further entry of the list of edges, and each S
+    entry_ns: float  # for each further entry of the list of edges, times S
     entry_bytes: float
     spectrum_bytes: float  # for each row of the mask and pixel of an edge of the grid
     image_bytes: float  # for each pixel of a mask image

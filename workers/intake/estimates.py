@@ -39,7 +39,8 @@ FEWEST_JOBS, MOST_JOBS = (
     30,
 )  # number of completed jobs of a kind from which the factor is computed, as a median
 BOUNDS = 0.2, 5.0
-# A job that was faster than this share of its estimate found its result in the catalogue.
+# If the measured time of a job is below this fraction of its estimate, the job found its result in the catalogue and
+# computed nothing. Such jobs are left out.
 FOUND = 0.05
 KEEP_FACTOR_S = 60.0
 _factors: WeakKeyDictionary[Catalogue, dict[str, tuple[float, float]]] = WeakKeyDictionary()
@@ -47,7 +48,7 @@ _factors: WeakKeyDictionary[Catalogue, dict[str, tuple[float, float]]] = WeakKey
 
 @dataclass(frozen=True)
 class Estimate:
-    """The expected time and memory of a job. ``start_s``: the time before it is multiplied by the measured factor."""
+    """The expected time and memory of a job. ``start_s``: the estimated time before the measured factor is applied."""
 
     memory_mib: int
     seconds: float
@@ -103,7 +104,8 @@ def estimate(
 
 
 def factor(kind: str, catalogue: Catalogue) -> float:
-    """The median of measured time divided by estimated time, for completed jobs of this kind; 1 if they are too few."""
+    """The median ratio of measured to estimated time of the completed jobs of this kind; 1 if there are too few
+    jobs."""
     known = _factors.setdefault(catalogue, {})
     value, until = known.get(kind, (1.0, -math.inf))
     if time.monotonic() < until:
@@ -154,7 +156,7 @@ def _margin_px(method: Mapping[str, Any], field: tuple[int, int], psf_px: int) -
 
 
 def _of_method(figures: Mapping[str, float], method: Mapping[str, Any]) -> float:
-    """The figure of a method; the largest of all methods if this one has not been measured yet."""
+    """The figure of a method; the largest figure of all methods if this method has not been measured yet."""
     return figures.get(method["name"], max(figures.values()))
 
 
@@ -214,7 +216,10 @@ def _linear(
 
 
 def _pixels(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> float:
-    """Number of pixels of the job's transit; without a transit, of its image; without an image, of its PSF."""
+    """Number of pixels of the job's transit.
+
+    If it has no transit: of its image; if it has no image either: of its PSF.
+    """
     if parameters.get("transit_id"):
         transit = catalogue.get(TransitRow, parameters["transit_id"], owner)
         return 0.0 if transit is None else transit.summary["unpacked_bytes"] / BYTES_A_PIXEL

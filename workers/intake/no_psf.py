@@ -21,15 +21,19 @@ MOST_SEARCHED = 500
 def no_psf(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> DataError:
     """The error "no-psf-for-instrument" for an image with this header summary.
 
-    Its fields: `image`, the name of the telescope; `instruments` that can be built, those first that agree most with the image;
-    `psfs` of the catalogue that could fit; and `ways` on. For both lists, `same` says what agrees with the image, and
-    `told` also what does not.
+    Its fields: `image` is the name of the telescope. `instruments` are the instruments whose PSF can be built, sorted
+    by how well they agree with the image. `psfs` are PSFs of the catalogue that could fit. `ways` are the possible next
+    steps. In both lists, `same` names the properties that agree with the image; `told` also says which properties
+    differ.
     """
     return unknown_instrument(header, list(_candidates(catalogue, header, owner)))
 
 
 def _candidates(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> Iterator[dict[str, Any]]:
-    """PSFs of the same telescope or plate scale, newest first, without those of another channel: at most MOST_NAMED."""
+    """At most MOST_NAMED PSFs of the same telescope or plate scale, newest first.
+
+    PSFs of other channels are left out.
+    """
     wanted = channel_of(None, header["wavelnth"])
     found = 0
     for row in catalogue.psfs.page(PsfFilter(), owner, limit=MOST_SEARCHED):

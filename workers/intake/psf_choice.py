@@ -26,7 +26,7 @@ class Found:
     wanted: PsfFilter
     context: PsfContextRow | None  # None: all PSFs were searched
     psfs: Sequence[PsfRow]  # at most MOST_NAMED + 1 PSFs
-    emptied_by: str | None  # the first filter that excluded all remaining PSFs; None if PSFs were found
+    emptied_by: str | None  # the first filter after which no PSF was left; None if PSFs were found
 
     def one(self) -> PsfRow:
         """The PSF. Raises ``DataError`` "no-psf-fits" or "several-psfs-fit"."""
@@ -111,7 +111,7 @@ def look_for_image(
 def picked_for_image(
     catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None
 ) -> Found | None:
-    """The PSF for an image, if the request names no PSF; None if the series of the image has no certified PSF.
+    """Find the PSF for an image if the request names no PSF; None if the series of the image has no certified PSF.
 
     Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context contains none of them.
     """

@@ -15,7 +15,8 @@ from workers.versions.series import TOTAL, series_of
 
 @dataclass(frozen=True)
 class ReasonedPsf:
-    """The PSF of a deconvolution. status None: the PSF is not built yet; name and version are then those of its instrument file."""
+    """The PSF of a deconvolution. status None: the PSF is not built yet, and name and version are those of the
+    instrument file."""
 
     id: str
     name: str
@@ -29,7 +30,7 @@ def reasoned_psf(
 ) -> ReasonedPsf:
     """The PSF that was chosen for a request, with a sentence that says why.
 
-    wanted: the parameters of the request. resolved: what ``workers.intake.requests.resolve`` made of them.
+    wanted: the parameters of the request. resolved: the same parameters after ``workers.intake.requests.resolve``.
     """
     row = catalogue.get(PsfRow, resolved.psf_id, owner)
     if row is not None:

@@ -1,6 +1,6 @@
-"""Deprecated PSFs: the service never chooses one by itself, and a product that was made with one has a warning.
+"""Deprecated PSFs: the service never chooses such a PSF by itself, and a product that was made with one has a warning.
 
-A context chooses the PSFs that it pins, also if they were deprecated later: this keeps its results reproducible.
+A context still uses the PSFs that it pins, even if they were deprecated later. So its results stay reproducible.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow, PsfRow
 from workers.versions.status import PsfStatus
 
-CODE = "psf-deprecated"  # of the error and of the warning
+CODE = "psf-deprecated"  # the code of the error and of the warning
 SHOWN_DIGITS = 12
 
 
@@ -31,7 +31,8 @@ class Deprecation:
 def check_not_withdrawn(catalogue: Catalogue, psf_id: str, owner: str, what: str, ways: str) -> None:
     """Raise ``DataError`` "psf-deprecated" if the PSF that the service would choose is deprecated.
 
-    what: the PSF as words for the message. ways: what the user can do; it may contain {psf}, the id of the PSF.
+    what: the name of the PSF in the message. ways: advice for the user; it may contain {psf}, which stands for the
+    PSF's id.
     """
     row = catalogue.get(PsfRow, psf_id, owner)
     if row is None or row.status != PsfStatus.DEPRECATED:
@@ -63,7 +64,10 @@ def deprecation(catalogue: Catalogue, psf: PsfRow) -> Deprecation | None:
 
 
 def details_now(catalogue: Catalogue, product: ProductRow) -> dict[str, Any]:
-    """The details of a product. If its PSF is deprecated now, its warnings say so, also if the product was made before that."""
+    """The details of a product.
+
+    If its PSF is deprecated now, the details contain a warning, even if the product is older.
+    """
     psf = catalogue.get(PsfRow, product.psf_id, product.owner)
     message = None if psf is None else withdrawn_warning(catalogue, psf)
     if message is None:
@@ -79,7 +83,7 @@ def _reason(catalogue: Catalogue, psf: PsfRow) -> str:
 
 
 def _last_reason(catalogue: Catalogue, psf: PsfRow) -> str:
-    """The reason that was given last, because naming a successor later may give none; empty if none was ever given."""
+    """The last reason that was given; empty if none was given. A later change that only names a successor may have no reason."""
     changes = catalogue.psfs.changes(psf.id, psf.owner)
     reasons = [one.reason for one in changes if one.status == PsfStatus.DEPRECATED and one.reason]
     return reasons[-1] if reasons else ""

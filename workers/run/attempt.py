@@ -48,12 +48,13 @@ class Cancelled(Exception):
 
 @dataclass
 class Attempt:
-    """A claimed job while it runs. A report of progress later than ``limit_s`` after ``started`` stops the job.
+    """A claimed job while it runs. The first report of progress later than ``limit_s`` after ``started`` stops the job.
 
-    child: the process, if it may be ended. It is ended if the job does not stop within ``cancel_s`` after it had to, and
-    if the thread of the heartbeats cannot run for ``silent_s``.
-    run_short: runs one waiting job of at most so many seconds in this process, while this job pauses; False if no such
-    job waits. A job pauses only in its main thread, and at most as long as it worked before.
+    child: this process; None if it must not be ended. The process is ended if the job must stop but still runs
+    ``cancel_s`` later, or if the thread of the heartbeats cannot run for ``silent_s``.
+    run_short(seconds): while this job pauses, runs one waiting job whose estimated time is at most ``seconds`` in this
+    process; returns False if no such job waits. A job pauses only in its main thread, and only for a job that is
+    expected to take no longer than this job has worked since its last pause.
     """
 
     catalogue: Catalogue
@@ -93,7 +94,7 @@ class Attempt:
                 self.child.expect_no_news()
 
     def _beat(self) -> None:
-        """Send heartbeats until the attempt ends or is cancelled. If the worker has to stop, hand the job back."""
+        """Send heartbeats until the attempt ends or is cancelled. If the worker must stop, hand the job back."""
         while not self.ended.wait(self.heartbeat_s):
             try:
                 if self.child is not None:
@@ -108,7 +109,8 @@ class Attempt:
                 log.warning("job %s: could not write the heartbeat: %s", self.lease.job_id, error)
                 continue
             except MemoryError as error:
-                # The job is at its limit, which concerns the task. The next heartbeat may find memory again.
+                # The job has reached its memory limit. Its task gets the error. The next heartbeat may have memory
+                # again.
                 log.warning("job %s: no memory for the heartbeat: %s", self.lease.job_id, error)
                 continue
             if not alive:
@@ -122,9 +124,9 @@ class Attempt:
                 )
 
     def _end_if_deaf(self) -> None:
-        """Wait until the task has noticed that it must stop. If it does not, end the process.
+        """Wait until the task has stopped. If it does not stop within ``cancel_s``, end the process.
 
-        A paused task cannot notice it. Its time starts when it continues.
+        A paused task cannot notice that it must stop, so its time begins when it continues.
         """
         if self.child is None:
             return
@@ -152,9 +154,9 @@ class Attempt:
             self._report(stage, step, steps)
 
     def compiling(self, done: bool) -> None:
-        """The task begins to compile a kernel, or has compiled one. Raises as ``report``.
+        """Report that the task begins to compile a kernel (``done`` False) or has compiled it. Raises as ``report``.
 
-        Without steps no short job runs meanwhile: numba must not be called while it compiles.
+        The report has 0 steps, so that no short job runs meanwhile: numba must not be called while it compiles.
         """
         with self.times.step(COMPILING, int(done)):
             if not done:
@@ -182,8 +184,8 @@ class Attempt:
     def _let_short_jobs_run(self) -> None:
         """Run waiting jobs that need no longer than this job has worked since its last pause.
 
-        Therefore a short job waits for a long one at most about as long as it takes itself, and the long job is at most
-        delayed by the time that it needs.
+        Therefore a short job waits for a long job at most about as long as the short job itself takes. Short jobs at
+        most double the time that the long job takes.
         """
         if self.run_short is None or threading.current_thread() is not threading.main_thread():
             return

@@ -5,7 +5,8 @@ does not count memory that is only reserved, or files that are mapped for readin
 LLVM and the memory allocator reserve much more than they use. An allocation beyond the limit raises MemoryError. On
 systems other than Linux, memory is not limited.
 
-A worker process that has ended is replaced by its parent (Celery's prefork pool). Other processes of the worker go on.
+When a worker process has ended, its parent starts a new one (Celery's prefork pool). Other processes of the worker
+continue.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ log = logging.getLogger(__name__)
 
 MIB = 2**20
 MARGIN = 1.5  # estimates of memory are correct within this factor
-# Each thread of a library has a stack, which counts in full. OpenBLAS, numba, the Fourier transforms and the tasks each
-# have as many threads as the settings say.
+# Each thread of a library has a stack, and the limit counts the whole stack. OpenBLAS, numba, the Fourier transforms
+# and the tasks each have the number of threads that the settings give.
 _POOLS = 4
 _EXIT_STATUS = 1
 
@@ -55,9 +56,9 @@ class Child:
             resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
     def expect_news_within(self, seconds: float) -> None:
-        """End the process unless this is called again, or ``expect_no_news`` is, within this time.
+        """End the process after this time, unless this method or ``expect_no_news`` is called before.
 
-        The clock runs in a thread without Python code, so it also ends a process whose C code never returns.
+        The clock runs in a thread that needs no Python code, so it also ends a process whose C code never returns.
         """
         faulthandler.dump_traceback_later(seconds, exit=True, file=2)
 

@@ -63,7 +63,7 @@ class Runner:
         child: Child | None = None,
     ) -> None:
         """submit: function that sends an unfinished job to the broker again. If it returns False, the reconciler sends the job.
-        child: this process, if its memory may be limited and it may be ended; None: the process is somebody else's.
+        child: this process, if the runner may limit its memory and end it; None: the runner must do neither.
         """
         self._settings, self._catalogue, self._store = settings, catalogue, store
         self._call_for_help, self._submit = call_for_help, submit
@@ -164,7 +164,7 @@ class Runner:
         return run_short
 
     def assist(self, job_id: str) -> None:
-        """Share the work of a job that another worker runs, until no part is left or the job ends."""
+        """Compute parts of a job that another worker runs, until no part is left or the job ends."""
         job = self._catalogue.jobs.get(job_id)
         if self._stopping.asked or job is None or job.phase != Phase.EXECUTING:
             return
@@ -244,7 +244,10 @@ class Runner:
             raise DataError("quota-exceeded", usage.no_room(NOT_KEPT))
 
     def _is_there(self, job: JobRow) -> bool:
-        """Whether the result already exists. An identical job may have made it, or an earlier attempt that could not record its end."""
+        """Whether the result already exists.
+
+        An identical job, or an earlier attempt that could not record its end, may have made it.
+        """
         made, find = job.work_key, self._catalogue.get
         if made is None:
             return False
@@ -296,8 +299,8 @@ class Runner:
         return int((job.estimate or {}).get("memory_mib", self._settings.max_job_memory_mib))
 
     def _unexpected(self, job: JobRow, error: Exception) -> JobError:
-        """The error of a job whose task raised an exception that is no error of the user: no room on the disk, no memory left, or
-        a fault of the software."""
+        """The error of a job whose task raised an exception that the user did not cause: a full disk, too little
+        memory, or a fault of the software."""
         if is_disk_full(error):
             return JobError(fault=Fault.TRANSIENT, code=STORAGE_FULL, message=NO_ROOM)
         if not is_out_of_memory(error):
@@ -321,7 +324,7 @@ class Runner:
         log.warning("job %s: temporary failure in attempt %d: %s", job.id, job.attempt, error)
         if job.attempt < self._settings.max_attempts:
             self._persist(lambda: self._catalogue.jobs.requeue(lease))
-        elif is_disk_full(error):  # that of the database
+        elif is_disk_full(error):  # the disk of the database is full
             self._fail(lease, JobError(fault=Fault.TRANSIENT, code=STORAGE_FULL, message=NO_ROOM))
         else:
             message = f"expected a temporary failure to pass; {job.attempt} attempts failed ({type(error).__name__}): try again later"

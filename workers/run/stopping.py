@@ -15,7 +15,7 @@ class Stopping:
     def __init__(self) -> None:
         self._let_go_at = RawValue(
             "d", 0.0
-        )  # the deadline by time.monotonic(), a clock that all processes share; 0: not asked to stop
+        )  # the deadline, as a time of time.monotonic(), a clock that all processes share; 0: the worker need not stop
 
     def ask(self, within_s: float) -> None:
         """Take no more jobs, and hand back the running one after ``within_s`` seconds. Repeated calls change nothing."""

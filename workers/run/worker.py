@@ -42,7 +42,10 @@ stopping = Stopping()  # made before the fork, so that the children share it wit
 
 @app.task(name=queue.RUN_JOB, bind=True)
 def run_job(task: Task, job_id: str) -> None:
-    """Run one job of the queue from which the message came. The message names one of its jobs."""
+    """Run one job of the queue from which the message came.
+
+    The message names a job of this queue, but another job may run.
+    """
     _runner().run_next(job_id, queue_of_broker(task.request.delivery_info["routing_key"]))
 
 
@@ -71,9 +74,7 @@ def _watch(**_: object) -> None:
     except SchemaError as error:
         raise SystemExit(f"Error: {error}") from error
     except SQLAlchemyError as error:
-        raise SystemExit(
-            f"Error: expected a working database; it answered: {checks.database_said(error)}"
-        ) from error
+        raise SystemExit(f"Error: expected a working database; got: {checks.database_said(error)}") from error
     threading.Thread(target=_end_at_the_latest, name="end at the latest", daemon=True).start()
 
 
@@ -94,7 +95,7 @@ def check_tables() -> None:
 
     catalogue = Catalogue(
         settings.catalogue_url
-    )  # closed below, because no connection may be open at the fork
+    )  # closed below, because no connection may be open when the process forks
     try:
         while True:
             try:
@@ -137,7 +138,10 @@ def _be_present() -> None:
                 _catalogue().census.take_leave(worker_name())
             else:
                 _catalogue().census.announce(worker_name(), started_at, software_version())
-        except (SQLAlchemyError, MemoryError) as error:  # no memory: the job of this process is at its limit
+        except (
+            SQLAlchemyError,
+            MemoryError,
+        ) as error:  # MemoryError: the job of this process has reached its limit
             log.warning("could not announce this worker: %s", str(error).split("\n")[0])
         if leaving:
             return
@@ -148,7 +152,7 @@ def _be_present() -> None:
 
 @lru_cache(maxsize=1)
 def _runner() -> Runner:
-    # Set this before numba is imported, because numba's omp layer kills forked children.
+    # Set this before numba is imported, because numba's OpenMP layer ends forked child processes.
     os.environ["NUMBA_THREADING_LAYER"] = "workqueue"
     os.environ["NUMBA_NUM_THREADS"] = str(settings.threads)
     from workers.files.opened import open_store

@@ -22,7 +22,8 @@ Result = TypeVar("Result", ProductRow, PsfRow, ReportRow)
 
 
 class TurnOver(Exception):
-    """A turn of a bulk run ends early so that other jobs can run; the job of the turn is queued again as if it had not started."""
+    """A turn of a bulk run ends although images are left, so that other jobs can run. The job of the turn is queued
+    again as if it had not started."""
 
 
 def _not_alone(_work: Callable[[], None]) -> JobError | None:
@@ -38,9 +39,9 @@ class Context:
     guarded(work): runs one piece of a job that has many pieces; returns the error of the piece, or None.
     others_wait(): True if other jobs wait, so that a job of many pieces should raise ``TurnOver``.
     lease: the lease under which a job takes its pieces.
-    times: measures the time of the reported stages. If the pieces of a job report stages of their own, the time of these
+    times: measures the time of the reported stages. If the pieces of a job report their own stages, the time of these
     stages is measured instead.
-    anew: compute everything anew, as a rerun must: use no solution that an earlier job kept.
+    anew: True for a rerun: compute everything anew, and use no solution that an earlier job kept.
     """
 
     catalogue: Catalogue
@@ -62,7 +63,10 @@ class Context:
         return FitsLimits(max_pixels=self.settings.max_pixels)
 
     def made(self, table: type[Result], identity: str) -> Result | None:
-        """The result of an earlier job; None if there is none, or if a file of it is lost: the task then makes it again."""
+        """The result of an earlier job; None if there is no such result or if a file of it is lost.
+
+        The task then makes it.
+        """
         row = self.catalogue.get(table, identity, self.owner)
         return row if row is not None and intact(self.store, row) else None
 

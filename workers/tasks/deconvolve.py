@@ -70,7 +70,7 @@ def load(context: Context, request: ResolvedDeconvolve, path: Path) -> Image:
     """Read an image file and mask its saturated pixels."""
     context.report("reading", 0, request.method.steps)
     image = read_observation(path, context.limits, saturation_dn=request.saturation_dn)
-    # A rerun repeats what was allowed once, also by versions that did not check this.
+    # A rerun repeats an earlier deconvolution, even if it was made by a version that did not check this.
     if not (request.again or context.anew):
         check_not_deconvolved(content_of(image.header))
     return image
@@ -84,7 +84,7 @@ def _prepared(max_bytes: int) -> PreparedPsfs:
 
 @dataclass(frozen=True)
 class _Asked:
-    """What a request asks for, with its inputs."""
+    """A request for a deconvolution, with its inputs."""
 
     inputs: Inputs
 
@@ -109,12 +109,12 @@ class _Asked:
         return _prepared(self.context.settings.psf_cache_mib * 2**20)
 
     def warnings(self) -> list[Warned]:
-        """What the user must know about the inputs. Raises DataError "channel-mismatch"."""
+        """The warnings about the inputs. Raises DataError "channel-mismatch"."""
         psf, row = self.psf, self.inputs.psf_row
-        # The request of an upload may give an instrument and a channel that the file does not.
+        # The request of an upload may give an instrument and a channel that the file does not contain.
         instrument, angstrom = of_upload(row, psf.instrument, psf.wavelength_angstrom)
         psf = replace(psf, instrument=instrument, wavelength_angstrom=angstrom)
-        # A rerun repeats what was allowed once, also by versions that did not compare channels.
+        # A rerun repeats an earlier deconvolution, even if it was made by a version that did not compare channels.
         allowed = self.request.other_channel or self.context.anew
         withdrawn_text = withdrawn.withdrawn_warning(self.context.catalogue, row)
         found = {} if withdrawn_text is None else {withdrawn.CODE: withdrawn_text}
@@ -128,7 +128,8 @@ class _Asked:
         return None if figures is None else figures.noise()
 
     def possible_psfs(self) -> list[Psf]:
-        """PSFs that differ from the PSF by its errors, on the image's pixels; empty if the file of the PSF contains no errors."""
+        """Variants of the PSF within its errors, on the image's pixels; empty if the file of the PSF contains no
+        errors."""
         psf = read_psf(self.context.store.verified(self.inputs.psf_row.file_sha256), self.context.limits)
         if psf.fitted is None:
             return []
@@ -154,7 +155,7 @@ class _Asked:
         )
 
     def begin(self, stage: str, steps: int) -> Callable[[int, int], None]:
-        """Report the begin of a stage; returns a progress function for code that counts its own steps."""
+        """Report that a stage begins; returns a progress function for code that counts its own steps."""
         self.context.report(stage, 0, steps)
         return self.progress(stage)
 
@@ -166,7 +167,7 @@ class _Asked:
 def make(
     context: Context, request: ResolvedDeconvolve, psf_row: PsfRow, image: Image, *, preview: bool = True
 ) -> Made:
-    """Deconvolve an image and measure what changed in it. ``preview``: also draw the preview picture."""
+    """Deconvolve an image and measure the changes. ``preview``: also draw the preview picture."""
     inputs = Inputs(context, request, psf_row, image)
     asked = _Asked(inputs)
     work = asked.work

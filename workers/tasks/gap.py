@@ -1,8 +1,8 @@
-"""The task ``gap-diagnose``: diagnoses the gap of an uploaded transit; the result is a report, and a corrected PSF if an
-effect explains the gap.
+"""The task ``gap-diagnose``: diagnoses the gap of an uploaded transit; the result is a report, and a corrected PSF if
+effects explain the gap.
 
 The gap is the rms of the residuals of the images, with the expected noise subtracted in quadrature. For the
-corrected PSF the fit is repeated with these effects in the model.
+corrected PSF the fit is repeated with the effects of the answer in the model.
 """
 
 from __future__ import annotations

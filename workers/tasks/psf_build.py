@@ -30,8 +30,8 @@ def psf_build(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
-    """The row of the PSF that a deconvolution names. If the catalogue does not contain this PSF and its recipe is known, the PSF is
-    built first.
+    """The row of the PSF that a deconvolution names. If the catalogue does not contain this PSF, it is built first from
+    its recipe, if the recipe is known.
 
     Raises DataError "no-such-psf", and "instrument-changed" if the recipe now gives another PSF.
     """

@@ -49,7 +49,10 @@ def report(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def _point() -> Kernel:
-    """A diffraction PSF that changes nothing (a point), for a given PSF that already contains the diffraction."""
+    """A diffraction PSF that changes nothing (a point).
+
+    It is used with a given PSF that already contains the diffraction.
+    """
     point = np.zeros((POINT_PX, POINT_PX))
     point[POINT_PX // 2, POINT_PX // 2] = 1.0
     return point

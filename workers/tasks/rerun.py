@@ -34,7 +34,10 @@ Thing = ProductRow | PsfRow
 
 
 class _RerunCatalogue(Catalogue):
-    """The catalogue with some rows hidden, as if they had not been made yet. Rows that are added go into the list ``made``, not into the database."""
+    """The catalogue with some rows hidden, as if they had not been made yet.
+
+    Added rows go into the list ``made``, not into the database.
+    """
 
     def __init__(self, real: Catalogue, hidden: frozenset[str]) -> None:
         vars(self).update(vars(real))  # the same database connection and tables
@@ -46,13 +49,13 @@ class _RerunCatalogue(Catalogue):
         return None if identity in self._hidden else super().get(table, identity, owner)
 
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
-        """Remember the row. Nothing is written to the database, and the quota is not used."""
+        """Add the row to the list ``made``. Nothing is written to the database, and the quota is not used."""
         self.made.append(row)
         return row, True
 
 
 def rerun(context: Context, parameters: Mapping[str, Any]) -> str:
-    """Make a product or a PSF again and compare; returns the report's id."""
+    """Make a product or a PSF again, and compare it with the first one; returns the report's id."""
     request = ResolvedRerun.model_validate(parameters)
     identity = rerun_identity(request, context.job_id)
     if context.catalogue.get(ReportRow, identity, context.owner) is not None:

@@ -26,7 +26,7 @@ _VERSION = re.compile(VERSION, re.ASCII)
 
 
 class PsfStatus(StrEnum):
-    """How far a PSF may be trusted."""
+    """The trust in a PSF."""
 
     DRAFT = "draft"
     CERTIFIED = "certified"

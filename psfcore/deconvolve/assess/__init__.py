@@ -1,1 +1,1 @@
-"""What deconvolution changed in an image, how certain its pixels are, and signs of artefacts."""
+"""Measures what a deconvolution changed in an image, the errors of the pixels, and the signs of artefacts."""

@@ -1,6 +1,7 @@
 """Signs of artefacts: structures that a deconvolution made and that are not on the Sun.
 
-There are four signs. None of them can be real, given the image before deconvolution ("the image before"):
+There are four signs. A comparison with the image before deconvolution ("the image before") shows that they cannot be
+real:
 
     hole        x < 0.02 y (or x <= 0) in a pixel with y > 5 sigma                             Eq. (1)
     overshoot   x > (y + 5 sigma) / h0: no scene without negative light can give this,
@@ -16,9 +17,10 @@ artefact score is the sum of the four signs, each divided by its value in ALARMS
 found. The score ranks the images of a catalogue; it is not a probability.
 
 sigma is computed from the noise of the camera if that noise is known. Otherwise sigma is estimated from the pixels
-(Immerkaer 1996); sigma_x always is. The estimate uses the second difference in both directions: for white noise, its
-standard deviation is 6 sigma. The pixels are divided into classes of brightness, and each class gives the median
-absolute value of its second differences. Structure in the image increases this estimate, so it is an upper limit.
+(Immerkaer 1996). sigma_x is always estimated from the pixels. The estimate uses the second difference in both
+directions: for white noise, the standard deviation of this difference is 6 sigma. The pixels are divided into classes
+of brightness, and the noise of a class follows from the median absolute value of its second differences. Structure in
+the image increases this estimate, so it is an upper limit.
 
 | symbol | name | unit |
 |---|---|---|
@@ -105,7 +107,7 @@ def find_artefacts(
 
 @dataclass(frozen=True, eq=False)
 class BrightnessClasses:
-    """Classes of pixels by brightness, all of the same size.
+    """Classes of pixels by brightness. All classes have the same number of pixels.
 
     members: indices of the pixels of each class. centres: median brightness of each class.
     """
@@ -131,7 +133,8 @@ def noise_from_pixels(pixels: Plane, brightness: Plane, counted: Flags, classes:
         return np.full(pixels.shape, smallest)
     centres = classes.centres
     levels = np.array([1.4826 * np.median(second[part]) for part in classes.members])
-    # The brightest class spans a wide range of brightness. In it, the noise grows like photon noise.
+    # The brightest class contains a wide range of brightness. Within it, the noise is assumed to grow like photon
+    # noise.
     beyond = np.sqrt(np.maximum(brightness, centres[-1]) / centres[-1]) if centres[-1] > 0 else 1.0
     return np.asarray(np.maximum(np.interp(brightness, centres, levels) * beyond, smallest))
 

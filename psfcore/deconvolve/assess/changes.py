@@ -2,10 +2,11 @@
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images": "bright features
 intensify by up to 40 %, while dark regions decrease by up to 85 %". The paper does not define a feature, the number
-of pixels over which it is averaged, or the meaning of "up to". This module therefore tabulates several definitions.
-Here a feature is a block of n x n pixels (BLOCKS_PX); the code calls it a structure. The brightest and the darkest blocks (TAILS_PCT) are selected by
-percentiles of the image before deconvolution. Each row of the table gives three numbers: the change of the summed
-light of these blocks, the median change, and the largest change without the most extreme 1 % of the blocks.
+of pixels over which it is averaged, or the meaning of "up to". This module therefore makes a table for several
+definitions. Here a feature is a block of n x n pixels (BLOCKS_PX); the code calls it a structure. The brightest and the
+darkest blocks (TAILS_PCT) are selected by percentiles of the image before deconvolution. Each row of the table gives
+three numbers: the change of the summed light of these blocks, the median of their changes, and the largest change after
+the most extreme 1 % of the blocks are left out.
 
     change = 100 (after / before - 1)                             Eq. (1)
     dynamic range = percentile 100 - p divided by percentile p    Eq. (2)    percentiles of the block means
@@ -156,7 +157,10 @@ def counted_pixels(image: Image, result: Plane, edge_px: int) -> Flags:
 
 
 def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
-    """Means of blocks of block_px x block_px pixels, shape (n_blocks,). All pixels of such a block must be counted."""
+    """Means of blocks of block_px x block_px pixels, shape (n_blocks,).
+
+    Only blocks whose pixels are all counted are used.
+    """
     if block_px == 1:
         return np.asarray(plane[counted])
     ny, nx = plane.shape[0] // block_px, plane.shape[1] // block_px
@@ -169,7 +173,7 @@ def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Block means (n,) before and after deconvolution, and for each tail the lower and the upper percentile of them."""
+    """Block means (n,) before and after deconvolution, and their lower and upper percentile for each tail."""
 
     block_px: int
     old: Plane

@@ -10,13 +10,13 @@ G and W are local means with a Gaussian window. Noise is added to the model imag
 because y already contains noise. The factor G(y) / G(H x) corrects m near the edges: a method that conserves flux does
 not restore light that leaves the field, so H x is smaller than y near the edges.
 
-Because of the window W, few noise realisations are enough. The variance of the result and n both follow the scene, so
-their quotient varies slowly from pixel to pixel. W averages this quotient with a Gaussian of 2 px, which covers about 50
-pixels. We measured the accuracy of sigma for Richardson-Lucy with 20 steps, compared with 300 realisations of noise on
-the true scene. With 8 realisations, the rms error of sigma is 8 % at 100 photons per pixel, 11 % at 7 photons and 19 %
-at 1 photon. A wider window blurs edges in sigma; a narrower window leaves more scatter. If noise is added to the
-observation instead (y + noise), sigma is less accurate at few photons. An error propagation through a linearised step
-is wrong by a factor of up to 3 at few photons.
+Because of the window W, few noise realisations are enough. The variance of the result and n are both large where the
+scene is bright, so their quotient varies slowly from pixel to pixel. W averages this quotient with a Gaussian of 2 px,
+which covers about 50 pixels. We measured the accuracy of sigma for Richardson-Lucy with 20 steps, by comparison with
+300 realisations of noise on the true scene. With 8 realisations, the rms error of sigma is 8 % at 100 photons per
+pixel, 11 % at 7 photons and 19 % at 1 photon. A wider window blurs the edges in sigma; a narrower window leaves more
+scatter. If the noise is added to the observation instead (y + noise), sigma is less accurate at few photons. Linear
+error propagation through the steps is wrong by a factor of up to 3 at few photons.
 
 A correction takes account of the scatter of sigma. The scatter of W(d_k^2 / n) between realisations gives the degrees of
 freedom nu by Satterthwaite's rule (1946). The root of a variance is too small on average, by the factor c4 for nu

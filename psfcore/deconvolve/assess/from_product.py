@@ -1,4 +1,4 @@
-"""Read a row of the contact sheet from a product: what a deconvolution by the service changed in an image.
+"""Read a row of the contact sheet from a product: the changes that a deconvolution by the service made in an image.
 
 The task ``deconvolve`` computed the numbers and stored them in the product's details. The product's QUALITY plane marks
 the suspected pixels. This module does not deconvolve; it only bins both images to thumbnails.

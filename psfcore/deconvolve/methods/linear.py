@@ -2,10 +2,10 @@
 
     x <- x + G w (y - H x),   x_0 = y,   G = T* / max(abs(T)^2, t^2)      Eq. (1)
 
-H is the convolution with the PSF, cut to the field. T is the PSF's Fourier transform on the padded, periodic plane. G
-therefore inverts H, except for light that crosses the edge of the field; a few steps correct for that light. Where
-abs(T) is below t (LEAST_TRANSFER), Eq. (1) is a Landweber step: frequencies at which the PSF has little power are
-restored slowly, and the noise at these frequencies is amplified slowly.
+H is the convolution with the PSF, cut to the field. T is the PSF's Fourier transform on the padded, periodic plane.
+Where abs(T) is at least t (LEAST_TRANSFER), G = 1 / T, which inverts H except for light that crosses the edge of the
+field; a few steps correct for this light. Where abs(T) is below t, Eq. (1) is a Landweber step: frequencies at which
+the PSF has little power are restored slowly, and the noise at these frequencies is amplified slowly.
 
 The method does not force the scene to be positive, so faint pixels have no bias. For one PSF, the method amplifies the
 noise of every image by the same factor, `noise_amplification` (2 to 2.4 for HRI_EUV). Negative pixels are used
@@ -48,7 +48,7 @@ def deconvolve(
 ) -> Deconvolved:
     """Estimate the scene from `image` [y, x], which was observed with `psf`. The first estimate is the observation.
 
-    The result may be negative. It is NaN where the image is not finite. Raises the errors of `problem.pose`.
+    The result may be negative. It is NaN where the image is not finite. Raises the same errors as `problem.pose`.
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
     iteration = Additive(problem, inverse_filter(problem.engine))

@@ -35,7 +35,7 @@ def method_names() -> list[str]:
 
 
 def may_be_negative(name: str) -> bool:
-    """Whether results of a method may be negative: its module says MAY_BE_NEGATIVE = True."""
+    """Whether results of a method may be negative: its module then has the constant MAY_BE_NEGATIVE = True."""
     return getattr(_module(name.replace("-", "_")), "MAY_BE_NEGATIVE", False)
 
 

@@ -10,9 +10,10 @@ fainter by the factor s at each step. Negative pixels are due to noise around ze
 because the method cannot represent negative light.
 
 In the paper the scene is zero beyond the field (edges "zero"). In this case, the outermost rows of the result become 4
-to 6 % too dark: the light that enters from beyond the field replaces the light that leaves the field only on average.
+to 6 % too dark: light that enters from beyond the field replaces the light that leaves the field, but only on average.
 If the mirror image of the field continues the scene, the error is at most 1.3 % (`python -m studies.edges`). The
-default is therefore "symmetric". A margin of about 64 px is enough, because the published step compensates the rest.
+default is therefore "symmetric". A margin of about 64 px is enough, because the published step compensates for the
+light that crosses the edge of the margin.
 
 | symbol | name | unit |
 |---|---|---|
@@ -80,7 +81,7 @@ def richardson_lucy(
 
 
 class _RichardsonLucy(Iteration):
-    """Eq. (1). A block of rows stays in the cache between two convolutions."""
+    """The iteration of Eq. (1). A block of rows stays in the cache between two convolutions."""
 
     def __init__(self, problem: Problem) -> None:
         estimate = light_above_floor(problem)

@@ -6,7 +6,7 @@
 
 R is one Richardson-Lucy step, with the masks and edges of `richardson_lucy`. With order 1, the term with q is left out.
 Predictions are kept above 0. A few accelerated steps change the estimate as much as many plain steps. If the image is
-noisy, they therefore also amplify the noise after fewer steps: stop by discrepancy.
+noisy, the noise is therefore also amplified after fewer steps: use the stopping rule "discrepancy".
 
 | symbol | name |
 |---|---|
@@ -67,7 +67,7 @@ def deconvolve(
 
 
 class _Accelerated(Iteration):
-    """Eq. (1) to (3). `measure` convolves `prediction`; after the last step, `prediction` is x."""
+    """The iteration of Eq. (1) to (3). `measure` convolves `prediction`; after the last step, `prediction` is x."""
 
     def __init__(self, problem: Problem, order: int) -> None:
         estimate = light_above_floor(problem)
@@ -115,7 +115,7 @@ class _Accelerated(Iteration):
         return float(np.clip(alike / length, 0, _MOST_ACCELERATION)) if length > 0 else 0.0  # Eq. (3)
 
     def _predict(self, acceleration: float) -> None:
-        """Eq. (1)."""
+        """Compute the prediction of Eq. (1)."""
         a = np.float32(acceleration)
         curvature = np.float32(acceleration**2 / 2 if self._order == 2 else 0)
 

@@ -63,7 +63,7 @@ def deconvolve(
 
 
 class _Extended(Iteration):
-    """Eq. (1)."""
+    """The iteration of Eq. (1)."""
 
     def __init__(self, problem: Problem) -> None:
         engine = problem.engine

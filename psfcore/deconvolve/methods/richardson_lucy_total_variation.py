@@ -3,10 +3,11 @@
     x <- x / (1 - k div(grad x / |grad x|)) * H^T( w y / (H x) + (1 - w) / s )      Eq. (1), their Eq. (14)
 
 Eq. (1) is the step of `richardson_lucy`, with the same masks and edges, and with a penalty on differences between
-neighbouring pixels. k is the weight of the penalty. A fit to the noise costs more penalty than it improves chi2, so
-further steps do not amplify the noise. We simulated HRI_EUV images with 100 photons in a quiet pixel. After 20 steps,
-the rms error of this method is 157 DN/s in an image of 512 px, and 92 DN/s at 1024 px. Plain Richardson-Lucy has 169
-and 130 DN/s. With the best number of steps, which is not known for real images, it reaches 166 and 112 DN/s.
+neighbouring pixels. k is the weight of the penalty. A fit to the noise increases the penalty by more than it decreases
+chi2, so further steps do not amplify the noise. We simulated HRI_EUV images with 100 photons in a quiet pixel. After 20
+steps, the rms error of this method is 157 DN/s in an image of 512 px, and 92 DN/s at 1024 px. The rms error of plain
+Richardson-Lucy is 169 and 130 DN/s, and with its best number of steps, which is not known for real images, 166 and
+112 DN/s.
 Structures that are as faint as the noise are lost too. Use this method for pictures and for finding features. Do not
 use it for the photometry of small spots: they stay smoothed even without noise, and the forward differences shift them
 by up to 0.002 px.
@@ -75,7 +76,8 @@ def deconvolve(
 
 
 class _TotalVariation(Iteration):
-    """Eq. (1). x is a plane [y, x], because the differences connect pixels of different blocks of the engine."""
+    """The iteration of Eq. (1). x is a plane [y, x], because the differences connect pixels of different blocks of the
+    engine."""
 
     def __init__(self, problem: Problem, smoothing: float) -> None:
         self.x = light_above_floor(problem)

@@ -1,1 +1,1 @@
-"""What a product adds to the image of its input: header cards of its own, and planes."""
+"""The parts that a product adds to the header and the image of its input: cards and planes."""

@@ -1,4 +1,4 @@
-"""The cards of a product that describe its file and its origin, in place of those of its input.
+"""The cards that describe the file and the origin of a product. They replace the same cards of the input.
 
 Sources: FITS standard 4.0, section 4.4.2; SOLARNET metadata recommendations (Haugan and Fredvik 2020) and the Solar
 Orbiter metadata standard (SOL-SGS-TN-0009) for FILENAME, PARENT, CREATOR and LEVEL.
@@ -9,11 +9,11 @@ Orbiter metadata standard (SOL-SGS-TN-0009) for FILENAME, PARENT, CREATOR and LE
 | PARENT | FILENAME of the input; left out if the input has none |
 | CREATOR | heliopsf and its version |
 | LEVEL | L3, a product derived from calibrated data; left out if the input has none |
-| DATE | left out: with the time of writing, equal content would give unequal bytes. The catalogue stores the time |
+| DATE | left out: the time of writing would make files of equal content differ. The catalogue stores the time |
 | ORIGIN, VERSION, JOBID | left out: they describe the institute, the version and the run that made the input |
 
-HISTORY keeps the values of the input. LVL_NUM stays: it numbers the calibration of the pixels, which a deconvolution
-does not change.
+The lines of HISTORY contain the values of these cards in the input. LVL_NUM is not changed: it is the level of the
+calibration, which a deconvolution does not change.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ Cards = dict[str, tuple[str | int, str]]
 
 @dataclass(frozen=True)
 class Described:
-    """header: the header of the input without the cards that must not pass on. cards: the product's own cards.
+    """header: the header of the input, without the cards that are not valid for the product. cards: the product's own
+    cards.
 
     history: lines of HISTORY with the values of the input.
     """
@@ -49,7 +50,7 @@ def described(source: Header, *, filename: str, creator: str, sha256: str) -> De
     filename: name of the product. sha256: hash of the input's file.
     """
     before = {key: optional_value(source, key) for key in _OF_FILE}
-    # A file name may fill its card, so cards with one have no comment.
+    # A file name may fill the whole card, so cards with a file name have no comment.
     cards: Cards = {"FILENAME": (filename, ""), "CREATOR": (creator, "made this file")}
     parent = optional_text(source, "FILENAME")
     if parent is not None:

@@ -40,8 +40,8 @@ def plane_hdu(
 ) -> fits.ImageHDU:
     """The HDU of a plane [y, x]. Bits are stored as uint8 or uint16, numbers as float32 in the unit of the image.
 
-    image_header: the header of the product's image; the cards of its coordinates are copied. meanings: for a plane of
-    bits, what each bit means.
+    image_header: the header of the product's image; the cards of its coordinates are copied. meanings: the meaning of
+    each bit, for a plane of bits; None for other planes.
     """
     is_bits = plane.dtype.kind in "ub"
     stored = plane.astype(_BITS_STORED.get(plane.dtype.itemsize, np.uint16) if is_bits else np.float32)

@@ -1,10 +1,11 @@
 """Check the header of a tile-compressed image, and read from it how the tiles are stored, before any decoder runs.
 
 Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sections 7.3 and 10.1. The decoders of
-astropy are C functions that trust the header. With BYTEPIX = 8, the decoder of RICE_1 returns twice the bytes that it
-has written: the second half is memory of the process. With a large BLOCKSIZE, it reads and writes past its buffers.
-Dithering without a valid ZDITHER0 reads outside the table of random numbers. Therefore every card on which a decoder
-depends must have a value of the standard. This module reads no pixels, so the web process can import it.
+astropy are C functions that trust the header. With BYTEPIX = 8, the decoder of RICE_1 returns twice the number of bytes
+that it has written; the second half is arbitrary memory of the process. With a large BLOCKSIZE, it reads and writes
+past its buffers. With dithering and an invalid ZDITHER0, astropy reads outside the table of random numbers. Therefore
+every card on which a decoder depends must have a value that the standard allows. This module reads no pixels, so the
+web process can import it.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _DITHER_SEEDS = 1, 10_000  # section 10.2: the values of ZDITHER0
 _LARGEST_INT = 2**31 - 1
 _ITEMS_OF = {COMPRESSED: "BIJ", GZIPPED: "BIJ", UNCOMPRESSED: "BIJED"}
 _NUMBERS_OF = {"ZSCALE": "ED", "ZZERO": "ED", "ZBLANK": "BIJ"}
-_NUMBERS = "LBIJKED"  # of a column that the decoders do not use
+_NUMBERS = "LBIJKED"  # the allowed types of a column that the decoders do not use
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,9 @@ class Compression:
     """How a compressed image is stored.
 
     shape: pixels (ny, nx). tile: pixels (ny, nx) of a tile that is not cut off at the edge of the image. items: bytes of
-    an item of the heap, by column. first, heap_bytes: start of the heap after the rows of the table, and its size, bytes.
-    bytepix,
-    blocksize: bytes of a pixel and pixels of a block for RICE_1. quantised: whether pixels are integers with a scale and a zero for each tile.
+    an item of the heap, by column. first, heap_bytes: position of the heap, counted from the start of the table's data,
+    and its size, bytes. bytepix, blocksize: bytes of a pixel and pixels of a block for RICE_1. quantised: whether
+    pixels are stored as integers, with a scale and a zero point for each tile.
     """
 
     codec: str
@@ -78,7 +79,7 @@ def compression_of(header: Header, nx: int, ny: int) -> Compression:
 def _check_keywords(header: Header) -> None:
     """Raise HeaderError "bad-card" for a keyword that astropy takes as a pattern when it removes the cards of the table.
 
-    A pattern may remove other cards, may be no valid expression, and may take long to compare.
+    A pattern may remove other cards, may be an invalid expression, or may take long to compare.
     """
     for keyword in header:
         if set("*?") & set(keyword) or keyword.endswith("..."):

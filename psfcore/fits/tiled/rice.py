@@ -1,8 +1,9 @@
 """Check that a stream of RICE_1 holds all pixels of its tile, without decoding their values.
 
-Source: FITS standard 4.0, section 10.4.1; R. L. White, fits_rdecomp in cfitsio (ricecomp.c), the decoder of astropy. That
-decoder compares its position with the end of the stream once in a block. In between it reads past the end, and it
-skips zero bytes until it finds another one, wherever that is. A stream that this module accepts is never read past its end.
+Sources: FITS standard 4.0, section 10.4.1; R. L. White, fits_rdecomp in cfitsio (ricecomp.c), which astropy uses as its
+decoder. The decoder compares its position with the end of the stream only once per block. Within a block it may read
+past the end, and it skips zero bytes until it finds a byte that is not zero, even beyond the stream. If this module
+accepts a stream, the decoder never reads past its end.
 
     stream = first pixel (B bytes), then blocks of N pixels: FS (3, 4 or 5 bits for B = 1, 2, 4), then
         FS = 0: all differences are 0, no bits                                                            Eq. (1)
@@ -36,7 +37,7 @@ def rice_is_complete(stream: bytes, pixels: int, bytepix: int, blocksize: int) -
 
 @compiled()
 def _bits_used(content, pixels, pixel_bits, blocksize, code_bits, largest_code):  # type: ignore[no-untyped-def]
-    """The number of bits of the stream that its pixels need; -1 if it ends too early."""
+    """The number of bits of the stream that its pixels need; -1 if the stream ends too early."""
     total = 8 * len(content)
     at = pixel_bits
     for first in range(0, pixels, blocksize):
@@ -53,7 +54,7 @@ def _bits_used(content, pixels, pixel_bits, blocksize, code_bits, largest_code):
             for _ in range(count):  # Eq. (3)
                 while at < total and not (content[at >> 3] >> (7 - (at & 7))) & 1:
                     at += 8 if at & 7 == 0 and content[at >> 3] == 0 else 1
-                at += code  # the one, and code - 1 bits
+                at += code  # the bit 1, and then code - 1 bits
                 if at > total:
                     return -1
         if at > total:

@@ -4,11 +4,11 @@ FITS standard 4.0, section 10.1: each row of the table holds descriptors (length
 heap. The decoders of astropy trust these numbers and the content of the heap. Therefore:
 
 - Every descriptor must lie within the heap.
-- A gzip stream does not say how large it is after decompression: half a megabyte can become half a gigabyte, whatever
-  ZNAXISn declare. Each stream is first decompressed up to a limit.
-- Every tile must hold exactly its pixels, of 1, 2, 4 or 8 bytes. A scaled pixel may have 4 bytes at most: for 8 bytes,
-  astropy 8.0 returns memory that it has not written.
-- A stream of RICE_1 must be complete, because the decoder reads on past its end (`psfcore.fits.tiled.rice`).
+- A gzip stream does not reliably state its decompressed size: half a megabyte can become half a gigabyte, even if the
+  cards ZNAXISn declare a small image. Therefore each stream is first decompressed up to a limit.
+- Every tile must contain exactly its pixels, with 1, 2, 4 or 8 bytes per pixel. A scaled pixel may have at most 4
+  bytes: for 8 bytes, astropy 8.0 returns memory that it has not written.
+- A stream of RICE_1 must be complete, because the decoder may read past its end (`psfcore.fits.tiled.rice`).
 """
 
 from __future__ import annotations

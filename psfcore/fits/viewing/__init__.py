@@ -1,1 +1,1 @@
-"""What a person looks at in a stored FITS file: the pixels of one plane, and the cards of all headers."""
+"""Reads the parts of a stored FITS file that a viewer shows: the pixels of one plane, and the cards of all headers."""

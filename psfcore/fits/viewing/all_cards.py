@@ -20,7 +20,7 @@ _KEYWORD_CHARACTERS = 8
 
 @dataclass(frozen=True)
 class ListedHeader:
-    """The header of HDU ``index``: its name (EXTNAME; empty if it has none), and (keyword, value, comment) of each card."""
+    """The header of HDU ``index``: the HDU's name (EXTNAME, or empty), and (keyword, value, comment) of each card."""
 
     index: int
     name: str
@@ -30,8 +30,8 @@ class ListedHeader:
 def all_cards(path: str | os.PathLike[str], limits: FitsLimits) -> list[ListedHeader]:
     """All headers of a file, with their cards in the order of the file.
 
-    A card that cannot be read has its text as the value. A tile-compressed image has the header of the table that holds it. Raises
-    HeaderError if a header is unusable or exceeds the limits.
+    If a card cannot be read, its value is its text. For a tile-compressed image, the header is the header of the table
+    that contains it. Raises HeaderError if a header is unusable or exceeds the limits.
     """
     with open_source(Path(path), limits) as source:
         return [_listed(header, hdu) for header, hdu, _kind in walk(source, limits, to_the_end=True)]
@@ -47,13 +47,17 @@ def _shown(card: fits.Card) -> tuple[str, JsonValue, str]:
     try:
         return card.keyword, _json(card.value), str(card.comment)
     except card_trouble():
-        # Not card.image: astropy then repairs the card and warns, and Python remembers every text of a warning.
+        # card.image is not used here: astropy would repair the card and warn, and Python keeps the text of every
+        # warning.
         text = str(card._image)[_KEYWORD_CHARACTERS:].removeprefix("=")
         return str(card.keyword), text.strip(), ""
 
 
 def _json(value: object) -> JsonValue:
-    """A card's value as JSON. JSON has no complex numbers and no infinity: they become text. A card without a value has null."""
+    """A card's value as JSON; null for a card without a value.
+
+    Complex numbers and infinity, which JSON lacks, become text.
+    """
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if value is None or isinstance(value, (str, bool, int, float)):

@@ -1,7 +1,7 @@
 """Decode one plane of a FITS file row by row, so that memory holds only some rows.
 
-A tile-compressed image is read in whole rows of tiles. The values are those of the file (BSCALE, BZERO and BLANK applied):
-nothing is divided or masked.
+A tile-compressed image is read in whole rows of tiles. The values are the values of the file after BSCALE, BZERO and
+BLANK are applied. No pixel is divided by the exposure time or masked.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ def _rows(hdu: Any) -> Iterator[Any]:
     at_once = max(1, _BLOCK_BYTES // (nx * _DECODED_BYTES))
     if isinstance(hdu, fits.CompImageHDU):
         tile_rows = hdu.tile_shape[0]
-        at_once = -(-at_once // tile_rows) * tile_rows  # no tile is decoded twice
+        # A multiple of tile_rows, so that no tile is decoded twice.
+        at_once = -(-at_once // tile_rows) * tile_rows
     for first in range(0, ny, at_once):
         yield hdu.section[first : min(first + at_once, ny)]
 

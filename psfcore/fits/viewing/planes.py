@@ -1,9 +1,9 @@
-"""Decoded planes of FITS files, kept for a while, so that a viewer's requests for one plane decode it once.
+"""Keeps decoded planes of FITS files for some time, so that a plane is decoded only once for many requests of a viewer.
 
-A decoded plane is a file without a name in the folder of temporary files, and not an array in memory: many slow clients may
-read different planes at the same time. The system's page cache keeps the pixels in memory as long as there is room. The disk
-space is free again as soon as the plane is no longer kept and nobody reads it. This module loads no numerical libraries;
-decoding does.
+A decoded plane is stored in a file without a name in the folder of temporary files. It is not an array in memory,
+because many slow clients may read different planes at the same time. The system's page cache keeps the pixels in memory
+as long as there is room. The disk space becomes free when the plane is no longer kept and nobody reads it. This module
+loads no numerical library; only the decoding needs one.
 """
 
 from __future__ import annotations
@@ -58,10 +58,10 @@ class Plane:
 
 
 class Planes:
-    """The planes that were used last: at most MOST_PLANES with together at most MOST_BYTES."""
+    """Keeps the planes that were used last: at most MOST_PLANES planes, with at most MOST_BYTES together."""
 
     def __init__(self, temporary: Callable[[], AbstractContextManager[Path]]) -> None:
-        """temporary: gives a path for a temporary file, which is removed at the end of the block."""
+        """temporary: a context manager that gives a path for a temporary file and removes the file at the end."""
         self._temporary = temporary
         self._kept: OrderedDict[Key, Plane] = OrderedDict()
         self._lock = threading.Lock()
@@ -78,7 +78,7 @@ class Planes:
     def decoded(self, key: Key, decode: Callable[[BinaryIO], Decoded]) -> Plane:
         """The plane. If it is not kept, ``decode`` writes it to a file. Raises the errors of ``decode``.
 
-        If several threads ask for the same plane at the same time, one of them decodes it and the others wait.
+        If several threads request the same plane at the same time, one of them decodes it and the others wait.
         """
         with self._lock:
             turn = self._turns.setdefault(key, _Turn())

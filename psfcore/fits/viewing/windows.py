@@ -1,7 +1,8 @@
 """Cut a window out of a decoded plane, and reduce it to blocks of pixels, some rows at a time.
 
-With the step n, a pixel of the answer stands for n x n pixels of the window. It is the mean of those that are finite, or NaN
-if none is. For a plane of bits it is their bitwise OR. Blocks at the upper edges of the window may hold fewer pixels.
+With the step n, each pixel of the answer represents a block of n x n pixels of the window. Its value is the mean of the
+finite pixels of the block, or NaN if no pixel is finite. For a plane of bits, its value is the bitwise OR of the
+pixels. Blocks at the upper edges of the window may contain fewer pixels.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ def window_of(
     height: int | None = None,
     step: int = 1,
 ) -> Window:
-    """A window of a plane of ``shape`` (ny, nx). Without a width or height it reaches to the end of the plane.
+    """A window of a plane of ``shape`` (ny, nx). If width or height is None, the window extends to the end of the
+    plane.
 
     Raises DataError "window-outside" if a part of the window is not in the plane.
     """
@@ -82,7 +84,8 @@ def _blocks(plane: Plane, window: Window, bits: bool) -> Iterator[NDArray[Any]]:
         yield from _read(plane, window, window.y, end, at_once)
         return
     reduced = _union if bits else _mean
-    # Either one read gives several rows of the answer, or several reads give one row of the answer.
+    # For a small step, one read gives several rows of the answer. For a large step, one row of the answer needs several
+    # reads.
     rows = max(1, at_once // step) * step
     for first in range(window.y, end, rows):
         yield reduced(_read(plane, window, first, min(first + rows, end), at_once), step)
@@ -98,7 +101,10 @@ def _read(plane: Plane, window: Window, first: int, end: int, at_once: int) -> I
 
 
 def _mean(pieces: Iterator[NDArray[np.float32]], step: int) -> NDArray[np.float64]:
-    """Means of blocks. The pieces are either one piece, or together one row of blocks."""
+    """Means of blocks.
+
+    ``pieces``: one piece with several rows of blocks, or several pieces that together form one row.
+    """
     total = count = np.zeros(())
     for piece in pieces:
         finite = np.isfinite(piece)

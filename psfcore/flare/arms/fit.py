@@ -41,7 +41,7 @@ class FitState:
     source: Plane
 
     def moved(self, step: NDArray[np.float64], geometry: Geometry) -> FitState:
-        """The state after a step in all quantities, in the order above."""
+        """The state after a step in all quantities, in the order pattern, amplitude, source."""
         one, two = self.pattern.size, self.pattern.size + self.amplitude.size
         return FitState(
             self.pattern + step[:one],
@@ -55,7 +55,7 @@ class FitResult:
     """The result of a fit, apart from its state.
 
     error: the standard errors of pattern and amplitudes. freedom: degrees of freedom. light: the fitted light of each
-    pixel, DN. done: the number of steps. why: the reason why the steps stopped.
+    pixel, DN. done: the number of Gauss-Newton steps. why: the reason why the fit stopped.
     """
 
     error: NDArray[np.float64]
@@ -271,7 +271,8 @@ def _solve(columns: Plane, target: NDArray[np.float64]) -> tuple[NDArray[np.floa
     """Solve the least-squares problem with the smallest norm; return solution, covariance and rank.
 
     Some combinations of parameters are undetermined: the planes can compensate for a constant and for slopes of S, and
-    the amplitudes for a factor of S. These combinations stay 0. Neither the angles nor the spacing depend on them.
+    the amplitudes can compensate for a factor of S. The solution is 0 along these combinations. Neither the angles nor
+    the spacing depend on them.
     """
     scale = np.sqrt((columns**2).sum(axis=0))
     scale[scale == 0] = 1.0

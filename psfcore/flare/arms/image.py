@@ -42,8 +42,8 @@ def source_centre(
 ) -> tuple[tuple[float, float], float]:
     """Return the position (x, y) of the source in px, and the radius of its saturated patch in px.
 
-    If no position is given, the middle of the patch is used, or the brightest pixel if no pixel is saturated. In the
-    latter case the radius is 1.5 px. Raises DataError "arms-bad-input", "no-flare".
+    If no position is given, the middle of the patch is used. If no pixel is saturated, the brightest pixel is used, and
+    the radius is 1.5 px. Raises DataError "arms-bad-input", "no-flare".
     """
     radius = float(np.sqrt(patch.sum() / np.pi)) if patch.any() else 1.5
     if given is not None:
@@ -81,7 +81,8 @@ def smooth(plane: Plane, usable: Flags, width_px: float) -> Plane:
 
 
 def expected_light(image: Plane, reference: Plane | None, usable: Flags) -> Plane:
-    """The light (DN, smoothed) whose photon noise is in the difference: of the image, plus the reference if there is one."""
+    """The light (DN, smoothed) whose photon noise is in the difference: the image, plus the reference if it is
+    given."""
     counts = image if reference is None else image + reference
     return smooth(np.nan_to_num(counts), usable, 2.0)
 

@@ -13,7 +13,7 @@ fit, the smooth light around the source is subtracted: the median of each ring w
 (Gauss-Newton) fits all quantities together except r_0, because an error of r_0 only shifts S. The errors of t and s come
 from the normal equations with all other quantities free; they are multiplied by the square root of the reduced chi^2.
 S must be at least one pixel wide, as in real images. If each order of a point source filled a single pixel, the fit
-would only find the centres of pixels.
+could only find the centres of these pixels.
 
 `search` finds the first values, `image` prepares the data, `orders` implements Eq. (1) and `fit` implements Eq. (2).
 
@@ -114,8 +114,8 @@ def measure_arms(
     centre_xy: position of the source; default: the middle of the largest saturated patch, else the brightest pixel.
     noise: (DN per photon, rms of the read noise in DN); default: estimated from the residuals.
     saturated: True where pixels must not be used; pixels that are not finite are never used.
-    angles_near_deg: one arm is searched within 3 degrees of each of these angles. spacing_range_px: the smallest and
-    the largest spacing that are searched.
+    angles_near_deg: one arm is searched within 3 degrees of each of these angles. spacing_range_px: the search is
+    limited to spacings between these two.
     source_radius_px: half size of S; default: from the saturated patch. reach_px: largest radius at which orders are used.
 
     Raises DataError "arms-bad-input", "all-masked", "no-flare", "too-few-peaks".
@@ -123,7 +123,7 @@ def measure_arms(
     difference, usable, patch = prepared(image, reference, saturated)
     centre, patch_radius = source_centre(difference, usable, patch, centre_xy)
     half = source_radius_px or float(np.clip(patch_radius + 2.0, 3.0, 8.0))
-    inner = 2 * (patch_radius + half)  # nearer to the source, a plane does not describe the smooth light
+    inner = 2 * (patch_radius + half)  # at smaller radii, a plane does not describe the smooth light well
     reach = min(reach_px or np.inf, _LARGEST_SEARCH_PX, float(np.hypot(*image.shape)))
     angles, spacing = search_arms(
         difference, usable, centre, n_arms, spacing_range_px, angles_near_deg, (inner, reach)

@@ -50,8 +50,8 @@ class Geometry:
 class Orders:
     """The fitted orders, and the pixels around them.
 
-    arm (index) and k have one value per order. row, column, nearest (index of the nearest order), value (of the
-    difference) and sigma have one value per pixel. number [y, x] is the index of a pixel in these lists, or -1.
+    Each order has one value of arm (its index) and of k. Each pixel has one value of row, column, nearest (index of the
+    nearest order), value (of the difference) and sigma. number [y, x] is the index of a pixel in these lists, or -1.
     """
 
     arm: NDArray[np.intp]

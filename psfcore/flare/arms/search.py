@@ -31,8 +31,9 @@ def search_arms(
 ) -> tuple[NDArray[np.float64], float]:
     """Return first values of the angles (degrees) and of the spacing (px).
 
-    Along an arm, the orders are brighter than the pixels beside the arm and than the pixels between the orders. At the
-    returned spacing, the difference between the orders and the pixels between the orders is largest on the found arms.
+    Along an arm, the orders are brighter than the pixels beside the arm and brighter than the pixels between the
+    orders. The returned spacing is the spacing at which, on the found arms, the orders exceed the pixels between them
+    most.
     """
     degrees = np.arange(-90.0, 90.0, _SEARCH_STEP_DEG)
     lit, seen = _along_lines(_contrast(difference, usable), usable, centre, degrees, radii_px)

@@ -57,7 +57,7 @@ class KeyRefused(Exception):
 
 
 class TooManyKeys(Exception):
-    """An owner has the largest number of valid keys already."""
+    """An owner already has the largest allowed number of valid keys."""
 
 
 class Keys:
@@ -78,8 +78,9 @@ class Keys:
     ) -> str:
         """Make a key and return it; it cannot be shown again. Raises ValueError for a bad owner or without scopes.
 
-        made_by: id of the key with which it is made. most: the largest number of valid keys of the owner. Raises ``TooManyKeys``
-        if the owner has as many. Of the revoked and expired keys, only as many of the newest are then kept.
+        made_by: id of the key with which it is made. most: the largest number of valid keys of the owner; None: no
+        limit. Raises ``TooManyKeys`` if the owner already has ``most`` valid keys. Otherwise only the newest ``most``
+        of the owner's revoked and expired keys are kept; the older ones are deleted.
         """
         if not OWNER.fullmatch(owner):
             raise ValueError(f"expected an owner of {OWNER_RULE}; got {owner!r}")
@@ -159,7 +160,7 @@ class Keys:
     def revoke(self, identity: str, *, and_made: bool = False) -> bool:
         """Revoke a key. The next request with it is refused. Returns False if there is no key with this id.
 
-        and_made: revoke also the keys that were made with it, and those that were made with these.
+        and_made: also revoke all keys that were made with this key, directly or with one of the keys made with it.
         """
         revoked_at = func.coalesce(KeyRow.revoked_at, time.time())
         with self._database.writing.begin() as session:
@@ -188,10 +189,13 @@ class Keys:
 
 
 def _make_room(session: Session, owner: str, most: int) -> None:
-    """Raise ``TooManyKeys`` if an owner has so many valid keys; keep only so many of its other keys."""
+    """Raise ``TooManyKeys`` if an owner already has ``most`` valid keys.
+
+    Otherwise keep only the newest ``most`` of the owner's revoked and expired keys, and delete the older ones.
+    """
     add_bytes(
         session, owner, 0
-    )  # locks the owner, so that requests at the same time are counted one after the other
+    )  # locks the owner, so that simultaneous requests are counted one after the other
     good = good_keys().where(KeyRow.owner == owner)
     if len(session.scalars(good.limit(most)).all()) >= most:
         raise TooManyKeys

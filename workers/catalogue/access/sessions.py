@@ -39,7 +39,10 @@ class Sessions:
         self._database, self._keys = database, keys
 
     def open(self, key: KeyRow, lasts_s: float) -> str:
-        """Begin a session of a valid key, and return its token. It lasts this time, s, but not longer than the key."""
+        """Begin a session of a valid key; returns the token.
+
+        The session lasts ``lasts_s`` seconds, but not longer than the key.
+        """
         token, now = secrets.token_urlsafe(32), time.time()
         until = now + lasts_s
         row = SessionRow(
@@ -63,7 +66,7 @@ class Sessions:
             row = session.get(SessionRow, _hash(token))
             key = None if row is None else session.get(KeyRow, row.key_id)
         if row is None or key is None or row.expires_at <= time.time():
-            # If the key ended with the session, its reason says more.
+            # If the key is not valid either, check_valid raises the reason, which says more than "session-ended".
             if key is not None:
                 self._keys.check_valid(key)
             raise KeyRefused("session-ended", "expected an open session; yours has ended: log in again")
@@ -96,7 +99,7 @@ def _ended() -> ColumnElement[bool]:
 
 
 def _close_oldest(session: Session, key_id: str) -> None:
-    """Delete the sessions of a key, but for the newest ones that may stay beside a new one."""
+    """Delete the oldest sessions of a key, so that a new session can be added. MOST_OF_A_KEY - 1 sessions stay."""
     newest_first = (SessionRow.created_at.desc(), SessionRow.id)
     newest = (
         select(SessionRow.id)

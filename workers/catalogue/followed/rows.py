@@ -1,7 +1,8 @@
-"""What streams of events read of the jobs and bulk runs of an owner.
+"""The queries with which streams of events find changed jobs and bulk runs of an owner.
 
-A stream asks every half second. Therefore no query reads more than ``MOST`` rows, each of them uses an index that begins
-with the owner, and only the few columns are read from which a change is seen. The whole rows are read after a change.
+A stream makes these queries every half second. Therefore no query reads more than ``MOST`` rows, and every query uses
+an index that begins with the owner. A query reads only the few columns that show whether a row has changed. The whole
+row is read only after a change.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ Followable = TypeVar("Followable", bound=JobRow | BulkRow)
 
 @dataclass(frozen=True)
 class State:
-    """The state of a row; a row has changed if its state is another one. ended_at: None while it has not ended."""
+    """The state of a row.
+
+    A row has changed if its state is not equal to the earlier state. ended_at: None until it ends.
+    """
 
     id: str
     ended_at: float | None
@@ -53,7 +57,8 @@ class Followed(Generic[Followable]):
         open_phases: Sequence[Collection[str]],
         only: ColumnElement[bool] | None = None,
     ) -> None:
-        """columns: their values make the state. open_phases: groups of phases; ``MOST`` rows of each group are followed.
+        """columns: the columns whose values form the state. open_phases: groups of phases; the newest ``MOST`` rows of
+        each group are followed.
 
         only: a condition on the rows; None: all rows.
         """
@@ -69,7 +74,7 @@ class Followed(Generic[Followable]):
             return float(session.execute(select(self._database.now)).scalar_one())
 
     def open(self, owner: str) -> list[State]:
-        """Rows that have not ended; of each group of phases the ``MOST`` newest ones, newest first."""
+        """Rows that have not ended: the newest ``MOST`` rows of each group of phases, newest first."""
         table, found = self._table, []
         with self._database.reading() as session:
             for group in self._open_phases:
@@ -88,7 +93,7 @@ class Followed(Generic[Followable]):
             return _states(session.execute(query.order_by(table.ended_at, table.id).limit(MOST)))
 
     def among(self, owner: str, ids: Collection[str]) -> list[State]:
-        """Those of a few rows that the owner has, in any phase."""
+        """The states of the rows with these few ids, in any phase. Ids that the owner does not have are left out."""
         if not ids:
             return []
         query = select(*self._columns).where(self._these(owner, ids))
@@ -96,7 +101,7 @@ class Followed(Generic[Followable]):
             return _states(session.execute(query))
 
     def rows(self, owner: str, ids: Collection[str]) -> dict[str, tuple[State, Followable]]:
-        """The whole rows of a few ids, with their states, by id."""
+        """The whole rows with these few ids, and their states, by id."""
         if not ids:
             return {}
         with self._database.reading() as session:

@@ -1,1 +1,1 @@
-"""Whose waiting job comes next, and ended jobs that run again."""
+"""The order in which waiting jobs start, and completed jobs that are queued again."""

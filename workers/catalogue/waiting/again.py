@@ -10,7 +10,7 @@ from workers.contract.phases import Phase
 
 
 class Again:
-    """Finds completed jobs and queues them again; each method is one transaction."""
+    """Finds completed jobs, and queues them again; each method is one transaction."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

@@ -1,8 +1,9 @@
-"""Places: how many waiting jobs are expected to start before a waiting job.
+"""Places: the number of waiting jobs that are expected to start before a given waiting job.
 
-More urgent queues come first. In a queue the owners take turns (``workers.catalogue.waiting.turns``): before an owner's k-th
-job, every owner whose turn is earlier starts up to k jobs, and every other owner up to k - 1. The place is an expectation:
-workers may serve only some queues, and later jobs of other owners may come first.
+More urgent queues come first. In a queue the owners take turns (``workers.catalogue.waiting.turns``). Before an owner's
+k-th job starts, every owner whose turn is earlier starts up to k jobs, and every other owner starts up to k - 1 jobs.
+The place is only an estimate: a worker may serve only some of the queues, and jobs that other owners submit later may
+start first.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from workers.contract.phases import Phase
 from workers.contract.queues import Queue
 
 MOST_COUNTED = 1000
-MOST_READ = 10_000  # waiting jobs of a queue, oldest first, from which the owners and their jobs are counted
+MOST_READ = 10_000  # of a queue, at most this number of waiting jobs is read, oldest first, to count each owner's jobs
 
 
 class Places:
@@ -38,7 +39,7 @@ class Places:
         return self._count(job.owner, Queue(job.queue), earlier)
 
     def before_new(self, owner: str, queue: Queue) -> int:
-        """The same for a job that the owner would submit now."""
+        """The number of waiting jobs that are expected to start before a job that the owner would submit now."""
         return self._count(owner, queue)
 
     def _count(self, owner: str, queue: Queue, *own: ColumnElement[bool]) -> int:
@@ -62,7 +63,10 @@ def _counted(session: Session, query: Select[str]) -> int:
 
 
 def _of_others(session: Session, owner: str, queue: Queue, own_before: int) -> int:
-    """The number of jobs of other owners that come before the owner's job after ``own_before`` jobs."""
+    """The number of jobs of other owners that start before the owner's next job.
+
+    own_before: the number of the owner's own jobs that start before this job.
+    """
     oldest = select(JobRow.owner).where(JobRow.phase == Phase.QUEUED, JobRow.queue == queue)
     read = oldest.order_by(JobRow.created_at).limit(MOST_READ).subquery()
     counts = select(read.c.owner, func.count()).where(read.c.owner != owner).group_by(read.c.owner)

@@ -2,8 +2,8 @@
 
 The broker delivers messages in the order in which jobs were submitted. If each message started the job that it names,
 one owner's many jobs would delay the single job of another. Therefore a message is only the right to start one job of
-its queue, and the database says which: there are as many messages as waiting jobs, so each job gets one. If messages are
-lost, the reconciler submits the jobs again that still wait. A message without a waiting job has no effect.
+its queue, and the database determines which job. There are as many messages as waiting jobs, so every job starts. If
+messages are lost, the reconciler submits the jobs that still wait again. A message has no effect if no job waits.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ class Turns:
 
         A message of the broker is the right to start one job of its queue; ``told_id`` is the job that it names. The
         owner whose jobs of this queue were claimed least recently comes first, so that the many jobs of one owner do not
-        delay the single job of another. Of an owner's jobs, the oldest comes first; a job that was handed back counts
-        from its last start. The number of an owner's running jobs does not count: an owner with one long job would
-        otherwise wait until nobody else has a job.
+        delay the single job of another. Of an owner's jobs, the oldest comes first; for a job that was handed back, the
+        time of its last start is used instead of its creation time. The number of an owner's running jobs has no
+        influence: otherwise an owner with one long running job would wait until no other owner has a waiting job.
         """
         while (job_id := self._next(told_id, queue)) is not None:
             lease = self._jobs.claim(job_id, worker)
             if lease is not None:
                 return lease
-        # The message is used up, so jobs that wait for an identical job need another message later.
+        # This message is used up. Jobs that wait for an identical job need another message later, so they are marked as
+        # not submitted.
         blocked = [JobRow.phase == Phase.QUEUED, JobRow.queue == queue, ~no_equal_at_work()]
         received = JobRow.submitted_at.is_not(None)
         self._database.change(update(JobRow).where(*blocked, received).values(submitted_at=None))
@@ -45,10 +46,10 @@ class Turns:
     def claim_short(
         self, queue: Queue, worker: str, *, seconds: float, memory_mib: int, not_of: str | None = None
     ) -> Lease | None:
-        """Claim a short job of a queue, to be run while a longer job pauses; None if there is none.
+        """Claim a short job of a queue, to run it while a longer job pauses; None if there is no such job.
 
-        seconds, memory_mib: the most that the job may need by its estimate. not_of: an owner whose jobs are not claimed.
-        The message of the claimed job has no effect when it arrives.
+        seconds, memory_mib: largest estimated time and memory of the job. not_of: an owner whose jobs are not claimed.
+        One message of the broker is then left over; it has no effect.
         """
         short = [
             JobRow.owner != (not_of or ""),
@@ -63,9 +64,9 @@ class Turns:
         return None
 
     def leave_next(self, told_id: str, queue: Queue) -> str | None:
-        """Record that a worker took a message from the broker but starts no job; returns the id of the job that it leaves.
+        """Record that a worker took a message from the broker but starts no job. The job will be submitted again.
 
-        This is the job that ``claim_next`` would have claimed. It is submitted again.
+        Returns the id of this job, which is the job that ``claim_next`` would have claimed; None if no job could start.
         """
         job_id = self._next(told_id, queue)
         if job_id is not None:
@@ -73,7 +74,7 @@ class Turns:
         return job_id
 
     def _next(self, told_id: str, queue: Queue) -> str | None:
-        """The job of a queue that comes next, of those that the broker has received."""
+        """The id of the job of a queue that comes next; None if no job of the queue could start now."""
         with self._database.reading() as session:
             for owner in session.scalars(_owners(queue)).all():
                 found = session.scalars(_oldest(owner, told_id, queue)).first()
@@ -83,7 +84,7 @@ class Turns:
 
 
 def _owners(queue: Queue) -> Select[str]:
-    """The owners whose jobs wait in a queue, the one who was served least recently first."""
+    """The owners whose jobs wait in a queue; the owner who was served least recently comes first."""
     number = func.coalesce(OwnerTurnRow.number, 0)
     turn = and_(OwnerTurnRow.owner == JobRow.owner, OwnerTurnRow.queue == JobRow.queue)
     waiting = select(JobRow.owner).outerjoin(OwnerTurnRow, turn)
@@ -94,7 +95,8 @@ def _owners(queue: Queue) -> Select[str]:
 def _oldest(owner: str, told_id: str, queue: Queue) -> Select[str]:
     """The owner's oldest job that could start now.
 
-    It was received by the broker, or the broker has just delivered its id, before the server recorded its submission.
+    The server has recorded that the broker received the job, and the retry of the job is not delayed. Or the job is
+    ``told_id``: the broker can deliver an id before the server has recorded its submission.
     """
     received = and_(JobRow.submitted_at.is_not(None), JobRow.delayed.is_(False))
     # Not no_equal_at_work(): that condition is tested for each waiting job, of which there may be many thousands.

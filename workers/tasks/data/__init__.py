@@ -1,1 +1,1 @@
-"""What tasks read and keep: transits, PSFs, solutions, products and reports."""
+"""Reads and keeps the data of tasks: PSFs, solutions, products and reports."""

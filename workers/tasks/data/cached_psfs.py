@@ -1,7 +1,8 @@
-"""Built PSFs of a temporary catalogue, kept for later commands in the user's cache.
+"""Keeps the built PSFs of a temporary catalogue in the user's cache, for later commands.
 
-The cache holds for each PSF its FITS file, its provenance, and the row of the catalogue with its tables and its picture. A PSF that
-the Python functions built has no row yet; it is made from the FITS file.
+For each PSF, the cache contains the FITS file, the provenance, and the row of the catalogue with the tables and the
+picture. If the Python functions built the PSF, the cache does not contain its row; the row is then made from the FITS
+file.
 """
 
 from __future__ import annotations
@@ -32,13 +33,16 @@ from workers.versions.series import TOTAL
 
 log = logging.getLogger(__name__)
 _ROW, _TABLES, _PREVIEW = "row.json", "tables.json", "preview.png"
-_ROW_FORMAT = 1  # raise it when the row, the tables or the picture get another content
+_ROW_FORMAT = 1  # raise this number when the content of the row, the tables or the picture changes
 _COLUMNS = ("name", "version", "instrument", "channel", "kind", "series", "status", "origin", "bytes")
 
 
 @dataclass(frozen=True)
 class CachedPsfs:
-    """The cache beside a catalogue and its store. adopt(path, sha256): adds a checked file to the store without copying it."""
+    """Exchanges PSFs between the cache and a catalogue with its store.
+
+    adopt(path, sha256): adds a checked file to the store without copying it.
+    """
 
     cache: PsfCache
     catalogue: Catalogue
@@ -49,7 +53,7 @@ class CachedPsfs:
     adopt: Callable[[Path, str], None]
 
     def recall(self, build: PsfBuild) -> None:
-        """Add the PSF of a recipe to the catalogue, if the cache holds it and the catalogue does not."""
+        """Add the PSF of a recipe to the catalogue, if the cache contains it and the catalogue does not."""
         identity = psf_identity(build)
         if self.catalogue.get(PsfRow, identity, self.owner) is not None:
             return
@@ -60,7 +64,10 @@ class CachedPsfs:
         self.catalogue.add(self._kept_row(identity, fits) or self._new_row(identity, build, fits))
 
     def remember(self, build: PsfBuild) -> None:
-        """Keep the PSF of a recipe in the cache, if the catalogue holds it. If the cache cannot be written, this is logged."""
+        """Keep the PSF of a recipe in the cache, if the catalogue contains it.
+
+        A failure to write the cache is only logged.
+        """
         identity = psf_identity(build)
         row = self.catalogue.get(PsfRow, identity, self.owner)
         if row is None or self.cache.find(identity, _ROW) is not None:
@@ -76,7 +83,7 @@ class CachedPsfs:
             if digest is not None and self.cache.find(row.id, part) is None:
                 self.cache.keep(row.id, part, partial(shutil.copyfile, self.store.path(digest)))
         about = {name: getattr(row, name) for name in (*_COLUMNS, "file_sha256", "preview_sha256", "details")}
-        # The row is kept last: with it, everything is there.
+        # The row is kept last: if the cache contains the row, it also contains the other files.
         for part, content in (
             (PROVENANCE, row.details["provenance"]),
             (_ROW, about | {"format": _ROW_FORMAT}),
@@ -84,7 +91,7 @@ class CachedPsfs:
             self.cache.keep(row.id, part, partial(_write_json, content))
 
     def _kept_row(self, identity: str, fits: CachedFile) -> PsfRow | None:
-        """The row that an earlier command kept; None if there is none, or if a file of it is missing."""
+        """The row that an earlier command kept; None if there is no such row, or if one of its files is missing."""
         kept = self.cache.find(identity, _ROW)
         if kept is None:
             return None
@@ -130,7 +137,8 @@ class CachedPsfs:
 
 
 def recipes_in(kind: str, resolved: Mapping[str, Any]) -> list[PsfBuild]:
-    """The recipes of the PSFs that a job builds unless the catalogue holds them. resolved: the job's resolved parameters."""
+    """The recipes of the PSFs that a job builds unless the catalogue contains them. resolved: the job's resolved
+    parameters."""
     if kind == "psf-build":
         return [PsfBuild.model_validate(resolved)]
     named = (resolved.get(name) for name in ("psf_recipe", "diffraction_recipe"))

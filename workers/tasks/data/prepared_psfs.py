@@ -24,7 +24,7 @@ Thing = TypeVar("Thing", Psf, tuple[Psf, Engine])
 
 
 class PreparedPsfs:
-    """Keeps the PSFs and engines that were used last, up to ``max_bytes``; it always keeps the last one."""
+    """Keeps the PSFs and engines that were used last, up to ``max_bytes`` together; it always keeps the newest one."""
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
@@ -35,7 +35,8 @@ class PreparedPsfs:
     ) -> Psf:
         """The PSF of a file on the pixels of an image with this header; repeated calls return the same object.
 
-        name: names the content of the file. find: returns the path of the file; it is called only if the PSF is not kept.
+        name: a key that identifies the content of the file. find: returns the path of the file; it is called only if
+        the PSF is not kept.
         """
         whole = self._once((name, limits), lambda: read_psf(find(), limits, parts=False), _kernel_bytes)
         factor = binning_factor(whole, header)

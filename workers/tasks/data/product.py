@@ -45,7 +45,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Warned:
-    """Something that a user of the product must know: a short code and a sentence."""
+    """A warning for users of the product: a short code and a sentence."""
 
     code: str
     message: str
@@ -162,7 +162,7 @@ def _cards(
         saturation=inputs.image.saturation,
         amplification=None if errors is None else errors.amplification,
     )
-    # The order of the cards is that of earlier versions: equal requests give equal bytes.
+    # The cards have the same order as in earlier versions, because equal requests must give equal bytes.
     ordered: dict[str, tuple[Any, str]] = {"PRODID": (identity, "")}
     for key, card in cards.items():
         if key == "SWHELIO":
@@ -196,9 +196,9 @@ def details_of(
     found: Changes,
     warnings: Sequence[Warned],
 ) -> dict[str, Any]:
-    """The details of the product's row: how it was made, what changed in the image, and the warnings.
+    """The details of the product's row: how the product was made, the measured changes, and the warnings.
 
-    Bright pixels are those at or above the 99th percentile of the input; dark pixels are those at or below the first.
+    A bright pixel is at or above the 99th percentile of the input; a dark pixel is at or below the first percentile.
     """
     image = inputs.image
     before, after = image.pixels[image.valid], result.pixels[image.valid]

@@ -1,11 +1,12 @@
 """Solutions of transits, kept for later jobs on the same transit.
 
-Fit, cross-validation, report and gap of a transit begin with the same inversion. The first job keeps its solution, and
-later jobs of the same owner read it. It is the same bit for bit. The identity of a solution contains everything that
-determines it, and the versions of the software and its libraries, so that the provenance of a result stays true. It does
-not contain the number of threads, which changes no result.
+The fit, the cross-validation, the report and the gap diagnosis of a transit begin with the same inversion. The first
+job keeps its solution, and later jobs of the same owner read it: a new inversion would give the same values, bit for
+bit. The identity of a solution contains everything that determines the solution, and the versions of the software and
+its libraries, so that the provenance of a result stays true. It does not contain the number of threads, which changes
+no result.
 
-A kept solution only saves time. If it cannot be read or kept, the job inverts the transit and goes on.
+A kept solution only saves time. If it cannot be read or kept, the job inverts the transit itself and continues.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def solved(
     start: Vector | None = None,
     progress: Progress,
 ) -> Solution:
-    """The solution of a transit: the owner's kept one, or a new one, which is then kept.
+    """The solution of a transit: the kept solution of the owner, or else a new solution, which is then kept.
 
     transit: as ``load_transit`` returns it for the request; only its noise may be replaced. A rerun computes anew and keeps
     nothing. Raises DataError as ``psfcore.scatter.inversion.invert`` does.
@@ -81,7 +82,7 @@ def solution_identity(
             "transit": request.transit_id,
             "saturation_dn": request.saturation_dn,
             "diffraction": diffraction_identity(request),
-            # Not the noise of the request: a diagnosis may replace it by the noise that the images show.
+            # This is not the noise of the request: a diagnosis may replace it by the noise measured in the images.
             "noise": [float(transit.noise.photon_gain_dn), float(transit.noise.read_noise_dn)],
             "shape": shape.name,
             "start": None if start is None else [float(q) for q in start],
@@ -93,7 +94,7 @@ def solution_identity(
 
 
 def _kept(context: Context, identity: str, transit: Transit) -> Solution | None:
-    """The owner's solution with this identity; None if there is none that can be read."""
+    """The owner's kept solution with this identity; None if it does not exist or cannot be read."""
     row = context.catalogue.get(SolutionRow, identity, context.owner)
     if row is None:
         return None

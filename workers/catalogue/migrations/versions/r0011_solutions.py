@@ -10,7 +10,7 @@ down_revision = "0010"
 
 
 def upgrade() -> None:
-    """Make the table. The solutions of earlier jobs were not kept."""
+    """Create the table. The solutions of earlier jobs were not kept."""
     op.create_table(
         "solutions",
         sa.Column("owner", sa.String(64), primary_key=True),

@@ -10,7 +10,10 @@ down_revision = "0012"
 
 
 def upgrade() -> None:
-    """Make the table and the column, and add the owner to an index. In a database of an earlier version, no owner has been served yet."""
+    """Create the table and the column, and add the owner to an index.
+
+    At first, the table records no turn of any owner.
+    """
     op.create_table(
         "owner_turns",
         sa.Column("owner", sa.String(64), primary_key=True),

@@ -1,4 +1,4 @@
-"""The rows of an owner count in the quota, not only the files."""
+"""The database rows of an owner count in the quota, in addition to the files."""
 
 from __future__ import annotations
 

@@ -9,6 +9,6 @@ down_revision = "0015"
 
 
 def upgrade() -> None:
-    """Make the indexes."""
+    """Create the indexes."""
     for table in ("jobs", "bulks"):
         op.create_index(f"{table}_ended", table, ["owner", "ended_at", "id"])

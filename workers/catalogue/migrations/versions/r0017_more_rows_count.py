@@ -26,7 +26,7 @@ COUNTED = {
 def upgrade() -> None:
     """Add the rows to the counts of all owners."""
     for table, counted in COUNTED.items():
-        # An owner of such rows may have no count yet.
+        # An owner who has such rows may have no row in the table of owners yet.
         op.execute(
             f"INSERT INTO owners (owner, bytes) SELECT DISTINCT owner, 0 FROM {table} "
             "WHERE owner NOT IN (SELECT owner FROM owners)"
