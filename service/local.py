@@ -43,9 +43,9 @@ from workers.contract.requests import PsfBuild
 from workers.contract.suggestions import explained
 from workers.files.intact import files_of
 from workers.files.store import Store, sha256_of
+from workers.intake.deprecated import details_now
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
-from workers.intake.withdrawn import details_now
 from workers.run import runner
 from workers.run.runner import Runner
 from workers.settings import Settings

@@ -16,7 +16,7 @@ from workers.catalogue.tables import ProductRow
 from workers.contract.requests import Identity
 from workers.files.collection import remove_unnamed
 from workers.files.intact import files_of
-from workers.intake.withdrawn import details_now
+from workers.intake.deprecated import details_now
 
 router = APIRouter(prefix="/v1/products", tags=["products"], responses=RESPONSES)
 

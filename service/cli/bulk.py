@@ -138,7 +138,7 @@ def submit(
         psf_id = named_psf(service, psf)
         if psf_id is not None and service.psf(psf_id)["status"] == PsfStatus.DEPRECATED:
             click.echo(
-                f"warning: PSF {short(psf_id)} was withdrawn; every product has this warning", err=True
+                f"warning: PSF {short(psf_id)} was deprecated; every product has this warning", err=True
             )
         made = service.submit_bulk(
             images=[*whole_ids(service, "images", images), *sent],

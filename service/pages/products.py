@@ -21,7 +21,7 @@ from service.pages.rendering import number, page, short
 from service.pages.visitors import PageReading, PageSubmitting
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow
 from workers.contract.requests import Identity
-from workers.intake import withdrawn
+from workers.intake.deprecated import CODE, deprecation
 
 MOST_RERUNS = 10
 router = APIRouter(prefix="/products/{product_id}", include_in_schema=False)
@@ -36,7 +36,7 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
     reruns = state.catalogue.page(ReportRow, owner=row.owner, limit=MOST_RERUNS, about_id=row.id)
     lost = _lost(state, row.file_sha256, row.bytes)
     image_lost = None if image is None else _lost(state, image.id, image.bytes)
-    deprecated = None if psf is None else withdrawn.deprecation(state.catalogue, psf)
+    deprecated = None if psf is None else deprecation(state.catalogue, psf)
     better = None if deprecated is None else deprecated.redo_with
     answer = page(
         request,
@@ -47,7 +47,7 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         psf=psf,
         lost=lost,
         image_lost=image_lost,
-        warnings=_warnings(row.details, without=withdrawn.CODE if deprecated else None),
+        warnings=_warnings(row.details, without=CODE if deprecated else None),
         deprecated=deprecated,
         redo=_again(row, psf_id="" if better is None else better.id),
         changed=_changed(row.details),

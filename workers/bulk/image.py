@@ -24,8 +24,8 @@ from workers.files import beneath
 from workers.files.full_disk import is_disk_full
 from workers.files.store import sha256_of
 from workers.intake import estimates
+from workers.intake.deprecated import details_now
 from workers.intake.requests import resolved_deconvolution
-from workers.intake.withdrawn import details_now
 from workers.tasks import deconvolve as deconvolve_task
 from workers.tasks.context import Context
 from workers.tasks.data import product

@@ -21,9 +21,9 @@ from workers.contract.methods import Parameters
 from workers.contract.requests import Deconvolve, PsfBuild
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.intake import compatibility
+from workers.intake.deprecated import check_not_deprecated
 from workers.intake.no_psf import no_psf
 from workers.intake.psf_choice import picked_for_image
-from workers.intake.withdrawn import check_not_withdrawn
 from workers.lineage import made_by
 
 
@@ -190,7 +190,7 @@ def _diffraction_of(asked: Asked, summary: dict[str, Any]) -> PsfBuild | None:
             f"got neither ({summary['instrument']!r})",
         )
     recipe = PsfBuild(instrument=summary["instrument"], component="diffraction")
-    check_not_withdrawn(
+    check_not_deprecated(
         asked.catalogue,
         psf_identity(recipe),
         asked.owner,
@@ -218,7 +218,7 @@ def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, o
     # The shipped instrument file at full size.
     recipe = PsfBuild(instrument=header["instrument"])
     identity = psf_identity(recipe)
-    check_not_withdrawn(
+    check_not_deprecated(
         catalogue,
         identity,
         owner,

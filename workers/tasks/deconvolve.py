@@ -24,8 +24,8 @@ from psfcore.scatter.samples import possible_psfs
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.identities import product_identity
 from workers.contract.resolved import ResolvedDeconvolve
-from workers.intake import withdrawn
 from workers.intake.compatibility import noise_of, of_upload
+from workers.intake.deprecated import CODE, deprecated_warning
 from workers.tasks.context import Context
 from workers.tasks.data.prepared_psfs import PreparedPsfs
 from workers.tasks.data.product import Inputs, Made, Warned, details_of, keep, save_preview, write
@@ -116,8 +116,8 @@ class _Asked:
         psf = replace(psf, instrument=instrument, wavelength_angstrom=angstrom)
         # A rerun repeats an earlier deconvolution, even if it was made by a version that did not compare channels.
         allowed = self.request.other_channel or self.context.anew
-        withdrawn_text = withdrawn.withdrawn_warning(self.context.catalogue, row)
-        found = {} if withdrawn_text is None else {withdrawn.CODE: withdrawn_text}
+        warning = deprecated_warning(self.context.catalogue, row)
+        found = {} if warning is None else {CODE: warning}
         found |= input_warnings(psf, self.inputs.image, other_channel=allowed)
         return [Warned(code, message) for code, message in found.items()]
 

@@ -233,7 +233,10 @@ def test_an_administrator_may_act_for_an_owner_and_nobody_else_may(
     assert root.get(address).status_code == 404
     assert root.get(address, headers=for_ann).status_code == 200
     odd = root.get(address, headers={"X-Owner": "a b"})
-    assert (odd.status_code, odd.json()["type"]) == (400, "urn:heliopsf:bad-owner") and "got 'a b'" in odd.json()["detail"]
+    assert (odd.status_code, odd.json()["type"]) == (
+        400,
+        "urn:heliopsf:bad-owner",
+    ) and "got 'a b'" in odd.json()["detail"]
     assert anns and service.client("bob").get(address, headers={"X-Owner": "a b"}).status_code == 403
     bob, ann = service.client("bob"), service.client("ann")
     assert bob.get(address, headers=for_ann).status_code == 403

@@ -108,6 +108,6 @@ def test_a_product_whose_psf_was_deprecated_says_what_to_do(
         kept = connection.scalar(select(ProductRow.details).where(ProductRow.id == after))["warnings"]
     engine.dispose()
     assert "psf-deprecated" in {one["code"] for one in kept}, "this product was made with the warning"
-    assert told(after) == [expected] and "withdrawn" not in "".join(
+    assert told(after) == [expected] and "was deprecated (" not in "".join(
         sentences(api.get(f"/products/{after}").text)
     )

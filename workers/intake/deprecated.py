@@ -28,7 +28,7 @@ class Deprecation:
     redo_with: PsfRow | None
 
 
-def check_not_withdrawn(catalogue: Catalogue, psf_id: str, owner: str, what: str, ways: str) -> None:
+def check_not_deprecated(catalogue: Catalogue, psf_id: str, owner: str, what: str, ways: str) -> None:
     """Raise ``DataError`` "psf-deprecated" if the PSF that the service would choose is deprecated.
 
     what: the name of the PSF in the message. ways: advice for the user; it may contain {psf}, which stands for the
@@ -40,18 +40,18 @@ def check_not_withdrawn(catalogue: Catalogue, psf_id: str, owner: str, what: str
     instead = "" if row.successor_id is None else f" (its successor is {row.successor_id[:SHOWN_DIGITS]})"
     raise DataError(
         CODE,
-        f"expected a PSF that is still in use; {what} was withdrawn ({_reason(catalogue, row)}){instead}: "
+        f"expected a PSF that is still in use; {what} was deprecated ({_reason(catalogue, row)}){instead}: "
         + ways.format(psf=psf_id[:SHOWN_DIGITS]),
     )
 
 
-def withdrawn_warning(catalogue: Catalogue, psf: PsfRow) -> str | None:
+def deprecated_warning(catalogue: Catalogue, psf: PsfRow) -> str | None:
     """The warning for users of a deprecated PSF; None for every other PSF."""
     if psf.status != PsfStatus.DEPRECATED:
         return None
     better = "another PSF" if psf.successor_id is None else f"its successor {psf.successor_id[:SHOWN_DIGITS]}"
     return (
-        f"PSF {psf.id[:SHOWN_DIGITS]} ({psf.name} {psf.version}) was withdrawn ({_reason(catalogue, psf)}); "
+        f"PSF {psf.id[:SHOWN_DIGITS]} ({psf.name} {psf.version}) was deprecated ({_reason(catalogue, psf)}); "
         f"use {better} for new products"
     )
 
@@ -69,7 +69,7 @@ def details_now(catalogue: Catalogue, product: ProductRow) -> dict[str, Any]:
     If its PSF is deprecated now, the details contain a warning, even if the product is older.
     """
     psf = catalogue.get(PsfRow, product.psf_id, product.owner)
-    message = None if psf is None else withdrawn_warning(catalogue, psf)
+    message = None if psf is None else deprecated_warning(catalogue, psf)
     if message is None:
         return product.details
     others = [one for one in product.details.get("warnings", ()) if one["code"] != CODE]

@@ -22,7 +22,7 @@ from workers.contract.identities import psf_identity
 from workers.contract.kinds import JobRequest
 from workers.contract.requests import PsfBuild, PsfFit
 from workers.intake import requests
-from workers.intake.withdrawn import details_now
+from workers.intake.deprecated import details_now
 from workers.versions.status import PsfStatus
 
 HRI = {"TELESCOP": "SOLO/EUI/HRI_EUV", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174}
@@ -49,7 +49,7 @@ def catalogue(local: LocalService, psf_file: Path, tmp_path: Path) -> Catalogue:
     return found
 
 
-def test_the_service_does_not_choose_a_psf_that_was_withdrawn(
+def test_the_service_does_not_choose_a_psf_that_was_deprecated(
     local: LocalService, catalogue: Catalogue, tmp_path: Path
 ) -> None:
     assert local.deconvolve(tmp_path / "i.fits", **FEW)["psf_id"] == BUILT
@@ -57,7 +57,7 @@ def test_the_service_does_not_choose_a_psf_that_was_withdrawn(
     with pytest.raises(DataError) as caught:
         local.deconvolve(tmp_path / "i.fits", **FEW)
     assert caught.value.code == "psf-deprecated"
-    for told in ("builds for hri_euv was withdrawn", "reason: wrong mesh", f"--psf {BUILT[:12]}"):
+    for told in ("builds for hri_euv was deprecated", "reason: wrong mesh", f"--psf {BUILT[:12]}"):
         assert told in caught.value.message
 
 
@@ -65,8 +65,8 @@ def test_the_error_names_the_successor(local: LocalService, catalogue: Catalogue
     catalogue.add(psf("better"))
     asked = StatusAsked(PsfStatus.CERTIFIED, "", version="2.0.0", supersedes=(BUILT,))
     catalogue.psfs.change(identity("better"), OWNER, asked, "tester")
-    withdrawn = StatusAsked(PsfStatus.DEPRECATED, "also wrong")
-    catalogue.psfs.change(identity("better"), OWNER, withdrawn, "tester")
+    changed = StatusAsked(PsfStatus.DEPRECATED, "also wrong")
+    catalogue.psfs.change(identity("better"), OWNER, changed, "tester")
     with pytest.raises(DataError) as caught:
         local.deconvolve(tmp_path / "i.fits", **FEW)
     assert f"no reason was given) (its successor is {identity('better')[:12]})" in caught.value.message
@@ -78,7 +78,7 @@ def test_a_named_deprecated_psf_is_used_with_a_warning(
     change(catalogue, PsfStatus.DEPRECATED, "wrong mesh")
     product = local.deconvolve(tmp_path / "i.fits", tmp_path / "o.fits", psf_id=BUILT, **FEW)
     (warning,) = (one for one in product["details"]["warnings"] if one["code"] == "psf-deprecated")
-    assert f"PSF {BUILT[:12]} (built 1.0.0) was withdrawn (reason: wrong mesh)" in warning["message"]
+    assert f"PSF {BUILT[:12]} (built 1.0.0) was deprecated (reason: wrong mesh)" in warning["message"]
     history = "".join(str(line) for line in fits.getheader(tmp_path / "o.fits")["HISTORY"])
     assert "WARNING (psf-deprecated)" in history
 
@@ -107,7 +107,7 @@ def test_a_context_of_an_earlier_moment_still_chooses_it(
     assert "psf-deprecated" in [one["code"] for one in product["details"]["warnings"]]
 
 
-def test_a_fit_does_not_choose_a_diffraction_psf_that_was_withdrawn(local: LocalService) -> None:
+def test_a_fit_does_not_choose_a_diffraction_psf_that_was_deprecated(local: LocalService) -> None:
     build = PsfBuild(instrument="hri_euv", component="diffraction")
     row = psf("diffraction", kind="diffraction")
     row.id = psf_identity(build)
