@@ -6,9 +6,9 @@
     DIR/truth/NNNN.json        salt and truth
     DIR/seals.jsonl            one line for each case: SHA-256 of salt and truth, computed before any diagnosis
 
-Each case has a target for most effects: the residual (percent) that the effect should leave in the discs after a refit of
-the PSF. The strength of the effect is set to reach this target, but at most to the largest plausible strength. The
-residual that the effect then leaves is measured, and is a part of the truth.
+Most effects have a target: the residual (percent) that the effect should leave in the discs after a refit of the PSF.
+The strength of the effect is set to reach this target, but at most to the largest plausible strength. Then the residual
+that the effect really leaves is measured; the truth states it.
 """
 
 from __future__ import annotations

@@ -3,16 +3,18 @@
     true closure = 1 - (sum of (s_i / n_i)^2) / (sum of (e_i / n_i)^2)                                Eq. (1)
 
 Eq. (1) is the closure that a perfect model of the true effect would reach on noise-free images. e_i is the residual of
-image i with the effect, after the PSF was refitted. s_i is the residual without the effect, which the sampling on pixels
-causes. n_i is the noise. The true closure is below 1, because the residual s_i stays in the images. The library and the
+image i with the effect, after the PSF was refitted. s_i is the residual of the same image without the effect; the
+sampling of the image on pixels causes it. n_i is the noise of the residual. The true closure is below 1, because a
+model of the effect does not remove s_i. The library and the
 blind set describe the same effect by different formulas; this difference counts as an error of the diagnosis.
 
-A report of schema gap/2 also states a set of hypotheses. Each is a list of effects that act together, `["unknown"]`, or `[]` for
-no gap. A hypothesis covers the truth if it names every required effect (`Judged.required_names`); further effects do no harm.
-For an effect that is not in the library it must be `["unknown"]`, for clean data `[]`. The second effect of a pair is not required
-if it leaves less than LOWER_LEVEL_PCT alone: a hypothesis with the first effect alone then covers the pair, because the discs
-hardly show the second one. If both effects leave less, both are required. A set is right and alone if it has one member, which
-covers the truth and names no effect that is not true.
+A report of schema gap/2 also states a set of hypotheses. A hypothesis is a list of effects that act together;
+`["unknown"]` is an unknown cause, and `[]` is no gap. A hypothesis covers the truth if it names every required effect
+(`Judged.required_names`); it may also name other effects. An effect that is not in the library is covered only by
+`["unknown"]`, and clean data only by `[]`. The second effect of a pair is not required if this effect alone leaves less
+than LOWER_LEVEL_PCT. A hypothesis with only the first effect then covers the pair, because the discs hardly show the
+second one. If both effects leave less, both are required. A set is right and alone if it has one member, which covers
+the truth and names no effect that is not true.
 """
 
 from __future__ import annotations
@@ -78,9 +80,10 @@ class Judged:
 
     @property
     def required_names(self) -> tuple[str, ...]:
-        """The withheld effects that an answer must contain: those that leave at least LOWER_LEVEL_PCT alone.
+        """The withheld effects that an answer must contain: the effects that each leave at least LOWER_LEVEL_PCT on
+        their own.
 
-        If no effect leaves at least LOWER_LEVEL_PCT alone, the answer must contain all withheld effects.
+        If no effect leaves that much, the answer must contain all withheld effects.
         """
         required = [
             effect["name"]
@@ -93,7 +96,8 @@ class Judged:
     def left_pct(self) -> float:
         """The residual that the effects leave in the discs after the refit, percent, rms over images.
 
-        If the truth does not state it, it is that of the ideal observer; NaN if nobody computed it.
+        If the truth does not state this residual, the value of the ideal observer is used; NaN if that was not
+        computed.
         """
         if self.truth.get("left_after_refit_pct") is not None:
             return float(self.truth["left_after_refit_pct"])
@@ -111,7 +115,7 @@ class Judged:
 
     @property
     def noncentrality(self) -> float:
-        """What the effects leave after the PSF is refitted, chi2; NaN if it was not computed."""
+        """The noncentrality of the case (`bounds.Known`), a chi2; NaN if it was not computed."""
         return math.nan if self.known is None else self.known.noncentrality
 
     @property
@@ -127,7 +131,8 @@ class Judged:
 
     @property
     def answer(self) -> tuple[str, ...]:
-        """The answer of the report: the effects that the verdict names. Empty unless it is `attributed` or `tie`."""
+        """The effects that the report names as the cause, if the verdict is `attributed` or `tie`. Empty for other
+        verdicts."""
         return tuple(self.report.get("answer", ())) if self.verdict in (ATTRIBUTED, TIE) else ()
 
     @property

@@ -223,7 +223,8 @@ def binned_glass(glass: Glass) -> Kernel:
 
 
 def _triangle() -> NDArray[np.float64]:
-    """The weights in Eq. (1) along one axis: the fraction of pairs of fine pixels, of two detector pixels, with a given offset."""
+    """The weights in Eq. (1) along one axis, for each offset: the fraction of pairs (s, t) of fine pixels with this
+    offset."""
     return np.asarray(1 - np.abs(np.arange(1 - FINE, FINE)) / FINE)
 
 
