@@ -38,12 +38,7 @@ from psfcore.transit.manifest import MANIFEST_NAME, read_manifest
 
 FUNCTION = "make_case"
 MOST_EFFECTS = 2
-_NO_NAMES = {
-    CLEAN,
-    PAIR,
-    FOREIGN,
-    "none",
-}  # no effect may have one of these names: they mean other things in the score
+_NO_NAMES = {CLEAN, PAIR, FOREIGN, "none"}  # no effect may have these names: the score uses them
 _RESIDUALS = ("left_before_refit_pct", "left_after_refit_pct")
 
 

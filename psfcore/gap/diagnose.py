@@ -74,11 +74,12 @@ class Diagnosis:
     """The diagnosis of one transit.
 
     Three values of the gap: before_refit, with the PSF that was fitted together with the named effects, but without these
-    effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear fits of
-    all effects, the most probable first, then those of the pairs in the answer set. p_value: of the gap. limits: what these data could have shown. shrinking: by the
-    label of the effects. corrected: the full refits with the named effects; the refit with the best effects comes first.
-    residual, residual_after: held-out images without and with the best effects. cautions: sentences on everything that
-    weakens the result.
+    effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear
+    fits of all effects, the most probable first, then those of the pairs in the answer set. p_value: the p-value of the
+    gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by their label. corrected: the
+    full refits with the named effects; the refit with the best effects comes first. residual, residual_after: the
+    residuals of held-out images without and with the best effects. cautions: sentences on everything that weakens the
+    result.
     """
 
     judgement: Judgement
@@ -131,7 +132,8 @@ def diagnose(
     start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit: whether to
     make full refits with the named effects in the model. seed: seeds the simulation and the bootstrap of the intervals.
     solution: a solution of this transit, shape and start that was made before, or a function that makes it; None: `invert`.
-    If the images show other noise than the transit states, it must be the solution with the noise that they show. Raises
+    If the noise measured in the images differs from the noise that the transit states, the solution must be made with
+    the measured noise. Raises
     the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError "bad-library" if the library is empty,
     "bad-coverage", and "bad-effects" if an added effect fails.
     """
@@ -248,7 +250,7 @@ def linear_model_of(
 
 
 def _favoured(model: LinearModel, found: Judgement) -> list[str]:
-    """The axes of the most probable effects; none if no gap is the verdict."""
+    """The axes of the most probable effects. Empty if the verdict is `none`, or if no hypothesis names an effect."""
     if found.verdict == "none" or found.best is None:
         return []
     return [axis for effect in model.evidence.effects if effect.name in found.best for axis in effect.axes]
@@ -257,7 +259,7 @@ def _favoured(model: LinearModel, found: Judgement) -> list[str]:
 def _limits(
     model: LinearModel, calibration: Calibration, coverage: float, refits: Sequence[Corrected]
 ) -> Limits:
-    """What these data could have shown; the limits of refitted effects come from the best refit with them."""
+    """The limits of all effects. For an effect that was refitted, excluded_95 comes from the best refit that contains it."""
     found = limits(model, threshold=calibration.threshold(coverage), temperature=calibration.temperature)
     for fit in reversed(refits):
         for effect in fit.effects:

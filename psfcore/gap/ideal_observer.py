@@ -3,8 +3,8 @@
     python -m psfcore.gap.ideal_observer FOLDER FILE.json
 
 FOLDER/with_effects and FOLDER/without_effects are transits of noise-free images (DN, fractions allowed), with the noise figures
-that images of this transit have. The program runs by itself, so that whoever made the transit need not share code with the gap
-library.
+that images of this transit have. It is a separate program, so that the code that simulated the transit and the gap
+library share nothing.
 """
 
 from __future__ import annotations

@@ -7,9 +7,9 @@ of this function in one pass:
 
     a . r = q . y,   q = a - (2 - G^T H^T) G^T (1 - D) H^T a        Eq. (1)
 
-An effect that changes the image by e therefore changes the cell by q . e, a sum over pixels. For an error of the gain
-common to all pixels, q . e is close to 0. The noise of a cell has two parts: the noise of the disc itself, and the noise
-of the scene that scatters into the disc. The covariance of two cells contains both parts:
+An effect that changes the image by e therefore changes the cell by q . e, a sum over pixels. If e is an error of the
+gain that is the same for all pixels, q . e is close to 0. The noise of a cell has two parts: the noise of the disc
+itself, and the noise of the scene that scatters into the disc. The covariance of two cells contains both parts:
 
     cov(a_1 . r, a_2 . r) = sum over all pixels of q_1 q_2 var(y)    Eq. (2)
 

@@ -1,4 +1,4 @@
-"""The linear fit of some effects, as a report states it: parameters, gain and p-value.
+"""The linear fit of one or several effects, as a report states it: parameters, gain and p-value.
 
 The gain of an effect is the decrease of chi2 when its parameters are fitted together with the PSF. From noise alone, a
 free parameter gains a chi2 variable with one degree of freedom, and the parameters of a random field gain less

@@ -1,12 +1,12 @@
 """The posterior: a probability for every hypothesis about the cause of the gap.
 
-The hypotheses are: no effect acts (`NONE`), one effect of the library acts, two act together, or something acts that is
-not in the library (`UNKNOWN`, `evidence.discrepancy`). The evidence of each is that of `evidence.likelihood`:
+The hypotheses are: no effect acts (`NONE`); one effect of the library acts; two effects act together; a cause outside
+the library acts (`UNKNOWN`, `evidence.discrepancy`). `evidence.likelihood` computes the evidence E of each hypothesis:
 
     p(h) ~ prior(kind of h) / (number of hypotheses of this kind) * E(h)              Eq. (1)
 
-The linear model holds only for a small effect. A full refit replaces the evidence of a hypothesis by that at the refit, and
-the evidence of all pairs with a refitted effect by that of the library at the refit.
+The linear model holds only for a small effect. A full refit of a hypothesis therefore gives this hypothesis a new
+evidence. If a single effect was refitted, all pairs with this effect get a new evidence too.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Kind = Literal["none", "single", "pair", "unknown"]
 NONE: Names = ()
 UNKNOWN: Names = ("unknown",)  # no effect may have this name
 KINDS: tuple[Kind, ...] = ("none", "single", "pair", "unknown")
-# Prior probabilities of the kinds: as often as not there is no gap or one that the library does not contain.
+# Prior probabilities of the kinds. With a probability of one half there is no gap, or its cause is not in the library.
 PRIOR: Mapping[Kind, float] = {"none": 0.35, "single": 0.4, "pair": 0.1, "unknown": 0.15}
 
 
@@ -72,10 +72,11 @@ class Posterior:
 
 
 def without_idle(probabilities: Mapping[Names, float]) -> dict[Names, float]:
-    """The probabilities after every pair that is less probable than one of its effects alone is counted to that effect.
+    """The probabilities, with the improbable pairs merged into single effects.
 
-    The data then do not show the second effect. A single effect therefore stands for this effect, alone or with another
-    effect that these data do not show.
+    If a pair is less probable than one of its effects alone, its probability is added to that effect: the data then do
+    not show the second effect. A single effect in the result means this effect alone, or together with an effect that
+    the data do not show.
     """
     out = dict(probabilities)
     for names, share in probabilities.items():
@@ -122,8 +123,8 @@ def at_refit(
 ) -> dict[Names, Weighed]:
     """The evidence at a full refit: of the refitted hypothesis, and of the pairs that contain a single refitted effect.
 
-    refit: the linear model at the refit, with the effects that may act. before: the linear model without any effect. taken: by
-    effect, what the refit subtracted from the images, by parameter.
+    refit: the linear model at the refit, with the effects that may act. before: the linear model without any effect.
+    taken: the amounts of the parameters that the refit subtracted from the images, by effect.
     """
     after = _with_blocks_of(before.evidence, refit.evidence, taken)
     refit = replace(refit, evidence=after)
@@ -134,10 +135,10 @@ def at_refit(
 
 
 def _with_blocks_of(before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]]) -> Evidence:
-    """The evidence of a refit, with the blocks from before it, from which the change by the effects is subtracted.
+    """The evidence of a refit, with other blocks: the blocks from before the refit, minus the change by the effects.
 
-    The images of a refit have less noise if a smooth change that follows each image was subtracted, for example a halo: the
-    blocks would show less noise, and this would count for the effect.
+    The change by some effects, for example a halo, is computed from each image and contains a part of its noise. If it
+    is subtracted from the images, their blocks have less noise, and this would wrongly count in favour of the effect.
     """
     first = {effect.name: effect for effect in before.effects}
     blocks = before.unocculted

@@ -7,7 +7,8 @@ the axes can be added (Shapley value).
 
 The p-value of an axis comes from random sign flips: each flip reverses the sign of the residuals of random images. A flip counts
 if this axis alone then decreases chi2 at least as much as for the true residuals. The p-value is the fraction of flips that
-count, times the number of axes. If the brightness of the unocculted field gives a smaller p-value, this one is used.
+count, times the number of axes. If the brightness of the unocculted field gives a smaller p-value, that p-value is
+used.
 """
 
 from __future__ import annotations
