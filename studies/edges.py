@@ -59,7 +59,7 @@ def study_psf() -> Psf:
 def rows(
     seed: int, psf: Psf, cache: EngineCache, *, methods: tuple[str, ...], ways: tuple[str | None, ...]
 ) -> Iterator[Row]:
-    """Every method with every treatment of edges on one scene; None is the default of the method."""
+    """One row for every method and every treatment of edges, on one scene. None: the default treatment of the method."""
     scene = solar_scene((SCENE_PX, SCENE_PX), seed)
     whole = observe(
         scene, psf, exposure_s=EXPOSURE_S, photon_gain_dn=PHOTON_GAIN_DN, read_noise_dn=READ_NOISE_DN, seed=seed,

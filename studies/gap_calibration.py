@@ -2,11 +2,11 @@
 
     python -m studies.gap_calibration -o DIR [--write]
 
-It makes a blind set (`psfcore.blind`), computes the posterior of every case, with full refits, and keeps it in DIR. From the
-probabilities of the true causes it computes the temperature and the threshold. It prints how well the answer sets do on these
-cases: each half of them with the calibration by the other half. With --write it writes
-psfcore/gap/verdict/calibration.json. The seed must not be used to test the diagnosis. The command continues where it was
-interrupted; one case takes about 15 s of one processor core.
+The command makes a blind set (`psfcore.blind`), computes the posterior of every case with full refits, and stores it in
+DIR. From the probabilities of the true causes it computes the temperature and the threshold. It prints how often the
+answer sets contain the true cause, and how large they are. For this, each half of the cases is tested with the
+calibration by the other half. With --write it writes psfcore/gap/verdict/calibration.json. The seed must not be used to
+test the diagnosis. The command continues where it was interrupted; one case takes about 15 s of one processor core.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ from psfcore.transit.folder import read_transit
 from psfcore.whole_files import write_whole
 
 KINDS = ("clean", "single", "pair", "unknown")
-LEAST_LEFT_PCT = 1.0  # an effect that leaves less alone need not be in the answer if another leaves more
+LEAST_LEFT_PCT = (
+    1.0  # the weaker effect of a pair need not be in the answer if it alone leaves less than this
+)
 TEMPERATURES = (0.5, 10.0)
 HOLDS_FOR = (
     "The coverage holds for transits like these: 18 images of 256 px in three pointings, with no effect, with one or two effects of the "

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from psfcore.errors import DataError
 from psfcore.transit.manifest import MANIFEST_NAME, is_plain_name
 
-RATIO_FLOOR_BYTES = 64 * 2**20  # an archive may always unpack to this number of bytes, whatever its ratio
+RATIO_FLOOR_BYTES = 64 * 2**20  # up to this number of unpacked bytes, max_ratio is not checked
 _HIDDEN = ("__MACOSX", "PaxHeader", "PaxHeaders", "Thumbs.db", "desktop.ini")
 
 
@@ -114,11 +114,10 @@ class Gate:
             self._folders.append("/".join(parts))
 
     def main_folder(self) -> str:
-        """The folder of the transit's files, after all members were checked: the top level if it has files, otherwise the one
-        folder there.
+        """The folder of the transit's files: the top level if it has files, otherwise the only folder there.
 
-        Raises DataError "archive-not-plain" if files are elsewhere than in this folder and in the folders beside them, or if
-        transit.json is not in it.
+        Call this after all members were checked. Raises DataError "archive-not-plain" if a file is neither in this
+        folder nor in a folder directly inside it, or if transit.json is in another folder.
         """
         folders = dict.fromkeys(file.folder for file in self._files)
         main = "" if "" in folders else next((one for one in folders if "/" not in one), "")

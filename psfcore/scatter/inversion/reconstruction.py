@@ -70,7 +70,7 @@ class TransitScenes:
         found: list[FoundPlace],
         dark: list[Pixels],
     ) -> TransitScenes:
-        """The scenes of an earlier reconstruction of a transit. optics: only for the order of the engine."""
+        """The scenes of an earlier reconstruction of a transit. optics: used only for the memory order of the engine."""
         sky = cls.__new__(cls)
         sky.transit, sky.scenes, sky.found, sky.dark = transit, scenes, found, dark
         sky.observed = [optics.lanes(frame.pixels) for frame in transit.frames]

@@ -24,9 +24,8 @@ the formula:
 
 There are two estimates of the error of an excess. The first is the spread over the samples, which contains the noise of
 the images. This spread is too small if a weight is at its lower bound of zero, or if only the prior determines a shell.
-The second estimate follows from the covariance matrix of
-the free fit. This matrix ignores the bounds and includes the prior. The
-larger of the two estimates is used.
+The second estimate follows from the covariance matrix of the free fit. This matrix ignores the bounds and includes the
+prior. The larger of the two estimates is used.
 
 | symbol | name |
 |---|---|
