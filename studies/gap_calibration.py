@@ -59,7 +59,7 @@ HOLDS_FOR = (
 class Case:
     """A case of known cause. true: the effects that an answer must contain. log_weights: as in `Posterior`.
 
-    departures: how far the full refits depart from first order (`Refits.departures`).
+    departures: how far each full refit differs from the first order (`Refits.departures`).
     """
 
     number: int
@@ -96,7 +96,10 @@ def weights_of(folder: Path) -> tuple[dict[Names, float], tuple[float, ...]]:
 
 
 def required(truth: Mapping[str, Any]) -> Names:
-    """The hypothesis that is the true cause of a case. A pair may count as its stronger effect alone."""
+    """The hypothesis that is the true cause of a case.
+
+    A pair counts as one effect if the other effect alone leaves less than LEAST_LEFT_PCT.
+    """
     if truth["kind"] == "unknown":
         return UNKNOWN
     effects = truth["effects"]

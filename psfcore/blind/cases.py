@@ -56,9 +56,10 @@ _KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
 class Case:
     """One case before it is made.
 
-    kind: one of KINDS. law, glass: the true scatter and the known part of the PSF. effects: at their nominal strengths.
-    target_pct: the residual that each effect alone should leave in the discs after a refit, percent; None: the strength
-    of the effect is already set. headroom: the saturation level divided by the brightest pixel; None: no saturation.
+    kind: one of KINDS. law, glass: the true scatter and the known part of the PSF. effects: the effects, at their
+    nominal strengths. target_pct: the residual that each effect alone should leave in the discs after a refit, percent;
+    None: the strength of the effect is already set. headroom: the saturation level divided by the brightest pixel;
+    None: no saturation.
     """
 
     number: int

@@ -255,7 +255,7 @@ def _write(
     exposures: Sequence[NDArray[Any]],
     level: float | None,
 ) -> None:
-    """Write exposures [y, x] in DN as a transit. level: at which high-only images clip, DN; None: no clipping."""
+    """Write exposures [y, x] in DN as a transit. level: the level at which high-only images clip, DN; None: no clipping."""
     folder.mkdir(parents=True)
     for n, dn in enumerate(exposures):
         write_plane(folder / f"{n:03d}.fits", dn, cards=_frame_cards(plan, n, level))

@@ -60,8 +60,10 @@ SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Shrinking:
-    """How far an effect closes the gap. closure: with blocks of time held out. closure_by_pointing: with one pointing at a time
-    held out. Both are None if there is no gap. held_out_fall: `closure.fall` of the blocks of time.
+    """How far an effect closes the gap.
+
+    closure: the closure if blocks of time are held out. closure_by_pointing: the closure if one pointing at a time is held out. Both are None if there is no gap. held_out_fall: `closure.fall` for the blocks of
+    time.
     """
 
     closure: Interval | None
@@ -181,7 +183,7 @@ def diagnose_solution(
     calibration: Calibration | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Diagnosis:
-    """Diagnose an existing fit. noise: the measured noise, if any. The other arguments and the errors are those of `diagnose`."""
+    """Diagnose an existing fit. noise: the measured noise, or None. The other arguments and the errors are as in `diagnose`."""
     calibration = calibration or shipped_calibration()
     view = View(solution)
     model, expected = linear_model_of(view, library, seed=seed, progress=progress)
@@ -233,7 +235,7 @@ def linear_model_of(
     seed: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> tuple[LinearModel, ExpectedGap]:
-    """The linear model of a fit with a library of effects, and the expected gap. seed: of the simulation.
+    """The linear model of a fit with a library of effects, and the expected gap. seed: the seed of the simulation.
 
     Raises the errors of `expected_gap` and `gather`.
     """

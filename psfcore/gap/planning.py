@@ -143,7 +143,7 @@ def planned_limits(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Planned:
-    """The limits of a plan. diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: of scenes and noise.
+    """The limits of a plan. diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: for scenes and noise.
 
     Raises DataError "too-few-images", and the errors of `true_sky` and `invert`.
     """

@@ -134,9 +134,9 @@ def make_report(
 ) -> PsfReport:
     """Fit a transit and evaluate the fit, or evaluate a given PSF.
 
-    dark_offsets: also fit with -5, -3, +3 and +5 DN added to every readout. seed: of all random samples (bootstrap,
-    subsets of equations, noise realisations). solution: as in `fit_transit`; not used if the PSF is given. Raises
-    DataError "plate-scale-mismatch", and the errors of `fit_transit` and `evaluate`.
+    dark_offsets: also fit with -5, -3, +3 and +5 DN added to every readout. seed: the seed of all random samples
+    (bootstrap, subsets of equations, noise realisations). solution: as in `fit_transit`; not used if the PSF is given.
+    Raises DataError "plate-scale-mismatch", and the errors of `fit_transit` and `evaluate`.
     """
     wanted = [s for s in STAGES if psf is None or s in ("evaluating", "tables")]
     if not dark_offsets and psf is None:

@@ -109,8 +109,8 @@ class DiscCells:
 
     index: the number of the frame among all frames. residual: observed minus expected (cells,), DN/s. expected: the light that
     the model predicts (cells,), DN/s. covariance: Eq. (2). jacobian: (columns, cells), DN/s for one unit of a parameter.
-    pixels, radius, azimuth: as in `Cells`. level_before: `level` before the light of an effect was subtracted from the
-    image, DN/s; None if nothing was subtracted.
+    pixels, radius, azimuth: as in `Cells`. level_before: the value of `level` before the light of an effect was
+    subtracted from the image, DN/s; None if nothing was subtracted.
     """
 
     index: int

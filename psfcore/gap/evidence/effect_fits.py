@@ -28,7 +28,7 @@ class EffectFit:
     """The linear fit of one effect, or of several effects, together with the PSF.
 
     values: value, error and unit of each parameter; the key is "parameter", or "effect.parameter" if there are several
-    effects. gain: the decrease of chi2. p_value: of the gain. step: the fit.
+    effects. gain: the decrease of chi2. p_value: the p-value of the gain. step: the fit.
     """
 
     names: tuple[str, ...]

@@ -64,7 +64,7 @@ class Directions:
     """Further columns: changes of the data that no effect of the library makes.
 
     discs: (discs, cells, columns), DN/s, with the cells of `LinearModel.evidence`, padded with zeros. unocculted: (columns,
-    images, blocks), DN/s. width: of their prior.
+    images, blocks), DN/s. width: the width of the prior of each column.
     """
 
     discs: Planes
@@ -77,9 +77,10 @@ class Weighed:
     """A hypothesis after its fit.
 
     log_evidence: ln E of Eq. (3), up to a constant that all hypotheses of one model share; minus infinity if no parameter can
-    act. columns: of the parameters that act, without those of the PSF. values: their best values. visible_error: the
-    chi2 that a relative error TEMPLATE_ERROR of the template would add in all data. It counts only the part of the
-    template that was not subtracted. If it is above `settled.VISIBLE`, the first order is not accurate enough.
+    act. columns: the columns of the parameters that act, without the coordinates of the PSF. values: their best values.
+    visible_error: the chi2 that a relative error TEMPLATE_ERROR of the template would add in all data. It counts only
+    the part of the template that was not subtracted. If it is above `settled.VISIBLE`, the first order is not accurate
+    enough.
     """
 
     log_evidence: float
@@ -192,7 +193,7 @@ class Likelihood:
     def fitted(self, columns: Sequence[int], values: Sequence[float]) -> tuple[Vector, Matrix]:
         """Two results of a fit of the columns of one effect: their values (of any sign), and the covariance.
 
-        values: about the values that the fit finds; the template error is that of this strength.
+        values: approximately the values that the fit finds; they set the template error.
         """
         first = len(self._base)
         theta = np.concatenate([np.zeros(first), np.asarray(values, dtype=np.float64)])

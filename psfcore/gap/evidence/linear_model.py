@@ -61,7 +61,7 @@ class Whitened:
 class Step:
     """A linear fit of some columns (parameters).
 
-    values: the fitted parameters. covariance: of the values. fall: the decrease of chi2 by all columns together.
+    values: the fitted parameters. covariance: their covariance. fall: the decrease of chi2 by all columns together.
     """
 
     columns: tuple[int, ...]

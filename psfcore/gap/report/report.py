@@ -118,7 +118,10 @@ def fits_of(report: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, Any]:
-    """The parameters of the shape. covariance: of its coordinates, from the linear model; the errors therefore contain the floor."""
+    """The parameters of the shape, with errors that contain the floor of the linear model.
+
+    covariance: the covariance of the coordinates, from the linear model.
+    """
     values, sigma = inversion.values, np.sqrt(np.diag(covariance))
     return {
         p.name: {

@@ -172,7 +172,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
 
 
 def _deviance(left: Vector, jacobian: Vector, covariance: Vector) -> float:
-    """Eq. (4). left: residuals (n,) in units of the noise. jacobian: (parameters, n). covariance: of the parameters."""
+    """Eq. (4). left: residuals (n,) in units of the noise. jacobian: (parameters, n). covariance: their covariance."""
     values, vectors = np.linalg.eigh(covariance)
     along = (np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T) @ jacobian
     inner = np.eye(values.size) + along @ along.T

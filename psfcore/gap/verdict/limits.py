@@ -123,7 +123,11 @@ class Alike:
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits of all effects, by name. distances: of every pair of effects, in sigma. untestable: the reasons, by name."""
+    """The limits of all effects, by name.
+
+    distances: the distance of every pair of effects, in sigma. alike: the pairs that the data cannot tell apart.
+    untestable: the reasons why effects cannot be tested, by name.
+    """
 
     effects: Mapping[str, EffectLimits]
     distances: Mapping[tuple[str, str], float]
@@ -160,8 +164,9 @@ def limits(
 ) -> Limits:
     """The limits of all effects.
 
-    threshold: the smallest probability of a hypothesis in the answer set. temperature, prior: of the posterior.
-    observed: whether the residuals of the model come from real data. Only then they can exclude strengths.
+    threshold: the smallest probability of a hypothesis in the answer set. temperature, prior: the temperature and the
+    prior of the posterior. observed: whether the residuals of the model come from real data. Only then they can exclude
+    strengths.
     """
     every = model.evidence.effects
     endless = [e.name for e in every if not all(math.isfinite(p.likely) for p in e.parameters)]
@@ -209,7 +214,7 @@ class _Need:
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """The columns of a hypothesis. widths: of the prior (scales, columns). offset: o_h of Eq. (2)."""
+    """The columns of a hypothesis. widths: the widths of the prior (scales, columns). offset: o_h of Eq. (2)."""
 
     columns: NDArray[np.intp]
     widths: Matrix

@@ -121,7 +121,7 @@ def at_refit(
     taken: Mapping[str, Sequence[float]],
     effects: Sequence[Effect],
 ) -> dict[Names, Weighed]:
-    """The evidence at a full refit: of the refitted hypothesis, and of the pairs that contain a single refitted effect.
+    """The evidence from a full refit, for the refitted hypothesis and, after a refit of a single effect, for its pairs.
 
     refit: the linear model at the refit, with the effects that may act. before: the linear model without any effect.
     taken: the amounts of the parameters that the refit subtracted from the images, by effect.
@@ -162,7 +162,7 @@ def weigh(
     names: Names,
     taken: Mapping[str, Sequence[float]] | None = None,
 ) -> Weighed:
-    """Weigh the hypothesis that some effects act. taken: as for `at_refit`."""
+    """Weigh the hypothesis that the effects `names` act together. taken: as in `at_refit`."""
     by_name = {effect.name: effect for effect in evidence.effects}
     # An effect that is fitted for each pointing may have fewer or more changes than parameters.
     columns = [

@@ -21,7 +21,7 @@ VISIBLE_SIGMA = 2.0
 
 
 class Refits:
-    """Full refits of a fit with effects in the model. view: of the fit. model: its linear model. failures: sentences."""
+    """Full refits with effects in the model. view, model: the view and the linear model of the fit. failures: sentences."""
 
     def __init__(
         self, view: View, model: LinearModel, progress: Progress = lambda stage, step, steps: None

@@ -43,7 +43,7 @@ _HEADER_BYTES = 4096  # no .npy header is longer
 
 @dataclass(frozen=True)
 class _FrameLight:
-    """The numbers of a FrameFit that are neither arrays nor part of its frame."""
+    """The single numbers of a FrameFit. Its arrays and its frame are stored elsewhere."""
 
     observed: float
     expected: float
