@@ -115,7 +115,8 @@ def evaluate(
     if not done:
         reasons = "; ".join(f"{file}: {why}" for file, why in list(left_out.items())[:3])
         raise DataError(
-            "no-occulter", f"expected at least one image with a usable occulter; got none ({reasons})"
+            "no-occulter",
+            f"expected at least one image with a usable occulter; got none ({reasons}): check the positions in transit.json",
         )
     frames = tuple(done[n] for n in sorted(done))
     return Evaluation(transit, frames, left_out, superposition.superposed())

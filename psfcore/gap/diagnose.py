@@ -62,8 +62,8 @@ SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0
 class Shrinking:
     """How far an effect closes the gap.
 
-    closure: the closure if blocks of time are held out. closure_by_pointing: the closure if one pointing at a time is held out. Both are None if there is no gap. held_out_fall: `closure.fall` for the blocks of
-    time.
+    closure: the closure if blocks of time are held out. closure_by_pointing: the closure if one pointing at a time is held
+    out. Both are None if there is no gap. held_out_fall: `closure.fall` for the blocks of time.
     """
 
     closure: Interval | None

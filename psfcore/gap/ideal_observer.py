@@ -29,7 +29,7 @@ LIMITS = FitsLimits(max_pixels=2**26)
 def main(arguments: Sequence[str]) -> int:
     """Run the program. Returns the exit status."""
     if len(arguments) != 2:
-        print("expected two arguments: a folder and a JSON file", file=sys.stderr)
+        print(f"expected two arguments, a folder and a JSON file; got {len(arguments)}", file=sys.stderr)
         return 2
     folder, file = (Path(one) for one in arguments)
     try:

@@ -67,7 +67,10 @@ class Gate:
         """Add members of any kind to the count. Raises DataError "archive-too-large"."""
         self._members += count
         if self._members > self.limits.max_files:
-            message = f"expected at most {self.limits.max_files} members; got more"
+            message = (
+                f"expected at most {self.limits.max_files} members; got more: pack only {MANIFEST_NAME} and the files "
+                "that it names"
+            )
             raise DataError("archive-too-large", message)
 
     def count_unpacked(self, count: int) -> None:
@@ -82,7 +85,7 @@ class Gate:
         """
         parts = _parts(raw_name)
         if not parts:
-            raise not_plain(raw_name, "expected the name of a file")
+            raise not_plain(raw_name, "expected a member with the name of a file")
         if _is_hidden(parts):
             return None
         if len(parts) > _DEEPEST:
@@ -97,7 +100,7 @@ class Gate:
         self._files[file] = raw_name
         if size > self.limits.max_member_bytes:
             most = self.limits.max_member_bytes
-            message = f"{shown(raw_name)}: expected at most {most} bytes; got {size}"
+            message = f"{shown(raw_name)}: expected a file of at most {most} bytes; got {size} bytes"
             raise DataError("archive-too-large", message)
         self._declared += size
         self._check(self._declared)
@@ -135,7 +138,7 @@ class Gate:
 
     def _check(self, count: int) -> None:
         if count > self._budget:
-            message = f"expected an archive that unpacks to at most {self._budget} bytes; got more"
+            message = f"expected an archive that unpacks to at most {self._budget} bytes; got more: pack fewer or smaller images"
             raise DataError("archive-too-large", message)
 
 
@@ -159,7 +162,7 @@ def _parts(raw_name: str) -> list[str]:
     parts = [part for part in raw_name.split("/") if part not in ("", ".")]
     climbs = raw_name.startswith("/") or "\\" in raw_name or ".." in parts
     if climbs or any(re.match(r"[A-Za-z]:", part) for part in parts):
-        message = f"expected names inside the archive's own folder; got {shown(raw_name)}"
+        message = f"expected names inside the folder of the archive; got {shown(raw_name)}: pack the files without their paths"
         raise DataError("archive-climbs", message)
     return parts
 

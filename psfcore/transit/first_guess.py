@@ -146,7 +146,10 @@ def first_guess(
     )
     telling = [p for p in pointings if math.isfinite(p.inhomogeneity)]
     if not telling:
-        message = "expected at least one image with the centre of the occulter in the field, in front of the Sun; got no such image"
+        message = (
+            "expected at least one image that shows the centre of the occulter in front of the Sun; got none: check the "
+            "positions in transit.json"
+        )
         raise DataError("no-first-guess", message)
     best = min(telling, key=lambda guess: guess.inhomogeneity)
     ratios = _finite([r for g in guesses if g.pointing == best.pointing for r in g.ratio.values()])

@@ -94,8 +94,9 @@ class Solver:
             reasons = "; ".join(f"{file}: {why}" for file, why in list(left_out.items())[:3])
             raise DataError(
                 "too-few-frames",
-                f"expected at least {LEAST_FRAMES} images with an occulter in them; got {len(frames)}"
-                + (f" ({reasons})" if reasons else ""),
+                f"expected at least {LEAST_FRAMES} images with a usable occulter; got {len(frames)}"
+                + (f" ({reasons})" if reasons else "")
+                + ": check the positions in transit.json, or add images",
             )
         return frames
 

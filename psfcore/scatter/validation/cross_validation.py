@@ -136,7 +136,9 @@ def bootstrap_samples(images: int, *, runs: int = RUNS, seed: int = 1) -> tuple[
     """
     blocks = folds(images)
     if not blocks:
-        raise DataError("too-few-images", f"expected at least 6 images for held-out blocks; got {images}")
+        raise DataError(
+            "too-few-images", f"expected at least 6 images for held-out blocks; got {images}: add images"
+        )
     rng = np.random.default_rng(seed)
     return tuple(
         _bootstrap_sample(run, fold, blocks, images, rng)
@@ -200,7 +202,7 @@ def shared_step(solution: Solution, sample: FoldSample) -> Vector:
     if not counted or np.linalg.cond(normal) > 1e12:
         raise DataError(
             "transit-says-too-little",
-            f"run {sample.run}, fold {sample.fold}: expected images that determine all parameters; got too few",
+            f"run {sample.run}, fold {sample.fold}: expected images that determine all parameters; got too few: add images",
         )
     return np.asarray(np.linalg.solve(normal, np.sum([k * f.score for k, f in counted], axis=0)))  # Eq. (1)
 
