@@ -81,7 +81,7 @@ class Case:
 
 
 def weights_of(folder: Path) -> tuple[dict[Names, float], tuple[float, ...]]:
-    """Two results: the weights of all hypotheses about the transit in a folder; how far its refits depart from first order."""
+    """Two results for the transit in a folder: the weights of all hypotheses; how far the refits differ from the first order."""
     transit = read_transit(
         folder, LIMITS, diffraction=lambda instrument, _shape: known_diffraction(instrument, threads=1)
     )

@@ -159,7 +159,7 @@ def main() -> None:
 
 
 def _kept(number: int, asked: Settings, folder: Path) -> Case:
-    """A case, from its file or computed now."""
+    """A case: read from its file, or computed now if there is no file."""
     file = folder / f"{number:04d}.json"
     about = asdict(asked)
     if not file.is_file():

@@ -45,7 +45,7 @@ _PLACE_STREAM = 2003
 
 @dataclass(frozen=True, eq=False)
 class NoiseFree:
-    """The images of a transit without noise [y, x], DN/s. saturation_dn: the level at which they are clipped; None: they are not."""
+    """The images of a transit without noise [y, x], DN/s. saturation_dn: the level at which they are clipped; None: no clipping."""
 
     rates: list[Plane]
     saturation_dn: float | None
@@ -141,8 +141,8 @@ def _quick_left(effect: Effect, case: Case, effect_free: EffectFree, estimator: 
 def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
     """The residual that an effect leaves without the other effects of the case, after a refit, to first order.
 
-    left_alone_pct: percent, rms over images. left_alone_chi2: the sum over images of (residual / noise)^2, for the means of
-    the discs.
+    left_alone_pct: the residual in percent, rms over images. left_alone_chi2: the sum over images of (residual /
+    noise)^2, where residual and noise are those of the disc means.
     """
     noise = left["refitted"]["noise_pct"]
     shown = sum((pct / noise[str(n)]) ** 2 for n, pct in by_itself.by_image_pct.items() if str(n) in noise)

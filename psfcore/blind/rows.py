@@ -101,6 +101,6 @@ def of_values(
     goal: str = "",
     met: Callable[[float], bool] | None = None,
 ) -> Row:
-    """The row of a number that ``of`` computes from the values, for example their mean."""
+    """The row of one number. of: the function that computes this number from the values, for example their mean."""
     found = float(of(values)) if values else None
     return Row(figure, len(values), found, None, goal, None if met is None or found is None else met(found))

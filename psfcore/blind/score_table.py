@@ -70,8 +70,9 @@ POWER_EDGES_PCT = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)
 class Score:
     """The score of a blind set.
 
-    rows: the table. confusion, power: see `_confusion` and `_power`. judged: number of cases with a report. failures: the
-    reason why a case has no report, by number. cases: one entry for each case.
+    rows: the rows of the table. confusion, power: the results of `_confusion` and `_power`. judged: the number of cases
+    with a report. failures: the reasons why cases have no report, by number of the case. cases: one entry for each
+    case.
     """
 
     rows: tuple[Row, ...]
@@ -199,7 +200,10 @@ def _axis_row(single: Sequence[Judged]) -> Row:
 
 
 def _confusion(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
-    """The number of cases by truth (row) and by the first effect named (column); without such an effect, by the verdict."""
+    """The confusion matrix: the number of cases for each truth (row) and each first named effect (column).
+
+    If a report names no effect, the column is its verdict.
+    """
     table: dict[str, Counter[str]] = {}
     for case in judged:
         table.setdefault(true_label(case), Counter())[said_label(case)] += 1

@@ -13,8 +13,8 @@ A report of schema gap/2 also states a set of hypotheses. A hypothesis is a list
 (`Judged.required_names`); it may also name other effects. An effect that is not in the library is covered only by
 `["unknown"]`, and clean data only by `[]`. The second effect of a pair is not required if this effect alone leaves less
 than LOWER_LEVEL_PCT. A hypothesis with only the first effect then covers the pair, because the discs hardly show the
-second one. If both effects leave less, both are required. A set is right and alone if it has one member, which covers
-the truth and names no effect that is not true.
+second one. If both effects leave less, both are required. A set is right and alone if it has only one member, and
+this member covers the truth and names no wrong effect.
 """
 
 from __future__ import annotations
@@ -176,14 +176,14 @@ def set_covers_truth(case: Judged) -> bool:
 
 
 def is_right_and_alone(case: Judged) -> bool:
-    """Whether the set has one member, which covers the truth and names no effect that is not true."""
+    """Whether the set has only one member, and this member covers the truth and names no wrong effect."""
     if case.members is None or len(case.members) != 1 or not covers(case, case.members[0]):
         return False
     return case.kind == FOREIGN or set(case.members[0]) <= set(case.true_names)
 
 
 def has_only_wrong_effects(case: Judged) -> bool:
-    """Whether the set has one member, which names effects, and none of them is true."""
+    """Whether the set has only one member, and this member names one or more effects, none of which is true."""
     if case.members is None or len(case.members) != 1:
         return False
     (member,) = case.members
@@ -196,7 +196,7 @@ def names_one_wrong(case: Judged) -> bool:
 
 
 def is_shown(case: Judged) -> bool:
-    """Whether chi2 of the residuals in the means of the discs is at least SHOWN_CHI2.
+    """Whether the chi2 of the residuals of the disc means is at least SHOWN_CHI2.
 
     For a pair, this must also hold for each required effect alone.
     """
@@ -222,7 +222,7 @@ def shown_chi2(truth: dict[str, Any]) -> float | None:
 def closure_share(case: Judged) -> float | None:
     """The closure by the first effect divided by the closure by the true effect; 1 if both are the same effect.
 
-    None if one of the closures is missing, or if that of the true effect is below LEAST_CLOSURE.
+    None if one of the closures is missing, or if the closure by the true effect is below LEAST_CLOSURE.
     """
     first, true = case.closure(case.first), case.closure(case.true_names[0])
     if case.first == case.true_names[0]:
@@ -271,7 +271,8 @@ def true_label(case: Judged) -> str:
 def said_label(case: Judged) -> str:
     """The column of the case in the confusion matrix: the first effect of the answer; the verdict if the answer is empty.
 
-    If the case is a pair, the order of the answer has no meaning: a true effect in the answer counts as the first.
+    For a pair, the order of the effects in the answer does not count: if the answer contains a true effect, that effect
+    is used.
     """
     if not case.answer:
         return case.verdict

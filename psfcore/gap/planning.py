@@ -2,8 +2,8 @@
 
 The images of the plan are simulated without noise and fitted; the limits follow from the linear model of this fit. The
 noise in this model is the noise of the planned exposures. The scene does not change, but the brightness of the images
-varies by BRIGHTNESS_SPREAD, because the Sun and the shutter do. Without it, any difference between images would seem to
-be an effect.
+varies by BRIGHTNESS_SPREAD, because the Sun and the shutter do. If the brightness did not vary, every difference
+between images would look like an effect.
 """
 
 from __future__ import annotations

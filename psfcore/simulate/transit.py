@@ -3,7 +3,7 @@
     D_i = round(min(g Poisson(I_i t / g) + read + dark, saturation)),  frame i = D_i / t     Eq. (1)
 
 The plan (plan.py) gives the positions and exposures, and the sky (sky.py) gives the noise-free images. transit_files.py
-writes the folder. Without a plan's whole_dn, D_i is not rounded. Only high-only images saturate.
+writes the folder. If whole_dn of the plan is False, D_i is not rounded. Only high-only images saturate.
 
 | symbol | name | unit |
 |---|---|---|

@@ -18,7 +18,7 @@ _HIDDEN = ("__MACOSX", "PaxHeader", "PaxHeaders", "Thumbs.db", "desktop.ini")
 
 _DEEPEST = 3  # parts of the longest name: the folder of the transit, a folder beside its files, a file
 _WHERE = (
-    "expected files at the top level or in one folder, and beside them at most one level of other folders"
+    "expected all files at the top level or in one folder, and no folders deeper than one level below that"
 )
 
 
@@ -52,8 +52,8 @@ class Admitted:
 class Gate:
     """Checks every member of one archive: its name, its number, its size, and the bytes unpacked so far.
 
-    The files of a transit are at the top level or in one folder. Files in the folders beside them (one level) are ignored, but
-    they are checked and counted as the others are.
+    The files of a transit are at the top level or in one folder. Beside them there may be other folders, one level
+    deep. The files in these folders are ignored, but they are checked and counted like all other files.
     """
 
     def __init__(self, limits: ArchiveLimits, archive_bytes: int) -> None:
@@ -158,7 +158,7 @@ def _above(folder: str) -> str:
 
 
 def _parts(raw_name: str) -> list[str]:
-    """The folders and the file of a member's name. Raises DataError "archive-climbs"."""
+    """The parts of a member's name: its folders and its file name. Raises DataError "archive-climbs"."""
     parts = [part for part in raw_name.split("/") if part not in ("", ".")]
     climbs = raw_name.startswith("/") or "\\" in raw_name or ".." in parts
     if climbs or any(re.match(r"[A-Za-z]:", part) for part in parts):

@@ -220,7 +220,7 @@ def _ratio(centre_dn_s: float, level_dn_s: float) -> float:
 
 
 def _range_over_mean(values: list[float]) -> float:
-    """The range of the finite values divided by their mean; infinite if the mean is not above 0."""
+    """The range (largest minus smallest) of the finite values divided by their mean; infinite if the mean is not above 0."""
     known = _finite(values)
     if known.size == 0 or known.mean() <= 0:
         return math.inf

@@ -223,7 +223,7 @@ def times_s(headers: Sequence[HeaderSummary]) -> list[float]:
 
 
 def _instant(text: str | None) -> datetime | None:
-    """A date of a header as an instant; without a time zone it is UTC. None if it cannot be read."""
+    """The instant of a date in a header. A date without a time zone is in UTC. None if the date cannot be read."""
     if text is None:
         return None
     try:

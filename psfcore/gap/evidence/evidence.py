@@ -60,8 +60,8 @@ class Evidence:
     """All the data that a diagnosis uses.
 
     effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns that
-    every fit contains. discs: one for each image that the fit used. image_info: one for every image. untestable: the reasons
-    why effects cannot be tested, by name. numbers: `Change.numbers` by column.
+    every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every image,
+    used or not. untestable: the reasons why effects cannot be tested, by name. numbers: `Change.numbers` by column.
     """
 
     effects: tuple[Effect, ...]

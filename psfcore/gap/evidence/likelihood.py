@@ -186,7 +186,7 @@ class Likelihood:
         )
 
     def gained(self, decrease: Vector) -> Vector:
-        """The gain of ln L, Eq. (2), if chi2 of the discs decreases by these amounts to the value that noise alone has."""
+        """The gain of ln L from Eq. (2) if chi2 of the discs decreases by these amounts, down to the value for noise alone."""
         whole = self._stiffness + self._cells
         return np.asarray(whole * (1 - (1 + decrease / whole) ** -CORRELATED) / (2 * CORRELATED))
 

@@ -16,8 +16,8 @@ STRENGTH = (
     "The simulated Sun does not change; a Sun that changes during the transit hides stronger effects."
 )
 OF_SEARCH = (
-    f"{SEARCHED} The effect searches for its position or form; the strength holds for the one that the search found in the "
-    "simulated images."
+    f"{SEARCHED} The effect searches for its position or form; the strength holds for the position or form that the search "
+    "found in the simulated images."
 )
 
 

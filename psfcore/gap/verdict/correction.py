@@ -277,8 +277,8 @@ def hold(effect: Effect, view: View) -> Effect:
 def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
     """The evidence `after`, in which an effect is subtracted, with the noise of cells and blocks of the evidence `before`.
 
-    The subtraction removes the light of the effect from the images, but not the photon noise of this light. Percentages also
-    keep their reference level.
+    The subtraction removes the light of the effect from the images, but not the photon noise of this light. The
+    reference level of percentages is also taken from `before`.
     """
     were = {disc.index: disc for disc in before.discs}
     discs = []

@@ -480,7 +480,7 @@ def _quantile_of_sum(cumulants: Matrix, probability: float) -> Vector:
 
 
 def _first_found(margin: Callable[[Vector], Vector], unit: float, most: float) -> float | None:
-    """The smallest strength whose margin is at least 0; None if there is none up to `most`. unit: the error of the strength."""
+    """The smallest strength, up to `most`, whose margin is at least 0; None if there is none. unit: the error of the strength."""
     if most <= WEAKEST_TRIED * unit:
         return None
     tried = np.geomspace(WEAKEST_TRIED * unit, min(STRONGEST_TRIED * unit, most), TRIED)

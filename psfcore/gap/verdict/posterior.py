@@ -63,7 +63,7 @@ class Posterior:
         return _sorted(dict(zip(names, shares.tolist(), strict=True)))
 
     def with_evidence(self, evidence: Mapping[Names, Weighed], effects: int) -> Posterior:
-        """The same posterior with another evidence of some hypotheses. effects: the number of effects in the library."""
+        """The same posterior with a new evidence for the given hypotheses. effects: the number of effects in the library."""
         weights = {names: w.log_evidence + _log_prior(names, effects) for names, w in evidence.items()}
         errors = {names: w.visible_error for names, w in evidence.items()}
         return replace(

@@ -1,4 +1,4 @@
-"""The full refits of a diagnosis. Each is made only once."""
+"""The full refits of a diagnosis. Each refit is made only once and then kept."""
 
 from __future__ import annotations
 

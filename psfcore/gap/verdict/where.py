@@ -240,7 +240,7 @@ def _fall_of(of: _Normal, columns: list[int]) -> float:
 def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
     """The decrease of chi2 by these columns, minus their number, at least 0.
 
-    scores: right-hand sides of the normal equations (flips, columns); the result has one value for each row.
+    scores: right-hand sides of the normal equations (flips, columns). The result has one value for each flip.
     """
     if not columns:
         return np.zeros(scores.shape[0])

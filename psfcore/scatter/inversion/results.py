@@ -98,7 +98,7 @@ class Inversion:
 
 @dataclass(frozen=True, eq=False)
 class Solution(Reconstruction):
-    """An inversion together with its scenes and optics, for later analyses. part: in the order of inversion.frames."""
+    """An inversion together with its scenes and optics, for later analyses. part: ordered like inversion.frames."""
 
     inversion: Inversion
 

@@ -168,7 +168,7 @@ def shared_fits(
 ) -> tuple[FoldFit, ...]:
     """The PSFs of all samples by Eq. (1), from the solution of all images.
 
-    Images that the solution did not use do not count in any sample. Raises DataError "transit-says-too-little" if a
+    Images that the solution did not use are left out of all samples. Raises DataError "transit-says-too-little" if a
     sample does not determine all parameters.
     """
     inversion = solution.inversion
