@@ -5,7 +5,8 @@ without edges. The same pixels are cut out and deconvolved alone, and compared w
 
     bias = sum(x) / sum(x_ref) - 1,    deviation = sum(abs(x - x_ref)) / sum(x_ref),    in percent     Eq. (1)
 
-The bias is the relative error of the mean of a band, the deviation that of its pixels.
+The bias is the relative error of the mean of a band. The deviation is the mean relative error of the pixels of the
+band.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def diffraction(size: int) -> NDArray[np.float64]:
 
 
 def drawn_truth(seed: int, stretch: float = 0.0, angle_deg: float = 0.0) -> ScatterTruth:
-    """A random power law similar to that of the paper."""
+    """A random power law similar to the power law of the paper."""
     rng = np.random.default_rng([seed, 77])
     return ScatterTruth(
         b_px=rng.uniform(5.0, 7.5),

@@ -68,7 +68,7 @@ def simulator_of(source: str) -> Callable[..., Any]:
 def simulate_case(
     source: str, *, seed: int, number: int, size_px: int, images: int, transit: Path, expected: Path
 ) -> dict[str, Any]:
-    """Let a simulator write a case. Returns the truth of the case. The arguments are those of `make_case`.
+    """Let a simulator write a case. Returns the truth of the case. The module docstring explains the arguments.
 
     Raises DataError "bad-simulator", and the errors of `psfcore.transit.manifest.read_manifest`.
     """

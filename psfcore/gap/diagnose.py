@@ -77,11 +77,11 @@ class Diagnosis:
 
     Three values of the gap: before_refit, with the PSF that was fitted together with the named effects, but without these
     effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear
-    fits of all effects, the most probable first, then those of the pairs in the answer set. p_value: the p-value of the
-    gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by their label. corrected: the
-    full refits with the named effects; the refit with the best effects comes first. residual, residual_after: the
-    residuals of held-out images without and with the best effects. cautions: sentences on everything that weakens the
-    result.
+        fits of all effects, the most probable first, then of the pairs that are best or decide the verdict. p_value:
+    the p-value of the gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by their
+    label. corrected: the full refits with the named effects; the refit with the best effects comes first. residual,
+    residual_after: the residuals of held-out images without and with the best effects. cautions: sentences on
+    everything that weakens the result.
     """
 
     judgement: Judgement
@@ -271,7 +271,7 @@ def _limits(
 
 
 def _fits(model: LinearModel, found: Judgement) -> tuple[EffectFit, ...]:
-    """The linear fits of all effects, the most probable first, then those of the pairs in the answer set and of the best pair."""
+    """The linear fits of all effects, the most probable first, then of the pairs that are best or decide the verdict."""
     effects = {effect.name: effect for effect in model.evidence.effects}
     ordered = sorted(effects, key=lambda name: -found.effects.get(name, 0.0))
     singles = [(name,) for name in ordered]
@@ -322,7 +322,7 @@ def _held_out_by(model: LinearModel, scheme: Sequence[Fold]) -> HeldOut | None:
 
 
 def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:
-    """The result of the full refit if it covers the same images as the linear model; otherwise that of the linear model."""
+    """The result of the full refit if it covers the same images as the linear model; otherwise the result of the linear model."""
     same = real is not None and linear is not None and real.images == linear.images
     return real if same else linear
 

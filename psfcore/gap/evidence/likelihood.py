@@ -5,8 +5,8 @@
 y are the residuals in the cells of the discs and the levels of the unocculted blocks. theta are the coordinates of the PSF
 and the parameters of the effects. No template is exact: delta is its relative error, a Gaussian of width TEMPLATE_ERROR.
 One delta is common to all cells of a disc (or all blocks of an image) and one belongs to each cell (or block); their
-variance is added to that of the noise. The scene and the brightness of each image are parameters of the unocculted blocks,
-as in `unocculted_blocks`.
+variance is added to the variance of the noise. The scene and the brightness of each image are parameters of the
+unocculted blocks, as in `unocculted_blocks`.
 
 ln det of the covariance, which the template error raises, counts as a part of chi2.
 
@@ -108,7 +108,7 @@ class _Part:
 
 
 class Likelihood:
-    """The likelihood of hypotheses about the data of a linear model. further: columns that follow those of the evidence."""
+    """The likelihood of hypotheses about the data of a linear model. further: columns that follow the columns of the evidence."""
 
     def __init__(self, model: LinearModel, further: Directions | None = None) -> None:
         evidence = model.evidence
@@ -143,8 +143,8 @@ class Likelihood:
     ) -> Weighed:
         """Weigh the hypothesis that some effects act. effects: the columns of each effect.
 
-        trials: the number of templates among which those of the effects were chosen. subtracted: the amounts that a
-        full refit subtracted from the images, by column; the fitted values are then the remaining amounts.
+        trials: the number of templates among which the templates of the effects were chosen. subtracted: the amounts
+        that a full refit subtracted from the images, by column; the fitted values are then the remaining amounts.
         """
         groups = [list(group) for group in effects]
         out = dict(zip((c for g in groups for c in g), subtracted, strict=True)) if len(subtracted) else {}

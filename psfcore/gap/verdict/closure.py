@@ -226,7 +226,7 @@ def closure(
 
 
 def fall(before: HeldOut, after: HeldOut) -> float:
-    """The deviance of `before` minus that of `after`, Eq. (4), summed over the folds that both contain.
+    """The deviance (Eq. (4)) of `before` minus the deviance of `after`, summed over the folds that both contain.
 
     It is positive if `after` predicts the held-out images better.
     """

@@ -101,7 +101,7 @@ class EffectLimits:
         return first or min(self.parameters, key=multiple)
 
     def as_json(self) -> dict[str, Any]:
-        """The limits of the leading parameter; those of all parameters, if there are several."""
+        """The limits of the leading parameter. If the effect has several parameters, the limits of all parameters are added."""
         found = {"parameter": self.leading.name} | self.leading.as_json()
         if len(self.parameters) > 1:
             found["parameters"] = {one.name: one.as_json() for one in self.parameters}

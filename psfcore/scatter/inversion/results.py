@@ -107,7 +107,7 @@ class Solution(Reconstruction):
 class SolutionWithoutErrors(Reconstruction):
     """A fit to some images of a transit, without errors. left_out: files that the fit could not use, with the reasons.
 
-    The scenes of images outside the fit are those of the solution from which the fit started.
+    The scenes of images outside the fit are taken from the solution from which the fit started.
     """
 
     coordinates: Vector
