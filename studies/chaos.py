@@ -1,10 +1,10 @@
-"""Jobs while everything they need is killed at random: nothing may be lost, nothing made twice, nothing stuck.
+"""Kill servers and workers at random while they process jobs: no job may be lost, done twice, or stuck.
 
     python -m studies.chaos [--jobs 300] [--kills 30] [--px 256] [--seed 1] [--redis-keeps]
 
-A PostgreSQL, a Redis, a service and two workers of the test's own, on free ports, in a temporary folder. Each kill is a
-SIGKILL to a whole process group, as when the power goes; what was killed starts again a moment later. Whoever sends the
-jobs tries again, as a person or an archive does, until each is taken.
+The study starts a PostgreSQL server, a Redis server, a service and two workers on free ports, with their files in a
+temporary folder. Each kill sends SIGKILL to a whole process group, which resembles a power failure. The killed process
+starts again a moment later. The client repeats each request until the service accepts it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from workers.files.store import sha256_of
 
 ENDED = ("COMPLETED", "ERROR", "ABORTED")
 LONGEST_S = 1800.0
-REST_S = (0.2, 3.0)  # how long what was killed stays away
+REST_S = (0.2, 3.0)  # time between the kill of a process and its new start
 STEPS = 20
 
 
@@ -53,7 +53,7 @@ class Process:
     kills: int = 0
 
     def start(self) -> None:
-        """Start it, in a process group of its own."""
+        """Start the server in its own process group."""
         with self.log.open("ab") as log:
             self.running = subprocess.Popen(
                 self.command,
@@ -66,22 +66,22 @@ class Process:
             )
 
     def kill(self) -> None:
-        """SIGKILL to it and all its children."""
+        """Send SIGKILL to the server and all its children."""
         assert self.running is not None
-        with suppress(ProcessLookupError):  # it may have ended by itself a moment ago
+        with suppress(ProcessLookupError):  # the server may have ended by itself a moment ago
             os.killpg(self.running.pid, signal.SIGKILL)
         self.running.wait()
         self.kills += 1
 
     @property
     def alive(self) -> bool:
-        """Whether it runs."""
+        """Whether the server runs."""
         return self.running is not None and self.running.poll() is None
 
 
 @dataclass
 class Servers:
-    """All of them, and where the service answers. database_url: for questions after the end."""
+    """All servers. address: the URL of the service. database_url: for queries after the end of the run."""
 
     processes: dict[str, Process]
     address: str
@@ -90,19 +90,19 @@ class Servers:
     stopped: threading.Event = field(default_factory=threading.Event)
 
     def kill_at_random(self, kills: int, rng: random.Random, pause_s: tuple[float, float]) -> None:
-        """Kill one after another, and start each again after a rest."""
+        """Kill one random server after another, and start each again after a pause."""
         for _ in range(kills):
             if self.stopped.wait(rng.uniform(*pause_s)):
                 return
             process = self.processes[rng.choice(sorted(self.processes))]
-            process.resting = True  # else its keeper would start it too
+            process.resting = True  # otherwise `keep_running` would start it too
             process.kill()
             time.sleep(rng.uniform(*REST_S))
             process.start()
             process.resting = False
 
     def keep_running(self) -> None:
-        """Start again what ended by itself: a supervisor's work, as compose's or systemd's."""
+        """Restart servers that ended by themselves, as a supervisor (docker compose, systemd) does."""
         while not self.stopped.wait(1.0):
             for process in self.processes.values():
                 if not process.resting and not process.alive and not self.stopped.is_set():
@@ -111,7 +111,7 @@ class Servers:
 
 @contextmanager
 def servers(folder: Path, *, redis_keeps: bool, workers: int = 2) -> Iterator[Servers]:
-    """Everything started and answering; at the end everything killed. Raises Missing."""
+    """Start all servers and wait until they answer; at the end, kill all of them. Raises Missing."""
     data = folder / "data"
     data.mkdir()
     database, redis, port = free_port(), free_port(), free_port()
@@ -124,7 +124,7 @@ def servers(folder: Path, *, redis_keeps: bool, workers: int = 2) -> Iterator[Se
             "HELIOPSF_DATA_DIR": str(data),
             "HELIOPSF_DATABASE_URL": database_url,
             "HELIOPSF_BROKER_URL": f"redis://127.0.0.1:{redis}/0",
-            "HELIOPSF_MAX_ATTEMPTS": "20",  # a job that is killed with its worker is no poison
+            "HELIOPSF_MAX_ATTEMPTS": "20",  # a job must not fail because its worker was killed several times
             "OMP_NUM_THREADS": "1",
         }
     )
@@ -147,7 +147,7 @@ def servers(folder: Path, *, redis_keeps: bool, workers: int = 2) -> Iterator[Se
         yield running
     finally:
         running.stopped.set()
-        time.sleep(REST_S[1] + 1)  # whoever starts things again has seen it
+        time.sleep(REST_S[1] + 1)  # the threads that start servers have now seen `stopped`
         for process in made.values():
             if process.alive:
                 process.kill()
@@ -158,7 +158,7 @@ def _postgresql(folder: Path, port: int) -> Process:
     initdb = shutil.which("initdb") or (str(found[-1]) if found else None)
     if initdb is None:
         raise Missing("no initdb of PostgreSQL on this machine")
-    user = "postgres" if os.geteuid() == 0 else None  # it does not run as root
+    user = "postgres" if os.geteuid() == 0 else None  # PostgreSQL refuses to run as root
     cluster = folder / "postgresql"
     cluster.mkdir()
     if user is not None:
@@ -205,7 +205,7 @@ def _healthy(address: str) -> bool:
 
 
 def patiently(client: httpx.Client, method: str, path: str, **options: object) -> httpx.Response:
-    """A request that is made again while the service, or what it needs, is away."""
+    """Send a request; repeat it while the service, or a server that it needs, does not answer."""
     deadline = time.monotonic() + 120
     while True:
         try:
@@ -221,7 +221,7 @@ def patiently(client: httpx.Client, method: str, path: str, **options: object) -
 
 
 def send(running: Servers, folder: Path, jobs: int, px: int) -> dict[str, str]:
-    """Upload as many different images and ask for each to be deconvolved; job by image."""
+    """Upload `jobs` different images and request a deconvolution of each. Returns the id of the job by id of the image."""
     sent: dict[str, str] = {}
     with httpx.Client(base_url=running.address, timeout=30) as client:
         psf = folder / "psf.fits"
@@ -240,7 +240,7 @@ def send(running: Servers, folder: Path, jobs: int, px: int) -> dict[str, str]:
 
 
 def wait_for_all(running: Servers, jobs: int) -> None:
-    """Until no job is left that has not ended. Raises AssertionError after LONGEST_S."""
+    """Wait until all jobs have ended. Raises AssertionError after LONGEST_S."""
     engine = create_engine(running.database_url.replace("postgresql://", "postgresql+psycopg://"))
 
     def ended() -> bool:
@@ -258,7 +258,10 @@ def wait_for_all(running: Servers, jobs: int) -> None:
 
 
 def check(running: Servers, sent: dict[str, str]) -> dict[str, int]:
-    """Every job completed, one product an image, every file whole; counts to report. Raises AssertionError."""
+    """Check that every job is completed, that every image has one product, and that every file is undamaged.
+
+    Returns counts for the output. Raises AssertionError.
+    """
     engine = create_engine(running.database_url.replace("postgresql://", "postgresql+psycopg://"))
     with engine.connect() as connection:
         jobs = connection.execute(text("SELECT id, phase, attempt, submissions, error FROM jobs")).all()
@@ -283,7 +286,7 @@ def check(running: Servers, sent: dict[str, str]) -> dict[str, int]:
 
 
 def run(jobs: int, kills: int, px: int, seed: int, *, redis_keeps: bool) -> dict[str, int]:
-    """All of it; what it came to. Raises AssertionError, Missing."""
+    """Run the study. Returns the counts. Raises AssertionError, Missing."""
     rng = random.Random(seed)
     with tempfile.TemporaryDirectory(prefix="heliopsf-chaos-") as temporary:
         folder = Path(temporary)
@@ -311,12 +314,12 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--px", type=int, default=256)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--redis-keeps", action="store_true", help="Redis with its append-only file")
+    parser.add_argument("--redis-keeps", action="store_true", help="let Redis write its append-only file")
     asked = parser.parse_args()
     started = time.perf_counter()
     found = run(asked.jobs, asked.kills, asked.px, asked.seed, redis_keeps=asked.redis_keeps)
     print(f"Redis {'keeps' if asked.redis_keeps else 'forgets'}; {time.perf_counter() - started:.0f} s")
-    print("all completed, each product once, no row stuck:")
+    print("all jobs completed, each image has one product, no job is stuck:")
     for name, count in found.items():
         print(f"  {name:<20} {count}")
 

@@ -5,7 +5,8 @@ without edges. The same pixels are cut out and deconvolved alone, and compared w
 
     bias = sum(x) / sum(x_ref) - 1,    deviation = sum(abs(x - x_ref)) / sum(x_ref),    in percent     Eq. (1)
 
-The bias is the relative error of the mean of a band, the deviation that of its pixels.
+The bias is the relative error of the mean of a band. The deviation is the mean relative error of the pixels of the
+band.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def study_psf() -> Psf:
 def rows(
     seed: int, psf: Psf, cache: EngineCache, *, methods: tuple[str, ...], ways: tuple[str | None, ...]
 ) -> Iterator[Row]:
-    """Every method with every treatment of edges on one scene; None is the default of the method."""
+    """One row for every method and every treatment of edges, on one scene. None: the default treatment of the method."""
     scene = solar_scene((SCENE_PX, SCENE_PX), seed)
     whole = observe(
         scene, psf, exposure_s=EXPOSURE_S, photon_gain_dn=PHOTON_GAIN_DN, read_noise_dn=READ_NOISE_DN, seed=seed,

@@ -2,11 +2,11 @@
 
     python -m studies.gap_calibration -o DIR [--write]
 
-It makes a blind set (`psfcore.blind`), computes the posterior of every case, with full refits, and keeps it in DIR. From the
-probabilities of the true causes it computes the temperature and the threshold. It prints how well the answer sets do on these
-cases: each half of them with the calibration by the other half. With --write it writes
-psfcore/gap/verdict/calibration.json. The seed must not be used to test the diagnosis. The command continues where it was
-interrupted; one case takes about 15 s of one processor core.
+The command makes a blind set (`psfcore.blind`), computes the posterior of every case with full refits, and stores it in
+DIR. From the probabilities of the true causes it computes the temperature and the threshold. It prints how often the
+answer sets contain the true cause, and how large they are. For this, each half of the cases is tested with the
+calibration by the other half. With --write it writes psfcore/gap/verdict/calibration.json. The seed must not be used to
+test the diagnosis. The command continues where it was interrupted; one case takes about 15 s of one processor core.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ from psfcore.transit.folder import read_transit
 from psfcore.whole_files import write_whole
 
 KINDS = ("clean", "single", "pair", "unknown")
-LEAST_LEFT_PCT = 1.0  # an effect that leaves less alone need not be in the answer if another leaves more
+LEAST_LEFT_PCT = (
+    1.0  # the weaker effect of a pair need not be in the answer if it alone leaves less than this
+)
 TEMPERATURES = (0.5, 10.0)
 HOLDS_FOR = (
     "The coverage holds for transits like these: 18 images of 256 px in three pointings, with no effect, with one or two effects of the "
@@ -57,7 +59,7 @@ HOLDS_FOR = (
 class Case:
     """A case of known cause. true: the effects that an answer must contain. log_weights: as in `Posterior`.
 
-    departures: how far the full refits depart from first order (`Refits.departures`).
+    departures: how far each full refit differs from the first order (`Refits.departures`).
     """
 
     number: int
@@ -79,7 +81,7 @@ class Case:
 
 
 def weights_of(folder: Path) -> tuple[dict[Names, float], tuple[float, ...]]:
-    """Two results: the weights of all hypotheses about the transit in a folder; how far its refits depart from first order."""
+    """Two results for the transit in a folder: the weights of all hypotheses; how far the refits differ from the first order."""
     transit = read_transit(
         folder, LIMITS, diffraction=lambda instrument, _shape: known_diffraction(instrument, threads=1)
     )
@@ -94,7 +96,10 @@ def weights_of(folder: Path) -> tuple[dict[Names, float], tuple[float, ...]]:
 
 
 def required(truth: Mapping[str, Any]) -> Names:
-    """The hypothesis that is the true cause of a case. A pair may count as its stronger effect alone."""
+    """The hypothesis that is the true cause of a case.
+
+    A pair counts as one effect if the other effect alone leaves less than LEAST_LEFT_PCT.
+    """
     if truth["kind"] == "unknown":
         return UNKNOWN
     effects = truth["effects"]

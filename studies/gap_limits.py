@@ -1,4 +1,4 @@
-"""How often an effect of the strength `found_90` is found, and how often the truth exceeds `excluded_95`.
+"""Test the limits: how often an effect of strength `found_90` is found, and how often the truth exceeds `excluded_95`.
 
     python -m studies.gap_limits -o DIR --cases 40 --seed 1
 
@@ -48,7 +48,7 @@ DIFFRACTION_PX = 512
 
 @dataclass(frozen=True)
 class Case:
-    """One case. strength: that was added. excluded_95: after the diagnosis. best: the most probable hypothesis."""
+    """One case. strength: the strength of the added effect. excluded_95: from the diagnosis. best: the most probable hypothesis."""
 
     effect: str
     parameter: str
@@ -60,7 +60,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Settings:
-    """What the cases depend on."""
+    """The settings that determine the cases."""
 
     seed: int
     images: int
@@ -159,7 +159,7 @@ def main() -> None:
 
 
 def _kept(number: int, asked: Settings, folder: Path) -> Case:
-    """A case, from its file or computed now."""
+    """A case: read from its file, or computed now if there is no file."""
     file = folder / f"{number:04d}.json"
     about = asdict(asked)
     if not file.is_file():
@@ -171,7 +171,9 @@ def _kept(number: int, asked: Settings, folder: Path) -> Case:
         )
     kept = json.loads(file.read_text("utf-8"))
     if kept["settings"] != about:
-        raise SystemExit(f"{folder} has cases of other settings ({kept['settings']}): name another folder")
+        raise SystemExit(
+            f"expected cases with the same settings in {folder}; got {kept['settings']}: name another folder"
+        )
     return Case(**kept["case"])
 
 

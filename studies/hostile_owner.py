@@ -1,11 +1,12 @@
-"""How much a hostile owner slows a peaceful one, how much memory the server takes, and whether anything is read across.
+"""Measure how a hostile owner affects a service: delay of another owner, memory of the server, access to others' data.
 
     python -m studies.hostile_owner [--minutes 10] [--alone-jobs 20] [--seed 1] [-o RESULT.json]
 
-A service in keys mode on Redis and PostgreSQL, with one worker. The peaceful owner uploads a new image again and again,
-deconvolves it and downloads the product: first alone, then while the hostile owner, whose key has every scope except
-admin, attacks in many threads. The attacking process has a low priority: it stands for another machine, whose computing
-takes no time from the service. The exit status is 1 if a figure misses its goal.
+The service runs in keys mode with Redis, PostgreSQL and one worker. The peaceful owner repeats one task: upload a new
+image, deconvolve it, download the product. The owner works first alone, and then while the hostile owner attacks in
+many threads. The key of the hostile owner has every scope except admin. The attacking process has a low priority,
+because it represents another machine, which takes no processor time from the service. The exit status is 1 if a figure
+misses its goal.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ DEEP_INSTRUMENT = SMALL_INSTRUMENT + "x = " + "[" * 20_000 + "\n"
 
 @dataclass
 class Peaceful:
-    """The owner who works. seconds: of each job, from the upload to the product. ids: what belongs to this owner."""
+    """The peaceful owner. seconds: time of each job, from the upload to the product. ids: the ids of this owner's data."""
 
     client: Client
     folder: Path
@@ -73,7 +74,7 @@ class Peaceful:
     made: int = 0
 
     def work(self, stop: Callable[[], bool]) -> None:
-        """One job after another until ``stop``."""
+        """Run one job after another until ``stop`` returns True."""
         while not stop():
             self.made += 1
             image, product = self.folder / f"{self.made}.fits", self.folder / f"{self.made}.product.fits"
@@ -94,7 +95,7 @@ class Peaceful:
 
 
 class Hostile:
-    """The owner who attacks. answers: statuses by attack. read_across: answers that contain another owner's things."""
+    """The hostile owner. answers: status codes by attack. read_across: responses that contain data of another owner."""
 
     def __init__(self, server: str, key: str, seed: int, folder: Path) -> None:
         self.answers: collections.Counter[str] = collections.Counter()
@@ -126,7 +127,7 @@ class Hostile:
         return self._client.upload_image(image)["id"], self._client.upload_psf(psf)["id"]
 
     def attack(self, number: int, stop: Callable[[], bool]) -> None:
-        """Attack at random until ``stop``."""
+        """Make random attacks until ``stop`` returns True."""
         rng = random.Random(1000 * self._seed + number)
         with httpx.Client(base_url=self._server, headers=self._headers, timeout=60) as http:
             while not stop():
@@ -145,14 +146,14 @@ class Hostile:
         return answer
 
     def from_the_table(self, http: httpx.Client, rng: random.Random) -> None:
-        """A file or a request of the tests' table of attacks."""
+        """Send a file or a request from the table of attacks in the tests."""
         one: Attack = rng.choice(TABLE)
         content = None if one.content is None else one.content()
         sent = http.request(one.method, one.address, headers=one.headers, content=content, json=one.json)
         self._note("from_the_table", sent)
 
     def many_jobs(self, http: httpx.Client, rng: random.Random) -> None:
-        """Long jobs, as many as are taken."""
+        """Submit ten long jobs."""
         for _ in range(10):
             method = {"name": "richardson-lucy", "steps": rng.randrange(20, 200)}
             parameters = {"image_id": self._image_id, "psf_id": self._psf_id, "method": method}
@@ -161,13 +162,13 @@ class Hostile:
             )
 
     def deep_json(self, http: httpx.Client, rng: random.Random) -> None:
-        """A large body that is slow to parse, with the key and without."""
+        """Send a large body that is slow to parse, with and without the key."""
         body = (b"[[],[]," * (BYTES_OF_JSON // 7))[:BYTES_OF_JSON]
         headers = {"Content-Type": "application/json"} | ({"Authorization": ""} if rng.random() < 0.5 else {})
         self._note("deep_json", http.post("/v1/jobs", content=body, headers=headers))
 
     def greedy_instrument(self, http: httpx.Client, rng: random.Random) -> None:
-        """Instrument files that ask for much memory."""
+        """Send instrument files that require much memory."""
         text = rng.choice([GREEDY_INSTRUMENT, DEEP_INSTRUMENT, SMALL_INSTRUMENT.replace("512", "500000")])
         parameters = {"instrument_file": text, "size": 4096}
         self._note(
@@ -175,7 +176,7 @@ class Hostile:
         )
 
     def many_members(self, http: httpx.Client, rng: random.Random) -> None:
-        """A transit whose list of images is very long."""
+        """Send a transit with a very long list of images."""
         text = b'{"schema":"transit/1","instrument":"hri_euv","images":[' + b"{}," * 1_400_000 + b"{}]}"
         file = io.BytesIO()
         with tarfile.open(fileobj=file, mode="w:gz") as archive:
@@ -185,7 +186,7 @@ class Hostile:
         self._note("many_members", http.post("/v1/transits", content=file.getvalue()))
 
     def wrong_ids(self, http: httpx.Client, rng: random.Random) -> None:
-        """A bulk run of many ids that are none."""
+        """Request a bulk run of many ids that do not exist."""
         ids = [f"{rng.getrandbits(256):064x}" for _ in range(3000)]
         answer = http.post("/v1/bulk", json={"images": ids, "psf_id": self._psf_id})
         self._note("wrong_ids", answer)
@@ -193,7 +194,7 @@ class Hostile:
             self._count("wrong_ids", "a long answer")
 
     def look_across(self, http: httpx.Client, rng: random.Random) -> None:
-        """What belongs to the peaceful owner."""
+        """Request data of the peaceful owner."""
         ids: dict[str, str] = json.loads((self._folder / IDS).read_text("utf-8"))
         for what, identity in ids.items():
             for end in ("", "/file", "/preview", "/lineage", "/psf"):
@@ -202,12 +203,12 @@ class Hostile:
                     self.read_across.append(f"/v1/{what}/{identity}{end}")
 
     def cutouts(self, http: httpx.Client, rng: random.Random) -> None:
-        """Large cut-outs of a PSF."""
+        """Request large cut-outs of a PSF."""
         size = rng.choice([2048, 2046, 2044])
         self._note("cutouts", http.get(f"/v1/psfs/{self._psf_id}/cutout", params={"size": size}))
 
     def long_names(self, http: httpx.Client, rng: random.Random) -> None:
-        """A PSF with a very long random name."""
+        """Upload a PSF with a very long random name."""
         y, x = np.indices((64, 64)) - 32
         hdu = fits.PrimaryHDU((np.exp(-0.5 * (x**2 + y**2) / 1.5**2) / 14.0).astype("f4"))
         hdu.header["PSFNAME"] = "".join(rng.choice("abcdefghij{}$\\") for _ in range(9000))
@@ -216,7 +217,7 @@ class Hostile:
         self._note("long_names", http.post("/v1/psfs", content=file.getvalue()))
 
     def idle(self, http: httpx.Client, rng: random.Random) -> None:
-        """Connections that say nothing, held for a while."""
+        """Open connections, send nothing, and hold them for a while."""
         address = urlsplit(self._server)
         held: list[socket.socket] = []
         try:
@@ -230,7 +231,7 @@ class Hostile:
         self._count("idle", f"{len(held)} connections")
 
     def slow_body(self, http: httpx.Client, rng: random.Random) -> None:
-        """A body that comes a byte at a time."""
+        """Send a request body one byte at a time."""
         address = urlsplit(self._server)
         head = f"POST /v1/jobs HTTP/1.1\r\nHost: {address.netloc}\r\nAuthorization: {self._headers['Authorization']}\r\n"
         with (
@@ -244,7 +245,7 @@ class Hostile:
         self._count("slow_body", "sent")
 
     def events(self, http: httpx.Client, rng: random.Random) -> None:
-        """A stream of events, held for a while."""
+        """Open a stream of events and hold it for a while."""
         jobs = http.get("/v1/jobs", params={"limit": 1}).json().get("items", [])
         for job in jobs:
             ends = time.monotonic() + rng.uniform(1, 10)
@@ -269,7 +270,7 @@ class PeakMemory(threading.Thread):
 
 
 def attack(server: str, key: str, seed: int, folder: Path, seconds: float, told: SimpleQueue[Any]) -> None:
-    """Attack in many threads for so many seconds. Tells None when it begins, and then the answers and what was read across."""
+    """Attack in many threads for `seconds`. Puts None into `told` at the start, and at the end the answers and `read_across`."""
     os.nice(LOW_PRIORITY)
     hostile = Hostile(server, key, seed, folder)
     told.put(None)
@@ -287,7 +288,7 @@ def attack(server: str, key: str, seed: int, folder: Path, seconds: float, told:
 
 
 def run(folder: Path, minutes: float, alone_jobs: int, seed: int) -> dict[str, object]:
-    """The study's figures."""
+    """Run the study and return its figures."""
     with stacks.served(folder, changes={"HELIOPSF_ACCESS": "keys"}) as stack:
         peaceful = Peaceful(Client(stack.client.server, key=_key(stack, "peaceful")), folder, "")
         write_psf(folder / "psf.fits", size=256)

@@ -1,4 +1,4 @@
-"""Makes the sample image that the first page offers.
+"""Make the sample image that the first page of the web site offers.
 
     python -m studies.sample_image
 

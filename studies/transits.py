@@ -1,13 +1,14 @@
-"""The accuracy of the inversion on simulated transits whose truth is known: bias, errors, pulls, places, stretch.
+"""Measure the accuracy of the inversion on simulated transits of known truth: bias, errors, pulls, positions, stretch.
 
     python -m studies.transits [--seeds 20] [--processes 2] [--published 0] [--stretch 0] [--size 512] [--images 30]
     python -m studies.transits --bands | --shapes
 
-Each seed has its own power law, scenes, ephemeris and noise. The output compares the cumulative curve of the total PSF with
-the truth, its rms with the photon bound, and lists pulls, the errors of the occulter's place, and the errors of the curve
-without noise at the true places. Options add the published recipe and stretched scatter. --bands: only the bands of
-cross-validations, compared with the truth. --shapes: only the residuals that shapes of scatter leave in held-out images,
-and the light near the centre that a free fit finds in excess of the power law; the truth is a power law.
+Each seed has its own power law, scenes, ephemeris and noise. The output compares the cumulative curve of the total PSF
+with the truth, and the rms of its errors with the photon bound. It also lists the pulls, the errors of the position of
+the occulter, and the errors of the curve for images without noise and with exact positions. Options add the published
+recipe and stretched scatter. --bands: only compare the bands of cross-validations with the truth. --shapes: only
+compare shapes of scatter by their residuals in held-out images, and compare the light of a free fit near the centre
+with the power law; the truth is a power law.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def diffraction(size: int) -> NDArray[np.float64]:
 
 
 def drawn_truth(seed: int, stretch: float = 0.0, angle_deg: float = 0.0) -> ScatterTruth:
-    """A random power law similar to that of the paper."""
+    """A random power law similar to the power law of the paper."""
     rng = np.random.default_rng([seed, 77])
     return ScatterTruth(
         b_px=rng.uniform(5.0, 7.5),
@@ -105,7 +106,7 @@ def one(seed: int, size: int, images: int, published: bool, stretch: bool) -> di
 
 
 def banded(seed: int, size: int, images: int) -> dict[str, Any]:
-    """The cross-validation of one seed: errors of the median, and half the width of the 1-sigma band."""
+    """Cross-validate one seed. Returns the errors of the median, and half the width of the 1-sigma band."""
     kernel, truth = diffraction(min(2 * size, REACH_GRID_PX)), drawn_truth(seed)
     solution = invert(simulate(default_plan(images, size), truth, kernel, seed).transit)
     radii = solution.inversion.radii_px
@@ -120,7 +121,7 @@ def banded(seed: int, size: int, images: int) -> dict[str, Any]:
 
 
 def shaped(seed: int, size: int, images: int) -> dict[str, Any]:
-    """One seed: shapes by their errors in held-out images, and the free fit compared with the power law."""
+    """For one seed, compare shapes by their errors in held-out images, and compare the free fit with the power law."""
     kernel, truth = diffraction(min(2 * size, REACH_GRID_PX)), drawn_truth(seed)
     solution = invert(simulate(default_plan(images, size), truth, kernel, seed).transit)
     found = bands(
@@ -155,7 +156,7 @@ def shapes_summary(rows: list[dict[str, Any]]) -> str:
 
 
 def bands_summary(rows: list[dict[str, Any]]) -> str:
-    """Pulls of the bands."""
+    """A table of the pulls of the bands."""
     pull = np.array([row["error"] for row in rows]) / np.array([row["sigma"] for row in rows])
     lines = [f"bands of {len(rows)} seeds; radii (px)   " + " ".join(f"{r:7g}" for r in rows[0]["radii"])]
     for name, values in (("pull, mean", pull.mean(0)), ("pull, width", pull.std(0, ddof=1))):

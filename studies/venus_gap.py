@@ -6,7 +6,8 @@ with a physical meaning:
 
     core = sum over terms of weight x term          Eq. (1)
 
-Choices of terms are compared by the error of each epoch when it is held out, and by BIC = n ln(rss / n) + k ln n.
+Choices of terms are compared by the rms error of held-out epochs, and by BIC = n ln(rss / n) + k ln n, where n is the
+number of epochs, k the number of terms, and rss the sum of the squared residuals.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ FILE = "data/real/occultation/aia193_venus_residuals.csv"
 class Explained:
     """One choice of terms.
 
-    weights: weight and error of each term, DN where the term has its mean. held_out_rms: DN. bic: BIC.
+    weights: weight and error of each term; the weight is the light in DN for the mean of the term. held_out_rms: DN.
     """
 
     terms: tuple[str, ...]

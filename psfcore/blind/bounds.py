@@ -1,32 +1,34 @@
-"""What could be known about a case: how probably an ideal observer names its cause, and nothing else.
+"""The probability that an ideal observer names the true cause of a case, and nothing else.
 
-The ideal observer knows the noise and the form of every effect. It says for every hypothesis h about the cause what chi2 the
-hypothesis leaves of the noise-free gap after everything unknown is refitted (ideal.json, gap-ideal/1). The truth leaves 0. With
-lambda_h, that chi2 plus the cost of h minus the cost of the truth, the noise of one transit gives
+The ideal observer knows the noise and the form of every effect. For every hypothesis h about the cause, ideal.json
+(gap-ideal/1) states the chi2 of the noise-free gap that remains after h and all unknown quantities are fitted. For the
+truth this chi2 is 0. Let lambda_h be this chi2 plus the cost of h minus the cost of the truth. Over noise realisations,
 
     chi2 of h - chi2 of the truth  ~  Normal(lambda_h, 4 lambda_h)                                   Eq. (1)
 
-because it is twice the logarithm of a likelihood ratio of two Gaussians (Kay, Fundamentals of Statistical Signal Processing II,
-1998, section 4.3). A hypothesis with fewer effects than the truth is simpler, and only significant data exclude it:
+because this difference is twice the logarithm of a likelihood ratio of two Gaussians (Kay, Fundamentals of Statistical
+Signal Processing II, 1998, section 4.3). A hypothesis with fewer effects than the truth is simpler, and only
+significant data exclude it:
 
     P = Phi(sqrt(lambda_h) - z),   z = Phi^-1(1 - LEVEL / (2 M))                                     Eq. (2)
 
 This is the power of a two-sided test of one among M effects (a noncentral chi2 of one degree of freedom, with the level
-divided by M after Bonferroni): for 18 effects it is 0.5, 0.9 and 0.99 at lambda 9, 18 and 28. A hypothesis with as many effects
-as the truth is as probable as the truth beforehand, and the one with the smallest chi2 is named. The truth is named if it is
-the best of all of them:
+divided by M after Bonferroni): for 18 effects it is 0.5, 0.9 and 0.99 at lambda 9, 18 and 28. The hypotheses
+with the same number of effects as the truth have the same prior probability as the truth. The observer names the one
+with the smallest chi2. This is the truth with the probability
 
     P = integral of phi(u) product over h of Phi(u + sqrt(lambda_h / 2)) du                          Eq. (3)
 
-For one rival this is Phi(sqrt(lambda) / 2). For M equally distant ones it is the forced choice between M + 1 alternatives, a
-maximum of Gaussian variables (Green and Swets, Signal Detection Theory and Psychophysics, 1966, chapter 2). Hypotheses with more
-effects than the truth contain it or are less probable; they are left out, and so are those that a right answer may name
-(`scoring`). The bound is the smallest of Eq. (2), for all hypotheses with fewer effects, and Eq. (3). A true effect that a right
-answer need not name counts as an effect of the truth if Eq. (2) finds it beside the others with a probability of one half or more:
-a rival then has to explain it too.
+For one rival this is Phi(sqrt(lambda) / 2). For M rivals at equal distances it is the forced choice between M + 1
+alternatives, a maximum of Gaussian variables (Green and Swets, Signal Detection Theory and Psychophysics, 1966, chapter
+2). Hypotheses with more effects than the truth are left out: they contain the truth, or are less probable. Hypotheses
+that a right answer may name (`scoring`) are left out too. The bound is the smallest of these values: Eq. (2) for each
+hypothesis with fewer effects, and Eq. (3). A right answer need not name every true effect. An effect that it need not
+name counts as an effect of the truth if Eq. (2) finds this effect beside the others with a probability of one half or
+more. A rival must then explain it too.
 
-Of an effect that is in no library every hypothesis of the library is a simpler one: unknown is what remains when all are excluded.
-On clean data the ideal observer names an effect with the probability LEVEL.
+If the true effect is not in the library, every hypothesis of the library counts as a simpler one. The observer names
+"unknown" if all of them are excluded. On clean data the ideal observer names an effect with the probability LEVEL.
 """
 
 from __future__ import annotations
@@ -51,8 +53,9 @@ _PHI = np.exp(-0.5 * _U**2) / math.sqrt(2 * math.pi) * (_U[1] - _U[0])
 class Known:
     """What an ideal observer could know about a case.
 
-    noncentrality: what the effects leave after the PSF is refitted. rival: lambda of the nearest hypothesis that is not true;
-    None for clean data. alone: the probability that the observer names the truth, and only the truth.
+    noncentrality: chi2 of the gap of noise-free images that remains after the PSF is refitted. rival: the smallest
+    lambda_h of all hypotheses h that are not true; None for clean data. alone: the probability that the observer names
+    the truth, and only the truth.
     """
 
     noncentrality: float
@@ -64,9 +67,10 @@ CLEAN = Known(0.0, None, 1 - LEVEL)
 
 
 def known(ideal: dict[str, Any], required: Sequence[str], true: Sequence[str], *, in_library: bool) -> Known:
-    """What could be known about a case. ideal: gap-ideal/1. required: the true effects that a right answer contains.
+    """What an ideal observer could know about a case.
 
-    true: all true effects. in_library: whether the library contains them.
+    ideal: the content of ideal.json (gap-ideal/1). required: the true effects that a right answer must contain. true:
+    all true effects. in_library: whether the library contains the true effects.
     """
     left = {
         frozenset(one["effects"]): (float(one["chi2"]), float(one["cost"])) for one in ideal["hypotheses"]
@@ -87,7 +91,7 @@ def known(ideal: dict[str, Any], required: Sequence[str], true: Sequence[str], *
 
 
 def _shown(left: dict[Effects, tuple[float, float]], required: Effects, true: Effects, among: int) -> Effects:
-    """The true effects that count: all of them if the data show those that are not required, otherwise the required ones."""
+    """The true effects that count: all, if the data also show those that are not required; otherwise the required ones."""
     if required == true or required not in left or true not in left:
         return required
     gain = sum(left[required]) - sum(left[true])

@@ -219,7 +219,7 @@ def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
             "scenes": [],
             "draw": 1,
             "simulator": "",
-        }  # what sets of earlier versions do not state
+        }  # the plans of earlier versions do not contain these values
         before = older | json.loads(file.read_text("utf-8"))
         same = {key: value for key, value in before.items() if key != "cases"}
         if same != {key: value for key, value in about.items() if key != "cases"}:

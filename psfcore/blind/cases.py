@@ -8,10 +8,11 @@ The same seed and number always give the same case. An effect is known if the ga
 - 3 have two known effects: two that are drawn at random, a strong one beside a changing Sun (`scene_evolution`), and two strong
   ones. Strong effects beside a changing Sun also occur in turn.
 
-The target of an effect is the residual that it should leave alone in the discs after a refit. It is drawn log-uniformly from
-USUAL_PCT, for a strong effect from STRONG_PCT. Every fourth case with one known effect is strong too. An effect whose largest
-plausible strength leaves less than its target gets this strength. The Sun beside a strong effect has no target, because the
-discs hardly show its changes; their relative rms is drawn log-uniformly from SUN_RMS.
+The target of an effect is the residual that this effect alone should leave in the discs after a refit of the PSF. It is
+drawn log-uniformly from USUAL_PCT, for a strong effect from STRONG_PCT. Every fourth case with one known effect is
+strong too. An effect whose largest plausible strength leaves less than its target gets this strength. The Sun beside a
+strong effect has no target, because the discs hardly show its changes; their relative rms is drawn log-uniformly from
+SUN_RMS.
 """
 
 from __future__ import annotations
@@ -55,10 +56,10 @@ _KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
 class Case:
     """One case before it is made.
 
-    kind: one of KINDS. law, glass: the true scatter and the known part of the PSF. effects: at their nominal strengths.
-    target_pct: the residual that each effect should leave in the discs after a refit, percent; None: the effect has its strength
-    already. headroom: the saturation
-    level divided by the brightest pixel; None: no saturation.
+    kind: one of KINDS. law, glass: the true scatter and the known part of the PSF. effects: the effects, at their
+    nominal strengths. target_pct: the residual that each effect alone should leave in the discs after a refit, percent;
+    None: the strength of the effect is already set. headroom: the saturation level divided by the brightest pixel;
+    None: no saturation.
     """
 
     number: int
@@ -97,8 +98,9 @@ def draw_case(
 
     only: names of effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction: half
     of the cases have the diffraction PSF of the instrument, and the others a synthetic one; False: all have a synthetic one.
-    left_pct: the residuals (percent) that an effect should leave in the discs after a refit. The values are used in turn,
-    each for all names of `only`; empty: drawn at random, for the names of `only` from USUAL_PCT. Raises DataError "unknown-effect", "bad-plan".
+    left_pct: the residuals (percent) that an effect should leave in the discs after a refit. The values are used in
+    turn, each for all names of `only`. Empty: the residuals are drawn at random; for the names of `only` they are drawn
+    from USUAL_PCT. Raises DataError "unknown-effect", "bad-plan".
     """
     kind, names, ranges = _what(seed, number, only, clean_only)
     rng = np.random.default_rng([seed, number, _TRUTH_STREAM])
@@ -123,7 +125,10 @@ def draw_case(
 def _what(
     seed: int, number: int, only: Sequence[str], clean_only: bool
 ) -> tuple[str, tuple[str, ...], tuple[Range, ...]]:
-    """The kind of a case, the names of its effects, and the ranges of their targets (percent); SUN_RMS is one of strengths."""
+    """The kind of a case, the names of its effects, and for each effect the range from which its target is drawn.
+
+    The ranges are in percent. SUN_RMS is not a range of targets: it is a range of strengths.
+    """
     if clean_only:
         return CLEAN, (), ()
     if only:
@@ -145,12 +150,16 @@ def _what(
 
 
 def _pair(seed: int, count: int) -> tuple[tuple[str, str], tuple[Range, Range]]:
-    """The names of two effects, and their ranges as from `_what`. count: the number of earlier pairs."""
+    """The two effects of a pair: their names, and the ranges of their targets as in the result of `_what`.
+
+    count: the number of pairs in the earlier cases.
+    """
     turn, place = divmod(count, 3)
     if place == 1:
         return (_in_turn(seed, turn, _BESIDE_SUN, 2), _SUN), (STRONG_PCT, SUN_RMS)
     rng = np.random.default_rng([seed, count, _KIND_STREAM, 2])
-    # Two strong effects without the Sun, whose largest plausible change leaves little in the discs.
+    # place 0: any two known effects. place 2: two strong effects, but not the changing Sun, because even its largest
+    # plausible change leaves little in the discs.
     names = _BESIDE_SUN if place else KNOWN
     first, second = rng.choice(len(names), size=2, replace=False)
     reach = STRONG_PCT if place else USUAL_PCT

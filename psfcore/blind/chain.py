@@ -117,7 +117,7 @@ class Chain:
         return self.plan.saturation_dn
 
     def read_out(self, expected: Sequence[Plane], seed: int) -> list[Plane]:
-        """The exposures in whole DN [y, x], with noise and clipping. seed: of the noise realisation."""
+        """The exposures in whole DN [y, x], with noise and clipping. seed: the seed of the noise realisation."""
         level = self.saturation_dn(expected)
         noisy = self._through_readout(expected, self._noisy(expected, [seed, _NOISE_STREAM]))
         return [

@@ -53,8 +53,9 @@ class _Discs:
 class Left:
     """The residual that an effect leaves in the discs, percent, rms over images.
 
-    The names with "clean" are the residual without any effect, which the sampling on pixels causes. by_image_pct: the
-    residual by image number that the effect leaves after the refit, with its sign.
+    The fields with "clean" in their names contain the residual of images without any effect. The sampling of these
+    images on pixels causes this residual. by_image_pct: the residual that the effect leaves after the refit, with its
+    sign, by image number.
     """
 
     before_refit_pct: float
@@ -80,7 +81,10 @@ class LinearEstimator:
         self._discs = [self._look(frame) for frame in frames]
 
     def left(self, images: Mapping[int, Plane]) -> Left:
-        """The residual that an effect leaves. images: with the effect [y, x], DN/s, by number. The refit uses only these images."""
+        """The residual that an effect leaves.
+
+        images: the images with the effect [y, x], DN/s, by number. The refit uses only these images.
+        """
         residuals = {n: self._residual(n, pixels) for n, pixels in images.items()}
         changes = {n: residuals[n][0] - self._discs[n].residual for n in images}
         clean = {n: self._discs[n].residual for n in images}

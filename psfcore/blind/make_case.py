@@ -6,9 +6,9 @@
     DIR/truth/NNNN.json        salt and truth
     DIR/seals.jsonl            one line for each case: SHA-256 of salt and truth, computed before any diagnosis
 
-Each case has a target for most effects: the residual (percent) that the effect should leave in the discs after a refit of
-the PSF. The strength of the effect is set to reach this target, but at most to the largest plausible strength. The
-residual that the effect then leaves is measured, and is a part of the truth.
+Most effects have a target: the residual (percent) that the effect should leave in the discs after a refit of the PSF.
+The strength of the effect is set to reach this target, but at most to the largest plausible strength. Then the residual
+that the effect really leaves is measured; the truth states it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _PLACE_STREAM = 2003
 
 @dataclass(frozen=True, eq=False)
 class NoiseFree:
-    """The images of a transit without noise [y, x], DN/s. saturation_dn: the level at which they are clipped; None: they are not."""
+    """The images of a transit without noise [y, x], DN/s. saturation_dn: the level at which they are clipped; None: no clipping."""
 
     rates: list[Plane]
     saturation_dn: float | None
@@ -141,8 +141,8 @@ def _quick_left(effect: Effect, case: Case, effect_free: EffectFree, estimator: 
 def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
     """The residual that an effect leaves without the other effects of the case, after a refit, to first order.
 
-    left_alone_pct: percent, rms over images. left_alone_chi2: the sum over images of (residual / noise)^2, for the means of
-    the discs.
+    left_alone_pct: the residual in percent, rms over images. left_alone_chi2: the sum over images of (residual /
+    noise)^2, where residual and noise are those of the disc means.
     """
     noise = left["refitted"]["noise_pct"]
     shown = sum((pct / noise[str(n)]) ** 2 for n, pct in by_itself.by_image_pct.items() if str(n) in noise)
@@ -255,7 +255,7 @@ def _write(
     exposures: Sequence[NDArray[Any]],
     level: float | None,
 ) -> None:
-    """Write exposures [y, x] in DN as a transit. level: at which high-only images clip, DN; None: no clipping."""
+    """Write exposures [y, x] in DN as a transit. level: the level at which high-only images clip, DN; None: no clipping."""
     folder.mkdir(parents=True)
     for n, dn in enumerate(exposures):
         write_plane(folder / f"{n:03d}.fits", dn, cards=_frame_cards(plan, n, level))

@@ -61,7 +61,10 @@ def share(
     goal: str = "",
     met: Callable[[float], bool] | None = None,
 ) -> Row:
-    """The fraction of some cases for which something holds."""
+    """The row of a fraction: the mean of ``holds`` over the cases.
+
+    holds: 1 if a case meets the condition, 0 if not; 0.5 counts as half a case.
+    """
     hits = float(sum(holds(case) for case in cases))
     found = hits / len(cases) if cases else None
     return Row(
@@ -77,9 +80,10 @@ def share(
 def share_of_expected(
     figure: str, cases: Sequence[Judged], holds: Callable[[Judged], bool], expected: Callable[[Judged], float]
 ) -> Row:
-    """The number of cases for which something holds, divided by the expected number, the sum of `expected`.
+    """The row of a ratio: the number of cases for which ``holds`` is true, divided by the sum of ``expected``.
 
-    The interval is Eq. (1) of the fraction of cases, divided by the mean of `expected`: that mean has no error.
+    holds: whether a case meets the condition. expected: the probability that an ideal observer meets it. The interval
+    is Eq. (1) for the fraction of cases, divided by the mean of ``expected``. This mean is treated as exact.
     """
     most = math.fsum(expected(case) for case in cases)
     if most <= 0:
@@ -97,6 +101,6 @@ def of_values(
     goal: str = "",
     met: Callable[[float], bool] | None = None,
 ) -> Row:
-    """A figure of some values, such as their mean."""
+    """The row of one number. of: the function that computes this number from the values, for example their mean."""
     found = float(of(values)) if values else None
     return Row(figure, len(values), found, None, goal, None if met is None or found is None else met(found))

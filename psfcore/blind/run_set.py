@@ -68,9 +68,9 @@ def run_set(
 
     command: a program and its arguments; {transit} and {report} stand for the paths. processes: number of diagnoses at the
     same time. ideal: a program, and its arguments, that computes what an ideal observer could know; {expected} and {ideal}
-    stand for the paths. Empty: this is not computed. It may fail without effect on the diagnosis; the next run tries it
-    again. keep: whether to keep the images of a case after their use. longest_s: a process that takes longer is killed.
-    Raises DataError "bad-command", "bad-seals", and "not-sealed" if a case has no seal.
+    stand for the paths. Empty: this is not computed. If this program fails, the diagnosis is not affected, and the next
+    run tries the program again. keep: whether to keep the images of a case after their use. longest_s: a process that
+    takes longer is killed. Raises DataError "bad-command", "bad-seals", and "not-sealed" if a case has no seal.
     """
     _check(command, ("{transit}", "{report}"))
     if ideal:
@@ -191,7 +191,10 @@ def _diagnose(made: BlindSet, number: int, command: Sequence[str], longest_s: fl
 def _compute_ideal(
     made: BlindSet, number: int, command: Sequence[str], keep: bool, longest_s: float, progress: Progress
 ) -> None:
-    """Compute what an ideal observer of a case could know, if the case lacks it, and remove the images without noise."""
+    """Compute what an ideal observer of a case could know, unless it is known. Then remove the images without noise.
+
+    keep: keep these images. If the computation fails, the images are kept too.
+    """
     if ideal_of(made, number) is None:
         with tempfile.TemporaryDirectory(prefix="ideal-") as temporary:
             result = Path(temporary) / "ideal.json"
@@ -201,7 +204,7 @@ def _compute_ideal(
                 progress(f"case {number:04d} has no ideal observer: {said.splitlines()[-1]:.100}")
                 return
             write_whole(made.ideal(number), result.read_text("utf-8"))
-            progress(f"case {number:04d} observed ideally, {wall_s:.1f} s")
+            progress(f"case {number:04d}: ideal observer computed, {wall_s:.1f} s")
     if not keep:
         shutil.rmtree(made.expected(number))
 

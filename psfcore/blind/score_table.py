@@ -10,7 +10,9 @@ refit of the PSF. The answer of a report is the set of effects that the verdict 
 | inconclusive on clean data | clean | the verdict is `inconclusive`; these cases are also false alarms |
 | answer contains the truth, >= 2 % | known effects and pairs with 2 % left or more | the answer contains the true effect. For a pair it must contain both effects; an effect that leaves less than 1 % alone is not required if the other leaves more |
 | the same, >= 1 % | known effects and pairs with 1 % left or more | as above; a case with the verdict `inconclusive` counts one half |
-| the same, shown by the discs | cases of the 2 % row in which chi2 of the means of the discs is SHOWN_CHI2 or more, without a fit of an effect; for a pair this also holds for each required effect alone, to first order | the answer contains the truth |
+| the same, shown by the discs | cases of the 2 % row in which the chi2 of the disc means, with no effect in the model,
+is SHOWN_CHI2 or more. For a pair, the same must hold for each required effect alone, to first order | the answer
+contains the truth |
 | first effect is the true one | single known effects, 2 % or more | the first entry of the report's `effects` is the true effect |
 | one wrong effect named with confidence | all | the verdict is `attributed`, and names one effect that is not true. For clean cases and unknown effects every name is wrong. The verdicts `tie` and `inconclusive` express doubt and do not count |
 | mean number of named effects | cases of the 2 % row with an answer | number of effects in the answer |
@@ -68,8 +70,9 @@ POWER_EDGES_PCT = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)
 class Score:
     """The score of a blind set.
 
-    rows: the table. confusion, power: see `_confusion` and `_power`. judged: number of cases with a report. failures: the
-    reason why a case has no report, by number. cases: one entry for each case.
+    rows: the rows of the table. confusion, power: the results of `_confusion` and `_power`. judged: the number of cases
+    with a report. failures: the reasons why cases have no report, by number of the case. cases: one entry for each
+    case.
     """
 
     rows: tuple[Row, ...]
@@ -197,7 +200,10 @@ def _axis_row(single: Sequence[Judged]) -> Row:
 
 
 def _confusion(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
-    """The number of cases by truth (row) and by the first effect named (column); without such an effect, by the verdict."""
+    """The confusion matrix: the number of cases for each truth (row) and each first named effect (column).
+
+    If a report names no effect, the column is its verdict.
+    """
     table: dict[str, Counter[str]] = {}
     for case in judged:
         table.setdefault(true_label(case), Counter())[said_label(case)] += 1

@@ -3,16 +3,18 @@
     true closure = 1 - (sum of (s_i / n_i)^2) / (sum of (e_i / n_i)^2)                                Eq. (1)
 
 Eq. (1) is the closure that a perfect model of the true effect would reach on noise-free images. e_i is the residual of
-image i with the effect, after the PSF was refitted. s_i is the residual without the effect, which the sampling on pixels
-causes. n_i is the noise. The true closure is below 1, because the residual s_i stays in the images. The library and the
+image i with the effect, after the PSF was refitted. s_i is the residual of the same image without the effect; the
+sampling of the image on pixels causes it. n_i is the noise of the residual. The true closure is below 1, because a
+model of the effect does not remove s_i. The library and the
 blind set describe the same effect by different formulas; this difference counts as an error of the diagnosis.
 
-A report of schema gap/2 also states a set of hypotheses. Each is a list of effects that act together, `["unknown"]`, or `[]` for
-no gap. A hypothesis covers the truth if it names every required effect (`Judged.required_names`); further effects do no harm.
-For an effect that is not in the library it must be `["unknown"]`, for clean data `[]`. The second effect of a pair is not required
-if it leaves less than LOWER_LEVEL_PCT alone: a hypothesis with the first effect alone then covers the pair, because the discs
-hardly show the second one. If both effects leave less, both are required. A set is right and alone if it has one member, which
-covers the truth and names no effect that is not true.
+A report of schema gap/2 also states a set of hypotheses. A hypothesis is a list of effects that act together;
+`["unknown"]` is an unknown cause, and `[]` is no gap. A hypothesis covers the truth if it names every required effect
+(`Judged.required_names`); it may also name other effects. An effect that is not in the library is covered only by
+`["unknown"]`, and clean data only by `[]`. The second effect of a pair is not required if this effect alone leaves less
+than LOWER_LEVEL_PCT. A hypothesis with only the first effect then covers the pair, because the discs hardly show the
+second one. If both effects leave less, both are required. A set is right and alone if it has only one member, and
+this member covers the truth and names no wrong effect.
 """
 
 from __future__ import annotations
@@ -78,9 +80,10 @@ class Judged:
 
     @property
     def required_names(self) -> tuple[str, ...]:
-        """The withheld effects that an answer must contain: those that leave at least LOWER_LEVEL_PCT alone.
+        """The withheld effects that an answer must contain: the effects that each leave at least LOWER_LEVEL_PCT on
+        their own.
 
-        If no effect leaves at least LOWER_LEVEL_PCT alone, the answer must contain all withheld effects.
+        If no effect leaves that much, the answer must contain all withheld effects.
         """
         required = [
             effect["name"]
@@ -93,7 +96,8 @@ class Judged:
     def left_pct(self) -> float:
         """The residual that the effects leave in the discs after the refit, percent, rms over images.
 
-        If the truth does not state it, it is that of the ideal observer; NaN if nobody computed it.
+        If the truth does not state this residual, the value of the ideal observer is used; NaN if that was not
+        computed.
         """
         if self.truth.get("left_after_refit_pct") is not None:
             return float(self.truth["left_after_refit_pct"])
@@ -111,7 +115,7 @@ class Judged:
 
     @property
     def noncentrality(self) -> float:
-        """What the effects leave after the PSF is refitted, chi2; NaN if it was not computed."""
+        """The noncentrality of the case (`bounds.Known`), a chi2; NaN if it was not computed."""
         return math.nan if self.known is None else self.known.noncentrality
 
     @property
@@ -127,7 +131,8 @@ class Judged:
 
     @property
     def answer(self) -> tuple[str, ...]:
-        """The answer of the report: the effects that the verdict names. Empty unless it is `attributed` or `tie`."""
+        """The effects that the report names as the cause, if the verdict is `attributed` or `tie`. Empty for other
+        verdicts."""
         return tuple(self.report.get("answer", ())) if self.verdict in (ATTRIBUTED, TIE) else ()
 
     @property
@@ -171,14 +176,14 @@ def set_covers_truth(case: Judged) -> bool:
 
 
 def is_right_and_alone(case: Judged) -> bool:
-    """Whether the set has one member, which covers the truth and names no effect that is not true."""
+    """Whether the set has only one member, and this member covers the truth and names no wrong effect."""
     if case.members is None or len(case.members) != 1 or not covers(case, case.members[0]):
         return False
     return case.kind == FOREIGN or set(case.members[0]) <= set(case.true_names)
 
 
 def has_only_wrong_effects(case: Judged) -> bool:
-    """Whether the set has one member, which names effects, and none of them is true."""
+    """Whether the set has only one member, and this member names one or more effects, none of which is true."""
     if case.members is None or len(case.members) != 1:
         return False
     (member,) = case.members
@@ -191,7 +196,7 @@ def names_one_wrong(case: Judged) -> bool:
 
 
 def is_shown(case: Judged) -> bool:
-    """Whether chi2 of the residuals in the means of the discs is at least SHOWN_CHI2.
+    """Whether the chi2 of the residuals of the disc means is at least SHOWN_CHI2.
 
     For a pair, this must also hold for each required effect alone.
     """
@@ -217,7 +222,7 @@ def shown_chi2(truth: dict[str, Any]) -> float | None:
 def closure_share(case: Judged) -> float | None:
     """The closure by the first effect divided by the closure by the true effect; 1 if both are the same effect.
 
-    None if one of the closures is missing, or if that of the true effect is below LEAST_CLOSURE.
+    None if one of the closures is missing, or if the closure by the true effect is below LEAST_CLOSURE.
     """
     first, true = case.closure(case.first), case.closure(case.true_names[0])
     if case.first == case.true_names[0]:
@@ -266,7 +271,8 @@ def true_label(case: Judged) -> str:
 def said_label(case: Judged) -> str:
     """The column of the case in the confusion matrix: the first effect of the answer; the verdict if the answer is empty.
 
-    If the case is a pair, the order of the answer has no meaning: a true effect in the answer counts as the first.
+    For a pair, the order of the effects in the answer does not count: if the answer contains a true effect, that effect
+    is used.
     """
     if not case.answer:
         return case.verdict

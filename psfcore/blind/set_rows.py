@@ -1,8 +1,9 @@
 """The rows of the table that judge the set of hypotheses in reports of schema gap/2.
 
-"Covers", "right and alone" and the members of a set are explained in `scoring`. "Noncentrality" and "rival" are figures of the
-ideal observer (`bounds`): what the effects leave after the PSF is refitted, and the distance to the nearest hypothesis that is
-not true. Rows that need them count only cases for which they were computed.
+"Covers", "right and alone" and the members of a set are explained in `scoring`. "Noncentrality" and "rival" are numbers
+of the ideal observer (`bounds.Known`): the chi2 of the gap that remains in noise-free images after the PSF is refitted,
+and the distance of the nearest hypothesis that is not true. Rows that need these numbers count only cases for which
+they were computed.
 
 | row | cases | counted |
 |---|---|---|
@@ -11,7 +12,8 @@ not true. Rows that need them count only cases for which they were computed.
 | right and alone / ideal observer | cases with an ideal observer, and clean cases | the sets that are right and alone, divided by the number that is expected of the ideal observer |
 | clean data: set without [] | clean | no member is [] |
 | one wrong effect alone in the set | all | the only member names effects, none of which is true |
-| not in the library: unknown in the set | effects that are not in the library, with a noncentrality, or a rival, of SEEN or more | a member is ["unknown"] |
+| not in the library: unknown in the set | effects that are not in the library; one row counts cases with a
+noncentrality of SEEN or more, the next row cases with a rival of SEEN or more | a member is ["unknown"] |
 | strong effects | cases with STRONG_PCT left or more | a member covers the truth |
 """
 
@@ -30,7 +32,9 @@ from psfcore.blind.scoring import (
     set_covers_truth,
 )
 
-SEEN = 30.0  # chi2: among eighteen effects, one that leaves this is found with a probability of 0.99
+SEEN = (
+    30.0  # chi2; an effect with this noncentrality is found among eighteen effects with a probability of 0.99
+)
 STRONG_PCT = 10.0
 KIND_WORDS = {CLEAN: "clean", SINGLE: "one effect", PAIR: "two effects", FOREIGN: "not in the library"}
 

@@ -2,17 +2,19 @@
 
     make_case(*, seed, number, size_px, images, transit, expected) -> truth
 
-seed, number: of the set and of the case; equal ones must give the same case. size_px, images: width of the square images, and
-their number. transit: an empty folder, into which the function writes the transit (`docs/transits.md`) and nothing else, because
-the diagnosis sees it. expected: a folder that does not exist. The function may write two further transits with the same noise
-figures but without noise into its folders `with_effects` and `without_effects`, for the ideal observer. truth is
+seed: the seed of the set. number: the number of the case. Equal values must give the same case. size_px: the width of
+the square images. images: the number of images. transit: an empty folder, into which the function writes the transit
+(`docs/transits.md`) and nothing else, because the diagnosis sees it. expected: a folder that does not exist. For the
+ideal observer, the function may write two further transits into the folders `with_effects` and `without_effects` of
+`expected`. Their images contain no noise, but they state the same noise figures. truth is
 
     {"effects": [{"name": "ghost", "strength": 0.02, "left_alone_pct": 3.1}, ...], "left_after_refit_pct": 3.1}
 
 effects: at most two; none in a clean case. Effects of the gap library have the names of the library; an effect with another name
-is not in the library. All other keys are optional. left_alone_pct: the residual that the effect leaves alone in the discs after a
-refit, percent, rms over images. left_after_refit_pct: that of all effects together; without it, the score takes that of the
-ideal observer. Further keys are kept. The truth gets a "kind" and is sealed like any other.
+is not in the library. All other keys are optional. left_alone_pct: the residual that this effect alone leaves in the
+discs after a refit, percent, rms over images. left_after_refit_pct: the residual that all effects together leave; if it
+is missing, the score uses the value of the ideal observer. Further keys are kept. The truth gets a "kind" and is sealed
+like any other.
 
 The code of the simulator is executed. Its name comes from the person who runs the command. The code may raise any error; it then
 becomes a DataError that names the line.
@@ -36,7 +38,7 @@ from psfcore.transit.manifest import MANIFEST_NAME, read_manifest
 
 FUNCTION = "make_case"
 MOST_EFFECTS = 2
-_NO_NAMES = {CLEAN, PAIR, FOREIGN, "none"}  # of effects: the score uses these words for other things
+_NO_NAMES = {CLEAN, PAIR, FOREIGN, "none"}  # no effect may have these names: the score uses them
 _RESIDUALS = ("left_before_refit_pct", "left_after_refit_pct")
 
 
@@ -66,7 +68,7 @@ def simulator_of(source: str) -> Callable[..., Any]:
 def simulate_case(
     source: str, *, seed: int, number: int, size_px: int, images: int, transit: Path, expected: Path
 ) -> dict[str, Any]:
-    """Let a simulator write a case. Returns the truth of the case. The arguments are those of `make_case`.
+    """Let a simulator write a case. Returns the truth of the case. The module docstring explains the arguments.
 
     Raises DataError "bad-simulator", and the errors of `psfcore.transit.manifest.read_manifest`.
     """
@@ -112,7 +114,10 @@ def checked_truth(source: str, truth: Any) -> dict[str, Any]:
     if not all(isinstance(name, str) and name for name in names) or len(set(names)) < len(names):
         raise _bad(source, f"expected effects with different names; got {names!r:.100}")
     if taken := sorted(_NO_NAMES & set(names)):
-        raise _bad(source, f"expected names of effects; got {taken[0]!r}: choose another name")
+        raise _bad(
+            source,
+            f"expected names of effects; got {taken[0]!r}, which has another meaning in the score: choose another name",
+        )
     if len(names) > MOST_EFFECTS:
         raise _bad(source, f"expected at most {MOST_EFFECTS} effects; got {len(names)}")
     numbers = [copied.get(key) for key in _RESIDUALS]

@@ -49,8 +49,8 @@ Vector = NDArray[np.float64]
 Plane = NDArray[np.float64]
 
 # Smallest depth of an occulter: the missing light divided by the light that a disc would hide according to the PSF. The
-# limit of the inversion is higher. Here a given PSF may lack scatter. The disc is then much brighter than this PSF
-# predicts, and the depth is smaller.
+# inversion uses a higher limit. The limit is lower here because a given PSF may lack scatter: the disc is then much
+# brighter than this PSF predicts, and the depth is smaller.
 LEAST_DEPTH = 0.2
 SLICE_HALF_PX = 20
 SLICES_A_POINTING = 3
@@ -115,7 +115,8 @@ def evaluate(
     if not done:
         reasons = "; ".join(f"{file}: {why}" for file, why in list(left_out.items())[:3])
         raise DataError(
-            "no-occulter", f"expected at least one image with a usable occulter; got none ({reasons})"
+            "no-occulter",
+            f"expected at least one image with a usable occulter; got none ({reasons}): check the positions in transit.json",
         )
     frames = tuple(done[n] for n in sorted(done))
     return Evaluation(transit, frames, left_out, superposition.superposed())
@@ -163,7 +164,7 @@ class _FrameSimulator:
     def noise_alone(
         self, n: int, dark: Pixels, simulated: NDArray[np.float32], rng: np.random.Generator
     ) -> Vector:
-        """s - y of the pixels in D, DN/s, from Eq. (1), if the PSF is perfect and the image has one noise realisation."""
+        """s - y of the pixels in D, DN/s, from Eq. (1), for a perfect PSF and one noise realisation of the image."""
         frame, optics = self.transit.frames[n], self.optics
         expected = frame.pixels.astype(np.float64)
         expected[dark] = simulated[dark]

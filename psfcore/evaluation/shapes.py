@@ -119,7 +119,7 @@ def compare_shapes_by_errors(
     if solution.inversion.shape.name != SOFTENED_POWER_LAW.name:
         raise DataError(
             "unknown-shape",
-            f"expected a fit of {SOFTENED_POWER_LAW.name}; got {solution.inversion.shape.name}",
+            f"expected a fit of the shape {SOFTENED_POWER_LAW.name}; got {solution.inversion.shape.name}: fit that shape first",
         )
     samples = _fold_samples(len(solution.transit.frames))
     named: dict[str, tuple[Solution | None, KernelOf]] = {
@@ -173,7 +173,9 @@ def _fold_samples(images: int) -> tuple[FoldSample, ...]:
     """One sample for each fold, without bootstrap: each fitted image counts once."""
     parts = folds(images)
     if not parts:
-        raise DataError("too-few-frames", f"expected at least 6 images for held-out folds; got {images}")
+        raise DataError(
+            "too-few-frames", f"expected at least 6 images for held-out folds; got {images}: add images"
+        )
     return tuple(
         FoldSample(0, k, tuple(int(n in fold.fitted) for n in range(images)), fold.held_out)
         for k, fold in enumerate(parts)

@@ -1,4 +1,4 @@
-"""The corrected PSF: it is fitted together with the effects that the verdict names, and contains those of the optics.
+"""The corrected PSF: it is fitted together with the named effects, and contains the changes by effects of the optics.
 
 H is the PSF fitted together with the effects. theta_k is parameter k of the effects of the optics. dH_k is the change of
 the image of a point source for one unit of theta_k. To first order, the corrected PSF is

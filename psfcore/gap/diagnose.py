@@ -60,8 +60,10 @@ SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Shrinking:
-    """How far an effect closes the gap. closure: with blocks of time held out. closure_by_pointing: with one pointing at a time
-    held out. Both are None if there is no gap. held_out_fall: `closure.fall` of the blocks of time.
+    """How far an effect closes the gap.
+
+    closure: the closure if blocks of time are held out. closure_by_pointing: the closure if one pointing at a time is held
+    out. Both are None if there is no gap. held_out_fall: `closure.fall` for the blocks of time.
     """
 
     closure: Interval | None
@@ -74,11 +76,12 @@ class Diagnosis:
     """The diagnosis of one transit.
 
     Three values of the gap: before_refit, with the PSF that was fitted together with the named effects, but without these
-    effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear fits of
-    all effects, the most probable first, then those of the pairs in the answer set. p_value: of the gap. limits: what these data could have shown. shrinking: by the
-    label of the effects. corrected: the full refits with the named effects; the refit with the best effects comes first.
-    residual, residual_after: held-out images without and with the best effects. cautions: sentences on everything that
-    weakens the result.
+    effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear
+        fits of all effects, the most probable first, then of the pairs that are best or decide the verdict. p_value:
+    the p-value of the gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by their
+    label. corrected: the full refits with the named effects; the refit with the best effects comes first. residual,
+    residual_after: the residuals of held-out images without and with the best effects. cautions: sentences on
+    everything that weakens the result.
     """
 
     judgement: Judgement
@@ -131,9 +134,10 @@ def diagnose(
     start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit: whether to
     make full refits with the named effects in the model. seed: seeds the simulation and the bootstrap of the intervals.
     solution: a solution of this transit, shape and start that was made before, or a function that makes it; None: `invert`.
-    If the images show other noise than the transit states, it must be the solution with the noise that they show. Raises
-    the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError "bad-library" if the library is empty,
-    "bad-coverage", and "bad-effects" if an added effect fails.
+    If the noise measured in the images differs from the noise that the transit states, the solution must be made with
+    the measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError
+    "bad-library" if
+        the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
     """
     if not library:
         raise DataError("bad-library", "expected a library with at least one effect; got none: add an effect")
@@ -179,7 +183,7 @@ def diagnose_solution(
     calibration: Calibration | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Diagnosis:
-    """Diagnose an existing fit. noise: the measured noise, if any. The other arguments and the errors are those of `diagnose`."""
+    """Diagnose an existing fit. noise: the measured noise, or None. The other arguments and the errors are as in `diagnose`."""
     calibration = calibration or shipped_calibration()
     view = View(solution)
     model, expected = linear_model_of(view, library, seed=seed, progress=progress)
@@ -231,7 +235,7 @@ def linear_model_of(
     seed: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> tuple[LinearModel, ExpectedGap]:
-    """The linear model of a fit with a library of effects, and the expected gap. seed: of the simulation.
+    """The linear model of a fit with a library of effects, and the expected gap. seed: the seed of the simulation.
 
     Raises the errors of `expected_gap` and `gather`.
     """
@@ -248,7 +252,7 @@ def linear_model_of(
 
 
 def _favoured(model: LinearModel, found: Judgement) -> list[str]:
-    """The axes of the most probable effects; none if no gap is the verdict."""
+    """The axes of the most probable effects. Empty if the verdict is `none`, or if no hypothesis names an effect."""
     if found.verdict == "none" or found.best is None:
         return []
     return [axis for effect in model.evidence.effects if effect.name in found.best for axis in effect.axes]
@@ -257,7 +261,7 @@ def _favoured(model: LinearModel, found: Judgement) -> list[str]:
 def _limits(
     model: LinearModel, calibration: Calibration, coverage: float, refits: Sequence[Corrected]
 ) -> Limits:
-    """What these data could have shown; the limits of refitted effects come from the best refit with them."""
+    """The limits of all effects. For an effect that was refitted, excluded_95 comes from the best refit that contains it."""
     found = limits(model, threshold=calibration.threshold(coverage), temperature=calibration.temperature)
     for fit in reversed(refits):
         for effect in fit.effects:
@@ -267,7 +271,7 @@ def _limits(
 
 
 def _fits(model: LinearModel, found: Judgement) -> tuple[EffectFit, ...]:
-    """The linear fits of all effects, the most probable first, then those of the pairs in the answer set and of the best pair."""
+    """The linear fits of all effects, the most probable first, then of the pairs that are best or decide the verdict."""
     effects = {effect.name: effect for effect in model.evidence.effects}
     ordered = sorted(effects, key=lambda name: -found.effects.get(name, 0.0))
     singles = [(name,) for name in ordered]
@@ -318,7 +322,7 @@ def _held_out_by(model: LinearModel, scheme: Sequence[Fold]) -> HeldOut | None:
 
 
 def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:
-    """The result of the full refit if it covers the same images as the linear model; otherwise that of the linear model."""
+    """The result of the full refit if it covers the same images as the linear model; otherwise the result of the linear model."""
     same = real is not None and linear is not None and real.images == linear.images
     return real if same else linear
 

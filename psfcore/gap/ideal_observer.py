@@ -3,8 +3,8 @@
     python -m psfcore.gap.ideal_observer FOLDER FILE.json
 
 FOLDER/with_effects and FOLDER/without_effects are transits of noise-free images (DN, fractions allowed), with the noise figures
-that images of this transit have. The program runs by itself, so that whoever made the transit need not share code with the gap
-library.
+that images of this transit have. It is a separate program, so that the code that simulated the transit and the gap
+library share nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LIMITS = FitsLimits(max_pixels=2**26)
 def main(arguments: Sequence[str]) -> int:
     """Run the program. Returns the exit status."""
     if len(arguments) != 2:
-        print("expected two arguments: a folder and a JSON file", file=sys.stderr)
+        print(f"expected two arguments, a folder and a JSON file; got {len(arguments)}", file=sys.stderr)
         return 2
     folder, file = (Path(one) for one in arguments)
     try:

@@ -1,8 +1,9 @@
 """A planned transit: which effects its images would show, and which effects they could not tell apart.
 
-The images of the plan are simulated without noise and fitted; the limits then follow from the linear model of this fit, whose
-noise is that of the planned exposures. The scene does not change, but the brightness of the images varies by
-BRIGHTNESS_SPREAD, because the Sun and the shutter do. Without it, any difference between images would seem to be an effect.
+The images of the plan are simulated without noise and fitted; the limits follow from the linear model of this fit. The
+noise in this model is the noise of the planned exposures. The scene does not change, but the brightness of the images
+varies by BRIGHTNESS_SPREAD, because the Sun and the shutter do. If the brightness did not vary, every difference
+between images would look like an effect.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ Kernel = NDArray[np.float64]
 
 SCHEMA = "gap-plan/1"
 INSTRUMENT = "hri_euv"
-SCATTER = ScatterTruth(6.15, 2.53, 0.411)  # that of HRI_EUV (Hofmeister et al.)
+SCATTER = ScatterTruth(6.15, 2.53, 0.411)  # the scatter of HRI_EUV (Hofmeister et al.)
 BRIGHTNESS_SPREAD = 0.01
-LEAST_IMAGES = 3  # the fit of a PSF needs as many
+LEAST_IMAGES = 3  # the fit of a PSF needs this number of images
 MEASURED = "its form is measured in the images, so it can be tested only after the observation"
 _BRIGHTNESS_STREAM = 3001
 
@@ -50,9 +51,9 @@ _BRIGHTNESS_STREAM = 3001
 class Planned:
     """The limits of a plan.
 
-    searched: effects that search for a position or form; their limits hold for the one that was found. settled_by: by effect,
-    the observation that confirms it. left_out: images that the fit cannot use, by the name that the simulation gives them, with
-    the reasons.
+    searched: effects that search for a position or form; their limits hold for the position or form that was found.
+    settled_by: the observation that confirms an effect, by effect. left_out: the reasons why the fit cannot use images,
+    by the name that the simulation gives the image.
     """
 
     plan: Plan
@@ -118,8 +119,9 @@ def limits_of_file(
 ) -> Planned:
     """The limits of the plan in a file, or of a transit (`read_plan`).
 
-    instrument: whose diffraction PSF is used; None: that of the transit, or else INSTRUMENT. diffraction: a file with a
-    diffraction PSF; None: the file that the transit names, or else that of the instrument. Raises the errors of `read_plan`,
+    instrument: the instrument whose diffraction PSF is used; None: the instrument of the transit or, if it names none,
+    INSTRUMENT. diffraction: a file with a diffraction PSF; None: the file that the transit names or, if it names none,
+    the diffraction PSF of the instrument. Raises the errors of `read_plan`,
     of reading or building a diffraction PSF, and of `planned_limits`.
     """
     found = read_plan(path, fits_limits)
@@ -141,7 +143,7 @@ def planned_limits(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Planned:
-    """The limits of a plan. diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: of scenes and noise.
+    """The limits of a plan. diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: for scenes and noise.
 
     Raises DataError "too-few-images", and the errors of `true_sky` and `invert`.
     """

@@ -213,7 +213,7 @@ class View:
         return self.solution.transit.frames[n].exposure_s
 
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
-        """The scene of frame n, with its occulter, convolved with dH (`slope`) [y, x], DN/s.
+        """The change of image n by dH: its scene with the occulter in front, convolved with dH (`slope`) [y, x], DN/s.
 
         weight: a factor [y, x] for the light of each scene pixel before the convolution (None: 1).
         """

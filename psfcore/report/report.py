@@ -7,7 +7,7 @@ step follows from the contributions of the images to the normal equations (the s
 are a bootstrap sample. In the evaluation, the fitted images of a fold count once each, and the PSF of the fold is
 evaluated on the held-out images. Only the dark offsets need new fits; these start from the fit to all images.
 
-A given PSF is evaluated without a fit. The report then lists the missing results: those that need a fit.
+A given PSF is evaluated without a fit. The report then lists the results that are missing because they need a fit.
 
 | symbol | name |
 |---|---|
@@ -134,9 +134,9 @@ def make_report(
 ) -> PsfReport:
     """Fit a transit and evaluate the fit, or evaluate a given PSF.
 
-    dark_offsets: also fit with -5, -3, +3 and +5 DN added to every readout. seed: of all random samples (bootstrap,
-    subsets of equations, noise realisations). solution: as in `fit_transit`; not used if the PSF is given. Raises
-    DataError "plate-scale-mismatch", and as `fit_transit` and `evaluate` do.
+    dark_offsets: also fit with -5, -3, +3 and +5 DN added to every readout. seed: the seed of all random samples
+    (bootstrap, subsets of equations, noise realisations). solution: as in `fit_transit`; not used if the PSF is given.
+    Raises DataError "plate-scale-mismatch", and the errors of `fit_transit` and `evaluate`.
     """
     wanted = [s for s in STAGES if psf is None or s in ("evaluating", "tables")]
     if not dark_offsets and psf is None:

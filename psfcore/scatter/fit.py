@@ -156,8 +156,8 @@ def fit_transit(
 ) -> TransitFit:
     """Fit a transit. as_published: also run the published recipe, and each correction of one bias alone.
 
-    solution: of this transit and shape, made before, or a function that makes it; None: `invert`. Raises DataError
-    "unknown-shape", and as `solution_of` and `invert` do.
+    solution: an existing solution of this transit and shape, or a function that makes it; None: `invert` makes it.
+    Raises DataError "unknown-shape", and the errors of `solution_of` and `invert`.
     """
     wanted = shape_named(shape)
     guess = first_guess(transit)

@@ -1,8 +1,8 @@
 """Sample PSFs that represent the uncertainty of a fitted PSF.
 
 The samples are the sigma points of the covariance (Julier and Uhlmann 1997): two sets of parameters for each parameter
-of the fit. The mean and the covariance of these sets are those of the fit. An image deconvolved with each of these PSFs
-varies. This variation is the part of the image's error that comes from the PSF.
+of the fit. The sets have the same mean and the same covariance as the fit. If an image is deconvolved
+with each of these PSFs, the results differ. Their spread is the part of the image's error that comes from the PSF.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ class Shape:
         return {p.name: p.value(float(q)) for p, q in zip(self.parameters, coordinates, strict=True)}
 
     def coordinates(self, values: Values) -> Vector:
-        """Coordinates of these values. A parameter that has no value here gets the value at which a fit starts."""
+        """Coordinates of these values. A parameter that is not in `values` gets the value at which a fit starts."""
         return np.array([p.coordinate(values.get(p.name, p.start)) for p in self.parameters])
 
     def shortened(self, step: Vector) -> tuple[Vector, bool]:

@@ -13,9 +13,9 @@ cannot use more. An estimator that uses the full likelihood can use slightly mor
 information of the photon count without read noise. This limit exceeds 1 / var(m) by the factor 1 + r^2 / (g m t). For g = 6 DN, r = 2 DN and 2.5 photons (m t = 15 DN) the factor is 94 / 90, about 4 % more.
 
 The data for the scatter are the fully dark pixels of every image: their four corners lie within the occulter's radius.
-The pixels around the disc are not used, neither here nor by the fit. They serve to estimate the scene, which is given
-here. The data for the position of an occulter are the pixels whose centres lie at most 5 px beyond its radius; the PSF
-is given. In high-only images, pixels that clip are left out.
+The bound and the fit do not use the pixels around the disc as data. The fit estimates the scene from them; here the
+scene is given. The data for the position of an occulter are the pixels whose centres lie at most 5 px beyond its
+radius; the PSF is given. In high-only images, pixels that clip are left out.
 
 | symbol | name | unit |
 |---|---|---|

@@ -1,6 +1,6 @@
-"""The light that a dark disc hides, with the exact share of each pixel that is partly behind the disc.
+"""The light that a dark disc hides. For pixels at the edge of the disc, the share behind the disc is exact.
 
-The share of a pixel behind the disc is the area that the disc and the square of the pixel have in common.
+The share of a pixel behind the disc is the area of the intersection of the disc and the square pixel.
 F(x, y) is the area of the part of the disc that lies left of x and below y. In closed form:
 
     share = F(x1, y1) - F(x0, y1) - F(x1, y0) + F(x0, y0)                              Eq. (1)

@@ -1,8 +1,8 @@
 """The header keywords of a simulated image: those that real images of the imitated instrument have.
 
-HRI_EUV images get the keywords of level 2 files of EUI. AIA images get those of level 1 files, which have no
-DETECTOR and no gain modes. Images of any other instrument get the keywords by which its TOML file recognises
-it, its wavelength and its plate scale.
+HRI_EUV images get the keywords of level 2 files of EUI. AIA images get the keywords of level 1 files, without
+DETECTOR and gain modes. Images of another instrument get three kinds of keywords: those by which
+the TOML file of the instrument recognises its images, the wavelength, and the plate scale.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class Shot:
 class Plan:
     """Everything that determines a simulated transit except the PSF and the seed.
 
-    views: what each pointing shows, one of VIEWS for each pointing in turn. ephemeris_error_px: rms error of the
+    views: one of VIEWS for each pointing, in the order of their numbers. ephemeris_error_px: rms error of the
     reported position along each axis. saturation_dn: level at which high-only images clip; None: no saturation. Combined
     images do not saturate. brightness: factor by which the scenes are multiplied. oversampling: number of scene pixels
     in a detector pixel along each axis, 1 or 2. beyond: "dark" if the scene ends at the edge of the field; "on" if the
@@ -142,11 +142,11 @@ def plan_from_json(content: dict[str, Any]) -> Plan:
 def default_plan(images: int = 30, size_px: int = 512, **changes: Any) -> Plan:
     """A transit like the one of the paper, with any number of images.
 
-    Up to 60 images, each pointing gets a third of them. More images are divided in the ratio of the paper: 24, 78 and 24.
-    In a limb pointing, the planet is far from the limb in 10 of 24 images (5 s, combined) and near it in the others
-    (0.9 s, high-only). In front of the solar disc, all images are 1.8 s, high-only. A field larger than 1024 px is
-    simulated with one scene pixel per detector pixel, a smaller one with two along each axis. changes: values for other
-    fields of Plan. Raises DataError "bad-plan".
+    Up to 60 images are divided equally between the pointings. More images are divided in the ratio of the paper: 24, 78
+    and 24. In a limb pointing, the planet is far from the limb in 10 of 24 images (5 s, combined) and near it in the
+    others (0.9 s, high-only). In front of the solar disc, all images are 1.8 s, high-only. A field larger than 1024 px
+    is simulated with one scene pixel per detector pixel, a smaller one with two along each axis. changes: values for
+    other fields of Plan. Raises DataError "bad-plan".
     """
     _expect(images >= 1, "at least one image", images)
     limb = images // 3 if images <= _THIRDS_UP_TO else round(images * _PAPER_LIMB_SHARE)

@@ -46,11 +46,13 @@ def scene_from_image(image: Plane, plan: Plan) -> Plane:
     are negative or not finite become 0. Raises DataError "bad-scene".
     """
     if image.ndim != 2 or min(image.shape) < 2:
-        raise DataError("bad-scene", f"expected an image of two axes; got shape {image.shape}")
+        raise DataError("bad-scene", f"expected a scene image with two axes; got shape {image.shape}")
     light = np.maximum(np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0), 0.0)
     if light.max() <= 0:
         raise DataError(
-            "bad-scene", "expected an image with light; all its pixels are 0, negative or not finite"
+            "bad-scene",
+            "expected a scene image with at least one positive pixel; all pixels of this image are 0, negative or not "
+            "finite: give another image",
         )
     edge = (plan.size_px + 2 * plan.margin_px) * plan.oversampling
     if min(light.shape) < edge:

@@ -27,7 +27,7 @@ from psfcore.transit.manifest import MANIFEST_NAME, MAX_MANIFEST_BYTES, TransitM
 
 LARGEST_SIZE_PX = 4096
 MOST_IMAGES = 1000
-_INTERVAL_S = 60.0  # between images whose times are not stated
+_INTERVAL_S = 60.0  # time between two images, if their times are not stated
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,11 @@ def _is_number(value: Any) -> bool:
 
 
 def _views(content: Mapping[str, Any], count: int) -> tuple[str, ...]:
-    """What each pointing shows: as stated; else both limbs and the disc for three pointings, and the disc for other numbers."""
+    """The view of each pointing, as the file states it.
+
+    Default: three pointings show the east limb, the disc and the west limb; with any other number, all pointings show
+    the disc.
+    """
     views = content.get("views")
     if views is None:
         return VIEWS if count == len(VIEWS) else (DISC,) * count

@@ -1,8 +1,8 @@
 """The true scatter kernel of a simulation: a softened power law that may be stretched and lopsided.
 
 Source: Hofmeister et al., The point-spread function of HRI_EUV, section "The diffuse scattered light". The paper's
-scatter is isotropic; stretch and dipole are additions. This code is independent of the code of the fit. An error in one
-of the two therefore shows in a comparison.
+scatter is isotropic; stretch and dipole are additions. This module shares no code with the fit. An error in
+one of the two therefore becomes visible when both are compared.
 
     s(u, v) = a F(u, v)  outside the central pixel,  s(0) = 1 - total                 Eq. (1)
     F = (b + r')^-c (1 + d cos(theta - t)),  r'^2 = (u / (1 + s))^2 + (v (1 + s))^2    Eq. (2)
@@ -96,7 +96,7 @@ def kernel_slopes(scatter: ScatterTruth) -> dict[str, Kernel]:
     """
     falloff = _falloff(scatter)
     norm = falloff.sum()
-    # The central pixel is 1 - total, whatever b, c and the stretch are: there the falloff and its slopes are 0.
+    # The central pixel is 1 - total for all b, c and stretches. The falloff and its slopes are 0 in this pixel.
     found = {
         name: (scatter.total / norm) * (slope - falloff * (slope.sum() / norm))
         for name, slope in _falloff_slopes(scatter, falloff).items()

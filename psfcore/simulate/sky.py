@@ -57,11 +57,14 @@ class TrueSky:
     threads: int = 1
 
     def true_scene(self, index: int) -> Plane:
-        """The scene of an image on the field, with the dark occulter in it."""
+        """The scene of image `index`, cropped to the field, without the light that the occulter hides."""
         return on_field(self.true_scene_and_beyond(index), self.plan.margin_px)
 
     def true_scene_and_beyond(self, index: int) -> Plane:
-        """The scene of an image with the dark occulter in it, plan.margin_px larger than the field on each side."""
+        """The scene of image `index` without the light that the occulter hides.
+
+        It is plan.margin_px larger than the field on each side.
+        """
         scene = self.scenes[self.plan.shots[index].pointing].copy()
         around = self.behind[index]
         rows, columns = around.window(self.plan.margin_px)
@@ -69,7 +72,7 @@ class TrueSky:
         return np.asarray(np.maximum(scene, 0.0))  # rounding gives -1e-14 for a hidden pixel
 
     def expected(self, index: int) -> Plane:
-        """The noise-free image, Eq. (1), on the field."""
+        """The noise-free image `index` from Eq. (1), on the pixels of the field."""
         around = self.behind[index]
         hidden = np.zeros((self.plan.size_px, self.plan.size_px))
         hidden[around.window()] = around.hidden(self.plan.place(index))
@@ -99,7 +102,8 @@ def true_sky(
 ) -> TrueSky:
     """The sky of a plan. Without `scenes`, the scenes are synthetic and follow from `seed`.
 
-    scenes: a scene for each pointing, in the form that scene_from_image returns. diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. Raises DataError "bad-diffraction", "bad-scene".
+    scenes: a scene for each pointing, in the form that scene_from_image returns. diffraction: weights [y, x], centre at
+    [n // 2, n // 2], sum 1. Raises DataError "bad-diffraction", "bad-scene".
     """
     _check_diffraction(diffraction)
     whole_px = plan.size_px + 2 * plan.margin_px
@@ -146,7 +150,8 @@ def _given(scenes: Mapping[int, Plane], pointing: int, plan: Plan) -> Plane:
     scene = np.asarray(scenes[pointing], dtype=np.float64)
     if not np.isfinite(scene).all() or scene.min() < 0:
         raise DataError(
-            "bad-scene", f"expected finite pixels >= 0; got others in the scene of pointing {pointing}"
+            "bad-scene",
+            f"expected finite pixels >= 0; got negative, NaN or infinite pixels in the scene of pointing {pointing}",
         )
     return scene
 

@@ -3,7 +3,7 @@
     D_i = round(min(g Poisson(I_i t / g) + read + dark, saturation)),  frame i = D_i / t     Eq. (1)
 
 The plan (plan.py) gives the positions and exposures, and the sky (sky.py) gives the noise-free images. transit_files.py
-writes the folder. Without a plan's whole_dn, D_i is not rounded. Only high-only images saturate.
+writes the folder. If whole_dn of the plan is False, D_i is not rounded. Only high-only images saturate.
 
 | symbol | name | unit |
 |---|---|---|
@@ -93,7 +93,7 @@ class SimulatedTransit:
         return self.sky.scenes
 
     def true_scene(self, index: int) -> Plane:
-        """The scene of an image on the field, with the dark occulter in it: [y, x] in DN/s, float64."""
+        """The scene of image `index` on the field, without the light that the occulter hides: [y, x] in DN/s, float64."""
         return self.sky.true_scene(index)
 
 
@@ -111,9 +111,9 @@ def simulate(
     """A transit of `plan`. Its PSF is `scatter` convolved with `diffraction`. Equal arguments give equal results.
 
     diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: random seed of the scenes, the ephemeris errors
-    and the noise. scene_seed: a different seed for the scenes. scenes: a scene for each pointing, used instead of a
-    synthetic one, in the form that drawn_scene and scene_from_image of psfcore.simulate.pointings return. imitated: the
-    instrument whose keywords the headers get. Raises DataError "bad-diffraction", "bad-scene".
+    and the noise. scene_seed: the seed of the scenes, if it differs from `seed`. scenes: a scene for each pointing,
+    used instead of a synthetic one, in the form that drawn_scene and scene_from_image of psfcore.simulate.pointings
+    return. imitated: the instrument whose keywords the headers get. Raises DataError "bad-diffraction", "bad-scene".
     """
     of_scenes = seed if scene_seed is None else scene_seed
     sky = true_sky(plan, scatter, diffraction, of_scenes, scenes=scenes, threads=threads)

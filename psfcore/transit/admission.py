@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from psfcore.errors import DataError
 from psfcore.transit.manifest import MANIFEST_NAME, is_plain_name
 
-RATIO_FLOOR_BYTES = 64 * 2**20  # an archive may always unpack to this number of bytes, whatever its ratio
+RATIO_FLOOR_BYTES = 64 * 2**20  # up to this number of unpacked bytes, max_ratio is not checked
 _HIDDEN = ("__MACOSX", "PaxHeader", "PaxHeaders", "Thumbs.db", "desktop.ini")
 
 
 _DEEPEST = 3  # parts of the longest name: the folder of the transit, a folder beside its files, a file
 _WHERE = (
-    "expected files at the top level or in one folder, and beside them at most one level of other folders"
+    "expected all files at the top level or in one folder, and no folders deeper than one level below that"
 )
 
 
@@ -52,8 +52,8 @@ class Admitted:
 class Gate:
     """Checks every member of one archive: its name, its number, its size, and the bytes unpacked so far.
 
-    The files of a transit are at the top level or in one folder. Files in the folders beside them (one level) are ignored, but
-    they are checked and counted as the others are.
+    The files of a transit are at the top level or in one folder. Beside them there may be other folders, one level
+    deep. The files in these folders are ignored, but they are checked and counted like all other files.
     """
 
     def __init__(self, limits: ArchiveLimits, archive_bytes: int) -> None:
@@ -67,7 +67,10 @@ class Gate:
         """Add members of any kind to the count. Raises DataError "archive-too-large"."""
         self._members += count
         if self._members > self.limits.max_files:
-            message = f"expected at most {self.limits.max_files} members; got more"
+            message = (
+                f"expected at most {self.limits.max_files} members; got more: pack only {MANIFEST_NAME} and the files "
+                "that it names"
+            )
             raise DataError("archive-too-large", message)
 
     def count_unpacked(self, count: int) -> None:
@@ -82,7 +85,7 @@ class Gate:
         """
         parts = _parts(raw_name)
         if not parts:
-            raise not_plain(raw_name, "expected the name of a file")
+            raise not_plain(raw_name, "expected a member with the name of a file")
         if _is_hidden(parts):
             return None
         if len(parts) > _DEEPEST:
@@ -97,7 +100,7 @@ class Gate:
         self._files[file] = raw_name
         if size > self.limits.max_member_bytes:
             most = self.limits.max_member_bytes
-            message = f"{shown(raw_name)}: expected at most {most} bytes; got {size}"
+            message = f"{shown(raw_name)}: expected a file of at most {most} bytes; got {size} bytes"
             raise DataError("archive-too-large", message)
         self._declared += size
         self._check(self._declared)
@@ -114,11 +117,10 @@ class Gate:
             self._folders.append("/".join(parts))
 
     def main_folder(self) -> str:
-        """The folder of the transit's files, after all members were checked: the top level if it has files, otherwise the one
-        folder there.
+        """The folder of the transit's files: the top level if it has files, otherwise the only folder there.
 
-        Raises DataError "archive-not-plain" if files are elsewhere than in this folder and in the folders beside them, or if
-        transit.json is not in it.
+        Call this after all members were checked. Raises DataError "archive-not-plain" if a file is neither in this
+        folder nor in a folder directly inside it, or if transit.json is in another folder.
         """
         folders = dict.fromkeys(file.folder for file in self._files)
         main = "" if "" in folders else next((one for one in folders if "/" not in one), "")
@@ -136,7 +138,7 @@ class Gate:
 
     def _check(self, count: int) -> None:
         if count > self._budget:
-            message = f"expected an archive that unpacks to at most {self._budget} bytes; got more"
+            message = f"expected an archive that unpacks to at most {self._budget} bytes; got more: pack fewer or smaller images"
             raise DataError("archive-too-large", message)
 
 
@@ -156,11 +158,11 @@ def _above(folder: str) -> str:
 
 
 def _parts(raw_name: str) -> list[str]:
-    """The folders and the file of a member's name. Raises DataError "archive-climbs"."""
+    """The parts of a member's name: its folders and its file name. Raises DataError "archive-climbs"."""
     parts = [part for part in raw_name.split("/") if part not in ("", ".")]
     climbs = raw_name.startswith("/") or "\\" in raw_name or ".." in parts
     if climbs or any(re.match(r"[A-Za-z]:", part) for part in parts):
-        message = f"expected names inside the archive's own folder; got {shown(raw_name)}"
+        message = f"expected names inside the folder of the archive; got {shown(raw_name)}: pack the files without their paths"
         raise DataError("archive-climbs", message)
     return parts
 

@@ -47,8 +47,14 @@ def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
 
     A .zip has a table of contents, and in a .tar the data can be skipped. A .tar.gz must be decompressed from start to
     end, within the limits.
-    Raises the DataErrors of ``unpack``; also "no-manifest", "bad-manifest", "missing-file" if transit.json names a file
-    that the archive does not contain, and "not-fits" if a named file cannot be FITS. The message names all such files.
+    Raises the DataErrors of ``unpack``, and these:
+
+    - "no-manifest" if the archive contains no transit.json;
+    - "bad-manifest" if transit.json cannot be read, or has wrong content;
+    - "missing-file" if transit.json names a file that the archive does not contain;
+    - "not-fits" if a file that transit.json names cannot be a FITS file.
+
+    If several files are missing or cannot be FITS files, one error names all of them.
     """
     sizes: dict[str, dict[str, int]] = {}  # by folder of the archive
     starts: dict[str, dict[str, bytes]] = {}
@@ -72,16 +78,20 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
 
     If all files are in one folder of the archive, that folder's name is dropped. Hidden files, files that operating
     systems add, and files of folders beside the transit's files are skipped.
-    Raises one of these DataErrors, and then removes all files that it wrote: "not-an-archive"; "archive-climbs" for a name that leads
-    out of the folder; "archive-not-plain" for links, devices, sparse or encrypted files, deeper folders, a name that
-    occurs twice, and a name that is not a plain file name; "archive-too-large" if there are more bytes or members than
-    the limits allow; "archive-broken". An OSError of the disk is raised unchanged.
+    If it raises an error, it first removes all files that it wrote. It raises OSError, and these DataErrors:
+
+    - "not-an-archive" if the file is neither a .zip nor a .tar nor a .tar.gz;
+    - "archive-climbs" if a name leads out of the folder;
+    - "archive-not-plain" for links, devices, sparse or encrypted files, deeper folders, a name that occurs twice, and a
+      name that is not a plain file name;
+    - "archive-too-large" if there are more bytes or members than the limits allow;
+    - "archive-broken" if the archive is damaged.
     """
     folder = Path(folder)
     written: list[tuple[str, Path]] = []  # folder of the archive, and path
     staged = {
         "": folder
-    }  # by folder of the archive. A name cannot begin with a full stop, so no file is called like these.
+    }  # by folder of the archive; no file has the name of a folder below, because file names do not begin with a full stop
     with ExitStack() as undo:
         if not folder.exists():
             folder.mkdir(parents=True)
@@ -133,8 +143,7 @@ def pack(folder: str | Path, path: str | Path) -> TransitManifest:
 def checked_folder(folder: Path) -> tuple[TransitManifest, dict[str, int]]:
     """The manifest of the transit in a folder, and the size in bytes of each of its files.
 
-    Raises DataError "no-manifest", "bad-manifest", "missing-file", and "not-fits" if a named file cannot be FITS. The message
-    names all such files.
+    Raises DataError "no-manifest", "bad-manifest", "missing-file" and "not-fits", as ``list_archive`` does.
     """
     manifest = read_manifest(folder)
     starts: dict[str, bytes] = {}
@@ -150,7 +159,8 @@ def _check_files(manifest: TransitManifest, starts: Mapping[str, bytes], where: 
     """Raise DataError if files that the manifest names are missing, or cannot be FITS by their first bytes."""
     missing = [
         DataError(
-            "missing-file", f"{name}: expected in {where}, because {MANIFEST_NAME} names it; it is missing"
+            "missing-file",
+            f"{name}: expected this file in {where}, because {MANIFEST_NAME} names it; it is missing: add it",
         )
         for name in manifest.files
         if name not in starts

@@ -146,7 +146,10 @@ def first_guess(
     )
     telling = [p for p in pointings if math.isfinite(p.inhomogeneity)]
     if not telling:
-        message = "expected at least one image with the centre of the occulter in the field, in front of the Sun; got no such image"
+        message = (
+            "expected at least one image that shows the centre of the occulter in front of the Sun; got none: check the "
+            "positions in transit.json"
+        )
         raise DataError("no-first-guess", message)
     best = min(telling, key=lambda guess: guess.inhomogeneity)
     ratios = _finite([r for g in guesses if g.pointing == best.pointing for r in g.ratio.values()])
@@ -217,7 +220,7 @@ def _ratio(centre_dn_s: float, level_dn_s: float) -> float:
 
 
 def _range_over_mean(values: list[float]) -> float:
-    """The range of the finite values divided by their mean; infinite if the mean is not above 0."""
+    """The range (largest minus smallest) of the finite values divided by their mean; infinite if the mean is not above 0."""
     known = _finite(values)
     if known.size == 0 or known.mean() <= 0:
         return math.inf

@@ -177,7 +177,8 @@ def _check_present(folder: Path, manifest: TransitManifest) -> None:
     if missing:
         named = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
         raise DataError(
-            "missing-file", f"expected all files that {MANIFEST_NAME} names in the folder; missing: {named}"
+            "missing-file",
+            f"expected all files that {MANIFEST_NAME} names in the folder; these files are missing: {named}",
         )
 
 
@@ -198,12 +199,16 @@ def _check_frame(
 ) -> None:
     ny, nx = header.shape
     if header.shape != first:
-        size = f"{first[1]} x {first[0]} px, as {first_file} has"
-        raise DataError("transit-shapes", f"{label}: expected {size}; got {nx} x {ny}")
+        size = f"{first[1]} x {first[0]} px, the size of {first_file}"
+        raise DataError(
+            "transit-shapes", f"{label}: expected {size}; got {nx} x {ny} px: cut all images to one size"
+        )
     largest = LARGEST_RADIUS_SHARE * min(ny, nx)
     if image.r > largest:
         message = f"expected a radius r of at most {largest:g} px in images of {nx} x {ny} px"
-        raise DataError("occulter-too-large", f"{label}: {message}; got {image.r:g}")
+        raise DataError(
+            "occulter-too-large", f"{label}: {message}; got {image.r:g} px: correct r in {MANIFEST_NAME}"
+        )
     check_reaches_in(Place(image.x, image.y, image.r), header.shape, label)
 
 
@@ -218,7 +223,7 @@ def times_s(headers: Sequence[HeaderSummary]) -> list[float]:
 
 
 def _instant(text: str | None) -> datetime | None:
-    """A date of a header as an instant; without a time zone it is UTC. None if it cannot be read."""
+    """The instant of a date in a header. A date without a time zone is in UTC. None if the date cannot be read."""
     if text is None:
         return None
     try:
@@ -296,15 +301,17 @@ def checked_kernel(kernel: Kernel, label: str) -> Kernel:
     smallest, largest = float(kernel.min()), float(kernel.max())
     if smallest < -_NEGATIVE_TOLERANCE * max(largest, 0.0):
         message = f"expected weights >= 0; got a smallest weight of {smallest:.3g}"
-        raise DataError("known-psf-negative", f"{label}: {message}")
+        raise DataError("known-psf-negative", f"{label}: {message}: give a PSF without negative weights")
     total = float(kernel.sum(dtype=np.float64))
     if abs(total - 1) > KNOWN_PSF_SUM_TOLERANCE:
-        message = "expected weights that sum to 1 on their own grid"
-        raise DataError("known-psf-sum", f"{label}: {message}; got a sum of {total:.6g}")
+        message = "expected weights that sum to 1 on their array"
+        raise DataError(
+            "known-psf-sum", f"{label}: {message}; got a sum of {total:.6g}: divide the weights by their sum"
+        )
     centre = (kernel.shape[0] // 2, kernel.shape[1] // 2)
     if kernel[centre] < largest * (1 - CENTRE_TOLERANCE):
         peak = tuple(int(p) for p in np.unravel_index(int(kernel.argmax()), kernel.shape))
         message = f"expected the peak at [y, x] = {centre}"
-        raise DataError("known-psf-not-centred", f"{label}: {message}; got {peak}")
+        raise DataError("known-psf-not-centred", f"{label}: {message}; got the peak at {peak}: shift the PSF")
     weights = np.maximum(kernel, 0.0, dtype=np.float64)
     return np.ascontiguousarray(weights / weights.sum())

@@ -82,8 +82,7 @@ def _starts_like(start: bytes, known: bytes) -> bool:
 
 
 class Member:
-    """A file in an archive, with its folder there. gate: counts the unpacked bytes; None if the input of the archive counts them
-    already."""
+    """A file in an archive. folder: its folder there. gate: counts the unpacked bytes; None: they are counted already."""
 
     def __init__(self, file: Admitted, size_bytes: int, stream: IO[bytes], gate: Gate | None = None) -> None:
         self.folder, self.name, self.size_bytes = file.folder, file.name, size_bytes

@@ -97,9 +97,15 @@ def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
     """
     unit = (image.unit or "").replace(" ", "").lower()
     if unit not in ("dn", "dn/s"):
-        raise DataError("unknown-unit", f"{file}: expected BUNIT 'DN' or 'DN/s'; got {image.unit!r:.40}")
+        raise DataError(
+            "unknown-unit",
+            f"{file}: expected BUNIT 'DN' or 'DN/s'; got {image.unit!r:.40}: convert the image, or correct BUNIT",
+        )
     if image.exposure_s is None:
-        raise DataError("no-exposure", f"{file}: expected XPOSURE or EXPTIME above 0 s; got neither")
+        raise DataError(
+            "no-exposure",
+            f"{file}: expected XPOSURE or EXPTIME above 0 s in the header; got neither: add one of these keywords",
+        )
     rate = image.pixels if unit == "dn/s" else image.pixels / image.exposure_s
     with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite and so a gap
         return rate.astype(np.float32), image.exposure_s
@@ -168,7 +174,7 @@ def _fill(exposure: Exposure, exposures: Sequence[Exposure]) -> FrameCounts:
         share = 100 * unfilled / kept.size
         raise DataError(
             "all-saturated",
-            f"{exposure.file}: {message}; got {share:.0f} % saturated pixels that cannot be filled",
+            f"{exposure.file}: {message}; got {share:.0f} % saturated pixels that cannot be filled: leave this image out",
         )
     _fill_from_neighbours(exposure.pixels, left & ~kept, exposure.gaps)
     return FrameCounts(

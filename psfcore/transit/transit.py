@@ -42,7 +42,7 @@ def check_reaches_in(place: Place, shape: tuple[int, ...], label: str) -> None:
         got = f"x = {place.x_px:g}, y = {place.y_px:g}, r = {place.radius_px:g}"
         raise DataError(
             "occulter-outside",
-            f"{label}: expected an occulter at least partly inside the {nx} x {ny} px; got {got}",
+            f"{label}: expected an occulter at least partly inside the image of {nx} x {ny} px; got {got}: correct the position",
         )
 
 

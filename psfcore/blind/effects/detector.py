@@ -187,8 +187,8 @@ class DarkCurrentDrift(Effect):
 class BrighterFatter(Effect):
     """Collected charge repels new charge into fainter neighbouring pixels. Not in the library.
 
-    strength: what moves from the brighter to the fainter of two neighbouring pixels, as a fraction of their difference,
-    if their mean is 1000 DN.
+    strength: the signal that moves from the brighter to the fainter of two neighbouring pixels, divided by the
+    difference of the two pixels. It holds for two pixels with a mean of 1000 DN.
     """
 
     name: ClassVar[str] = "brighter_fatter"

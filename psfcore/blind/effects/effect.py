@@ -2,7 +2,7 @@
 
     scene -> occulter -> optics -> light on fine pixels -> light on detector pixels -> photons -> readout
 
-An effect changes one or two of these steps. With strength 0 it changes nothing.
+An effect changes one or two of these steps. An effect of strength 0 changes nothing.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class Earlier:
 class Effect:
     """The base class of all effects. It changes no step of the simulation.
 
-    unit: of the strength. cause: the physical cause, as text. nominal: a strength that the discs show. largest: the largest
-    plausible strength. power: the residual that the effect leaves is proportional to strength**power. varies: whether its
-    optics differ from image to image. noise_realisations: number of noise realisations over which its change is averaged; 0
-    if the change does not depend on noise.
+    unit: the unit of the strength. cause: the physical cause, as text. nominal: a strength whose change is visible in
+    the discs. largest: the largest plausible strength. power: the residual that the effect leaves is proportional to
+    strength**power. varies: whether its optics differ from image to image. noise_realisations: number of noise
+    realisations over which its change is averaged; 0 if the change does not depend on noise.
     """
 
     strength: float
@@ -98,8 +98,8 @@ class Effect:
     ) -> Plane | None:
         """Change the fraction of each fine pixel [y, x] of a window that the occulter covers.
 
-        share: this fraction; None: that of a disc that does not move. place: the position of the disc. first, shape: the first
-        detector pixel (y, x) and the size of the window. The default returns `share`.
+        share: this fraction; None: the fraction that a disc at rest covers. place: the position of the disc. first,
+        shape: the first detector pixel (y, x) and the size of the window. The default returns `share`.
         """
         return share
 

@@ -43,9 +43,9 @@ class Glass:
     """The known part of the PSF: the diffraction by a pupil and the orders of a mesh. Its sum is 1.
 
     kind: SYNTHETIC, or the name of an instrument whose mount and meshes are built. size_px: size of the array in detector
-    pixels. The other fields describe a synthetic pattern. core_px, wing_px: exponential scales of its core, which is far
-    narrower than a pixel as for a telescope at this wavelength, and of its wing. wing_share, arm_share: the fractions of the
-    light in the wing and in the orders of the mesh. pitch_px: the spacing of the orders.
+    pixels. The other fields describe a synthetic pattern. core_px, wing_px: the exponential scales of its core and of
+    its wing; the core is far narrower than a pixel, as in a real telescope at this wavelength. wing_share, arm_share:
+    the fractions of the light in the wing and in the orders of the mesh. pitch_px: the spacing of the orders.
     """
 
     kind: str
@@ -100,8 +100,9 @@ def _add_spot(plane: Kernel, x_px: float, y_px: float, light: float) -> None:
 def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel:
     """The convolved patterns of mount, entrance mesh and filter-wheel mesh of an instrument, with a changed entrance mesh.
 
-    The pattern of the entrance mesh is computed separately, so that only this mesh is rotated. The convolution therefore
-    blurs its orders by the pupil a second time. The known PSF of the case contains the same blur.
+    The pattern of the entrance mesh is computed separately, so that only this mesh is rotated. This pattern already
+    contains the blur by the pupil; the convolution adds this blur a second time. The known PSF of the case contains the
+    same blur.
     """
     instrument = load_instrument(name)
     entrance = next(mesh for mesh in instrument.meshes if mesh.place == "entrance")
@@ -190,7 +191,7 @@ def fine_optics(law: ScatterTruth, glass: Glass, size_px: int) -> FineOptics:
 
 
 def scaled_scatter(falloff: Kernel, law: ScatterTruth, amplitude: float) -> Kernel:
-    """The fine scatter kernel, as Eq. (2), for a falloff [y, x].
+    """The fine scatter kernel of Eq. (2) with another falloff [y, x] in place of the power law.
 
     The central pixel is set so that the central pixel of the binned kernel is 1 - total.
     """
@@ -223,7 +224,8 @@ def binned_glass(glass: Glass) -> Kernel:
 
 
 def _triangle() -> NDArray[np.float64]:
-    """The weights in Eq. (1) along one axis: the fraction of pairs of fine pixels, of two detector pixels, with a given offset."""
+    """The weights in Eq. (1) along one axis, for each offset: the fraction of pairs (s, t) of fine pixels with this
+    offset."""
     return np.asarray(1 - np.abs(np.arange(1 - FINE, FINE)) / FINE)
 
 

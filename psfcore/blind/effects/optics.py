@@ -165,7 +165,7 @@ def _blurred(optics: FineOptics, blur: Plane) -> FineOptics:
 
 
 def _square(reach_px: float, finer: int) -> tuple[Plane, Plane]:
-    """x (1, n) and y (n, 1) of samples up to reach_px, in detector px. Each fine pixel has `finer` samples along each axis."""
+    """Coordinates of samples up to reach_px, in detector px: x (1, n) and y (n, 1). A fine pixel has `finer` samples per axis."""
     half = int(np.ceil(reach_px * FINE)) + 1
     at = (np.arange((2 * half + 1) * finer) + 0.5) / finer - half - 0.5
     return at[None, :] / FINE, at[:, None] / FINE

@@ -92,7 +92,8 @@ class Nonlinearity(Effect):
 
 @dataclass(frozen=True)
 class ColumnSmear(Effect):
-    """Every pixel gets a fraction of the mean of its column, and of the light of the pixels that it passes in the readout."""
+    """Every pixel gets a fraction of the mean of its column, and of the pixels that its charge passes during the
+    readout."""
 
     passed: float = 0.5
 
@@ -114,7 +115,7 @@ class ColumnSmear(Effect):
 
 @dataclass(frozen=True)
 class Persistence(Effect):
-    """A fraction of each of the last four images, of any pointing, remains in an image and decays with time."""
+    """An image contains a fraction of the four preceding images, of any pointing. The fraction decays with time."""
 
     decay_s: float = 300.0
 

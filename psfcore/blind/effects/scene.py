@@ -90,9 +90,9 @@ class SceneEvolution(Effect):
 class OutOfFieldLight(Effect):
     """In each pointing, a bright band beyond one edge of the field scatters light into the field.
 
-    strength: brightness of the band, times the entry of `levels` for the pointing. The band is half as wide as the field,
-    and begins a twelfth of the field beyond the edge. edges: the edge of each pointing; 0 left, 1 right, 2 below, 3 above.
-    b_px, c, a: parameters of the power law that scatters the light of the band.
+    strength: the brightness of the band in a pointing is `strength` times the entry of `levels`. The band is half as
+    wide as the field, and begins a twelfth of the field beyond the edge. edges: the edge of each pointing; 0 left, 1
+    right, 2 below, 3 above. b_px, c, a: parameters of the power law that scatters the light of the band.
     """
 
     edges: tuple[int, ...] = (0, 1, 1)

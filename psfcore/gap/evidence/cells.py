@@ -7,9 +7,9 @@ of this function in one pass:
 
     a . r = q . y,   q = a - (2 - G^T H^T) G^T (1 - D) H^T a        Eq. (1)
 
-An effect that changes the image by e therefore changes the cell by q . e, a sum over pixels. For an error of the gain
-common to all pixels, q . e is close to 0. The noise of a cell has two parts: the noise of the disc itself, and the noise
-of the scene that scatters into the disc. The covariance of two cells contains both parts:
+An effect that changes the image by e therefore changes the cell by q . e, a sum over pixels. If e is an error of the
+gain that is the same for all pixels, q . e is close to 0. The noise of a cell has two parts: the noise of the disc
+itself, and the noise of the scene that scatters into the disc. The covariance of two cells contains both parts:
 
     cov(a_1 . r, a_2 . r) = sum over all pixels of q_1 q_2 var(y)    Eq. (2)
 
@@ -96,7 +96,7 @@ def sensitivities(optics: Optics, dark: Pixels, weights: Matrix) -> Planes:
 
 
 def whitening(covariance: Matrix) -> Matrix:
-    """The whitening matrix of a covariance (n, n): it scales values with this covariance to unit noise. Zeros for no noise."""
+    """The whitening matrix of a covariance (n, n): it scales values with this covariance to unit noise. It is 0 if there is no noise."""
     values, vectors = np.linalg.eigh(covariance)
     if values[-1] <= 0:
         return np.zeros_like(covariance)
@@ -109,8 +109,8 @@ class DiscCells:
 
     index: the number of the frame among all frames. residual: observed minus expected (cells,), DN/s. expected: the light that
     the model predicts (cells,), DN/s. covariance: Eq. (2). jacobian: (columns, cells), DN/s for one unit of a parameter.
-    pixels, radius, azimuth: as in `Cells`. level_before: `level` before the light of an effect was subtracted from the
-    image, DN/s; None if nothing was subtracted.
+    pixels, radius, azimuth: as in `Cells`. level_before: the value of `level` before the light of an effect was
+    subtracted from the image, DN/s; None if nothing was subtracted.
     """
 
     index: int

@@ -1,16 +1,18 @@
-"""The discrepancy: what the data could show that no effect of the library describes.
+"""The discrepancy: a change of the data that stands for a cause outside the library.
 
-A discrepancy changes the means of the discs, their cells or the unocculted blocks smoothly along what these are ordered by:
-position on the detector, time, intensity, exposure time, pointing, radius and azimuth. It is a sum of Legendre polynomials
-along each of these orders, times the expected light, with random coefficients. It is independent of the library and of
-the images: it changes the data themselves, and a cause with any of these orders resembles it.
+A discrepancy changes the means of the discs, their cells or the unocculted blocks smoothly along one or several
+properties. These properties are called orders: position on the detector, time, intensity, exposure time, pointing,
+radius and azimuth. The discrepancy is a sum of Legendre polynomials along each order, times the expected light, with
+random coefficients. It does not depend on the library or on the images. A cause that varies along one of the orders
+resembles it.
 
-A cause may also follow no order at all: then every disc has its own change, every block of the detector has its own change
-that is the same in all readouts, or both. These alternatives have many coefficients, so they are probable only if every
-other hypothesis leaves much more than noise.
+A cause may also follow no order. The alternatives for this case are: every disc has its own change; every cell of every
+disc has its own change; every block of the detector has its own change, which is the same in all readouts. These
+alternatives have many coefficients, so they are probable only if the residuals after every other hypothesis are much
+larger than the noise.
 
-One order may vary, or several. Each set of orders in ALTERNATIVES is one way in which the data may depart from the model;
-the hypothesis "unknown" is all of them with equal probability.
+Each set of orders in ALTERNATIVES is one alternative: the data vary along all orders of the set. The hypothesis "unknown"
+contains all alternatives with equal probability.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ DEGREE = 3
 DETECTOR = ("x", "y")
 OF_DISCS = (*DETECTOR, "time", "intensity", "exposure", "pointing", "radius", "azimuth")
 OF_BLOCKS = ("unocculted_time", "unocculted_exposure", "unocculted_intensity")
-# Without any order: each disc by itself, its cells too, and each block of the detector in every readout.
+# Changes without any order: one for each disc, one for each cell of each disc, one for each block of the detector.
 EACH_DISC, EACH_CELL, EACH_READOUT = "disc", "cell", "readout"
 ALTERNATIVES: tuple[tuple[str, ...], ...] = (
     ("x",),
@@ -59,7 +61,7 @@ ALTERNATIVES: tuple[tuple[str, ...], ...] = (
     (EACH_READOUT,),
     (EACH_DISC, EACH_READOUT),
 )
-# What each order is called in a report.
+# The words for each order in a report.
 WORDS = {
     "x": "the position along detector x",
     "y": "the position along detector y",

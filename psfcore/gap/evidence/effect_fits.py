@@ -1,4 +1,4 @@
-"""The linear fit of some effects, as a report states it: parameters, gain and p-value.
+"""The linear fit of one or several effects, as a report states it: parameters, gain and p-value.
 
 The gain of an effect is the decrease of chi2 when its parameters are fitted together with the PSF. From noise alone, a
 free parameter gains a chi2 variable with one degree of freedom, and the parameters of a random field gain less
@@ -28,7 +28,7 @@ class EffectFit:
     """The linear fit of one effect, or of several effects, together with the PSF.
 
     values: value, error and unit of each parameter; the key is "parameter", or "effect.parameter" if there are several
-    effects. gain: the decrease of chi2. p_value: of the gain. step: the fit.
+    effects. gain: the decrease of chi2. p_value: the p-value of the gain. step: the fit.
     """
 
     names: tuple[str, ...]

@@ -38,7 +38,7 @@ AT_ONCE = 16  # number of fields that are processed together
 
 @dataclass(frozen=True)
 class ImageInfo:
-    """The circumstances of one image, which are its values on the axes.
+    """The properties of one image: its values on the axes.
 
     described: whether the neighbouring images in time show the scene around the occulter; the fitted position of the occulter
     is then reliable.
@@ -60,8 +60,8 @@ class Evidence:
     """All the data that a diagnosis uses.
 
     effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns that
-    every fit contains. discs: one for each image that the fit used. image_info: one for every image. untestable: the reasons
-    why effects cannot be tested, by name. numbers: `Change.numbers` by column.
+    every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every image,
+    used or not. untestable: the reasons why effects cannot be tested, by name. numbers: `Change.numbers` by column.
     """
 
     effects: tuple[Effect, ...]
@@ -158,7 +158,7 @@ def gather(
 def _changes(
     view: View, library: Sequence[Effect]
 ) -> tuple[list[Change], dict[str, tuple[int, ...]], dict[str, str]]:
-    """Three results: the changes of all effects in one list; the indices in this list by effect; the reasons by untestable effect."""
+    """Three results: the changes of all effects in one list; their indices by effect; why effects are untestable, by effect."""
     changes: list[Change] = []
     columns: dict[str, tuple[int, ...]] = {}
     untestable: dict[str, str] = {}

@@ -34,7 +34,7 @@ class ExpectedGap:
 
 
 def simulated(view: View, seed: int) -> Transit:
-    """The transit, with images simulated from the fitted model and its scenes, with noise. seed: of the noise."""
+    """The transit with simulated images: the fitted model and its scenes, plus noise. seed: the seed of the noise."""
     solution = view.solution
     transit, optics = solution.transit, solution.optics
     frames = []

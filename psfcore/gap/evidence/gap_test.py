@@ -1,7 +1,8 @@
 """The p-value of a gap: the probability of residuals at least as large as these if there is no gap.
 
-Four tests of the fit of the PSF alone: chi2 of the patterns that a gap of any cause produces (`patterns`), of the means of
-the discs, of all cells, and of the blocks of the unocculted field. The smallest p-value counts, times the number of tests.
+The fit of the PSF alone is tested with four values of chi2: of the patterns that a gap of any cause produces
+(`patterns`), of the means of the discs, of all cells, and of the blocks of the unocculted field. The result is the
+smallest p-value of these tests, times the number of tests.
 """
 
 from __future__ import annotations

@@ -1,27 +1,30 @@
-"""The ideal observer: what noise-free images of a transit could tell about the cause of a gap.
+"""The ideal observer: how well noise-free images of a transit distinguish the hypotheses about the cause of a gap.
 
 An ideal observer knows the noise and the form of every effect, but not the PSF, the scene, the brightness of the images and
 the strength of the effect. Let d be the gap of noise-free images: the residuals in the cells of the discs and the levels of
 the unocculted blocks, with the effect minus without it. J_h are the responses to the PSF and to the parameters of the effects
-of hypothesis h. With the covariance C of photon and read noise, hypothesis h leaves
+of hypothesis h. C is the covariance of photon and read noise. After
+the fit of hypothesis h, the chi2 of the remaining gap is
 
-    chi2_h = min over theta of (d - J_h theta)^T C^-1 (d - J_h theta)                    Eq. (1)
+    chi2_h = min over theta of (d - J_h theta)^T C^-1 (d - J_h theta)          Eq. (1)
 
-of the gap. This is the distance of h from the truth: over many noise realisations, chi2 of h exceeds chi2 of the truth by
+This is the distance of h from the truth: over many noise realisations, the chi2 of h exceeds the chi2 of the truth by
 chi2_h on average, with a standard deviation of 2 sqrt(chi2_h). For the hypothesis without any effect, chi2_h is the
-noncentrality: what remains of the gap after the PSF is refitted. Scene and brightness are eliminated from the blocks as in
-`unocculted_blocks`; a parameter that cannot be negative is not negative here.
+noncentrality: the chi2 of the gap that remains after the PSF is refitted. Scene and brightness are eliminated from the
+blocks as in `unocculted_blocks`. A parameter that cannot be negative is fitted with this limit.
 
-The residuals without the effect are what the sampling on pixels causes. They are subtracted, because the ideal observer knows
-them; they come from a fit of their own. All discs are where the images without the effect show them: an effect that moves the
-found places of the occulters, such as a changing Sun, does not change what is compared.
+In images without the effect, only the sampling on pixels causes residuals. The ideal observer knows these residuals, so
+they are subtracted. A separate fit to the images without the effect gives them. The positions of all discs are also
+those of this fit. An effect that shifts the fitted positions, such as a changing Sun, therefore does not change which
+pixels are compared.
 
-Two kinds of effect adapt to the data. A random field has many parameters, and the template of a changing Sun is measured in the
-images. They pay for this freedom on average
+Two kinds of effect adapt to the data. A random field has many parameters, and the template of a changing Sun is
+measured in the images. This freedom has a cost, in units of chi2. Its mean over noise realisations is
 
     cost = sum of [ln(1 + l) - l / (1 + l)] + (MEASURED - 1) n                            Eq. (2)
 
-with l of `linear_model`, Eq. (3), and n the numbers that were measured to build the template (`likelihood`).
+where l are the eigenvalues of Eq. (3) in `linear_model`, and n is the number of values that were measured to build the
+template (`likelihood`).
 
 The effects are used to first order, at the PSF that was fitted to the images with the effect.
 """
@@ -54,7 +57,7 @@ SCHEMA = "gap-ideal/1"
 
 @dataclass(frozen=True)
 class Left:
-    """What one hypothesis leaves. effects: that act together; empty: no effect. chi2: Eq. (1). cost: Eq. (2)."""
+    """One hypothesis: the effects that act together (empty: no effect), chi2 of Eq. (1), and cost of Eq. (2)."""
 
     effects: tuple[str, ...]
     chi2: float
@@ -63,12 +66,12 @@ class Left:
 
 @dataclass(frozen=True)
 class IdealObserver:
-    """What noise-free images of a transit could tell.
+    """What an ideal observer could know about a transit.
 
-    left: of every hypothesis: no effect, one effect of the library, or two. left_after_refit_pct: the residual that the effect
-    leaves in the discs, percent, rms over images. sampling_chi2: chi2 of the residuals that the sampling causes in the discs,
-    after the PSF is refitted; they are not part of `left`. untestable: why an effect of the library is in no hypothesis, by
-    name.
+    left: one entry for every hypothesis: no effect, one effect of the library, or two. left_after_refit_pct: the
+    residual that the effect leaves in the discs, percent, rms over images. sampling_chi2: chi2 of the residuals that
+    the sampling causes in the discs, after the PSF is refitted; they are not part of `left`. untestable: the reasons
+    why effects of the library are in no hypothesis, by name.
     """
 
     left: tuple[Left, ...]
@@ -78,7 +81,7 @@ class IdealObserver:
 
     @property
     def noncentrality(self) -> float:
-        """What remains of the gap after the PSF is refitted."""
+        """The chi2 of the gap that remains after the PSF is refitted, without any effect in the model."""
         return self.left[0].chi2
 
     def to_json(self) -> dict[str, Any]:
@@ -103,12 +106,12 @@ def ideal_observer(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> IdealObserver:
-    """What the ideal observer of a transit could know. Both transits: noise-free images, with the noise that real ones have.
+    """What the ideal observer of a transit could know. Both transits: noise-free images that state the noise of real ones.
 
     Raises the errors of `psfcore.scatter.inversion.invert`, and "bad-effects".
     """
     found = invert(with_effects, threads=threads, progress=progress)
-    # Not started at the PSF of `found`: a strong effect can move it so far that the way back is lost.
+    # This fit does not start at the PSF of `found`: a strong effect can change that PSF so much that the fit would fail.
     clean = invert(without_effects, threads=threads, progress=progress)
     solution = _at_places_of(clean, found)
     evidence = gather(solution, library, progress=progress)
@@ -132,7 +135,7 @@ def ideal_observer(
 
 
 def left_by_hypotheses(model: LinearModel) -> tuple[Left, ...]:
-    """What every hypothesis leaves of the residuals of a model: no effect, every effect, every pair of effects."""
+    """chi2 and cost of every hypothesis for the residuals of a model: no effect, every effect, every pair of effects."""
     effects = model.evidence.effects
     single = [(effect,) for effect in effects]
     return tuple(_left(model, some) for some in [(), *single, *itertools.combinations(effects, 2)])
@@ -189,10 +192,10 @@ def _sampling_residuals(evidence: Evidence, solution: Solution, clean: Solution)
 
 
 def _without_sampling(seen: UnoccultedBlocks, clean: UnoccultedBlocks) -> UnoccultedBlocks:
-    """Blocks with an effect, without those differences between images that also exist without the effect.
+    """Blocks of images with an effect, minus the differences between images that also exist without the effect.
 
-    The prior of the brightness gets the width that it would have in images with noise: otherwise noise-free images would say
-    that the brightness is known exactly, which no observer of real images can know.
+    The prior of the brightness gets the width that it would have in images with noise. Otherwise the brightness would
+    be known exactly from the noise-free images; from real images it is never known exactly.
     """
     levels = seen.levels.copy()
     for pointing in np.unique(seen.pointing):
@@ -206,7 +209,7 @@ def _without_sampling(seen: UnoccultedBlocks, clean: UnoccultedBlocks) -> Unoccu
 
 
 def _chi2_in_discs(model: LinearModel, residuals: Sequence[Vector]) -> float:
-    """chi2 of some residuals in the cells of the discs, after the coordinates of the PSF are refitted to them."""
+    """chi2 of these residuals in the cells of the discs, after the coordinates of the PSF are refitted to the residuals."""
     base = list(model.evidence.base)
     seen = np.concatenate([disc.white @ one for disc, one in zip(model.discs, residuals, strict=True)])
     jacobian = np.concatenate([disc.jacobian[base].T for disc in model.discs])

@@ -5,27 +5,30 @@
 y are the residuals in the cells of the discs and the levels of the unocculted blocks. theta are the coordinates of the PSF
 and the parameters of the effects. No template is exact: delta is its relative error, a Gaussian of width TEMPLATE_ERROR.
 One delta is common to all cells of a disc (or all blocks of an image) and one belongs to each cell (or block); their
-variance is added to that of the noise. The scene and the brightness of each image are parameters of the unocculted blocks,
-as in `unocculted_blocks`.
+variance is added to the variance of the noise. The scene and the brightness of each image are parameters of the
+unocculted blocks, as in `unocculted_blocks`.
 
 ln det of the covariance, which the template error raises, counts as a part of chi2.
 
-The noise itself is known only to the relative error scale_error of one simulation, and no hypothesis describes a changing
-Sun completely. Let chi2 be that of the n numbers of the discs, or of the blocks. With nu = 2 / scale_error^2,
+The noise itself is known only to the relative error scale_error of one simulation, and no hypothesis describes a
+changing Sun completely. Let chi2 be the chi2 of the n numbers of the discs, or of the n numbers of the blocks. With
+nu = 2 / scale_error^2,
 
     s = (nu + chi2) / (nu + n),    ln L = (nu + n) (s^-k - 1) / (2 k),  k = CORRELATED    Eq. (2)
 
-For s near 1 this is -chi2 / 2 plus a constant. What a hypothesis leaves far beyond the noise is not independent from block
-to block; Eq. (2) therefore counts it less, and a misfit that every hypothesis has decides nothing.
+For s near 1 this is -chi2 / 2 plus a constant. Residuals far above the noise are correlated between blocks.
+Eq. (2) therefore gives them less weight, so that a misfit of all hypotheses does not decide between the hypotheses.
 
 The strengths are integrated out. Near the best fit ln L is a quadratic form with the normal matrix N, and a parameter has a
 Gaussian prior of width w, its likely size times one of SCALES with equal probability:
 
     ln E = ln L + ln det(1 + w N w)^-1/2 + terms of the prior                             Eq. (3)
 
-N is the normal matrix of the strengths with the PSF free (its Schur complement). The integral is that of Laplace. A parameter that cannot be negative has a half Gaussian. A hypothesis whose template was
-chosen among many pays the logarithm of their number. Each number that was measured in the blocks to build a template adds
-MEASURED to their chi2: it gains 1 from noise alone, and nothing is known of its likely size.
+N is the normal matrix of the strengths with the PSF free (its Schur complement). The integral is computed in the
+Laplace approximation. The prior of a parameter that cannot be negative is half a Gaussian. If a template was chosen
+among many, the logarithm of their number is subtracted from ln E. For each number that was measured in the blocks to
+build a template, MEASURED is added to the chi2 of the blocks: noise alone lowers this chi2 by 1 for each number, and
+the likely size of the number is unknown.
 """
 
 from __future__ import annotations
@@ -61,7 +64,7 @@ class Directions:
     """Further columns: changes of the data that no effect of the library makes.
 
     discs: (discs, cells, columns), DN/s, with the cells of `LinearModel.evidence`, padded with zeros. unocculted: (columns,
-    images, blocks), DN/s. width: of their prior.
+    images, blocks), DN/s. width: the width of the prior of each column.
     """
 
     discs: Planes
@@ -74,8 +77,10 @@ class Weighed:
     """A hypothesis after its fit.
 
     log_evidence: ln E of Eq. (3), up to a constant that all hypotheses of one model share; minus infinity if no parameter can
-    act. columns: of the parameters that act, without those of the PSF. values: their best values. visible_error: chi2 that
-    a template error of TEMPLATE_ERROR of what is not subtracted would add in all data: above 1, first order is not enough.
+    act. columns: the columns of the parameters that act, without the coordinates of the PSF. values: their best values.
+    visible_error: the chi2 that a relative error TEMPLATE_ERROR of the template would add in all data. It counts only
+    the part of the template that was not subtracted. If it is above `settled.VISIBLE`, the first order is not accurate
+    enough.
     """
 
     log_evidence: float
@@ -103,7 +108,7 @@ class _Part:
 
 
 class Likelihood:
-    """The likelihood of hypotheses about the data of a linear model. further: columns that follow those of the evidence."""
+    """The likelihood of hypotheses about the data of a linear model. further: columns that follow the columns of the evidence."""
 
     def __init__(self, model: LinearModel, further: Directions | None = None) -> None:
         evidence = model.evidence
@@ -138,8 +143,8 @@ class Likelihood:
     ) -> Weighed:
         """Weigh the hypothesis that some effects act. effects: the columns of each effect.
 
-        trials: the number of templates among which those of the effects were chosen. subtracted: what a full refit subtracted
-        from the images, by column; the fitted values are then those of the remainder.
+        trials: the number of templates among which the templates of the effects were chosen. subtracted: the amounts
+        that a full refit subtracted from the images, by column; the fitted values are then the remaining amounts.
         """
         groups = [list(group) for group in effects]
         out = dict(zip((c for g in groups for c in g), subtracted, strict=True)) if len(subtracted) else {}
@@ -181,14 +186,14 @@ class Likelihood:
         )
 
     def gained(self, decrease: Vector) -> Vector:
-        """The gain of ln L, Eq. (2), if chi2 of the discs decreases by these amounts to the value that noise alone has."""
+        """The gain of ln L from Eq. (2) if chi2 of the discs decreases by these amounts, down to the value for noise alone."""
         whole = self._stiffness + self._cells
         return np.asarray(whole * (1 - (1 + decrease / whole) ** -CORRELATED) / (2 * CORRELATED))
 
     def fitted(self, columns: Sequence[int], values: Sequence[float]) -> tuple[Vector, Matrix]:
         """Two results of a fit of the columns of one effect: their values (of any sign), and the covariance.
 
-        values: about the values that the fit finds; the template error is that of this strength.
+        values: approximately the values that the fit finds; they set the template error.
         """
         first = len(self._base)
         theta = np.concatenate([np.zeros(first), np.asarray(values, dtype=np.float64)])
@@ -274,7 +279,7 @@ class Likelihood:
             size, log_det = np.sqrt(np.diag(normal) + prior), 0.0
             log_det = float(np.linalg.slogdet((normal + np.diag(prior)) / np.outer(size, size))[1])
             log_det += 2 * float(np.log(size).sum())
-            # The PSF has no prior: what it could be must not count, because it differs between refits.
+            # The PSF has no prior. The volume of its coordinates must not count, because it differs between refits.
             log_det -= float(np.linalg.slogdet(normal[:base, :base])[1])
             quadratic = float(step @ normal @ step - 2 * gradient @ step + prior @ (whole + step) ** 2)
             above = (whole + step)[base:][positive] / np.sqrt(np.diag(inverse)[base:][positive])

@@ -61,7 +61,7 @@ class Whitened:
 class Step:
     """A linear fit of some columns (parameters).
 
-    values: the fitted parameters. covariance: of the values. fall: the decrease of chi2 by all columns together.
+    values: the fitted parameters. covariance: their covariance. fall: the decrease of chi2 by all columns together.
     """
 
     columns: tuple[int, ...]
@@ -131,7 +131,7 @@ class LinearModel:
         return means(self.evidence)
 
     def fit(self, columns: Sequence[int], equations: tuple[Matrix, Vector] | None = None) -> Step:
-        """Fit the coordinates of the PSF and these columns. equations: as from `equations` (None: of all images)."""
+        """Fit the coordinates of the PSF and these columns. equations: a result of `equations` (None: for all images)."""
         here = [*self.evidence.base, *columns]
         normal, score = self.equations() if equations is None else equations
         normal, score = normal[np.ix_(here, here)] + np.diag(self._prior[here]), score[here]

@@ -36,7 +36,8 @@ TRUSTED = 0.15  # the stated noise is used if the ratio of variances differs fro
 class MeasuredNoise:
     """The noise that the images show.
 
-    noise: from the fitted line. ratio: measured variance divided by stated variance, the median over all blocks. blocks: the
+    noise: photon gain and read noise from the fitted line. ratio: measured variance divided by stated variance, the
+    median over all blocks. blocks: the
     number of blocks.
     """
 

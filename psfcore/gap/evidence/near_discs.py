@@ -84,7 +84,7 @@ class NearDiscs:
     def of_copies(self, n: int, image: Field, displacements: Sequence[tuple[int, int]]) -> Plane:
         """The response of the cells of disc n to copies of an image [y, x], in units of their noise (cells, copies).
 
-        displacements: of each copy, whole pixels (x, y).
+        displacements: the displacement of each copy, in whole pixels (x, y).
         """
         (top, left), planes = self._corners[n], self._planes[n]
         copies = [cut(image, top - dy, left - dx, self._size).ravel() for dx, dy in displacements]

@@ -45,12 +45,12 @@ FLICKERING = 4.0  # a block flickers if its chi2 per degree of freedom exceeds t
 class UnoccultedBlocks:
     """The blocks of all images. Arrays have the shape (images, blocks) and the unit DN/s, if not stated otherwise.
 
-    levels: the mean of each block, with the hidden light added. variance: the variance of the noise plus that of the floor,
-    (DN/s)^2. free: whether a block is away from the disc and from filled pixels. means: the mean of each block in the mean
-    image of the pointing. errors: (columns, images, blocks), the change by one unit of the parameter of each column.
-    pointing: (images,). kind: (images,), one number for each combination of pointing, gain mode and exposure. part:
-    (images,), whether an image is used. across: the number of blocks in a row of blocks. given_gain_width: the width of the
-    prior of g_n; None: the spread of g_n in these images.
+    levels: the mean of each block, with the hidden light added. variance: the variance of the noise plus the variance
+    of the floor, (DN/s)^2. free: whether a block is away from the disc and from filled pixels. means: the mean of each
+    block in the mean image of the pointing. errors: (columns, images, blocks), the change by one unit of the parameter
+    of each column. pointing: (images,). kind: (images,), one number for each combination of pointing, gain mode and
+    exposure. part: (images,), whether an image is used. across: the number of blocks in a row of blocks.
+    given_gain_width: the width of the prior of g_n; None: the spread of g_n in these images.
     """
 
     levels: Matrix

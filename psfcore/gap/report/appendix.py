@@ -123,7 +123,7 @@ def made_of(found: Diagnosis, report: Report) -> list[Part]:
                 "floor",
                 f"{100 * FLOOR:g}",
                 unit="%",
-                meaning="relative error, common to all cells of a disc, that allows for unknown causes",
+                meaning="relative error common to all cells of a disc; it accounts for causes that are in no model",
             ),
             Value(
                 "calibration",

@@ -8,13 +8,14 @@ from psfcore.gap.verdict.limits import ALIKE, EffectLimits, Limits
 
 NOT_FOUND = "not found"
 STATED = (
-    "Detected: the strength that the answer would contain, without “no gap”, with a probability of 90 %. Excluded: the true strength is larger "
-    "with a probability of at most 5 %, if the effect acts as the library describes it. The strength is the value of the "
-    "parameter while the other parameters of the effect are 0."
+    "Detected: an effect of this strength would be found with a probability of 90 %; the answer then contains the effect and "
+    "excludes “no gap”. Excluded: the true strength is larger than this value with a probability of at most 5 %, if the effect "
+    "acts as the library describes it. The strength is the value of the parameter while the other parameters of the effect are 0."
 )
 DISTANCE = (
-    f"The distance is what a fit of the second effect leaves of the first one at the strength that would be found, in sigma. "
-    f"Below {ALIKE:g} the images could not tell the two effects apart."
+    "The distance of two effects, in sigma: the first effect acts with the strength that would be found, and the second effect is "
+    "fitted to its change of the images. The distance is the square root of the remaining chi2. "
+    f"Below {ALIKE:g} sigma the images cannot tell the two effects apart."
 )
 
 
@@ -47,7 +48,7 @@ def alike_parts(found: Limits) -> list[Part]:
 
 
 def _matrix(found: Limits) -> Details:
-    """The distances of all pairs; a column has the number of its effect."""
+    """A table of the distances of all pairs. The number at the top of a column is the number of the effect in its row."""
     names, distances = list(found.effects), found.distances
     rows = []
     for k, name in enumerate(names):

@@ -321,7 +321,7 @@ def _effects_figure(report: Report) -> Figure:
         effects_png(report),
         f"The effects of the library, the most probable first (at most {MOST_EFFECTS}). Each bar is the closure by one effect: the fraction of the gap in "
         "held-out images that disappears when the effect is added to the model. The line is its 90 % interval; an arrow marks where the chart cuts it. Blue: the named effects, or the tied effects. A wrong effect may also close much of a gap, so the probability decides. "
-        "The probability is that of the effect acting alone or with another effect; for a pair it is that of the pair.",
+        "The probability in the row of an effect is the probability that it acts, alone or with another effect. In the row of a pair, both effects act.",
         "Bars of held-out closure by effect",
     )
 

@@ -11,13 +11,13 @@ from psfcore.gap.verdict.limits import ALIKE, EffectLimits
 
 SEARCHED = "*"
 STRENGTH = (
-    "A strength is found if, with 90 % probability, the answer of a diagnosis contains the effect and excludes “no effect”. "
-    "It is the value of the named parameter while the other parameters of the effect are 0. The simulated Sun does not change; "
-    "a Sun that changes during the transit hides stronger effects."
+    "An effect of this strength would be found with a probability of 90 %: the answer of the diagnosis then contains the effect "
+    "and excludes “no effect”. The strength is the value of the named parameter while the other parameters of the effect are 0. "
+    "The simulated Sun does not change; a Sun that changes during the transit hides stronger effects."
 )
 OF_SEARCH = (
-    f"{SEARCHED} The effect searches for its position or form; the strength holds for the one that the search found in the "
-    "simulated images."
+    f"{SEARCHED} The effect searches for its position or form; the strength holds for the position or form that the search "
+    "found in the simulated images."
 )
 
 
@@ -38,7 +38,7 @@ def plan_page(found: Planned) -> Page:
 
 
 def sentence(found: Planned) -> str:
-    """What the reader meets first."""
+    """The summary sentence of the page."""
     limits = found.limits
     visible = sum(_is_credible(one) for one in limits.effects.values())
     pairs = len(limits.alike)

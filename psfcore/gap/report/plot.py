@@ -90,7 +90,11 @@ def map_png(report: Report) -> bytes:
 
 
 def draw_map(figure: Any, charts: Sequence[Any], report: Report) -> None:
-    """Draw the map without effects on the first chart; with the named effects, on the same scale, on the second chart, if any."""
+    """Draw the residual of each image at the position of its disc on the detector.
+
+    First chart: the fitted model without effects. Second chart, if there is one: the model with the named effects, on
+    the same colour scale.
+    """
     rows = report["images"]
     before, after = _column(rows, "residual_pct"), _column(rows, "residual_after_pct")
     top = _scale(before, _column(rows, "noise_pct"))

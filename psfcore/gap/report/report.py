@@ -118,7 +118,10 @@ def fits_of(report: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, Any]:
-    """The parameters of the shape. covariance: of its coordinates, from the linear model; the errors therefore contain the floor."""
+    """The parameters of the shape, with errors that contain the floor of the linear model.
+
+    covariance: the covariance of the coordinates, from the linear model.
+    """
     values, sigma = inversion.values, np.sqrt(np.diag(covariance))
     return {
         p.name: {
@@ -241,7 +244,7 @@ def sentence(found: Diagnosis) -> str:
 
 
 def _not_excluded(judged: Judgement) -> str:
-    """What the answer set contains beyond the verdict, as a sentence; empty if there is nothing."""
+    """A sentence about the hypotheses in the answer set that the verdict does not name; empty if there are none."""
     decided = 1 if judged.verdict == "none" else len(judged.deciding)
     others = judged.members[decided:]
     return f" These data do not exclude {_listed(others, judged)}." if others else ""
@@ -271,7 +274,7 @@ def hypothesis_words(names: Names) -> str:
 
 
 def percent_words(share: float) -> str:
-    """A probability as text. It is never written as certain."""
+    """A probability as text. The text never says 0 % or 100 %."""
     percent = 100 * share
     if percent >= 99.5:
         return "> 99 %"

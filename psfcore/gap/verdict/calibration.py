@@ -1,7 +1,7 @@
 """The calibration: which hypotheses belong to the answer set, from simulated cases of known cause.
 
-The answer set contains the hypotheses whose probability is at least a threshold. Among n simulated cases, let the
-probability that the posterior gave to the true cause be known. Then
+The answer set contains the hypotheses whose probability is at least a threshold. The threshold follows from n simulated
+cases, whose true causes are known. For each case, take the probability that the posterior gave to the true cause. Then
 
     threshold = the k-th smallest of these probabilities,  k = floor((n + 1) (1 - coverage))      Eq. (1)
 

@@ -172,7 +172,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
 
 
 def _deviance(left: Vector, jacobian: Vector, covariance: Vector) -> float:
-    """Eq. (4). left: residuals (n,) in units of the noise. jacobian: (parameters, n). covariance: of the parameters."""
+    """Eq. (4). left: residuals (n,) in units of the noise. jacobian: (parameters, n). covariance: their covariance."""
     values, vectors = np.linalg.eigh(covariance)
     along = (np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T) @ jacobian
     inner = np.eye(values.size) + along @ along.T
@@ -226,7 +226,7 @@ def closure(
 
 
 def fall(before: HeldOut, after: HeldOut) -> float:
-    """The deviance of `before` minus that of `after`, Eq. (4), summed over the folds that both contain.
+    """The deviance (Eq. (4)) of `before` minus the deviance of `after`, summed over the folds that both contain.
 
     It is positive if `after` predicts the held-out images better.
     """

@@ -37,9 +37,9 @@ WORSE_SHARE = 0.05
 class Corrected:
     """A full refit with effects in the model.
 
-    values: value, error and unit of each parameter of the effects; the value is summed over all rounds. subtracted: by effect,
-    what was subtracted from the images in the last round, by parameter. model: the linear model at the refit. rounds: number
-    of rounds made.
+    values: value, error and unit of each parameter of the effects; the value is summed over all rounds. subtracted: the
+    amounts of the parameters that were subtracted from the images in the last round, by effect. model: the linear model
+    at the refit. rounds: number of rounds made.
     """
 
     effects: tuple[Effect, ...]
@@ -275,10 +275,10 @@ def hold(effect: Effect, view: View) -> Effect:
 
 
 def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
-    """The evidence `after` an effect was subtracted, with the noise of cells and blocks from `before` the subtraction.
+    """The evidence `after`, in which an effect is subtracted, with the noise of cells and blocks of the evidence `before`.
 
-    The subtraction removes the light of the effect from the images, but not the photon noise of this light. Percentages also
-    keep their reference level.
+    The subtraction removes the light of the effect from the images, but not the photon noise of this light. The
+    reference level of percentages is also taken from `before`.
     """
     were = {disc.index: disc for disc in before.discs}
     discs = []

@@ -10,15 +10,18 @@ eigenvectors V. The decrease of chi2 by the fit of h is a weighted sum of noncen
 
 In place of q_h / 2, the code uses the gain of Eq. (2) of `evidence.likelihood`, which is a little smaller.
 o_h contains the prior probability of h, the number of templates among which it chose, and ln 2 for a parameter that cannot be
-negative. d^2 is the noncentrality. The cumulants of q_h are c_r = sum of w_i^r (1 + r d_i^2), without the factor 2^(r-1) (r-1)!.
-Its quantiles follow from those of chi2 by the first three cumulants (Imhof 1961, Biometrika 48, 419), and the latter by the
-formula of Wilson & Hilferty. Where the prior has several widths, Eq. (2) is averaged over them.
+negative. The noise-free gain of h is the sum of w_i d_i^2. The cumulants of q_h are c_r = sum of w_i^r (1 + r d_i^2),
+without the factor 2^(r-1) (r-1)!. The quantiles of q_h follow from the quantiles of a chi2 variable with the same first
+three cumulants (Imhof 1961, Biometrika 48, 419), and these from the formula of Wilson & Hilferty. If the prior has
+several widths, Eq. (2) is averaged over them.
 
-found_90 is the smallest strength at which the effect belongs to the answer, and "no effect" does not, if the q_h of all hypotheses have
-their 10 % quantiles. These q_h vary together where the hypotheses are alike; those of other hypotheses hardly count.
+found_90 is the smallest strength at which the effect belongs to the answer and "no effect" does not, computed with the
+10 % quantile of every q_h. Hypotheses that resemble the effect have q_h that vary together with its own; the q_h of
+other hypotheses hardly count.
 
-The strength of a random field is the standard deviation of its coefficients. The coefficients then are random too, so that q_h
-has the covariance N_HH + t^2 N_HE S^2 N_EH in place of a noncentrality; S are the likely sizes of the coefficients.
+The strength of a random field is the standard deviation of its coefficients. Because the coefficients are random, the
+change by the effect is random too. It adds to the covariance of the scores of h, which becomes N_HH + t^2 N_HE S^2
+N_EH; E are the columns of the field, and S are the likely sizes of its coefficients.
 
 excluded_95 is the 95 % quantile of the strength after the fit of the effect: a Gaussian with the fitted value and its error,
 cut at 0 for a parameter that cannot be negative. The error contains the template error of `evidence.likelihood`.
@@ -79,16 +82,16 @@ class ParameterLimits:
 
 @dataclass(frozen=True)
 class EffectLimits:
-    """The limits of one effect: of each parameter, while the other parameters are 0."""
+    """The limits of one effect: one entry for each parameter, valid if the other parameters are 0."""
 
     effect: str
     parameters: tuple[ParameterLimits, ...]
 
     @property
     def leading(self) -> ParameterLimits:
-        """The parameter that stands for the effect: the first that would be found at its likely size.
+        """The parameter whose limits are stated for the effect: the first whose found_90 is at most its likely size.
 
-        If there is none, it is the parameter that would be found at the smallest multiple of its likely size.
+        If there is none, it is the parameter with the smallest ratio of found_90 to likely size.
         """
 
         def multiple(one: ParameterLimits) -> float:
@@ -98,7 +101,7 @@ class EffectLimits:
         return first or min(self.parameters, key=multiple)
 
     def as_json(self) -> dict[str, Any]:
-        """The limits of the leading parameter; those of all parameters, if there are several."""
+        """The limits of the leading parameter. If the effect has several parameters, the limits of all parameters are added."""
         found = {"parameter": self.leading.name} | self.leading.as_json()
         if len(self.parameters) > 1:
             found["parameters"] = {one.name: one.as_json() for one in self.parameters}
@@ -107,7 +110,7 @@ class EffectLimits:
 
 @dataclass(frozen=True)
 class Alike:
-    """Two effects that these data cannot tell apart. distance: in sigma. would_separate: an observation that would."""
+    """Two effects that these data cannot tell apart. would_separate: an observation that would tell them apart."""
 
     pair: tuple[str, str]
     distance: float
@@ -120,7 +123,11 @@ class Alike:
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits of all effects, by name. distances: of every pair of effects, in sigma. untestable: the reasons, by name."""
+    """The limits of all effects, by name.
+
+    distances: the distance of every pair of effects, in sigma. alike: the pairs that the data cannot tell apart.
+    untestable: the reasons why effects cannot be tested, by name.
+    """
 
     effects: Mapping[str, EffectLimits]
     distances: Mapping[tuple[str, str], float]
@@ -157,8 +164,9 @@ def limits(
 ) -> Limits:
     """The limits of all effects.
 
-    threshold, temperature, prior: of the answer and of the posterior. observed: whether the residuals of the model are data, so
-    that they exclude strengths.
+    threshold: the smallest probability of a hypothesis in the answer set. temperature, prior: the temperature and the
+    prior of the posterior. observed: whether the residuals of the model come from real data. Only then they can exclude
+    strengths.
     """
     every = model.evidence.effects
     endless = [e.name for e in every if not all(math.isfinite(p.likely) for p in e.parameters)]
@@ -183,15 +191,16 @@ def limits(
 
 @dataclass(frozen=True)
 class _Need:
-    """What a hypothesis needs to belong to the answer."""
+    """The condition under which a hypothesis belongs to the answer. threshold, temperature: as in `limits`."""
 
     threshold: float
     temperature: float
 
     def margin(self, log_odds: Matrix, own: int) -> Vector:
-        """At least 0 where hypothesis `own` belongs to the answer and "no effect" does not.
+        """One number for each strength: 0 or more if hypothesis `own` belongs to the answer and "no effect" does not.
 
-        log_odds: (strengths, hypotheses), of each hypothesis against "no effect".
+        Otherwise the number is negative. log_odds: (strengths, hypotheses), ln of the weight of each hypothesis divided
+        by the weight of "no effect".
         """
         against = log_odds / self.temperature
         whole = logsumexp(np.pad(against, ((0, 0), (0, 1))), axis=1)
@@ -205,7 +214,7 @@ class _Need:
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """The columns of a hypothesis. widths: of the prior (scales, columns). offset: o_h of Eq. (2)."""
+    """The columns of a hypothesis. widths: the widths of the prior (scales, columns). offset: o_h of Eq. (2)."""
 
     columns: NDArray[np.intp]
     widths: Matrix
@@ -275,8 +284,8 @@ class _Limits:
             return None
         change = self._normal[:, column]
         positive = [p.positive for p in effect.parameters[: self._of[effect.name].size]]
-        # A fit leaves out a positive parameter that it finds negative. For a parameter that is 0 this is as probable as not, so
-        # that the mean of ln E is between that of all parameters and that of those that cannot be left out.
+        # A fit leaves out a positive parameter if its fitted value is negative. If the true value is 0, this happens in half of
+        # all cases. ln E is therefore the mean of two values: with all parameters, and without those that may be left out.
         fewer = [m for m in range(len(positive)) if m == k or not positive[m]]
         own = (self._single[effect.name], self._hypothesis(effect, fewer))
         sided = math.log(2) if positive[k] else 0.0
@@ -372,7 +381,7 @@ class _Limits:
         return out
 
     def _distance(self, acting: Effect, fitted: Effect, at: ParameterLimits) -> float | None:
-        """The chi2, as its square root, that `fitted` leaves of the change by `acting` at its found_90."""
+        """The square root of the chi2 that remains if `fitted` is fitted to the change by `acting` with the strength found_90."""
         if at.found_90 is None:
             return None
         rival = self._single[fitted.name]
@@ -411,8 +420,8 @@ def _odds_of(
 ) -> Callable[[Vector], Vector]:
     """A function of the strength: Eq. (2) with the 1 - FOUND quantile of q_h.
 
-    change: the columns of N that belong to what acts: one for a fixed change, several for a random field. gained: the gain of
-    ln L by a decrease of chi2.
+    change: the columns of N of the parameters that act: one column for a fixed change, several for a random field.
+    gained: the gain of ln L by a decrease of chi2.
     """
     inner = normal[np.ix_(hypothesis.columns, hypothesis.columns)]
     spread, cumulants = [], []
@@ -471,7 +480,7 @@ def _quantile_of_sum(cumulants: Matrix, probability: float) -> Vector:
 
 
 def _first_found(margin: Callable[[Vector], Vector], unit: float, most: float) -> float | None:
-    """The smallest strength whose margin is at least 0; None if there is none up to `most`. unit: the error of the strength."""
+    """The smallest strength, up to `most`, whose margin is at least 0; None if there is none. unit: the error of the strength."""
     if most <= WEAKEST_TRIED * unit:
         return None
     tried = np.geomspace(WEAKEST_TRIED * unit, min(STRONGEST_TRIED * unit, most), TRIED)

@@ -1,12 +1,12 @@
 """The posterior: a probability for every hypothesis about the cause of the gap.
 
-The hypotheses are: no effect acts (`NONE`), one effect of the library acts, two act together, or something acts that is
-not in the library (`UNKNOWN`, `evidence.discrepancy`). The evidence of each is that of `evidence.likelihood`:
+The hypotheses are: no effect acts (`NONE`); one effect of the library acts; two effects act together; a cause outside
+the library acts (`UNKNOWN`, `evidence.discrepancy`). `evidence.likelihood` computes the evidence E of each hypothesis:
 
     p(h) ~ prior(kind of h) / (number of hypotheses of this kind) * E(h)              Eq. (1)
 
-The linear model holds only for a small effect. A full refit replaces the evidence of a hypothesis by that at the refit, and
-the evidence of all pairs with a refitted effect by that of the library at the refit.
+The linear model holds only for a small effect. A full refit of a hypothesis therefore gives this hypothesis a new
+evidence. If a single effect was refitted, all pairs with this effect get a new evidence too.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Kind = Literal["none", "single", "pair", "unknown"]
 NONE: Names = ()
 UNKNOWN: Names = ("unknown",)  # no effect may have this name
 KINDS: tuple[Kind, ...] = ("none", "single", "pair", "unknown")
-# Prior probabilities of the kinds: as often as not there is no gap or one that the library does not contain.
+# Prior probabilities of the kinds. With a probability of one half there is no gap, or its cause is not in the library.
 PRIOR: Mapping[Kind, float] = {"none": 0.35, "single": 0.4, "pair": 0.1, "unknown": 0.15}
 
 
@@ -63,7 +63,7 @@ class Posterior:
         return _sorted(dict(zip(names, shares.tolist(), strict=True)))
 
     def with_evidence(self, evidence: Mapping[Names, Weighed], effects: int) -> Posterior:
-        """The same posterior with another evidence of some hypotheses. effects: the number of effects in the library."""
+        """The same posterior with a new evidence for the given hypotheses. effects: the number of effects in the library."""
         weights = {names: w.log_evidence + _log_prior(names, effects) for names, w in evidence.items()}
         errors = {names: w.visible_error for names, w in evidence.items()}
         return replace(
@@ -72,10 +72,11 @@ class Posterior:
 
 
 def without_idle(probabilities: Mapping[Names, float]) -> dict[Names, float]:
-    """The probabilities after every pair that is less probable than one of its effects alone is counted to that effect.
+    """The probabilities, with the improbable pairs merged into single effects.
 
-    The data then do not show the second effect. A single effect therefore stands for this effect, alone or with another
-    effect that these data do not show.
+    If a pair is less probable than one of its effects alone, its probability is added to that effect: the data then do
+    not show the second effect. A single effect in the result means this effect alone, or together with an effect that
+    the data do not show.
     """
     out = dict(probabilities)
     for names, share in probabilities.items():
@@ -120,10 +121,10 @@ def at_refit(
     taken: Mapping[str, Sequence[float]],
     effects: Sequence[Effect],
 ) -> dict[Names, Weighed]:
-    """The evidence at a full refit: of the refitted hypothesis, and of the pairs that contain a single refitted effect.
+    """The evidence from a full refit, for the refitted hypothesis and, after a refit of a single effect, for its pairs.
 
-    refit: the linear model at the refit, with the effects that may act. before: the linear model without any effect. taken: by
-    effect, what the refit subtracted from the images, by parameter.
+    refit: the linear model at the refit, with the effects that may act. before: the linear model without any effect.
+    taken: the amounts of the parameters that the refit subtracted from the images, by effect.
     """
     after = _with_blocks_of(before.evidence, refit.evidence, taken)
     refit = replace(refit, evidence=after)
@@ -134,10 +135,10 @@ def at_refit(
 
 
 def _with_blocks_of(before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]]) -> Evidence:
-    """The evidence of a refit, with the blocks from before it, from which the change by the effects is subtracted.
+    """The evidence of a refit, with other blocks: the blocks from before the refit, minus the change by the effects.
 
-    The images of a refit have less noise if a smooth change that follows each image was subtracted, for example a halo: the
-    blocks would show less noise, and this would count for the effect.
+    The change by some effects, for example a halo, is computed from each image and contains a part of its noise. If it
+    is subtracted from the images, their blocks have less noise, and this would wrongly count in favour of the effect.
     """
     first = {effect.name: effect for effect in before.effects}
     blocks = before.unocculted
@@ -161,7 +162,7 @@ def weigh(
     names: Names,
     taken: Mapping[str, Sequence[float]] | None = None,
 ) -> Weighed:
-    """Weigh the hypothesis that some effects act. taken: as for `at_refit`."""
+    """Weigh the hypothesis that the effects `names` act together. taken: as in `at_refit`."""
     by_name = {effect.name: effect for effect in evidence.effects}
     # An effect that is fitted for each pointing may have fewer or more changes than parameters.
     columns = [

@@ -1,4 +1,4 @@
-"""The full refits of a diagnosis. Each is made only once."""
+"""The full refits of a diagnosis. Each refit is made only once and then kept."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ VISIBLE_SIGMA = 2.0
 
 
 class Refits:
-    """Full refits of a fit with effects in the model. view: of the fit. model: its linear model. failures: sentences."""
+    """Full refits with effects in the model. view, model: the view and the linear model of the fit. failures: sentences."""
 
     def __init__(
         self, view: View, model: LinearModel, progress: Progress = lambda stage, step, steps: None
@@ -53,10 +53,11 @@ class Refits:
 
     @property
     def departures(self) -> dict[Names, float]:
-        """How far each refit of a visible effect departs from first order: the template error, measured.
+        """The measured template error of each refit: how far the refit differs from the first order.
 
-        The rms difference between what the linear fit and the refit leave in the cells, in units of the change of the cells by the
-        effect. Without those refits whose effects change the cells by less than VISIBLE_SIGMA, because noise dominates there.
+        It is the rms difference between the residuals of the linear fit and of the refit in the cells, divided by the
+        rms change of the cells by the effect. If the effects change the cells by less than VISIBLE_SIGMA, noise
+        dominates, and the refit is left out.
         """
         out = {}
         for names, made in self._made.items():
@@ -92,7 +93,7 @@ class Refits:
         return self._made[names]
 
     def _start(self, effects: Sequence[Effect]) -> EffectFit:
-        """The linear fit from which a refit starts: with every parameter, if an effect would keep none of its parameters."""
+        """The linear fit from which a refit starts. If an effect would lose all its parameters, the fit keeps all parameters."""
         start = fit_effects(self._model, effects)
         kept = set(start.step.columns)
         if all(kept.intersection(self._model.evidence.columns[effect.name]) for effect in effects):

@@ -1,9 +1,10 @@
 """The settled posterior: the linear model is replaced by full refits where it is not exact enough.
 
-A plausible hypothesis is refitted if an error of its template (`likelihood.TEMPLATE_ERROR`) would be visible in the data. The most
-probable one comes first. Before a pair, the more probable of its effects is refitted alone: this also weighs all pairs with this effect,
-and a strong effect that is not linear can make a pair look better than the effect alone. The refits end when no plausible
-hypothesis needs one.
+A plausible hypothesis is refitted if an error of its template (`likelihood.TEMPLATE_ERROR`) would be visible in the
+data. The most probable hypothesis comes first. Before a pair is refitted, the more probable of its effects is refitted
+alone, for two reasons: this refit also gives the evidence of all pairs with this effect; and a strong effect that is
+not linear can make a pair look more probable than the effect alone. The refits end when no plausible hypothesis needs a
+refit, or after MOST_REFITS refits.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ MOST_REFITS = 4  # a pair, its two effects, and a rival
 VISIBLE = 9.0  # a template error is visible if it adds this much to chi2
 PLAUSIBLE = 0.02
 
-# A function that makes a full refit of a hypothesis. It returns the evidence at the refit, of this hypothesis and of the
-# others that the refit also tests; None if the refit failed.
+# A function that makes a full refit of a hypothesis. It returns the evidence of this hypothesis, and of the other
+# hypotheses that the refit also tests; None if the refit failed.
 Refit = Callable[[Names], "Mapping[Names, Weighed] | None"]
 
 

@@ -34,9 +34,10 @@ LEAST_IMAGES = 6
 class Judgement:
     """The verdict of a diagnosis, and the probabilities from which it follows.
 
-    answer: the effects that the verdict names; for `inconclusive`, those of the most probable hypothesis that names effects,
-    which are not certain, or empty. members: the answer set, the most probable hypothesis first. deciding: those members that
-    decide the verdict. coverage: of the set.
+    answer: the effects that the verdict names. For `inconclusive`, these are the effects of the most probable
+    hypothesis that names effects, and they are not certain; empty if there is no such hypothesis. members: the answer
+    set, the most probable hypothesis first. deciding: the members that
+    decide the verdict. coverage: the coverage of the answer set.
     hypotheses: the probability of each hypothesis, the most probable first, after `posterior.without_idle`. effects: the
     probability that each effect acts, alone or with another; also of "none" and "unknown". orders: `Posterior.orders`.
     failed: the hypotheses whose full refit failed.

@@ -7,7 +7,8 @@ the axes can be added (Shapley value).
 
 The p-value of an axis comes from random sign flips: each flip reverses the sign of the residuals of random images. A flip counts
 if this axis alone then decreases chi2 at least as much as for the true residuals. The p-value is the fraction of flips that
-count, times the number of axes. If the brightness of the unocculted field gives a smaller p-value, this one is used.
+count, times the number of axes. If the brightness of the unocculted field gives a smaller p-value, that p-value is
+used.
 """
 
 from __future__ import annotations
@@ -239,7 +240,7 @@ def _fall_of(of: _Normal, columns: list[int]) -> float:
 def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
     """The decrease of chi2 by these columns, minus their number, at least 0.
 
-    scores: right-hand sides of the normal equations (flips, columns); the result has one value for each row.
+    scores: right-hand sides of the normal equations (flips, columns). The result has one value for each flip.
     """
     if not columns:
         return np.zeros(scores.shape[0])

@@ -157,8 +157,8 @@ def _sum_strips(
 def _running_sums(image, top, first, running):  # type: ignore[no-untyped-def]
     """P of Eq. (2) for the four rows that begin at `top`, at indices that begin at `first`.
 
-    P is constant beyond the columns of the image. Beyond the last row of the image, the last row is used again. The four
-    independent sums hide the latency of each addition.
+    P is constant beyond the columns of the image. If fewer than four rows remain, the last row of the image fills the
+    rest; the caller does not use these copies. The four independent sums hide the latency of each addition.
     """
     ny, nx = image.shape
     places = running.shape[1]

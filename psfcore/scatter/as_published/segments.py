@@ -160,8 +160,9 @@ class Segments:
 
         kernel_function: returns the weights at the offsets (dx, dy), which are two arrays in px of the same shape. Beyond
         32 px, pixels are grouped into cells; the side of a cell is about a sixteenth of its distance from the
-        centre. Four points represent a cell. Their mean and covariance are those of the cell's pixels. For power laws, also stretched ones, the result
-        has a relative error of at most 1e-5, compared with the mean over all pixels that `mean_of_map` computes (tested).
+        centre. Four points represent a cell. Their mean and covariance are those of the cell's pixels. For power laws,
+        also stretched ones, the result has a relative error of at most 1e-5, compared with the mean over all pixels
+        that `mean_of_map` computes (tested).
         """
         nodes = self._nodes
         return self._mean(nodes, kernel_function(nodes.dx, nodes.dy))

@@ -115,9 +115,10 @@ def solution_of(
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Solution:
-    """The given solution, or the one that the given function makes; None: that of `invert`.
+    """The given solution, or the solution that the given function makes. If nothing is given, `invert` makes it.
 
-    Raises DataError "other-solution" if the given solution is of other images, noise, diffraction PSF or shape.
+    Raises DataError "other-solution" if the given solution was made from other images, noise or diffraction PSF, or
+    with another shape.
     """
     if not isinstance(given, Solution):
         make: Inverter = invert if given is None else given

@@ -1,8 +1,8 @@
-"""Write the solution of a transit to a file, and read it back bit for bit.
+"""Write the solution of a transit to a file, and read it back without any change of its numbers.
 
 The file is a zip archive without compression: one .npy file per array, and solution.json with everything else. It
-contains only what `invert` computed. Images, noise and diffraction PSF come from the transit, so that a solution can be
-read only together with the transit of which it was made. The PSF at the solution is computed from the coordinates.
+contains only what `invert` computed. Images, noise and diffraction PSF come from the transit. A solution can therefore
+be read only together with the transit from which it was made. The PSF at the solution is computed from the coordinates.
 
 | array | content |
 |---|---|
@@ -38,12 +38,12 @@ from psfcore.whole_files import whole_file
 MOST_BYTES = 4 * 2**30  # of a file; S3 takes up to 5 GiB in one request
 MOST_JSON_BYTES = 2**24
 _JSON = "solution.json"
-_HEADER_BYTES = 4096  # more than a .npy header needs
+_HEADER_BYTES = 4096  # no .npy header is longer
 
 
 @dataclass(frozen=True)
 class _FrameLight:
-    """The numbers of a FrameFit that are neither arrays nor part of its frame."""
+    """The single numbers of a FrameFit. Its arrays and its frame are stored elsewhere."""
 
     observed: float
     expected: float
@@ -53,7 +53,7 @@ class _FrameLight:
 
 @dataclass(frozen=True)
 class _Contents:
-    """The content of solution.json. found: of every frame of the transit; lights: of the frames in part."""
+    """The content of solution.json. found: one entry for each frame of the transit. lights: one for each fitted frame."""
 
     version: Literal[1]
     shape: str
@@ -118,9 +118,10 @@ def _arrays(solution: Solution) -> Iterator[tuple[str, NDArray[Any]]]:
 
 
 def read_solution(path: Path, transit: Transit, *, threads: int = 1) -> Solution:
-    """The solution in a file, with the transit of which it was made.
+    """Read a solution from a file. transit: the transit from which the solution was made.
 
-    Raises DataError "bad-solution" if the file is damaged, of an unknown version, or of another transit; and OSError.
+    Raises OSError, and DataError "bad-solution" if the file is damaged, has an unknown version, or belongs to another
+    transit.
     """
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -142,13 +143,13 @@ def _first_line(error: Exception) -> str:
 
 
 class _Members:
-    """The members of an archive. Each is read only if its size is what is expected. Raises ValueError."""
+    """The members of an archive. A member is read only if it has the expected size; otherwise ValueError is raised."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive = archive
 
     def contents(self) -> _Contents:
-        """What solution.json says."""
+        """The content of solution.json."""
         contents = _CONTENTS.validate_python(json.loads(self._bytes(_JSON, MOST_JSON_BYTES)))
         assert isinstance(contents, _Contents)
         return contents
@@ -176,7 +177,7 @@ class _Members:
     def _array(
         self, name: str, dtype: np.dtype[Any], shape: tuple[int | None, ...], most: int | None = None
     ) -> NDArray[Any]:
-        """An array of this type and shape. None in the shape: any length; then its data may have `most` bytes."""
+        """An array of this type and shape. None in the shape stands for any length; the data may then have up to `most` bytes."""
         sizes = [n for n in shape if n is not None]
         limit = int(np.prod(sizes)) * dtype.itemsize if most is None else most
         with self._open(f"{name}.npy", limit + _HEADER_BYTES) as member:
@@ -193,7 +194,7 @@ class _Members:
             return bytes(member.read())
 
     def _open(self, name: str, most: int) -> Any:
-        """A member to read, if it has at most this many bytes."""
+        """Open a member for reading. Raises ValueError if it has more than `most` bytes."""
         info = self._info(name)
         if info.compress_type != zipfile.ZIP_STORED or info.file_size > most:
             raise ValueError(

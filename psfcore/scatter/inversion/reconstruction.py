@@ -70,7 +70,7 @@ class TransitScenes:
         found: list[FoundPlace],
         dark: list[Pixels],
     ) -> TransitScenes:
-        """The scenes of an earlier reconstruction of a transit. optics: only for the order of the engine."""
+        """The scenes of an earlier reconstruction of a transit. optics: used only for the memory order of the engine."""
         sky = cls.__new__(cls)
         sky.transit, sky.scenes, sky.found, sky.dark = transit, scenes, found, dark
         sky.observed = [optics.lanes(frame.pixels) for frame in transit.frames]
@@ -187,7 +187,7 @@ class Reconstruction:
         return pixel_weight(self.transit, n, expected)
 
     def jacobian(self, n: int, slope: Blur) -> Vector:
-        """The derivative of the expected dark pixels of image n, from Eq. (4). slope: derivative of the total PSF."""
+        """The derivative of the expected light in the dark pixels of image n, from Eq. (4). slope: derivative of the total PSF."""
         return jacobian_row(self.optics, slope, self.blanked_scene(n), self.sky.dark[n])
 
 
@@ -198,7 +198,7 @@ def pixel_weight(transit: Transit, n: int, expected: Vector) -> Vector:
 
 
 def jacobian_row(optics: Optics, slope: Blur, blanked: Lanes, dark: Pixels) -> Vector:
-    """The derivative of the expected dark pixels with respect to one coordinate: Eq. (4) with the opposite sign."""
+    """The derivative of the expected light in the dark pixels with respect to one coordinate: minus Eq. (4)."""
     changed = slope.convolve(blanked)
     scene = optics.invert_once(changed)
     put(scene, dark, 0.0)

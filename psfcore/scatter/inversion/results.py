@@ -98,7 +98,7 @@ class Inversion:
 
 @dataclass(frozen=True, eq=False)
 class Solution(Reconstruction):
-    """An inversion together with its scenes and optics, for later analyses. part: in the order of inversion.frames."""
+    """An inversion together with its scenes and optics, for later analyses. part: ordered like inversion.frames."""
 
     inversion: Inversion
 
@@ -107,7 +107,7 @@ class Solution(Reconstruction):
 class SolutionWithoutErrors(Reconstruction):
     """A fit to some images of a transit, without errors. left_out: files that the fit could not use, with the reasons.
 
-    The scenes of images outside the fit are those of the solution from which the fit started.
+    The scenes of images outside the fit are taken from the solution from which the fit started.
     """
 
     coordinates: Vector

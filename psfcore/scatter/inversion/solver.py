@@ -94,8 +94,9 @@ class Solver:
             reasons = "; ".join(f"{file}: {why}" for file, why in list(left_out.items())[:3])
             raise DataError(
                 "too-few-frames",
-                f"expected at least {LEAST_FRAMES} images with an occulter in them; got {len(frames)}"
-                + (f" ({reasons})" if reasons else ""),
+                f"expected at least {LEAST_FRAMES} images with a usable occulter; got {len(frames)}"
+                + (f" ({reasons})" if reasons else "")
+                + ": check the positions in transit.json, or add images",
             )
         return frames
 
@@ -159,7 +160,7 @@ class Solver:
         return measured
 
     def _measure_one(self, model: _Model, n: int, kept: _Slopes | None) -> _Measured:
-        """Compute Eq. (1) for one image. Compute Eq. (3) and (4) too, unless those of an earlier round are reused."""
+        """Compute Eq. (1) for one image. If `kept` is given, reuse its weights and Jacobian; otherwise compute Eq. (3) and (4)."""
         sky, optics = self._sky, model.optics
         dark, observed = sky.dark[n], sky.observed[n]
         scene = optics.invert(observed, sky.scenes[n], steps=WARM_STEPS)  # step (d)

@@ -24,9 +24,8 @@ the formula:
 
 There are two estimates of the error of an excess. The first is the spread over the samples, which contains the noise of
 the images. This spread is too small if a weight is at its lower bound of zero, or if only the prior determines a shell.
-The second estimate follows from the covariance matrix of
-the free fit. This matrix ignores the bounds and includes the prior. The
-larger of the two estimates is used.
+The second estimate follows from the covariance matrix of the free fit. This matrix ignores the bounds and includes the
+prior. The larger of the two estimates is used.
 
 | symbol | name |
 |---|---|
@@ -137,7 +136,9 @@ def bootstrap_samples(images: int, *, runs: int = RUNS, seed: int = 1) -> tuple[
     """
     blocks = folds(images)
     if not blocks:
-        raise DataError("too-few-images", f"expected at least 6 images for held-out blocks; got {images}")
+        raise DataError(
+            "too-few-images", f"expected at least 6 images for held-out blocks; got {images}: add images"
+        )
     rng = np.random.default_rng(seed)
     return tuple(
         _bootstrap_sample(run, fold, blocks, images, rng)
@@ -167,7 +168,7 @@ def shared_fits(
 ) -> tuple[FoldFit, ...]:
     """The PSFs of all samples by Eq. (1), from the solution of all images.
 
-    Images that the solution did not use do not count in any sample. Raises DataError "transit-says-too-little" if a
+    Images that the solution did not use are left out of all samples. Raises DataError "transit-says-too-little" if a
     sample does not determine all parameters.
     """
     inversion = solution.inversion
@@ -201,7 +202,7 @@ def shared_step(solution: Solution, sample: FoldSample) -> Vector:
     if not counted or np.linalg.cond(normal) > 1e12:
         raise DataError(
             "transit-says-too-little",
-            f"run {sample.run}, fold {sample.fold}: expected images that determine all parameters; got too few",
+            f"run {sample.run}, fold {sample.fold}: expected images that determine all parameters; got too few: add images",
         )
     return np.asarray(np.linalg.solve(normal, np.sum([k * f.score for k, f in counted], axis=0)))  # Eq. (1)
 
