@@ -106,7 +106,9 @@ def looks_like(judged: Judgement) -> list[tuple[str, float]]:
 
 
 def order_words(orders: Names) -> str:
-    """A change along some orders of the data, as text."""
+    """A change along some orders of the data, or one that resembles an effect, as text."""
+    if orders[:1] == UNKNOWN:
+        return f"a change that resembles {orders[1].replace('_', ' ')}"
     if len(orders) > MOST_ORDERS:
         return "a change along many orders of the data"
     return "a change that varies with " + " and ".join(WORDS[order] for order in orders)

@@ -1,12 +1,16 @@
 """The posterior: a probability for every hypothesis about the cause of the gap.
 
-The hypotheses are: no effect acts (`NONE`); one effect of the library acts; two effects act together; a cause outside
-the library acts (`UNKNOWN`, `evidence.discrepancy`). `evidence.likelihood` computes the evidence E of each hypothesis:
+The hypotheses are: no effect acts (`NONE`); one effect of the library acts; two effects act together; three effects act
+together, of which two are the most probable pair; a cause outside the library acts (`UNKNOWN`). A cause outside the
+library changes the data along their orders (`evidence.discrepancy`), or it resembles an effect of the library: its
+change is that of the effect with a relative error of RELATED. `evidence.likelihood` computes the evidence E of each
+hypothesis:
 
     p(h) ~ prior(kind of h) / (number of hypotheses of this kind) * E(h)              Eq. (1)
 
 The linear model holds only for a small effect. A full refit of a hypothesis therefore gives this hypothesis a new
-evidence. If a single effect was refitted, all pairs with this effect get a new evidence too.
+evidence. If a single effect was refitted, all pairs with this effect get a new evidence too, and so do the triples of the
+most probable of these pairs and the cause that resembles this effect.
 """
 
 from __future__ import annotations
@@ -21,26 +25,31 @@ import numpy as np
 from scipy.special import logsumexp
 
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.discrepancy import ALTERNATIVES, discrepancy
+from psfcore.gap.evidence.discrepancy import ALTERNATIVES, RELATED, discrepancy
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Likelihood, Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 
 Names = tuple[str, ...]
-Kind = Literal["none", "single", "pair", "unknown"]
+Kind = Literal["none", "single", "pair", "triple", "unknown"]
 
 NONE: Names = ()
 UNKNOWN: Names = ("unknown",)  # no effect may have this name
-KINDS: tuple[Kind, ...] = ("none", "single", "pair", "unknown")
+KINDS: tuple[Kind, ...] = ("none", "single", "pair", "triple", "unknown")
 # Prior probabilities of the kinds. With a probability of one half there is no gap, or its cause is not in the library.
-PRIOR: Mapping[Kind, float] = {"none": 0.35, "single": 0.4, "pair": 0.1, "unknown": 0.15}
+PRIOR: Mapping[Kind, float] = {"none": 0.35, "single": 0.4, "pair": 0.09, "triple": 0.01, "unknown": 0.15}
 
 
 def kind_of(names: Names) -> Kind:
     """The kind of a hypothesis."""
-    if names == UNKNOWN:
+    if names[:1] == UNKNOWN:
         return "unknown"
-    return KINDS[min(len(names), 2)]
+    return KINDS[min(len(names), 3)]
+
+
+def resembling(name: str) -> Names:
+    """The alternative of `UNKNOWN` that the cause resembles this effect."""
+    return (*UNKNOWN, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +57,19 @@ class Posterior:
     """The weights of all hypotheses.
 
     log_weights: ln of prior times evidence of each hypothesis, up to a common constant. visible_error: `Weighed.visible_error`
-    by hypothesis. orders: the probability of each alternative of the discrepancy if the cause is unknown.
+    by hypothesis. alternatives: the logarithms of the weights of the alternatives of which `UNKNOWN` consists: the orders of
+    a discrepancy, or `resembling`.
     """
 
     log_weights: dict[Names, float]
     visible_error: dict[Names, float]
-    orders: dict[Names, float]
+    alternatives: dict[Names, float]
+
+    @property
+    def orders(self) -> dict[Names, float]:
+        """The probability of each alternative if the cause is unknown."""
+        whole = logsumexp(list(self.alternatives.values()))
+        return {names: math.exp(weight - whole) for names, weight in self.alternatives.items()}
 
     def probabilities(self, temperature: float = 1.0) -> dict[Names, float]:
         """The probability of each hypothesis, the most probable first. temperature: divides the logarithms of the weights."""
@@ -64,27 +80,36 @@ class Posterior:
 
     def with_evidence(self, evidence: Mapping[Names, Weighed], effects: int) -> Posterior:
         """The same posterior with a new evidence for the given hypotheses. effects: the number of effects in the library."""
-        weights = {names: w.log_evidence + _log_prior(names, effects) for names, w in evidence.items()}
-        errors = {names: w.visible_error for names, w in evidence.items()}
-        return replace(
-            self, log_weights=self.log_weights | weights, visible_error=self.visible_error | errors
-        )
+        named = {names: w for names, w in evidence.items() if kind_of(names) != "unknown"}
+        weights = {names: w.log_evidence + _log_prior(names, effects) for names, w in named.items()}
+        errors = {names: w.visible_error for names, w in named.items()}
+        alternatives = dict(self.alternatives)
+        prior = _log_prior(UNKNOWN, effects) - math.log(max(len(alternatives), 1))
+        for names in evidence.keys() & alternatives:
+            alternatives[names] = evidence[names].log_evidence + prior
+        if alternatives:
+            weights[UNKNOWN] = float(logsumexp(list(alternatives.values())))
+        return Posterior(self.log_weights | weights, self.visible_error | errors, alternatives)
 
 
 def without_idle(probabilities: Mapping[Names, float]) -> dict[Names, float]:
-    """The probabilities, with the improbable pairs merged into single effects.
+    """The probabilities, with the improbable pairs and triples merged into hypotheses with fewer effects.
 
-    If a pair is less probable than one of its effects alone, its probability is added to that effect: the data then do
-    not show the second effect. A single effect in the result means this effect alone, or together with an effect that
-    the data do not show.
+    If a hypothesis is less probable than one of its effects alone, or than two of its three effects, its probability is
+    added to that hypothesis: the data then do not show the other effect. A hypothesis in the result means these effects
+    alone, or together with an effect that the data do not show.
     """
     out = dict(probabilities)
-    for names, share in probabilities.items():
-        if kind_of(names) == "pair":
-            alone = [(name,) for name in names if (name,) in probabilities]  # a failed refit leaves one out
-            likelier = max(alone, key=lambda one: probabilities[one], default=None)
-            if likelier is not None and share <= probabilities[likelier]:
-                out[likelier] += out.pop(names)
+    for names in sorted(probabilities, key=len, reverse=True):
+        if kind_of(names) not in ("pair", "triple"):
+            continue
+        fewer = [part for n in range(1, len(names)) for part in itertools.combinations(names, n)]
+        likelier = max(
+            (part for part in fewer if part in out), key=lambda part: probabilities[part], default=None
+        )
+        # A hypothesis whose refit failed is missing.
+        if likelier is not None and probabilities[names] <= probabilities[likelier]:
+            out[likelier] += out.pop(names)
     return _sorted(out)
 
 
@@ -98,20 +123,36 @@ def posterior(model: LinearModel) -> Posterior:
     further = discrepancy(evidence)
     likelihood = Likelihood(model, further.directions)
     weighed = {names: weigh(likelihood, evidence, names) for names in _hypotheses(evidence.effects)}
-    orders = {
-        orders: likelihood.weigh([columns]).log_evidence
+    weighed |= _triples(likelihood, evidence, weighed, evidence.effects)
+    unknown = {
+        orders: likelihood.weigh([columns])
         for orders in ALTERNATIVES
         if (columns := further.columns(orders, evidence.size))
     }
-    logs = np.array(list(orders.values()))
-    whole = float(logsumexp(logs))
-    count = len(evidence.effects)
-    return Posterior(
-        {names: w.log_evidence + _log_prior(names, count) for names, w in weighed.items()}
-        | {UNKNOWN: whole - math.log(logs.size) + _log_prior(UNKNOWN, count)},
-        {names: w.visible_error for names, w in weighed.items()},
-        dict(zip(orders, np.exp(logs - whole).tolist(), strict=True)),
+    unknown |= {
+        resembling(effect.name): weigh(likelihood, evidence, (effect.name,), template_error=RELATED)
+        for effect in evidence.effects
+    }
+    return Posterior({}, {}, dict.fromkeys(unknown, 0.0)).with_evidence(
+        weighed | unknown, len(evidence.effects)
     )
+
+
+def _triples(
+    likelihood: Likelihood,
+    evidence: Evidence,
+    weighed: Mapping[Names, Weighed],
+    effects: Sequence[Effect],
+    taken: Mapping[str, Sequence[float]] | None = None,
+) -> dict[Names, Weighed]:
+    """Weigh the triples that contain the most probable pair. taken: as in `at_refit`."""
+    pairs = [names for names in weighed if kind_of(names) == "pair"]
+    if not pairs:
+        return {}
+    best = max(pairs, key=lambda names: weighed[names].log_evidence)
+    others = [effect.name for effect in effects if effect.name not in best]
+    triples = [_in_order((*best, other), effects) for other in others]
+    return {names: weigh(likelihood, evidence, names, taken) for names in triples}
 
 
 def at_refit(
@@ -131,7 +172,12 @@ def at_refit(
     likelihood = Likelihood(refit)
     others = [e.name for e in effects if e.name not in names] if len(names) == 1 else []
     pairs = [_in_order((*names, other), effects) for other in others]
-    return {one: weigh(likelihood, refit.evidence, one, taken) for one in (names, *pairs)}
+    found = {one: weigh(likelihood, refit.evidence, one, taken) for one in (names, *pairs)}
+    if len(names) > 1:
+        return found
+    found |= _triples(likelihood, refit.evidence, found, effects, taken)
+    found[resembling(names[0])] = weigh(likelihood, refit.evidence, names, taken, template_error=RELATED)
+    return found
 
 
 def _with_blocks_of(before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]]) -> Evidence:
@@ -161,8 +207,13 @@ def weigh(
     evidence: Evidence,
     names: Names,
     taken: Mapping[str, Sequence[float]] | None = None,
+    *,
+    template_error: float | None = None,
 ) -> Weighed:
-    """Weigh the hypothesis that the effects `names` act together. taken: as in `at_refit`."""
+    """Weigh the hypothesis that the effects `names` act together.
+
+    taken: as in `at_refit`. template_error: as in `Likelihood.weigh`.
+    """
     by_name = {effect.name: effect for effect in evidence.effects}
     # An effect that is fitted for each pointing may have fewer or more changes than parameters.
     columns = [
@@ -175,7 +226,10 @@ def weigh(
         for value in before.get(name, (0.0,) * len(some))
     ]
     return likelihood.weigh(
-        columns, trials=math.prod(by_name[name].trials for name in names), subtracted=subtracted
+        columns,
+        trials=math.prod(by_name[name].trials for name in names),
+        subtracted=subtracted,
+        template_error=template_error,
     )
 
 
@@ -189,6 +243,6 @@ def _in_order(names: Names, effects: Sequence[Effect]) -> Names:
 
 
 def _log_prior(names: Names, effects: int) -> float:
-    count = {"none": 1, "single": effects, "pair": math.comb(effects, 2), "unknown": 1}
+    count = {"single": effects, "pair": math.comb(effects, 2), "triple": math.comb(effects, 3)}
     kind = kind_of(names)
-    return math.log(PRIOR[kind] / max(count[kind], 1))
+    return math.log(PRIOR[kind] / max(count.get(kind, 1), 1))

@@ -36,7 +36,8 @@ def with_shares(shares: Mapping[Names, float], images: int = 12) -> Diagnosis:
         (LEAST,) * 19,
         {"seed": 5, "version": "1.2.3", "command": "python -m made", "holds_for": HOLDS_FOR},
     )
-    judgement = verdict_of(Posterior(logs, {}, ORDERS), calibration, images=images)
+    orders = {order: math.log(share) for order, share in ORDERS.items()}
+    judgement = verdict_of(Posterior(logs, {}, orders), calibration, images=images)
     fits = diagnose._fits(found().model, judgement)
     shrinking = {fit.label: found().shrinking.get(fit.label, Shrinking(None, None, None)) for fit in fits}
     changed = replace(found(), judgement=judgement, calibration=calibration, fits=fits, shrinking=shrinking)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict.posterior import (
     NONE,
@@ -16,6 +17,7 @@ from psfcore.gap.verdict.posterior import (
     _with_blocks_of,
     kind_of,
     posterior,
+    resembling,
     without_idle,
 )
 from tests.psfcore.gap.linear_models import with_residuals
@@ -48,6 +50,43 @@ def test_a_pair_that_the_data_do_not_show_counts_to_its_effect() -> None:
     assert found == {("a",): pytest.approx(0.55), ("b", "c"): 0.3, NONE: 0.1, ("b",): 0.05, ("c",): 0.0}
     assert list(found) == [("a",), ("b", "c"), NONE, ("b",), ("c",)]
     assert [kind_of(names) for names in (NONE, UNKNOWN, *found)][:3] == ["none", "unknown", "single"]
+
+
+def test_a_triple_that_the_data_do_not_show_counts_to_two_of_its_effects() -> None:
+    a, ab, abc, bcd = ("a",), ("a", "b"), ("a", "b", "c"), ("b", "c", "d")
+    assert [kind_of(names) for names in (a, ab, abc)] == ["single", "pair", "triple"]
+    found = without_idle({NONE: 0.05, a: 0.1, ab: 0.4, abc: 0.2, bcd: 0.25})
+    assert found == {ab: pytest.approx(0.6), bcd: 0.25, a: 0.1, NONE: 0.05}
+    assert without_idle({NONE: 0.1, a: 0.5, ab: 0.1, abc: 0.3}) == {a: pytest.approx(0.9), NONE: 0.1}
+
+
+def test_every_third_effect_is_weighed_beside_the_most_probable_pair(evidence: Evidence) -> None:
+    both = replace(with_residuals(evidence, {"dark_offset": 300.0, "nonlinearity": 5.0}), scale_error=0.1)
+    found = posterior(both)
+    pairs, triples = ([n for n in found.log_weights if kind_of(n) == kind] for kind in ("pair", "triple"))
+    best = max(pairs, key=lambda names: found.log_weights[names])
+    assert len(triples) == len(evidence.effects) - 2 and all(set(best) < set(names) for names in triples)
+    assert all(names == tuple(e.name for e in evidence.effects if e.name in names) for names in triples)
+
+
+def test_a_cause_outside_the_library_may_resemble_an_effect(evidence: Evidence) -> None:
+    """The change of every cell differs from that of an offset by a factor of its own, so that no effect describes it."""
+    offset = strong_offset(evidence)
+    rng = np.random.default_rng(4)
+    discs = tuple(
+        replace(disc, residual=disc.residual * rng.uniform(0.5, 1.5, disc.residual.size))
+        for disc in offset.evidence.discs
+    )
+    model = replace(offset, evidence=replace(offset.evidence, discs=discs))
+    exact, near = posterior(offset), posterior(model)
+    key = resembling("dark_offset")
+    assert kind_of(key) == "unknown" and UNKNOWN not in near.alternatives
+    assert sum(near.orders.values()) == pytest.approx(1.0)
+    assert exact.probabilities()[UNKNOWN] < 0.01
+    assert near.alternatives[key] - near.log_weights[OFFSET] > exact.alternatives[key] - exact.log_weights[OFFSET] + 10
+    # A new evidence of an alternative is a part of the hypothesis "unknown".
+    again = near.with_evidence({key: Weighed(1e4, (), np.zeros(0), 0.0)}, len(evidence.effects))
+    assert again.orders[key] == pytest.approx(1.0) and next(iter(again.probabilities())) == UNKNOWN
 
 
 def test_after_a_failed_refit_a_pair_without_any_weight_counts_to_its_other_effect() -> None:
