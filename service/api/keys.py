@@ -105,7 +105,7 @@ def list_keys(
     owner: Annotated[
         str | None,
         Query(
-            max_length=64,
+            pattern=rf"^(\*|{OWNER.pattern})$",
             description="owner of the keys; `*`: all owners. Others than your own need the scope admin",
         ),
     ] = None,
