@@ -132,7 +132,8 @@ def short(identity: str) -> str:
 
 
 def remote(server: str | None) -> Client:
-    """A client of the service at ``server``, with the key that the command was given."""
+    """A client of the service at ``server``. It uses the key of the option ``--key`` or of HELIOPSF_KEY, if one is
+    given."""
     from service.client.http import Client
 
     return Client(server, key=click.get_current_context().meta.get(_KEY), say=say)
@@ -158,7 +159,8 @@ def is_psf_id(psf: str) -> bool:
 
 
 def whole_id(service: Operations, things: str, identity: str) -> str:
-    """The whole id of a thing from its first digits. things: the part of its address, such as "psfs"."""
+    """The whole id of a thing from its first digits. things: the part of the address that names the type, such as
+    "psfs"."""
     if len(identity) == DIGITS:
         return identity
     found: str = service.get(f"/v1/{things}/{identity}")["id"]

@@ -63,7 +63,7 @@ class _Source:
 
 
 def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Outcome:
-    """Deconvolve an image of a bulk run, unless its product exists.
+    """Deconvolve an image of a bulk run. If its product exists already, use this product.
 
     If another job is making the product now, wait for that job and use its product.
     """
@@ -110,7 +110,8 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
         if row is None:
             raise DataError(
                 "no-such-image",
-                f"expected the id of an uploaded image; got {taken.source}, which is not in the catalogue",
+                f"expected the id of an uploaded image; got {taken.source}, which is not in the catalogue: "
+                "upload the image first",
             )
         yield _Source(None, row.id, row.summary, row.filename or "image")
         return

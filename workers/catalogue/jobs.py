@@ -63,12 +63,13 @@ class Jobs:
         estimate: dict[str, Any] | None = None,
         quota_mib: int | None = None,
     ) -> tuple[JobRow, bool]:
-        """Queue a new job, or share the live job of an identical request; also returns whether the job is new.
+        """Queue a new job, or share the job of an identical request that is queued, executing or completed. Returns
+        the job, and whether it is new.
 
         queue: the queue of the new job; None: the default queue of the job's kind. A shared job that waits in a less
-        urgent queue moves to ``queue``. A cancelled job or a job with UWS terms is not shared: the new job then gets a
-        different key. It waits while the other job executes, and then uses the result of the other job, if there is
-        one. quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
+        urgent queue moves to ``queue``. A cancelled job or a job with UWS terms is not shared: the new job then gets
+        a different key. The new job waits while the other job executes. If the other job has a result, the new job
+        then uses this result. quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
         """
         queue = queue or queue_of(kind)
         for _ in range(3):  # between the two statements, the identical job may fail
@@ -97,10 +98,11 @@ class Jobs:
         raise RuntimeError(f"job for request {request_key} neither inserted nor found")
 
     def _shared(self, owner: str, request_key: str) -> tuple[str, JobRow | None]:
-        """Find the live job that an identical request can share; returns its key and the job.
+        """Find the queued, executing or completed job that an identical request can share; returns its key and the job.
 
-        If there is no such job, returns the key for a new job, and None. If an identical job cannot be shared, the key of
-        the new job is computed from the id of that job. Later identical requests then find the new job.
+        If there is no such job, returns the key for a new job, and None instead of a job. If an identical job cannot
+        be shared, the key of the new job is computed from the id of that job. Later identical requests then find the
+        new job.
         """
         key = request_key
         live = select(JobRow, TermsRow.job_id).outerjoin(TermsRow, TermsRow.job_id == JobRow.id)
@@ -139,7 +141,7 @@ class Jobs:
         self._set([JobRow.id == job_id, JobRow.phase == Phase.QUEUED], submitted_at=None)
 
     def claim(self, job_id: str, worker: str) -> Lease | None:
-        """QUEUED -> EXECUTING. Exactly one of the workers that try gets the lease; all others get None.
+        """QUEUED -> EXECUTING. If several workers try, exactly one gets the lease; the others get None.
 
         While another job with the same result executes, every worker gets None; the job is submitted again later.
         """
