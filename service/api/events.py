@@ -139,8 +139,9 @@ def stream(request: Request, state: Shared, caller: Caller, say: Say) -> Respons
     """A stream of the texts of ``say``, which counts as a stream of the caller until it ends.
 
     The stream ends after a text with ``last``, after ``stream_s`` seconds, when the server stops, and when the key is
-    revoked or expires. ``say`` is called every ``LOOK_EVERY_S`` seconds in a thread. If ``say`` raises SQLAlchemyError,
-    it is called again later and must then return the same news: a failed call must not change its state.
+    revoked or expires. ``say`` is called every ``LOOK_EVERY_S`` seconds in a thread. If ``say`` raises
+    SQLAlchemyError, it is called again later and must then return the same text: a failed call must not change the
+    state of ``say``.
     """
     state.streams.open(caller.name)
     ends_at = time.monotonic() + state.settings.stream_s

@@ -148,7 +148,8 @@ async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Sha
 
 @router.delete("/{job_id}", summary="UWS: abort and destroy a job", **routing.TO_JOB)
 def delete_uws_job(job_id: str, request: Request, caller: Submitting, state: Shared) -> Response:
-    """Delete the job in any phase. If a worker runs the job, the worker stops it. Its result stays in the catalogue."""
+    """Delete the job in any phase. If a worker runs the job, the worker stops it. The result of the job stays in the
+    catalogue."""
     check_own(_find(state, caller, job_id))
     state.catalogue.uws.destroy(job_id)
     return RedirectResponse(_jobs_url(request), 303)
