@@ -129,16 +129,16 @@ _SELDOM_ACCEPTS = Seldom(lambda record: record.getMessage().startswith("socket.a
 
 
 def _no_request(record: logging.LogRecord) -> bool:
-    """True unless the record is about a request that was answered without a failure of the service (status below
-    500)."""
+    """False if the record is about a request that was answered without a failure of the service (status below 500);
+    otherwise True."""
     return record.name != REQUESTS or getattr(record, "fields", {}).get("status", 500) >= 500
 
 
 def configure(settings: Settings, *, verbose: bool = False) -> None:
     """Write the logs of the process to standard error. Repeated calls change nothing.
 
-    A person who starts a service on a terminal does not see a line for each request, unless ``verbose`` is true or
-    HELIOPSF_LOG_FORMAT is set; otherwise these lines would hide the address of the service.
+    A person who starts a service on a terminal sees a line for each request only if ``verbose`` is true or
+    HELIOPSF_LOG_FORMAT is set: these lines would hide the address of the service.
     """
     stream = sys.__stderr__ or sys.stderr
     form = settings.log_format or ("text" if stream.isatty() else "json")

@@ -32,7 +32,7 @@ class Settings(BaseSettings):
     data_dir: Path = Field(
         default_factory=default_data_dir,
         description="folder of stored files and, by default, of the SQLite database; default: the user's data folder, on Linux "
-        "`~/.local/share/heliopsf`, unless `heliopsf-data` in the working folder holds data of an earlier version",
+        "`~/.local/share/heliopsf`; if `heliopsf-data` in the working folder holds data of an earlier version, that folder",
     )
     store_url: str | None = Field(
         None,
@@ -45,7 +45,7 @@ class Settings(BaseSettings):
     quota_mib: int = Field(
         0,
         ge=0,
-        description="largest size of an owner's stored files and database rows, unless the owner has a limit of its own, MiB; 0: unlimited",
+        description="largest size of an owner's stored files and database rows, MiB; 0: unlimited; `heliopsf store quota` sets another limit for an owner",
     )
     min_free_mib: int = Field(
         256,
@@ -86,7 +86,7 @@ class Settings(BaseSettings):
     reconcile_s: float = Field(
         2.0,
         gt=0,
-        description="interval at which queued jobs that the broker may have lost are searched for, s",
+        description="interval between two searches for queued jobs that the broker may have lost, s",
     )
     resubmit_s: float = Field(
         30.0, gt=0, description="time after which a queued job is sent to the broker for the second time, s"

@@ -108,7 +108,7 @@ class Bulks:
         return self._set(bulk_id, AT_WORK, phase=BulkPhase.PAUSED)
 
     def resume(self, bulk_id: str) -> bool:
-        """PAUSED, ERROR -> RUNNING, or LISTING if its files are not all listed."""
+        """PAUSED, ERROR -> RUNNING, or LISTING if not all files of the run are listed."""
         now = {"running_since": time.time(), "error": None}
         return self._set(bulk_id, STOPPED, BulkRow.listed, phase=BulkPhase.RUNNING, **now) or self._set(
             bulk_id, STOPPED, BulkRow.listed.is_(False), phase=BulkPhase.LISTING, **now
@@ -119,7 +119,8 @@ class Bulks:
         return self._set(bulk_id, OPEN, phase=BulkPhase.CANCELLED, ended_at=time.time())
 
     def delete(self, bulk_id: str) -> bool:
-        """Delete a run and its images; their products stay. False if there is no such run, or if it is LISTING or RUNNING.
+        """Delete a run and its images; their products stay. Returns False if there is no such run, or if the run is
+        LISTING or RUNNING.
 
         The run is cancelled first, so that nobody resumes it. Then its images are deleted in batches, and finally the
         run. Each batch is one transaction, which also subtracts the bytes of the batch from the owner's count. If
@@ -220,7 +221,7 @@ class Bulks:
     def begin_listing(self, bulk_id: str, lease: Lease) -> bool:
         """Begin to list the files under this lease. Files that a lost worker listed are deleted first.
 
-        False if the lease is lost or the run is not LISTING.
+        Returns False if the lease is lost or the run is not LISTING.
         """
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
@@ -236,7 +237,7 @@ class Bulks:
     def add_listed(
         self, bulk_id: str, lease: Lease, images: Sequence[Listed], quota_mib: int | None = None
     ) -> bool:
-        """Add images to a run. False if another lease now lists the files, or if the run is not LISTING.
+        """Add images to a run. Returns False if another lease now lists the files, or if the run is not LISTING.
 
         quota_mib: as for ``create``.
         """
@@ -251,7 +252,8 @@ class Bulks:
             return True
 
     def end_listing(self, bulk_id: str, lease: Lease) -> bool:
-        """LISTING -> RUNNING, or LISTING -> COMPLETED if no image is left. False under the conditions of ``add_listed``."""
+        """LISTING -> RUNNING, or LISTING -> COMPLETED if no image is left. Returns False under the conditions of
+        ``add_listed``."""
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
             if bulk is None or bulk.phase != BulkPhase.LISTING or bulk.lister != lease.token:

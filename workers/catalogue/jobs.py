@@ -183,11 +183,11 @@ class Jobs:
         )
 
     def heartbeat(self, lease: Lease) -> bool:
-        """Record that the worker is alive; False if the lease is lost or the job was cancelled."""
+        """Record that the worker is alive. Returns False if the lease is lost or the job was cancelled."""
         return self._set([*_held(lease), JobRow.cancel_requested.is_(False)], heartbeat_at=self._database.now)
 
     def progress(self, lease: Lease, stage: str, step: int, steps: int) -> bool:
-        """Store the job's progress and a heartbeat; False if the lease is lost or the job was cancelled.
+        """Store the job's progress and a heartbeat. Returns False if the lease is lost or the job was cancelled.
 
         A job counts its steps several times. A new count begins when the number of steps changes, or when the step is
         smaller than the step before. The row stores the time and the step at which the current count began; the
@@ -205,13 +205,13 @@ class Jobs:
         )
 
     def complete(self, lease: Lease, result_id: str) -> bool:
-        """EXECUTING -> COMPLETED; False if the lease is lost."""
+        """EXECUTING -> COMPLETED. Returns False if the lease is lost."""
         return self._set(
             _held(lease), phase=Phase.COMPLETED, ended_at=self._database.now, result_id=result_id, lease=None
         )
 
     def fail(self, lease: Lease, error: JobError) -> bool:
-        """EXECUTING -> ERROR; False if the lease is lost."""
+        """EXECUTING -> ERROR. Returns False if the lease is lost."""
         return self._set(
             _held(lease),
             phase=Phase.ERROR,
@@ -221,7 +221,7 @@ class Jobs:
         )
 
     def requeue(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED after a transient failure; False if the lease is lost.
+        """EXECUTING -> QUEUED after a transient failure. Returns False if the lease is lost.
 
         The job is submitted again after the waiting time of ``unsubmitted``. A cancelled job is aborted instead.
         """
@@ -229,7 +229,7 @@ class Jobs:
         return self._set(_held(lease), **self._again(), **delay)
 
     def abort(self, lease: Lease) -> bool:
-        """EXECUTING -> ABORTED, when the worker has stopped a cancelled job; False if the lease is lost."""
+        """EXECUTING -> ABORTED, when the worker has stopped a cancelled job. Returns False if the lease is lost."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(True)],
             phase=Phase.ABORTED,
@@ -248,7 +248,8 @@ class Jobs:
         )
 
     def hand_back(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED, because the worker stops. The attempt does not count. False if the lease is lost."""
+        """EXECUTING -> QUEUED, because the worker stops. The attempt does not count. Returns False if the lease is
+        lost."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(False)],
             phase=Phase.QUEUED,

@@ -50,7 +50,8 @@ class NamedFiles:
                 yield from self._in(table, solutions_from)
 
     def among(self, digests: frozenset[str]) -> frozenset[str]:
-        """Those of a few hashes to which the row of an upload, a PSF, a product, a report or a solution refers.
+        """The hashes in ``digests`` (a few) to which the row of an upload, a PSF, a product, a report or a solution
+        refers.
 
         Jobs and bulk runs are not searched. They refer to things by id, and every existing thing has a row of its own.
         """
@@ -67,9 +68,8 @@ class NamedFiles:
         return frozenset(named)
 
     def kept(self, table: type[Row]) -> Iterator[Row]:
-        """All rows of a table whose rows refer to files.
-
-        They are read in batches, so that no transaction stays open for long.
+        """All rows of a table that refers to files. The rows are read in batches, so that no transaction stays open
+        for long.
         """
         last: tuple[str, str] | None = None
         while True:

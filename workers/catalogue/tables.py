@@ -356,7 +356,7 @@ class PartRow(Base):
 
 
 class WorkerRow(Base):
-    """A running worker process. It renews its heartbeat and deletes the row when it ends."""
+    """A running worker process. The process renews its heartbeat, and deletes the row when the process ends."""
 
     __tablename__ = "workers"
     name: Mapped[str] = mapped_column(

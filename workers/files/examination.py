@@ -1,4 +1,4 @@
-"""Compare the files of the store with what the catalogue says about them."""
+"""Compare the files of the store with the rows of the catalogue."""
 
 from __future__ import annotations
 

@@ -218,7 +218,7 @@ def _linear(
 def _pixels(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> float:
     """Number of pixels of the job's transit.
 
-    If it has no transit: of its image; if it has no image either: of its PSF.
+    If the job has no transit, the number of pixels of its image; if it has no image either, of its PSF.
     """
     if parameters.get("transit_id"):
         transit = catalogue.get(TransitRow, parameters["transit_id"], owner)

@@ -63,9 +63,8 @@ class Context:
         return FitsLimits(max_pixels=self.settings.max_pixels)
 
     def made(self, table: type[Result], identity: str) -> Result | None:
-        """The result of an earlier job; None if there is no such result or if a file of it is lost.
-
-        The task then makes it.
+        """The result of an earlier job; None if there is no such result or if a file of it is lost. If the answer is
+        None, the task makes the result.
         """
         row = self.catalogue.get(table, identity, self.owner)
         return row if row is not None and intact(self.store, row) else None
