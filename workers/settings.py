@@ -228,7 +228,8 @@ class Settings(BaseSettings):
 
     @classmethod
     def apart(cls, data_dir: Path, *, gap_effects: str = "") -> Settings:
-        """Default settings with this data folder. They ignore the environment, so that they cannot touch a running service."""
+        """Default settings with this data folder. These settings ignore the environment, so that the process cannot
+        touch a running service."""
         return cls(_env_prefix="HELIOPSF_APART_", data_dir=data_dir, gap_effects=gap_effects)
 
     @property
@@ -288,7 +289,7 @@ class Settings(BaseSettings):
 
     @property
     def presence_s(self) -> float:
-        """Interval at which a worker announces itself, s. It is shorter than the lease."""
+        """Interval at which a worker announces itself, s. This interval is shorter than the lease."""
         return max(self.heartbeat_s, self.lease_s / 3)
 
     @property

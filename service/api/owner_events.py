@@ -1,14 +1,14 @@
 """All jobs and bulk runs of an owner in one stream of server-sent events: ``/v1/events``.
 
-Browsers open at most six connections to a server over HTTP/1.1. A page with one stream for each job would use all of
-them.
+Browsers open at most six connections to a server over HTTP/1.1. A page with one stream for each job would use all six.
 
-A stream reads the database every ``LOOK_EVERY_S`` seconds; the number of queries does not depend on the number of jobs.
-It remembers the last state of each open job (a job that has not ended), and sends the jobs whose state has changed. A
-remembered job that is no longer open has ended or was deleted; the stream reads it by its id, without comparing times.
-A job that ended before the stream first read it is found by the time of its end. Bulk runs can be deleted after
-their end: the stream also reads the ended runs that it has sent, and tells which of them were deleted. The id of an event is a time (database
-clock): a client that reconnects with this id gets the jobs that ended after this time.
+A stream reads the database every ``LOOK_EVERY_S`` seconds; the number of queries does not depend on the number of
+jobs. The stream remembers the last state of each open job (a job that has not ended), and sends the jobs whose state
+has changed. A remembered job that is no longer open has ended or was deleted; the stream reads it by its id, without
+comparing times. A job that ended before the stream first read it is found by the time of its end. Bulk runs can be
+deleted after their end: the stream also reads the ended runs that it has sent, and reports the deleted runs. The id
+of an event is a time (database clock): a client that reconnects with this id gets the jobs that ended after this
+time.
 """
 
 from __future__ import annotations

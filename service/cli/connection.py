@@ -32,7 +32,7 @@ class _Id(click.ParamType):
     name = "id"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The digits in lower case. Only such texts become part of an address of the service."""
+        """The digits in lower case. A text that is not an id never becomes part of an address of the service."""
         digits = str(value).lower()
         if not _ID.fullmatch(digits):
             self.fail(
@@ -132,8 +132,8 @@ def short(identity: str) -> str:
 
 
 def remote(server: str | None) -> Client:
-    """A client of the service at ``server``. It uses the key of the option ``--key`` or of HELIOPSF_KEY, if one is
-    given."""
+    """A client of the service at ``server``. The client uses the key from the option ``--key`` or from HELIOPSF_KEY,
+    if a key is given."""
     from service.client.http import Client
 
     return Client(server, key=click.get_current_context().meta.get(_KEY), say=say)

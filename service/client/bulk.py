@@ -175,10 +175,10 @@ class BulkClient(ABC):
         """Yield the state of your jobs and bulk runs: ("job", description), ("bulk", description), ("gone", {"kind",
         "id"}).
 
-        It first yields the jobs and bulk runs that have not ended or that ended in the last seconds, and those whose
-        ids are in ``jobs`` and ``bulks``. Then it yields each job or bulk run again when it changes. The iteration
-        does not end by itself. If the service does not answer, the client tries again for up to 10 minutes and then
-        raises ``ServiceError``.
+        The iteration first yields the jobs and bulk runs that have not ended or that ended in the last seconds, and
+        those whose ids are in ``jobs`` and ``bulks``. Then the iteration yields each job or bulk run again when its
+        state changes. The iteration does not end by itself. If the service does not answer, the client tries again
+        for up to 10 minutes and then raises ``ServiceError``.
         """
         with closing(self._told("/v1/events", params={"job": list(jobs), "bulk": list(bulks)})) as events:
             for event in events:

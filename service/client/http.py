@@ -129,7 +129,7 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return self._json("POST", "/v1/jobs", json=body)
 
     def estimate(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        """Estimate a job without starting it. The arguments and the errors are those of ``submit``.
+        """Estimate a job without starting it. The arguments and the errors are the same as for ``submit``.
 
         "estimate" has the expected ``seconds`` and ``memory_mib``, "psf" says which PSF a deconvolution would use and why, and
         "existing" is the address of the result if there is one already.

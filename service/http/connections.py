@@ -20,8 +20,8 @@ from workers.settings import Settings
 
 log = logging.getLogger(__name__)
 log.addFilter(logs.Seldom())
-# The event loop accepts this number of connections before it looks at any of them. It is small, because each one needs a
-# file descriptor before the bound on connections can apply.
+# The event loop accepts up to this number of connections in one step. This number is small, because each
+# connection needs a file descriptor before the bound on connections can apply.
 ACCEPTED_AT_ONCE = 16
 LISTEN = 512  # connections that the system keeps until the server accepts them
 # File descriptors that the server needs besides its connections: its database connections (SQLite: three each), its logs,

@@ -13,7 +13,8 @@ from service.http.access import Access
 from service.http.bodies import BodyLimits
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
-# Style sheets, scripts and pictures of pages. They contain no data of owners, and the page of a refusal needs them.
+# Style sheets, scripts and pictures of pages. These files contain no data of owners, and the page of a
+# refusal needs them.
 FOR_EVERYBODY = "/static/"
 
 

@@ -1,9 +1,9 @@
 """The jobs of the service by IVOA UWS 1.1, for clients of the Virtual Observatory: ``/uws/jobs``.
 
-Citation: REC-UWS-1.1 (24 October 2016), section 2.2. A job is PENDING until the client starts it. It has a limit
-on its execution time, and a time at which it is destroyed. Each request has a job of its own, but identical requests share
-their result: one of the identical jobs runs, and the others wait in phase QUEUED. If that job fails, the next one runs.
-Destroying a job does not delete its result. Errors are plain text.
+Citation: REC-UWS-1.1 (24 October 2016), section 2.2. A job is PENDING until the client starts it. A job has a limit
+on its execution time, and a time at which it is destroyed. Each request has a job of its own, but identical requests
+share their result: one of the identical jobs runs, and the others wait in phase QUEUED. If that job fails, the next
+one runs. Destroying a job does not delete its result. Errors are plain text.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Makes a worker take messages from the queue of highest priority, and only when one of its processes is idle.
 
-By default Celery and kombu do not do this. They serve the queues in turn and ignore their priority. With early
-acknowledgement they also fetch one message more than they can start. A more urgent job would then wait for two jobs
-instead of one.
+By default Celery and kombu do not do this. Celery and kombu serve the queues in turn and ignore their priority. With
+early acknowledgement they also fetch one message more than they can start. A more urgent job would then wait for two
+jobs instead of one.
 """
 
 from __future__ import annotations

@@ -133,7 +133,8 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
 
 
 def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Source) -> ResolvedDeconvolve:
-    """The deconvolution with its PSF. This is the PSF of the bulk run, or the PSF that its context pins for the image."""
+    """The deconvolution with its PSF. The PSF is that of the bulk run, or the PSF that the context of the run pins
+    for the image."""
     wanted = Deconvolve(
         image_id=source.sha256,
         psf_id=bulk.psf_id,

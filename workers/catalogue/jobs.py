@@ -262,9 +262,9 @@ class Jobs:
     def give_up_silent(self, lease_s: float, max_attempts: int) -> list[str]:
         """Queue the jobs again whose worker has been silent for longer than ``lease_s``; returns the ids of these jobs.
 
-        A cancelled job is aborted instead. A job that was already started ``max_attempts`` times ends in ERROR.
-        If the database's clock was set back, a heartbeat may lie in the future. It then counts as a heartbeat of this
-        moment, so that the lease of a lost worker does not last until the clock has caught up.
+        A cancelled job is aborted instead. A job that was already started ``max_attempts`` times ends in ERROR. If
+        the database's clock was set back, a heartbeat may lie in the future. Such a heartbeat counts as a heartbeat
+        of this moment, so that the lease of a lost worker does not last until the clock has caught up.
         """
         now = self._database.now
         ahead = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at > now + lease_s]
@@ -364,7 +364,7 @@ def no_equal_at_work() -> ColumnElement[bool]:
 
 def is_at_work(phase: InstrumentedAttribute[str]) -> ColumnElement[bool]:
     """The condition that a job executes."""
-    # The phase is a literal in the text of the statement. Only then do the databases use the partial index.
+    # The phase is a literal in the text of the statement. The databases use the partial index only then.
     return phase == literal(Phase.EXECUTING.value, literal_execute=True)
 
 

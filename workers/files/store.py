@@ -225,7 +225,7 @@ class Store:
         return True
 
     def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
-        """Finish ``remove``: of the files that were moved aside, restore those in ``named`` and delete the others.
+        """Finish ``remove``: of the files that were moved aside, restore the files in ``named`` and delete all others.
 
         If there are such files, ``named`` is read after ``after_s`` seconds. Returns the hashes of the restored files.
         """

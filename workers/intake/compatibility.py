@@ -59,7 +59,8 @@ def noise_of(request: ResolvedDeconvolve, header: Cards) -> NoiseFigures | None:
 
 
 def of_upload(row: PsfRow, instrument: str | None, angstrom: float | None) -> tuple[str | None, float | None]:
-    """The instrument and the wavelength of a PSF: those of its file, or else those that the request of its upload gave."""
+    """The instrument and the wavelength of a PSF: the values in its file, or else the values in the request of its
+    upload."""
     if angstrom is None and row.channel is not None and row.channel.isdecimal():
         angstrom = float(row.channel)
     return instrument or row.instrument, angstrom

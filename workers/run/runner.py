@@ -1,5 +1,5 @@
-"""Runs one job: claims it, sends heartbeats, runs its task and records the outcome. Only this module turns an exception into
-the error of a job."""
+"""Runs one job: claims it, sends heartbeats, runs its task and records the outcome. No other module turns an
+exception into the error of a job."""
 
 from __future__ import annotations
 

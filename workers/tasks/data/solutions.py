@@ -3,8 +3,8 @@
 The fit, the cross-validation, the report and the gap diagnosis of a transit begin with the same inversion. The first
 job keeps its solution, and later jobs of the same owner read it: a new inversion would give the same values, bit for
 bit. The identity of a solution contains everything that determines the solution, and the versions of the software and
-its libraries, so that the provenance of a result stays true. It does not contain the number of threads, which changes
-no result.
+its libraries, so that the provenance of a result stays true. The identity does not contain the number of threads,
+because this number changes no result.
 
 A kept solution only saves time. If it cannot be read or kept, the job inverts the transit itself and continues.
 """
