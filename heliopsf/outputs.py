@@ -114,7 +114,7 @@ def _as_map(image: Any, result: Deconvolution) -> Any:
     meta = copy.deepcopy(image.meta)
     _describe(meta, result)
     made = type(image)(result.pixels, meta, mask=_mask(result), uncertainty=_uncertainty(result))
-    # Set afterwards: the class of a Map may choose other settings when it is made.
+    # The settings are set last, because the class of a Map may choose other settings for a new Map.
     made.plot_settings.update(copy.deepcopy(image.plot_settings))
     return made
 

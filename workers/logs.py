@@ -90,7 +90,7 @@ def _one_line(text: str) -> str:
 
 
 class Seldom(logging.Filter):
-    """Writes at most one record of each kind in ``every_s`` seconds. The next record says how many were left out.
+    """Writes at most one record of each kind in ``every_s`` seconds. The next record says how many records were left out.
 
     Two records are of the same kind if they come from the same logger and the first lines of their message templates
     are equal. The filter is for messages that clients without a key can cause; without it, these messages could fill

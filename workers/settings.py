@@ -272,7 +272,7 @@ class Settings(BaseSettings):
 
     @property
     def gone_s(self) -> float:
-        """Time after SIGTERM after which a worker exits even if its job is not finished, s.
+        """Longest time from SIGTERM to the exit of a worker, even if its job is not finished, s.
 
         It is longer than ``stop_s``: a worker checks only at each heartbeat whether it must hand back its job, and then Celery
         needs a few seconds to end.

@@ -124,7 +124,7 @@ def certify(
 @REASON
 @SERVER
 def deprecate(psf_id: str, successor: str | None, reason: str, server: str | None) -> None:
-    """Withdraw a certified PSF from use, or name the successor of a deprecated PSF."""
+    """Deprecate a certified PSF, so that it is no longer chosen; or name the successor of a deprecated PSF."""
     with user_errors(), remote(server) as service:
         instead_id = None if successor is None else whole_id(service, "psfs", successor)
         said = service.deprecate_psf(psf_id, instead_id, reason=reason)
