@@ -96,7 +96,7 @@ class LocalStore(Store):
         return next(iter(seen))
 
     def keep(self, temporary: Path, digest: str | None = None) -> str:
-        """Store a file. If the user has a file with this content, that file is used and stays as it is."""
+        """Store a file. If the user has a file with this content, the store uses that file and does not change it."""
         digest = digest or sha256_of(temporary)
         return digest if digest in self._files else super().keep(temporary, digest)
 

@@ -1,4 +1,4 @@
-"""``heliopsf serve``: the web process and, in embedded mode, a worker process beside it."""
+"""``heliopsf serve``: the web process and, in embedded mode, also a worker process."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class Ancestor(BaseModel):
     parents: list[Ancestor] = []
     cut: bool = Field(
         False,
-        description="true if the parents are left out here, because they are listed elsewhere in this answer or there are too many",
+        description="true: the parents are left out here, because they are listed elsewhere in this answer or because there are too many things",
     )
 
 

@@ -1,7 +1,7 @@
 """Logs of the service and its workers on standard error: one line for each record, as JSON or as text.
 
-``bind`` stores the request, the job or its owner once; all later log lines of the same context contain them.
-Headers, keys and contents of files are never logged.
+``bind`` stores the request, the job or its owner once; all later log lines of the same context then contain these
+values. Headers, keys and contents of files are never logged.
 """
 
 from __future__ import annotations

@@ -347,7 +347,8 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
-    """The conditions as the request contains them. If a keyword has several values, any of them meets the condition."""
+    """The conditions in the form that the request needs. If a keyword has several values, one of these values is
+    enough."""
     where: dict[str, Any] = {}
     for key, sign, value in conditions:
         if sign == "=":

@@ -142,7 +142,7 @@ class BulkClient(ABC):
     def wait_for_bulk(self, bulk_id: str, *, progress: Progress | None = None) -> dict[str, Any]:
         """Wait until a bulk run ends, is paused or has failed; returns its description.
 
-        Raises ``WaitInterrupted`` on Control-C; the bulk run goes on.
+        Raises ``WaitInterrupted`` on Control-C; the bulk run then continues.
         """
         try:
             for bulk in self.follow(f"/v1/bulk/{bulk_id}"):

@@ -69,9 +69,9 @@ def deconvolve_many(
     files that have the name of a product but are not this product. progress(done, of) is called at the beginning and after
     each image.
 
-    Raises ``ServiceError`` for an error that concerns every image: "output-not-writable", a refused key, a full quota, or
-    no answer from the service. Images whose jobs are in flight are finished first, if the service answers. Raises
-    ``WaitInterrupted`` on Control-C; the jobs that this exception names continue.
+    Raises ``ServiceError`` for an error that concerns every image: "output-not-writable", a refused key, a full
+    quota, or no answer from the service. If the service answers, images whose jobs are in flight are finished before
+    the error is raised. Raises ``WaitInterrupted`` on Control-C; the jobs that this exception names continue.
     """
     check_output_folder(folder)
     Path(folder).mkdir(parents=True, exist_ok=True)

@@ -143,7 +143,8 @@ class Jobs:
     def claim(self, job_id: str, worker: str) -> Lease | None:
         """QUEUED -> EXECUTING. If several workers try, exactly one gets the lease; the others get None.
 
-        While another job with the same result executes, every worker gets None; the job is submitted again later.
+        While another job with the same result executes, every worker gets None; the reconciler submits the job again
+        later.
         """
         lease = Lease(job_id, uuid.uuid4().hex)
         now = self._database.now

@@ -98,7 +98,8 @@ def _removed(
 
     If a row refers to a file after the removal, the file is restored.
     """
-    # First restore files that an earlier, killed collection moved aside, if a row refers to them.
+    # An earlier collection may have been killed after it moved files aside. First restore those files that a
+    # row refers to.
     store.settle(catalogue.named_files.all())
     gone = [blob for blob in old if store.remove(blob.digest, kept_before)]
     put_back = store.settle(catalogue.named_files.all(), after_s=second_look_after_s)

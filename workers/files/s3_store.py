@@ -127,7 +127,7 @@ class RemoteStore(Store):
         """Remove a file. If the file was stored again since ``kept_before``, or no longer exists, do nothing.
 
         Returns whether the file was removed. Raises ``StoreAway``. S3 cannot check and remove a file in one step.
-        Therefore a copy is kept aside until ``settle``, in case the file is stored again between the two steps.
+        Therefore a copy is kept until ``settle``: the file may be stored again between the two steps.
         """
         with _answering():
             if not self._is_old(digest, kept_before):

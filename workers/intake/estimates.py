@@ -1,8 +1,8 @@
 """Estimates the time and memory of a job from the sizes of its inputs, before the job is accepted.
 
 The initial values are in ``workers.intake.cost_model``. The time is then multiplied by a factor that was measured on
-completed jobs of the same kind in this catalogue. A wrong estimate does little harm: a job that takes too long is
-stopped, and memory is not reserved.
+completed jobs of the same kind in this catalogue. A wrong estimate does little harm, because a job that takes too
+long is stopped, and no memory is reserved.
 
 | symbol | name | unit |
 |---|---|---|

@@ -59,8 +59,8 @@ def solved(
 ) -> Solution:
     """The solution of a transit: the kept solution of the owner, or else a new solution, which is then kept.
 
-    transit: as ``load_transit`` returns it for the request; only its noise may be replaced. A rerun computes anew and keeps
-    nothing. Raises DataError as ``psfcore.scatter.inversion.invert`` does.
+    transit: as ``load_transit`` returns it for the request; only its noise may be replaced. A rerun computes a new
+    solution and does not keep it. Raises DataError as ``psfcore.scatter.inversion.invert`` does.
     """
     identity = solution_identity(request, transit, shape, start)
     kept = None if context.anew else _kept(context, identity, transit)
