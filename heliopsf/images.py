@@ -72,19 +72,19 @@ def deconvolve(
         >>> image = sunpy.map.Map("aia.fits")
         >>> sharp = heliopsf.deconvolve(image)
 
-    The first parameters are those of ``aiapy.psf.deconvolve``, so calls of that function work unchanged.
+    The first parameters are the same as in ``aiapy.psf.deconvolve``, so calls of that function work unchanged.
 
     smap: the image. A sunpy Map, an NDData or a CCDData gives an object of the same class. An array gives an array, and
     needs ``psf``. A path of a FITS file or an ``Image`` gives a ``Deconvolution``. A list of these gives a list.
     Cut-outs work like whole images. Pixels that are NaN or masked are not used; they are NaN in the result.
     psf: a ``Psf``, a path of a FITS file, or an array whose centre is [ny // 2, nx // 2]; default: the PSF that is built for
     the telescope in the header, see ``psf_for``. The PSF is rebinned if the image is binned.
-    iterations: number of steps; default: that of the method (Richardson-Lucy: 20; aiapy: 25).
-    clip_negative: whether pixels below 0 count as 0; default: the rule of the method. The Richardson-Lucy methods always
-    count them as 0. For ``linear`` and ``basic-iterative`` the default is False.
+    iterations: number of steps; default: the number of the method (Richardson-Lucy: 20; aiapy: 25).
+    clip_negative: whether pixels below 0 count as 0; default: the rule of the method. The Richardson-Lucy methods
+    always count these pixels as 0. For ``linear`` and ``basic-iterative`` the default is False.
     use_gpu: without effect, because heliopsf computes on the processor; ``threads`` is the number of threads.
     method: "richardson-lucy", "linear" or another method.
-    noise: photon gain (DN per photon) and read noise (DN rms); default: those of the instrument, if known.
+    noise: photon gain (DN per photon) and read noise (DN rms); default: the values of the instrument, if known.
     error_draws: number of noise realisations (2 to 64) for the standard deviation of each pixel: ``uncertainty`` of the
     result. Each realisation takes as long as one deconvolution. 0: no uncertainty.
     saturation_dn: pixels at or above this level (DN) are ignored; default: the level that the header or the instrument
@@ -141,10 +141,10 @@ def psf_for(
     threads: int | None = None,
     progress: Told = None,
 ) -> Psf:
-    """The PSF for an image, on the pixels of the image. It is the PSF that a service without certified PSFs takes.
+    """The PSF for an image, on the pixels of the image. A service without certified PSFs chooses the same PSF.
 
     image: as for ``deconvolve``, or a header (a ``Header`` of astropy, or a table of cards such as ``Map.meta``).
-    The first call for a telescope takes up to a minute; the PSF is then kept (``heliopsf cache``).
+    The first call for a telescope takes up to a minute; the PSF is then kept in a cache (see ``heliopsf cache``).
 
     Raises ``DataError`` "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch".
     """
@@ -269,7 +269,7 @@ def _with_steps(parameters: Mapping[str, Any], iterations: int | None) -> dict[s
         return dict(parameters)
     if "steps" in parameters:
         raise DataError(
-            "bad-steps", "expected iterations or steps; got both: give one of them, they mean the same"
+            "bad-steps", "expected iterations or steps; got both, which mean the same: give only one of them"
         )
     return {**parameters, "steps": iterations}
 

@@ -1,6 +1,7 @@
 """Images as users have them: files, sunpy Maps, NDData and CCDData, arrays. Each becomes an ``Image`` of the core.
 
-``sunpy`` and ``astropy.nddata`` are looked up among the loaded modules: an object of their classes exists only if they are loaded.
+This module does not import ``sunpy`` and ``astropy.nddata``. An object of one of their classes can exist only if
+these modules are already loaded.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def is_map(image: Any) -> bool:
 
 
 def is_nddata(image: Any) -> bool:
-    """Whether an object is an NDData, such as a CCDData. A sunpy Map is one too."""
+    """Whether an object is an NDData, such as a CCDData. A sunpy Map is also an NDData."""
     return _is_of(image, "astropy.nddata", "NDData")
 
 
@@ -135,7 +136,7 @@ def _pixels(data: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _header(meta: Mapping[str, Any]) -> Header:
-    """The cards of a table. Values that no card can hold are left out: they do not describe the observation."""
+    """The cards of a table. Values that no card can hold are left out: such values do not describe the observation."""
     if isinstance(meta, Header):
         return meta.copy()
     header = Header()

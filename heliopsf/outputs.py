@@ -29,13 +29,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Cards with statistics of the input's pixels. They are wrong for the result, so they are removed.
+# Cards with statistics of the input's pixels. These values are wrong for the result, so the cards are removed.
 _STATISTICS = re.compile(r"data(min|max|mean|medn|rms|std|skew|kurt|cent|p\d\d)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Deconvolution(Deconvolved):
-    """A deconvolved image: ``pixels`` [y, x] in the unit of the image, how they were made, and what is known about them.
+    """A deconvolved image: ``pixels`` [y, x] in the unit of the image, and the inputs, errors and warnings that
+    belong to it.
 
     image: the input, with its mask. psf: the PSF on the pixels of the image. errors: planes with the standard deviation of
     each pixel, if they were asked for. warnings: sentences by their codes.
@@ -101,7 +102,8 @@ def in_form_of(image: Any, result: Deconvolution) -> Any:
 
 
 def used_psf(psf: Psf) -> UsedPsf:
-    """The PSF as the cards of a result name it, with the id that a service would use: that of its recipe or file."""
+    """The PSF as the cards of a result name it, with the id that a service would use: the id of its recipe or of its
+    file."""
     identity = psf.provenance.get("psf_id")
     if identity is None:  # weights in memory
         identity = hashlib.sha256(f"{psf.kernel.shape}".encode() + psf.kernel.tobytes()).hexdigest()
@@ -112,7 +114,7 @@ def _as_map(image: Any, result: Deconvolution) -> Any:
     meta = copy.deepcopy(image.meta)
     _describe(meta, result)
     made = type(image)(result.pixels, meta, mask=_mask(result), uncertainty=_uncertainty(result))
-    # Set afterwards: the class of a Map may choose other settings when it is made.
+    # The settings are set last, because the class of a Map may choose other settings for a new Map.
     made.plot_settings.update(copy.deepcopy(image.plot_settings))
     return made
 

@@ -79,9 +79,9 @@ def fit_scatter(
     threads: default: all cores.
     progress: True, or a function that is called with (stage, step, steps) after each step.
 
-    The result holds the total PSF (``kernel`` [y, x], 2048 px) and its scatter kernel. It also holds the curve of
-    1 - encircled energy (radius in px, light in percent), the parameters with their errors, and the limits of the fit.
-    Raises ``DataError``, for example "no-manifest" or "too-few-frames".
+    The result holds the total PSF (``kernel`` [y, x], 2048 px) and its scatter kernel. The result also holds the
+    curve of 1 - encircled energy (radius in px, light in percent), the parameters with their errors, and the limits
+    of the fit. Raises ``DataError``, for example "no-manifest" or "too-few-frames".
     """
     threads = threads or cores()
     fitted = _read(transit, noise, saturation_dn, threads)
@@ -101,8 +101,8 @@ def diagnose_gap(
 ) -> GapDiagnosis:
     """Fit a transit and find out which effect explains the residuals of the fit.
 
-    coverage: the probability with which the answer set contains the true cause. The other parameters are those of
-    ``fit_scatter``. ``report()`` of the result is the report (JSON). Raises the same errors as ``fit_scatter``.
+    coverage: the probability with which the answer set contains the true cause. The other parameters are the same as
+    in ``fit_scatter``. ``report()`` of the result is the report (JSON). Raises the same errors as ``fit_scatter``.
     """
     threads = threads or cores()
     found = diagnose.diagnose(

@@ -96,7 +96,7 @@ class LocalStore(Store):
         return next(iter(seen))
 
     def keep(self, temporary: Path, digest: str | None = None) -> str:
-        """Store a file. If the user has a file with this content, that file is used and stays as it is."""
+        """Store a file. If the user has a file with this content, the store uses that file and does not change it."""
         digest = digest or sha256_of(temporary)
         return digest if digest in self._files else super().keep(temporary, digest)
 
@@ -197,8 +197,8 @@ class LocalService(Operations):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        """Add a PSF. As in a service, a PSF that heliopsf made keeps its id, unless name, version, instrument, channel
-        or kind is given."""
+        """Add a PSF. As in a service, a PSF that heliopsf made keeps its id. If name, version, instrument, channel or
+        kind is given, the PSF gets a new id."""
         source = Path(path)
         limits = FitsLimits(max_pixels=self._settings.max_pixels)
         summary = read_summary(source, limits)
@@ -226,7 +226,7 @@ class LocalService(Operations):
         return identity
 
     def result_id(self, kind: str, **parameters: Any) -> str:
-        """The id that the result of such a job has or would have. No job is started."""
+        """The id that the result of a job with these parameters has or would have. No job is started."""
         return self._resolved(kind, parameters)[1]
 
     def release(self, product: dict[str, Any]) -> None:

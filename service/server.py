@@ -1,4 +1,4 @@
-"""``heliopsf serve``: the web process and, in embedded mode, a worker process beside it."""
+"""``heliopsf serve``: the web process and, in embedded mode, also a worker process."""
 
 from __future__ import annotations
 
@@ -61,7 +61,8 @@ def serve(
             )
         )
         _prepare(settings, host)
-        # After its shutdown the server raises the signal again. It becomes an exception here, so that the worker is stopped too.
+        # After its shutdown the server raises the signal again. This handler turns the signal into an
+        # exception, so that the worker is stopped too.
         signal.signal(signal.SIGTERM, _raise_exit)
         with embedded_worker(settings):
             announce(address)
@@ -170,6 +171,7 @@ def _stop(worker: subprocess.Popen[bytes], within_s: float) -> None:
     try:
         worker.wait(within_s)
     except subprocess.TimeoutExpired:
-        # A worker normally ends before this. If not, the next server queues its job again, so no job is lost.
+        # A worker normally ends before this time. If it does not, the next server queues its job again, so no
+        # job is lost.
         os.killpg(worker.pid, signal.SIGKILL)
         worker.wait()

@@ -38,6 +38,7 @@ import numpy as np
 import psutil
 from astropy.io import fits
 
+from psfcore.whole_files import write_whole
 from service.client.errors import ServiceError
 from service.client.http import Client
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
@@ -89,7 +90,7 @@ class Peaceful:
             self.seconds.append(time.monotonic() - started)
             assert product.stat().st_size > 0
             self.ids |= {"products": made["id"], "images": made["image_id"]}
-            (self.folder / IDS).write_text(json.dumps(self.ids), "utf-8")
+            write_whole(self.folder / IDS, json.dumps(self.ids))
             product.unlink()
             image.unlink()
 

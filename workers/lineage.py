@@ -50,7 +50,7 @@ class Ancestor(BaseModel):
     parents: list[Ancestor] = []
     cut: bool = Field(
         False,
-        description="true if the parents are left out here, because they are listed elsewhere in this answer or there are too many",
+        description="true: the parents are left out here, because they are listed elsewhere in this answer or because there are too many things",
     )
 
 
@@ -72,12 +72,13 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
     if isinstance(row, PsfRow) and row.origin == "uploaded":
         raise DataError(
             "not-made-here",
-            f"expected a PSF that this service made; PSF {row.id} was uploaded, so no job made it",
+            f"expected a PSF that this service made; PSF {row.id} was uploaded, so no job made it: choose a built or fitted PSF",
         )
     if parameters is None:
         raise DataError(
             "parameters-unknown",
-            f"expected the parameters that {row.id} was made with; they were not recorded and its job was deleted",
+            f"expected the parameters that {row.id} was made with; these parameters were not recorded, and the job was "
+            "deleted: submit a new request instead",
         )
     try:
         return _job_of(row, parameters)
@@ -86,7 +87,7 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
         raise DataError(
             "parameters-outdated",
             f"expected parameters that this version accepts; {row.id} was made with others: "
-            f"{'/'.join(map(str, first['loc']))}: {first['msg']}",
+            f"{'/'.join(map(str, first['loc']))}: {first['msg']}: submit a new request instead",
         ) from error
 
 

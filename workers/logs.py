@@ -1,7 +1,7 @@
 """Logs of the service and its workers on standard error: one line for each record, as JSON or as text.
 
-``bind`` stores the request, the job or its owner once; all later log lines of the same context contain them.
-Headers, keys and contents of files are never logged.
+``bind`` stores the request, the job or its owner once; all later log lines of the same context then contain these
+values. Headers, keys and contents of files are never logged.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _one_line(text: str) -> str:
 
 
 class Seldom(logging.Filter):
-    """Writes at most one record of each kind in ``every_s`` seconds. The next record says how many were left out.
+    """Writes at most one record of each kind in ``every_s`` seconds. The next record says how many records were left out.
 
     Two records are of the same kind if they come from the same logger and the first lines of their message templates
     are equal. The filter is for messages that clients without a key can cause; without it, these messages could fill
@@ -129,16 +129,16 @@ _SELDOM_ACCEPTS = Seldom(lambda record: record.getMessage().startswith("socket.a
 
 
 def _no_request(record: logging.LogRecord) -> bool:
-    """True unless the record is about a request that was answered without a failure of the service (status below
-    500)."""
+    """False if the record is about a request that was answered without a failure of the service (status below 500);
+    otherwise True."""
     return record.name != REQUESTS or getattr(record, "fields", {}).get("status", 500) >= 500
 
 
 def configure(settings: Settings, *, verbose: bool = False) -> None:
     """Write the logs of the process to standard error. Repeated calls change nothing.
 
-    A person who starts a service on a terminal does not see a line for each request, unless ``verbose`` is true or
-    HELIOPSF_LOG_FORMAT is set; otherwise these lines would hide the address of the service.
+    A person who starts a service on a terminal sees a line for each request only if ``verbose`` is true or
+    HELIOPSF_LOG_FORMAT is set: these lines would hide the address of the service.
     """
     stream = sys.__stderr__ or sys.stderr
     form = settings.log_format or ("text" if stream.isatty() else "json")

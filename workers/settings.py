@@ -32,7 +32,7 @@ class Settings(BaseSettings):
     data_dir: Path = Field(
         default_factory=default_data_dir,
         description="folder of stored files and, by default, of the SQLite database; default: the user's data folder, on Linux "
-        "`~/.local/share/heliopsf`, unless `heliopsf-data` in the working folder holds data of an earlier version",
+        "`~/.local/share/heliopsf`; if `heliopsf-data` in the working folder holds data of an earlier version, that folder",
     )
     store_url: str | None = Field(
         None,
@@ -45,12 +45,12 @@ class Settings(BaseSettings):
     quota_mib: int = Field(
         0,
         ge=0,
-        description="largest size of an owner's stored files and database rows, unless the owner has a limit of its own, MiB; 0: unlimited",
+        description="largest size of an owner's stored files and database rows, MiB; 0: unlimited; `heliopsf store quota` sets another limit for an owner",
     )
     min_free_mib: int = Field(
         256,
         ge=0,
-        description="smallest free space of the disk of data_dir, MiB; with less, uploads and jobs are refused and /readyz answers 503",
+        description="smallest free space of the disk of data_dir, MiB; if less is free, uploads and jobs are refused, and /readyz answers 503",
     )
     database_url: str | None = Field(
         None, description="SQLAlchemy URL of the database; default: SQLite in data_dir"
@@ -86,7 +86,7 @@ class Settings(BaseSettings):
     reconcile_s: float = Field(
         2.0,
         gt=0,
-        description="interval at which queued jobs that the broker may have lost are searched for, s",
+        description="interval between two searches for queued jobs that the broker may have lost, s",
     )
     resubmit_s: float = Field(
         30.0, gt=0, description="time after which a queued job is sent to the broker for the second time, s"
@@ -228,7 +228,8 @@ class Settings(BaseSettings):
 
     @classmethod
     def apart(cls, data_dir: Path, *, gap_effects: str = "") -> Settings:
-        """Default settings with this data folder. They ignore the environment, so that they cannot touch a running service."""
+        """Default settings with this data folder. These settings ignore the environment, so that the process cannot
+        touch a running service."""
         return cls(_env_prefix="HELIOPSF_APART_", data_dir=data_dir, gap_effects=gap_effects)
 
     @property
@@ -271,7 +272,7 @@ class Settings(BaseSettings):
 
     @property
     def gone_s(self) -> float:
-        """Time after SIGTERM after which a worker exits even if its job is not finished, s.
+        """Longest time from SIGTERM to the exit of a worker, even if its job is not finished, s.
 
         It is longer than ``stop_s``: a worker checks only at each heartbeat whether it must hand back its job, and then Celery
         needs a few seconds to end.
@@ -288,7 +289,7 @@ class Settings(BaseSettings):
 
     @property
     def presence_s(self) -> float:
-        """Interval at which a worker announces itself, s. It is shorter than the lease."""
+        """Interval at which a worker announces itself, s. This interval is shorter than the lease."""
         return max(self.heartbeat_s, self.lease_s / 3)
 
     @property

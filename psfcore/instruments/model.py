@@ -212,11 +212,17 @@ class Instrument(Checked):
     scatter: Scatter | None = None
 
     def check(self) -> None:
-        """WAVELNTH of the table [match] is a number, its other keys are texts."""
+        """WAVELNTH of the table [match] is a number, its other keys are texts. No spectral line is too weak to be normalised."""
         wrong = [
             Fault(("match", key), f"expected {'a number' if key == 'WAVELNTH' else 'a text'}", value)
             for key, value in self.match.items()
             if isinstance(value, str) == (key == "WAVELNTH")
+        ]
+        total = sum(line.weight for line in self.bandpass)
+        wrong += [
+            Fault(("bandpass", k, "weight"), f"expected at least {_LEAST:g} of the sum of all weights", line.weight)
+            for k, line in enumerate(self.bandpass)
+            if not _LEAST <= line.weight / total
         ]
         if wrong:
             raise BadValues(wrong)

@@ -245,7 +245,7 @@ def cancel_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
 
 @router.post("/{bulk_id}/retry", summary="Retry failed images")
 def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
-    """Queue the failed images again. Done images are not processed again.
+    """Queue the failed images again. Images that are already done are not processed again.
 
     The answer is 409 if this run has ended and another bulk run of an identical request is open. The message names that run.
     """
@@ -263,9 +263,10 @@ def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
 def delete_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> Response:
     """Remove the run from the catalogue and from your quota. Its products and the files in its output folder stay.
 
-    The manifest and the reasons of failures are deleted with the run. A run that is LISTING or RUNNING answers 409: cancel it
-    first. If the service stops during the deletion, a cancelled run with fewer images may be left: delete it again. Products
-    that are only in the output folder are made again by a later run, because only the deleted run knew them.
+    The manifest and the reasons of failures are deleted with the run. The answer is 409 if the run is LISTING or
+    RUNNING: cancel the run first. If the service stops during the deletion, a cancelled run with fewer images may
+    remain: delete this run again. If a product is only in the output folder, a later run makes the product again,
+    because only the deleted run knew its file.
     """
     row = find(state, caller, bulk_id)
     if not state.catalogue.bulks.delete(row.id):

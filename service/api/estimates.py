@@ -38,7 +38,7 @@ class EstimateView(BaseModel):
 
     parameters: dict[str, Any] = Field(description="the parameters, with every default and the PSF filled in")
     result_id: str = Field(
-        description="id that the result has, or would have; for a kind whose jobs always make a new result (`rerun`), it is "
+        description="id that the result has, or would have; for a kind whose jobs always make a new result (`rerun`), this id is "
         "different each time"
     )
     existing: str | None = Field(

@@ -138,9 +138,10 @@ async def _follow(
 def stream(request: Request, state: Shared, caller: Caller, say: Say) -> Response:
     """A stream of the texts of ``say``, which counts as a stream of the caller until it ends.
 
-    The stream ends after a text with ``last``, after ``stream_s`` seconds, when the server stops, and when the key is
-    revoked or expires. ``say`` is called every ``LOOK_EVERY_S`` seconds in a thread. If ``say`` raises SQLAlchemyError,
-    it is called again later and must then return the same news: a failed call must not change its state.
+    The stream ends after a text with ``last``, or after ``stream_s`` seconds. The stream also ends when the server
+    stops, and when the key is revoked or expires. ``say`` is called every ``LOOK_EVERY_S`` seconds in a thread. If
+    ``say`` raises SQLAlchemyError, it is called again later and must then return the same text: a failed call must
+    not change the state of ``say``.
     """
     state.streams.open(caller.name)
     ends_at = time.monotonic() + state.settings.stream_s

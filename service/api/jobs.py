@@ -35,7 +35,7 @@ class Progress(BaseModel):
     step: int
     steps: int
     time_left_s: float | None = Field(
-        description="estimated time until the last of `steps`, s; null: unknown. It is estimated from the speed since the "
+        description="estimated time until the last of `steps`, s; null: unknown. The estimate uses the speed since the "
         "job began to count these steps"
     )
 

@@ -1,8 +1,8 @@
 """The keys of an owner: ``/v1/keys``.
 
-A client can make further keys for its owner. A new key has no scope that the key of the request lacks, and it does not
-last longer, so nobody can gain rights by making keys. With a key of scope ``admin``, a client can make keys for any
-owner, with any scopes and any lifetime.
+A client can make further keys for its owner. A new key has only scopes of the key of the request, and does not last
+longer than this key. So nobody can gain rights by making keys. With a key of scope ``admin``, a client can make keys
+for any owner, with any scopes and any lifetime.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ def list_keys(
     owner: Annotated[
         str | None,
         Query(
-            max_length=64,
-            description="owner of the keys; `*`: all owners. Others than your own need the scope admin",
+            pattern=rf"^(\*|{OWNER.pattern})$",
+            description="owner of the keys; `*`: all owners. To list the keys of another owner, you need the scope admin",
         ),
     ] = None,
     limit: Limit = 50,
@@ -124,8 +124,8 @@ def list_keys(
 
 @router.post("", status_code=201, summary="Make a key")
 def make_key(body: NewKey, response: Response, caller: Submitting, state: Shared) -> MadeKey:
-    """Make a key. Only this answer contains the whole key. The new key has no scope that your own key lacks, and does
-    not last longer, unless your own key has the scope admin."""
+    """Make a key. Only this answer contains the whole key. If your own key does not have the scope admin, the new key
+    can have only scopes of your own key, and does not last longer than your own key."""
     _check_used(state)
     owner = body.owner or caller.owner
     _check_for(caller, owner)
@@ -172,9 +172,9 @@ def revoke_key(
         ),
     ] = False,
 ) -> KeyView:
-    """Revoke a key. From now on, requests with it are refused; its logins in browsers and its event streams end. Jobs
-    that were submitted with it continue. To revoke a key with scopes that your own key lacks, your key needs the scope
-    admin."""
+    """Revoke a key. From now on, the service refuses requests with this key, and ends its logins in browsers and its
+    event streams. Jobs that were submitted with the key continue. To revoke a key with scopes that your own key does
+    not have, you need the scope admin."""
     row = _find(state, caller, key_id)
     _check_scopes(caller, map(Scope, row.scopes), "use a key with these scopes, or ask the operator")
     state.catalogue.keys.revoke(key_id, and_made=and_made)
@@ -229,8 +229,8 @@ def _check_scopes(caller: Caller, scopes: Iterable[Scope], advice: str) -> None:
 
 
 def _end(state: Shared, caller: Caller, body: NewKey) -> float | None:
-    """The end of a new key. Raises ``Problem`` 422 if it is in the past, and 403 if it is later than the end of the
-    caller's key."""
+    """The end of a new key. Raises ``Problem`` 422 if this end is in the past, and 403 if it is later than the end of
+    the caller's key."""
     now = time.time()
     asked = body.end(now)
     if asked is not None and asked <= now:

@@ -1,14 +1,14 @@
 """All jobs and bulk runs of an owner in one stream of server-sent events: ``/v1/events``.
 
-Browsers open at most six connections to a server over HTTP/1.1. A page with one stream for each job would use all of
-them.
+Browsers open at most six connections to a server over HTTP/1.1. A page with one stream for each job would use all six.
 
-A stream reads the database every ``LOOK_EVERY_S`` seconds; the number of queries does not depend on the number of jobs.
-It remembers the last state of each open job (a job that has not ended), and sends the jobs whose state has changed. A
-remembered job that is no longer open has ended or was deleted; the stream reads it by its id, without comparing times.
-A job that ended before the stream first read it is found by the time of its end. Bulk runs can be deleted after
-their end: the stream also reads the ended runs that it has sent, and tells which of them were deleted. The id of an event is a time (database
-clock): a client that reconnects with this id gets the jobs that ended after this time.
+A stream reads the database every ``LOOK_EVERY_S`` seconds; the number of queries does not depend on the number of
+jobs. The stream remembers the last state of each open job (a job that has not ended), and sends the jobs whose state
+has changed. A remembered job that is no longer open has ended or was deleted; the stream reads it by its id, without
+comparing times. A job that ended before the stream first read it is found by the time of its end. Bulk runs can be
+deleted after their end: the stream also reads the ended runs that it has sent, and reports the deleted runs. The id
+of an event is a time (database clock): a client that reconnects with this id gets the jobs that ended after this
+time.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ class Watch(Generic[Followable]):
     """The rows of one table (jobs or bulk runs) as a stream last read them.
 
     kind: name of the events. named: ids that the request names; these rows are followed in any phase. place: the next
-    look reads rows that ended after this place. known: the last state that was sent of each row, by id; None: the last
-    event was ``gone``. after_end: the number of rows that were sent and have ended, and that the stream follows until they
-    are deleted; it follows those that ended last.
+    look reads rows that ended after this place. known: the last state that was sent of each row, by id; None: the
+    last event was ``gone``. after_end: number of ended rows that the stream still follows, to report when they are
+    deleted. These are the rows that ended last.
     """
 
     kind: str
@@ -77,8 +77,8 @@ class Watch(Generic[Followable]):
     after_end: int = 0
 
     def look(self) -> tuple[list[News], Watch[Followable]]:
-        """The news since the last look, and the watch for the next look. This watch does not change, so a failed look
-        loses nothing."""
+        """The events since the last look, and the watch for the next look. This object does not change, so no event
+        is lost if a look fails."""
         again_from = self.rows.now() - OVERLAP_S
         ended = self.rows.ended(self.owner, self.place)
         open_now = self.rows.open(self.owner)
@@ -99,8 +99,8 @@ class Watch(Generic[Followable]):
         return news, replace(self, place=place, known=known | dict.fromkeys(self.named.intersection(gone)))
 
     def _expected(self) -> set[str]:
-        """Ids of rows whose state must be known after each look: those that had not ended, ``after_end`` of those that had, and
-        those that the request names."""
+        """Ids of rows whose state must be known after each look: the rows that had not ended, the ``after_end`` rows
+        that ended last, and the rows that the request names."""
         not_ended = {one for one, state in self.known.items() if state and state.ended_at is None}
         return not_ended.union(self._ended_last(self.known), self.named)
 
@@ -152,12 +152,12 @@ async def follow_all(
     ] = None,
     last_id: Moment = None,
 ) -> Response:
-    """First send all jobs and bulk runs that have not ended or that ended in the last seconds. Then send each one when
-    it changes.
+    """First send all jobs and bulk runs that have not ended or that ended in the last seconds, and those that the
+    request names. Then send each job or bulk run again when it changes.
 
     A client that reconnects with `Last-Event-ID` also gets the jobs and bulk runs that ended in the meantime; it may
-    get some of them twice. If an owner has very many waiting jobs, only the newest are sent at first; each of the
-    others is sent when it starts. The turns of bulk runs, which are jobs too, are not sent.
+    get some of these jobs and bulk runs twice. If an owner has very many waiting jobs, only the newest are sent at
+    first; each of the others is sent when it starts. The turns of bulk runs, which are jobs too, are not sent.
     """
     catalogue, owner = state.catalogue, caller.owner
     since = Place(
@@ -192,7 +192,8 @@ async def follow_all(
 
 
 def _with_id(texts: Sequence[str], place: float, *, alone: bool) -> str:
-    """The texts. Only the last contains the id of ``place``, so a client that gets only some asks for all again.
+    """The texts of events. Only the last text contains the id of ``place``. So a client that received only some of
+    the texts asks for all of them again.
 
     alone: send the id even if there is no text.
     """

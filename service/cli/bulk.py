@@ -240,7 +240,8 @@ def cancel(bulk_id: str, server: str | None) -> None:
 def delete(bulk_ids: tuple[str, ...], server: str | None) -> None:
     """Delete bulk runs from the service, so that they no longer count in your quota. Their products are kept.
 
-    The manifest of a run is deleted with it; `bulk report -o FILE` saves it before. Cancel a run that is at work first.
+    The manifest of a run is deleted with the run. To keep the manifest, save it first with `bulk report -o FILE`.
+    Before you delete a run that is LISTING or RUNNING, cancel it.
     """
     with user_errors(), remote(server) as service:
         for bulk_id in bulk_ids:
@@ -326,7 +327,7 @@ def _said(found: dict[str, Any]) -> list[str]:
 
 
 def _end_with_status(found: dict[str, Any]) -> None:
-    """Exit with status 1 unless the run is completed and every image is done."""
+    """Exit with status 1 if the run is not completed or if an image failed."""
     if found["phase"] != "COMPLETED" or found["images"]["failed"]:
         sys.exit(1)
 
@@ -346,7 +347,8 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
-    """The conditions as the request contains them. If a keyword has several values, any of them meets the condition."""
+    """The conditions in the form that the request needs. If a keyword has several values, one of these values is
+    enough."""
     where: dict[str, Any] = {}
     for key, sign, value in conditions:
         if sign == "=":

@@ -128,7 +128,8 @@ COMMANDS = (changes,)
 def _one_by_one(
     service: Operations, parameters: dict[str, Any], products: dict[str, dict[str, Any]]
 ) -> Callable[[str], Treated]:
-    """A function that deconvolves one image with the service and measures what changed. It adds the ids of the products to ``products``."""
+    """A function that deconvolves one image with the service and measures what changed. The function adds the ids of
+    the products to ``products``."""
     from psfcore.deconvolve.assess.from_product import changes_in_product
 
     def one(name: str) -> Treated:

@@ -32,7 +32,7 @@ class _Id(click.ParamType):
     name = "id"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The digits in lower case. Only such texts become part of an address of the service."""
+        """The digits in lower case. A text that is not an id never becomes part of an address of the service."""
         digits = str(value).lower()
         if not _ID.fullmatch(digits):
             self.fail(
@@ -132,7 +132,8 @@ def short(identity: str) -> str:
 
 
 def remote(server: str | None) -> Client:
-    """A client of the service at ``server``, with the key that the command was given."""
+    """A client of the service at ``server``. The client uses the key from the option ``--key`` or from HELIOPSF_KEY,
+    if a key is given."""
     from service.client.http import Client
 
     return Client(server, key=click.get_current_context().meta.get(_KEY), say=say)
@@ -158,7 +159,8 @@ def is_psf_id(psf: str) -> bool:
 
 
 def whole_id(service: Operations, things: str, identity: str) -> str:
-    """The whole id of a thing from its first digits. things: the part of its address, such as "psfs"."""
+    """The whole id of a thing from its first digits. things: the part of the address that names the type, such as
+    "psfs"."""
     if len(identity) == DIGITS:
         return identity
     found: str = service.get(f"/v1/{things}/{identity}")["id"]

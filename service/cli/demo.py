@@ -84,7 +84,7 @@ def run(image: Path | None, output: Path, progress: Progress) -> list[str]:
                     image, product_file, preview=picture, progress=progress, overwrite=True
                 )
         except WaitInterrupted as stop:
-            raise KeyboardInterrupt from stop  # the job does not go on, because the demo stops its service
+            raise KeyboardInterrupt from stop  # the job does not continue, because the demo stops its service
         finally:
             server.terminate()
             server.wait(60)
@@ -109,7 +109,8 @@ def said(output: Path, image: Path, product_file: Path, picture: Path, product: 
 
 
 def _command() -> str:
-    """How to call heliopsf: by its name if the shell finds it, otherwise by its path beside Python, as after ``make demo``."""
+    """How to call heliopsf: by its name if the shell finds this name, otherwise by its path in the folder of Python,
+    as after ``make demo``."""
     beside = Path(sys.executable).with_name("heliopsf")
     if shutil.which("heliopsf") or not beside.exists():
         return "heliopsf"

@@ -34,8 +34,8 @@ FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 def _not_stdout(
     self: click.Path, value: Any, param: click.Parameter | None, ctx: click.Context | None
 ) -> None:
-    """Refuse "-", which many programs take for standard output. Commands write messages to standard output; these would
-    damage a file that is written to it."""
+    """Refuse "-", which means standard output in many programs. Commands write their messages to standard output; the
+    messages would damage a file that is written there too."""
     if str(value) == "-":
         self.fail(
             "expected a name; got '-': results are not written to standard output. './-' is a file of this name",
@@ -56,7 +56,7 @@ class OutputFile(click.Path):
 class OutputPlace(OutputFile):
     """The type of an option that names a file to write, or a folder in which the command chooses the file name.
 
-    decides: the command itself decides whether the path is a folder, and checks it.
+    decides: the command itself decides whether the path is a folder, and checks the path.
     """
 
     def __init__(self, *, decides: bool = False) -> None:
@@ -66,7 +66,7 @@ class OutputPlace(OutputFile):
     def convert(  # type: ignore[override]
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> Place:
-        """The path, and whether it is a folder: it exists as one, or the text ends in a slash."""
+        """The path, and whether it is a folder: a folder of this name exists, or the text ends in a slash."""
         path = super().convert(value, param, ctx)
         return Place(Path(path), is_folder=str(value).endswith(("/", os.sep)) or Path(path).is_dir())
 
@@ -150,7 +150,7 @@ DATA = click.option(
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace output files that exist")
 
-NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (`heliopsf key create` of the operator makes keys)"
+NO_KEY = "this service needs a key: set HELIOPSF_KEY to your key (the operator makes keys with `heliopsf key create`)"
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 

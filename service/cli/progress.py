@@ -51,7 +51,8 @@ def duration(seconds: float) -> str:
 
 
 def told(stage: str, step: int, steps: int) -> str:
-    """A stage and its step as text; only the stage if its number of steps is unknown (then it is reported as 1)."""
+    """A stage and its step as text; only the stage if its number of steps is unknown (an unknown number is reported
+    as 1)."""
     if (steps <= 1 and step < steps) or not steps:
         return stage
     return f"{stage}: {STEPS_OF.get(stage, 'step')} {step} of {steps}"

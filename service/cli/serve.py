@@ -22,7 +22,7 @@ from workers.contract.queues import Queue, queues_named
     "-v",
     "--verbose",
     is_flag=True,
-    help="Also log every request on a terminal; elsewhere, requests are always logged",
+    help="Also log every request on a terminal; a log that is not on a terminal always contains every request",
 )
 def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
     """Start a service over HTTP, and keep it running until it is interrupted.

@@ -36,7 +36,8 @@ def service_address(text: str) -> str:
 
 
 def how_to_start(server: str) -> str:
-    """What to do if no service answers at this address: the command that starts one there, if the address is of this machine."""
+    """What to do if no service answers at this address: the command that starts a service there, if the address is on
+    this machine."""
     parts = urlsplit(server)
     if parts.scheme != "http" or not is_loopback(parts.hostname or ""):
         return "check the address, or ask the operator whether the service runs"

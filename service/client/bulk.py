@@ -45,7 +45,7 @@ class BulkClient(ABC):
 
     @abstractmethod
     def _answer(self, method: str, address: str, **options: Any) -> httpx.Response:
-        """The answer to a request, as it came."""
+        """The answer to a request, unchanged."""
 
     @abstractmethod
     def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
@@ -142,7 +142,7 @@ class BulkClient(ABC):
     def wait_for_bulk(self, bulk_id: str, *, progress: Progress | None = None) -> dict[str, Any]:
         """Wait until a bulk run ends, is paused or has failed; returns its description.
 
-        Raises ``WaitInterrupted`` on Control-C; the bulk run goes on.
+        Raises ``WaitInterrupted`` on Control-C; the bulk run then continues.
         """
         try:
             for bulk in self.follow(f"/v1/bulk/{bulk_id}"):
@@ -172,11 +172,13 @@ class BulkClient(ABC):
     def events(
         self, *, jobs: Sequence[str] = (), bulks: Sequence[str] = ()
     ) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield all news of your jobs and bulk runs: ("job", description), ("bulk", description), ("gone", {"kind", "id"}).
+        """Yield the state of your jobs and bulk runs: ("job", description), ("bulk", description), ("gone", {"kind",
+        "id"}).
 
-        The first news are the jobs and bulk runs that have not ended and those in ``jobs`` and ``bulks`` (ids); then
-        comes each one that changes. The iteration does not end by itself. If the service does not answer, the client
-        tries again for up to 10 minutes and then raises ``ServiceError``.
+        The iteration first yields the jobs and bulk runs that have not ended or that ended in the last seconds, and
+        those whose ids are in ``jobs`` and ``bulks``. Then the iteration yields each job or bulk run again when its
+        state changes. The iteration does not end by itself. If the service does not answer, the client tries again
+        for up to 10 minutes and then raises ``ServiceError``.
         """
         with closing(self._told("/v1/events", params={"job": list(jobs), "bulk": list(bulks)})) as events:
             for event in events:
@@ -184,7 +186,7 @@ class BulkClient(ABC):
 
     def _told(self, address: str, **options: Any) -> Generator[dict[str, str], None, None]:
         """The events of a stream. If the connection is lost, the stream is opened again. The iteration ends if the
-        service has no more events (204)."""
+        service answers 204 (no more events)."""
         last_id: str | None = None
         wait_s, heard_at, lost = FIRST_WAIT_S, time.monotonic(), False
         while True:

@@ -29,8 +29,8 @@ class ServiceError(Exception):
 
 
 def error_lines(message: str, fields: Mapping[str, Any]) -> list[str]:
-    """An error as lines to print: the message, then, if the error has them, the PSFs that could fit the image and the
-    next steps."""
+    """An error as lines to print: the message; then the PSFs that could fit the image and the next steps, if the
+    error contains them."""
     lines = [message]
     if fields.get("instruments"):
         lines.append("Instruments whose PSF can be built:")

@@ -120,8 +120,8 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **series})
 
     def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        """Submit a job; returns its description. If an identical job was submitted before, the description is of that
-        job.
+        """Submit a job; returns its description. If an identical job was submitted before, returns the description of
+        that job.
 
         queue: "bulk" runs the job after all jobs of other queues; default: the queue of its kind.
         """
@@ -129,7 +129,7 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return self._json("POST", "/v1/jobs", json=body)
 
     def estimate(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        """Estimate a job without starting it. The arguments and the errors are those of ``submit``.
+        """Estimate a job without starting it. The arguments and the errors are the same as for ``submit``.
 
         "estimate" has the expected ``seconds`` and ``memory_mib``, "psf" says which PSF a deconvolution would use and why, and
         "existing" is the address of the result if there is one already.
@@ -138,13 +138,14 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return self._json("POST", "/v1/estimates", json=body)
 
     def result_id(self, kind: str, **parameters: Any) -> str:
-        """The id that the result of such a job has or would have. No job is started."""
+        """The id that the result of a job with these parameters has or would have. No job is started."""
         body = {"kind": kind, "parameters": parameters}
         identity: str = self._json("POST", "/v1/jobs/identity", json=body)["result_id"]
         return identity
 
     def image_id(self, path: str | Path, sha256: str) -> str:
-        """The id of an image. The image is uploaded unless the service has it. sha256: hash of the file."""
+        """The id of an image. If the service does not have the image, the image is uploaded. sha256: hash of the
+        file."""
         try:
             identity: str = self.get(f"/v1/images/{sha256}")["id"]
         except ServiceError as error:
@@ -173,9 +174,9 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
     ) -> dict[str, Any]:
         """Wait until a job is completed; returns its description.
 
-        If the service does not answer, for example while it is restarted, the client tries again for ten minutes. Raises
-        ``ServiceError`` if the job failed or was cancelled, ``TimeoutError`` after ``timeout_s``, and ``WaitInterrupted`` on
-        Control-C. After the last two, the job continues.
+        If the service does not answer, for example while it is restarted, the client tries again for ten minutes.
+        Raises ``ServiceError`` if the job failed or was cancelled, ``TimeoutError`` after ``timeout_s``, and
+        ``WaitInterrupted`` on Control-C. After ``TimeoutError`` or ``WaitInterrupted``, the job continues.
         """
         try:
             return self._ended(self._followed(job, progress, timeout_s))

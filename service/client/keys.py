@@ -8,7 +8,7 @@ from typing import Any
 
 
 class KeysClient(ABC):
-    """The requests about keys, of a service that requires them.
+    """The requests about keys, for a service that requires keys.
 
     Every method raises ``service.client.errors.ServiceError``; its ``code`` is the reason ("keys-not-used", "scope-missing", ...).
     """

@@ -1,7 +1,8 @@
 """Deconvolves many images into a folder, through a service or in this process.
 
-A few jobs are in flight at a time, so that the workers of a service need not wait for uploads and downloads. One thread does
-everything in the order of the images: it begins images until enough jobs are in flight, then waits for the oldest of them.
+A few jobs are in flight at a time, so that the workers of a service need not wait for uploads and downloads. One
+thread does everything in the order of the images: it begins images until enough jobs are in flight, then waits for
+the oldest job.
 
 The file of a product is named after the image's file and the product's identity. An image is skipped if the folder
 already contains its product, made from the same bytes with the same PSF and parameters. Products in the folder are
@@ -68,9 +69,9 @@ def deconvolve_many(
     files that have the name of a product but are not this product. progress(done, of) is called at the beginning and after
     each image.
 
-    Raises ``ServiceError`` for an error that concerns every image: "output-not-writable", a refused key, a full quota, or
-    no answer from the service. Images whose jobs are in flight are finished first, if the service answers. Raises
-    ``WaitInterrupted`` on Control-C; the jobs that this exception names continue.
+    Raises ``ServiceError`` for an error that concerns every image: "output-not-writable", a refused key, a full
+    quota, or no answer from the service. If the service answers, images whose jobs are in flight are finished before
+    the error is raised. Raises ``WaitInterrupted`` on Control-C; the jobs that this exception names continue.
     """
     check_output_folder(folder)
     Path(folder).mkdir(parents=True, exist_ok=True)
@@ -96,7 +97,7 @@ class _Begun:
 
 
 class _Run:
-    """Images on their way through a service, in their order; the first one is finished first."""
+    """The images whose outcome is not yet known, in their order; the first image is finished first."""
 
     def __init__(
         self,
@@ -133,7 +134,8 @@ class _Run:
         return [one.job for one in self._begun if isinstance(one, _Begun) and one.job is not None]
 
     def _finished(self, leave: int) -> Iterator[Outcome]:
-        """Finish images, oldest first, until at most ``leave`` jobs are in flight and the oldest image left has one."""
+        """Finish images, oldest first, until at most ``leave`` jobs are in flight and the oldest unfinished image has
+        a job in flight."""
         while self._begun:
             first = self._begun[0]
             if isinstance(first, _Begun):
@@ -144,7 +146,8 @@ class _Run:
             yield first
 
     def _begin(self, image: Path) -> _Begun | Outcome:
-        """Upload an image and submit its job, unless its product is in the folder or an earlier image makes it."""
+        """Upload an image and submit its job. No job is submitted if the product is in the folder, or if an earlier
+        image makes the same product."""
         with image.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         image_id = _patiently(lambda: self._service.image_id(image, sha256))
@@ -178,7 +181,8 @@ class _Run:
 
 
 def _told(image: Path, step: Callable[[], _Step]) -> _Step | Outcome:
-    """The answer of a step, or the outcome of the image if the step failed. Raises ``ServiceError`` if every image would fail."""
+    """The answer of a step, or the outcome of the image if the step failed. Raises ``ServiceError`` if the error
+    concerns every image."""
     try:
         return step()
     except ServiceError as error:

@@ -1,8 +1,9 @@
-"""The requests to a service. They use a few abstract operations. The HTTP client and the service in this process
-implement these.
+"""The requests to a service. The requests use a few abstract operations, which the HTTP client and the service in
+this process implement.
 
-A method that writes files checks them before it sends anything (``service.client.outputs.check_outputs``). An existing
-file is replaced only with ``overwrite=True``, and only when the new file is complete.
+A method that writes files first checks these files, and then sends its request
+(``service.client.outputs.check_outputs``). An existing file is replaced only with ``overwrite=True``, and only when
+the new file is complete.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ class Operations(ABC):
     """
 
     server: str | None = None
-    jobs_at_once = 1  # in this process, a job runs when somebody waits for it
+    jobs_at_once = 1  # in this process, a job runs when ``wait`` is called
 
     @abstractmethod
     def upload_image(self, path: str | Path) -> dict[str, Any]:
@@ -55,16 +56,17 @@ class Operations(ABC):
 
     @abstractmethod
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
-        """Submit a job; returns its description. If an identical job was submitted before, the description is of that
-        job."""
+        """Submit a job; returns its description. If an identical job was submitted before, returns the description of
+        that job."""
 
     @abstractmethod
     def result_id(self, kind: str, **parameters: Any) -> str:
-        """The id that the result of such a job has or would have. No job is started."""
+        """The id that the result of a job with these parameters has or would have. No job is started."""
 
     @abstractmethod
     def image_id(self, path: str | Path, sha256: str) -> str:
-        """The id of an image. The image is uploaded unless the service has it. sha256: hash of the file."""
+        """The id of an image. If the service does not have the image, the image is uploaded. sha256: hash of the
+        file."""
 
     @abstractmethod
     def release(self, product: dict[str, Any]) -> None:
@@ -231,7 +233,7 @@ class Operations(ABC):
         overwrite: bool = False,
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Upload a transit, make a report on its PSF and download it; returns its description.
+        """Upload a transit, make a report on its PSF and download the report; returns the description of the report.
 
         report, page, preview: where to write the report as JSON, as HTML, and its plot (PNG). noise: as for
         ``deconvolve``. parameters: ``psf_id`` of a PSF to test (default: fit a PSF), ``seed``, ``dark_offsets``, ``shapes``.

@@ -22,7 +22,7 @@ class NoKeyYet(Exception):
 
 @dataclass(frozen=True)
 class Access:
-    """Whether requests need a key, and which host names they may use. hosts is None if any name is allowed."""
+    """Whether requests need a key, and which host names requests may use. hosts is None if any name is allowed."""
 
     keys: bool
     hosts: frozenset[str] | None
@@ -38,7 +38,8 @@ class Access:
 
 
 def check_can_serve(settings: Settings, host: str, catalogue: Catalogue) -> None:
-    """Check, before a server listens, that somebody can use it. Raises ``NoKeyYet`` if it needs keys by default and no key exists."""
+    """Before a server listens, check that somebody can use the server. Raises ``NoKeyYet`` if the server needs keys
+    by default and no key exists."""
     access = Access.of(settings, host)
     if not access.keys:
         if not is_loopback(host):

@@ -1,7 +1,7 @@
 """Bounds on the body of a request: its size, its time, and the number of values in it.
 
-A body costs memory and time before its content is known. Therefore its size is bounded while it arrives, a client that
-sends too slowly gets an error, and the values in JSON are counted before Python objects are made of them.
+A body costs memory and time before its content is known. Therefore its size is bounded while it arrives, a client
+that sends too slowly gets an error, and the values in JSON are counted before Python makes objects of these values.
 """
 
 from __future__ import annotations

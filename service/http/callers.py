@@ -1,11 +1,11 @@
 """Identifies the caller of a request and checks its scopes. Each route names the scope that it needs.
 
-A program sends its key in ``Authorization``: as a bearer token, or as the password of HTTP Basic (with any user name), which
-clients of the Virtual Observatory support. A browser sends the cookie of its session, which began with a key (``/login``), and
-may do what this key allows. If a request has both, the key counts. An open service needs no key; everything in it belongs
-to one owner.
+A program sends its key in ``Authorization``: as a bearer token, or as the password of HTTP Basic (with any user
+name), which clients of the Virtual Observatory support. A browser sends the cookie of its session. The session began
+with a key (``/login``), and allows what this key allows. If a request has both a key and a cookie, the key counts. An
+open service needs no key; everything in it belongs to one owner.
 
-A browser adds the cookie by itself, so a page of another site could try to use it. Three rules prevent this:
+A browser adds the cookie by itself, so a page of another site could try to use the cookie. Three rules prevent this:
 
 - The cookie has ``SameSite=Strict``: browsers do not send it with requests that another site causes.
 - ``service.http.guard`` refuses every change whose ``Sec-Fetch-Site`` or ``Origin`` names another site.
@@ -87,10 +87,11 @@ def _caller(
 
 
 def admit(request: Request, state: State, scopes: Iterable[str], form_token: str | None = None) -> Caller:
-    """The caller of a request, counted against its limits. It waits for the database, so call it in a thread.
+    """The caller of a request, counted against its limits. This function waits for the database, so call it in a
+    thread.
 
-    form_token: the token that the request contains; default: that of its header. Raises ``Problem`` 401 without a valid key or
-    session, 403 if a scope or the form token is missing, and 429 if the caller has reached a limit.
+    form_token: the token that the request contains; default: the token in the header. Raises ``Problem`` 401 without
+    a valid key or session, 403 if a scope or the form token is missing, and 429 if the caller has reached a limit.
     """
     caller = _let_in(request, state, form_token or request.headers.get(FORM_TOKEN, ""))
     request.state.caller = caller
@@ -120,7 +121,7 @@ def cookie_name(request: Request) -> str:
     """The name of the cookie of a session.
 
     Browsers accept a cookie with the prefix ``__Host-`` only over HTTPS and only from this host. So no other host of
-    the domain can set it.
+    the domain can set such a cookie.
     """
     return f"__Host-{SESSION_COOKIE}" if request.url.scheme == "https" else SESSION_COOKIE
 

@@ -20,8 +20,8 @@ from workers.settings import Settings
 
 log = logging.getLogger(__name__)
 log.addFilter(logs.Seldom())
-# The event loop accepts this number of connections before it looks at any of them. It is small, because each one needs a
-# file descriptor before the bound on connections can apply.
+# The event loop accepts up to this number of connections in one step. This number is small, because each
+# connection needs a file descriptor before the bound on connections can apply.
 ACCEPTED_AT_ONCE = 16
 LISTEN = 512  # connections that the system keeps until the server accepts them
 # File descriptors that the server needs besides its connections: its database connections (SQLite: three each), its logs,
@@ -41,9 +41,9 @@ _FULL_BODY = (
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """most: largest number of connections that are open at the same time. header_s: longest time until the header of a
-    request is complete, from the connection or from the last answer. stalled_s: longest time in which a client takes no
-    part of its answer."""
+    """most: largest number of connections that are open at the same time. header_s: longest time until the header of
+    a request is complete, from the connection or from the last answer. stalled_s: longest time in which a client
+    receives no part of its answer."""
 
     most: int
     header_s: float
@@ -68,11 +68,12 @@ class BoundedConnection(H11Protocol):
 
     @property
     def answering(self) -> bool:
-        """Whether a request has arrived on this connection that is not answered completely."""
+        """Whether this connection has a request that is not completely answered yet."""
         return self.cycle is not None and not self.cycle.response_complete
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Accept the connection. If too many are open, close one that waits for a request; if none waits, refuse this."""
+        """Accept the connection. If too many are open, close the one that has waited longest for a request. If all
+        are answering requests, refuse this connection."""
         super().connection_made(transport)
         if self._open_connections() > self.limits.most and not self._close_the_longest_waiting():
             log.warning(
@@ -97,18 +98,19 @@ class BoundedConnection(H11Protocol):
             self._stop_header_timer()
 
     def on_response_complete(self) -> None:
-        """Await the next request. Until it comes, the rest of a body that nobody reads is received and dropped."""
+        """Wait for the next request. If nobody reads the rest of a body, the server receives it and drops it."""
         super().on_response_complete()
         if not self.answering and not self.transport.is_closing():
             self._await_header()
 
     def pause_writing(self) -> None:
-        """Start the timer for a client that takes no part of its answer."""
+        """Start a timer: the connection is closed if the client receives no part of its answer in this time."""
         super().pause_writing()
         self._stalled_timer = self.loop.call_later(self.limits.stalled_s, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Stop this timer: the client has taken a part of its answer, or the connection ends."""
+        """Stop the timer that `pause_writing` started: the client received a part of its answer, or the connection
+        ended."""
         if self._stalled_timer is not None:
             self._stalled_timer.cancel()
             self._stalled_timer = None
@@ -130,7 +132,8 @@ class BoundedConnection(H11Protocol):
         return sum(not one.transport.is_closing() for one in self.connections)
 
     def _close_the_longest_waiting(self) -> bool:
-        """Close the other connection that has waited longest for a request; False if all are answering requests."""
+        """Of the other connections, close the one that has waited longest for a request. Returns False if all are
+        answering requests."""
         waiting = [
             one
             for one in self.connections
@@ -155,7 +158,8 @@ def bounded(limits: ConnectionLimits) -> type[BoundedConnection]:
 
 
 def _most(wanted: int) -> int:
-    """The number of connections for which there are file descriptors. If needed, it first raises the process's limit."""
+    """The number of connections for which there are file descriptors. If needed, this function first raises the limit
+    of the process."""
     needed = OWN_DESCRIPTORS + PER_CONNECTION * wanted
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < needed:

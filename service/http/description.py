@@ -1,4 +1,4 @@
-"""Corrects the OpenAPI description where the framework describes the answers wrongly."""
+"""Corrects the OpenAPI description, because the framework describes some answers wrongly."""
 
 from __future__ import annotations
 

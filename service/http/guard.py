@@ -13,7 +13,8 @@ from service.http.access import Access
 from service.http.bodies import BodyLimits
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
-# Style sheets, scripts and pictures of pages. They contain no data of owners, and the page of a refusal needs them.
+# Style sheets, scripts and pictures of pages. These files contain no data of owners, and the page of a
+# refusal needs them.
 FOR_EVERYBODY = "/static/"
 
 
@@ -44,8 +45,8 @@ class _Guard:
         except problems.Problem as problem:
             await self._refusal(Request(scope), problem)(scope, receive, kept)
             return
-        # Nobody reads the body of a request that changes nothing. A stream of events receives only to learn when its client
-        # leaves, so no limit may end it.
+        # Nobody reads the body of a request that changes nothing. A stream of events receives only to notice
+        # that its client has disconnected, so no limit may end the stream.
         if scope["method"] not in SAFE_METHODS:
             receive = self._bodies.received(scope["path"], headers, receive)
         try:

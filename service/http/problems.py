@@ -67,8 +67,8 @@ STATUS_OF = {
     "too-much-memory": 413,
     "not-an-archive": 415,
 }
-# Headers of every answer, unless the route sets others. They forbid browsers to guess media types, to show the answer in a
-# frame, to send a referrer, and to load content.
+# Headers of every answer; a route may set others. The headers forbid browsers to guess media types, to show
+# the answer in a frame, to send a referrer, and to load content.
 SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -92,7 +92,7 @@ class ProblemDocument(BaseModel):
 class Problem(HTTPException):
     """An error with its HTTP status. Any endpoint may raise it. The answer is then a problem document.
 
-    It is an HTTPException: FastAPI replaces other exceptions that are raised while it reads a body.
+    The class is an HTTPException, because FastAPI replaces other exceptions that are raised while a body is read.
     """
 
     def __init__(

@@ -45,7 +45,8 @@ class Allowed:
 
 
 def check_disk(state: State, more_bytes: int = 0) -> None:
-    """Raise ``Problem`` 507 if the data folder's disk would have less free space than the setting after ``more_bytes``."""
+    """Raise ``Problem`` 507 if, after ``more_bytes`` more bytes, the data folder's disk would have less free space
+    than the setting requires."""
     free = checks.free_bytes(state.settings.data_dir)
     least = state.settings.min_free_mib * MIB
     if free - more_bytes < least:

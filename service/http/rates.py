@@ -124,7 +124,8 @@ class AtOnce:
         self._lock = threading.Lock()
 
     def open(self, who: str) -> None:
-        """Count one more. Raises ``Problem`` 429 if the caller already has ``most`` open."""
+        """Count a further request or stream of a caller. Raises ``Problem`` 429 if the caller already has ``most``
+        open."""
         with self._lock:
             if self._open[who] >= self._most:
                 raise Problem(
@@ -142,7 +143,7 @@ class AtOnce:
             return self._open.total()
 
     def close(self, who: str) -> None:
-        """Count one fewer."""
+        """Record that a request or stream of a caller has ended."""
         with self._lock:
             self._open[who] -= 1
             if not self._open[who]:

@@ -56,7 +56,7 @@ def complete(request: Request, state: State, owner: str) -> None:
                 404,
                 f"no-such-{thing}",
                 f"expected the id of {shown}, or its first {FEWEST_DIGITS} or more digits; got {text}: no {_NAMED.get(thing, thing)} "
-                f"of yours has an id that begins so{_LISTED.get(thing, '')}",
+                f"of yours has an id that begins with these digits{_LISTED.get(thing, '')}",
             )
         if len(found) > 1:
             error = several_ids_fit(text, found)

@@ -32,7 +32,8 @@ class State:
     rates: Rates
     streams: AtOnce
     requests: AtOnce
-    # Limits how many cut-outs are made at once, because each keeps a core busy. Others wait without using a thread.
+    # Limits how many cut-outs are made at once, because each keeps a core busy. Other requests wait without
+    # using a thread.
     cutouts: anyio.CapacityLimiter
     # The same for decoding planes and headers.
     decoding: anyio.CapacityLimiter

@@ -81,7 +81,7 @@ FoundOut = TypeVar("FoundOut", covariant=True)
 
 @dataclass(frozen=True)
 class Upload(Generic[Found]):
-    """A completely received file and a summary of its content. It is not yet in the store."""
+    """A completely received file and a summary of its content. The file is not yet in the store."""
 
     path: Path
     sha256: str
@@ -372,7 +372,7 @@ class _Body:
 
 
 def label(filename: str | None) -> str | None:
-    """A short printable label from a client's file name. It is never used as a path."""
+    """A short printable label from a client's file name. The label is never used as a path."""
     if not filename:
         return None
     last = re.split(r"[/\\]", filename)[-1]

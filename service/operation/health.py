@@ -29,7 +29,7 @@ class Readiness(BaseModel):
 
     status: str
     parts: dict[str, str] = Field(
-        description="state of database, storage, and broker or embedded worker; `ok` if it answers"
+        description="state of the database, of the storage, and of the broker or embedded worker; `ok`: the part answers"
     )
 
 

@@ -2,10 +2,10 @@
 then back.
 
 The routes of pages have a parameter ``PageReading``, ``PageSubmitting``, ``PageBulk``, ``PageCertifying`` or
-``PageVisiting``. It replaces the parameter from ``service.http.callers`` that routes of the API have. There are two
-differences: without a session the visitor is redirected, and the form token may also be a field of the form. The field
-is read only if no header says from which site the request comes. It is never read from a multipart form, because such a
-form may contain a large file, which only the route may read.
+``PageVisiting``. This parameter replaces the parameter from ``service.http.callers`` that routes of the API have.
+There are two differences: without a session the visitor is redirected, and the form token may also be a field of the
+form. The field is read only if no header says from which site the request comes. The field is never read from a
+multipart form, because such a form may contain a large file, which only the route may read.
 """
 
 from __future__ import annotations

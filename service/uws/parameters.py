@@ -29,7 +29,8 @@ from workers.intake.requests import resolve
 MAX_FORM_BYTES = 2**20
 MAX_FIELDS = 64
 SHOWN = 120
-# The last four are phases of the standard. Jobs of this service are never in them, but clients may ask for them.
+# The last four are phases of the standard. Jobs of this service are never in these phases, but clients may
+# ask for such jobs.
 PHASES = frozenset({*Phase, "HELD", "SUSPENDED", "UNKNOWN", "ARCHIVED"})
 INTEGER = re.compile(r"-?[0-9]{1,15}", re.ASCII)
 

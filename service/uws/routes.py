@@ -1,9 +1,9 @@
 """The jobs of the service by IVOA UWS 1.1, for clients of the Virtual Observatory: ``/uws/jobs``.
 
-Citation: REC-UWS-1.1 (24 October 2016), section 2.2. A job is PENDING until the client starts it. It has a limit
-on its execution time, and a time at which it is destroyed. Each request has a job of its own, but identical requests share
-their result: one of the identical jobs runs, and the others wait in phase QUEUED. If that job fails, the next one runs.
-Destroying a job does not delete its result. Errors are plain text.
+Citation: REC-UWS-1.1 (24 October 2016), section 2.2. A job is PENDING until the client starts it. A job has a limit
+on its execution time, and a time at which it is destroyed. Each request has a job of its own, but identical requests
+share their result: one of the identical jobs runs, and the others wait in phase QUEUED. If that job fails, the next
+one runs. Destroying a job does not delete its result. Errors are plain text.
 """
 
 from __future__ import annotations
@@ -148,7 +148,8 @@ async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Sha
 
 @router.delete("/{job_id}", summary="UWS: abort and destroy a job", **routing.TO_JOB)
 def delete_uws_job(job_id: str, request: Request, caller: Submitting, state: Shared) -> Response:
-    """Delete the job in any phase. If a worker runs the job, the worker stops it. Its result stays in the catalogue."""
+    """Delete the job in any phase. If a worker runs the job, the worker stops it. The result of the job stays in the
+    catalogue."""
     check_own(_find(state, caller, job_id))
     state.catalogue.uws.destroy(job_id)
     return RedirectResponse(_jobs_url(request), 303)

@@ -1,10 +1,10 @@
 """Files that UWS clients send with the parameters of a job: ``UPLOAD=name,param:part`` and a part of the form with the file.
 
-Citation: IVOA DALI 1.1 (17 May 2017), standard parameter UPLOAD. The name says what the file is. It determines which
-parameter of the job gets its id: ``UPLOAD=image,param:f`` adds the image in the part ``f``, and sets ``image_id``. A
-file is checked and stored in the same way as by ``POST /v1/images``, ``/v1/transits`` or ``/v1/psfs``. Files at other
-addresses (``UPLOAD=name,http://...``) are refused: if the service fetched any address, clients could use it to reach
-machines that they cannot reach themselves.
+Citation: IVOA DALI 1.1 (17 May 2017), standard parameter UPLOAD. The name says what the file is, and determines which
+parameter of the job gets the id of the file: ``UPLOAD=image,param:f`` adds the image in the part ``f``, and sets
+``image_id``. A file is checked and stored in the same way as by ``POST /v1/images``, ``/v1/transits`` or
+``/v1/psfs``. Files at other addresses (``UPLOAD=name,http://...``) are refused: if the service fetched any address,
+clients could use it to reach machines that they cannot reach themselves.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ SentForm = Annotated[Sent, Depends(_sent)]
 def ids_of(sent: Sent, kind: str) -> dict[str, str]:
     """The parameters that the files of a form set: the id of each file, by the name of the parameter.
 
-    Raises ``Problem`` if UPLOAD is malformed, names a part that the form does not have, or sets a parameter twice; if the kind
-    of job has no such parameter; and if no UPLOAD names a file.
+    Raises ``Problem`` if UPLOAD is malformed, names a part that the form does not have, or sets a parameter twice; if
+    the kind of job has no such parameter; and if the form contains a file that no UPLOAD names.
     """
     return {NAMES[name]: sent.parts[part].sha256 for name, part in _named(sent, kind).items()}
 

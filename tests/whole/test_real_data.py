@@ -52,7 +52,10 @@ def test_real_aia_images_need_no_option(
 ) -> None:
     product = stack.client.deconvolve(shared / name, tmp_path / "out.fits")
     assert abs(product["details"]["flux_change_pct"]) < 1
-    assert product["details"]["dark_change_pct"] < 0 < product["details"]["bright_change_pct"]
+    dark = product["details"]["dark_change_pct"]
+    # The darkest pixels of the binned image sum to less than zero, so that their change has no percentage.
+    assert dark is None if name == AIA_GZ else dark < 0
+    assert product["details"]["bright_change_pct"] > 0
     assert fits.getheader(tmp_path / "out.fits")["PSFNAME"] == psf
 
 

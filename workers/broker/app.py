@@ -36,8 +36,8 @@ def make_app(settings: Settings) -> Celery:
         # crashes when it loses its broker (kombu 5.7).
         task_acks_late=False,
         worker_prefetch_multiplier=1,
-        # If a process has ended, Celery waits for its result before it gives a job to the process that replaces it. Our
-        # jobs have no results in Celery.
+        # If a process has ended, Celery waits for the result of its job before the new process gets a job.
+        # This wait is short, because our jobs have no results in Celery.
         worker_lost_wait=0.1,
         task_queues=[BrokerQueue(broker_name(queue), routing_key=broker_name(queue)) for queue in Queue],
         task_default_queue=broker_name(Queue.INTERACTIVE),
@@ -51,7 +51,8 @@ def make_app(settings: Settings) -> Celery:
 
 
 def submit(app: Celery, job_id: str, queue: Queue = Queue.INTERACTIVE) -> bool:
-    """Send the id of a job to the broker. False if the broker does not answer; the reconciler then tries again."""
+    """Send the id of a job to the broker. Returns False if the broker does not answer; the reconciler then tries
+    again."""
     try:
         app.send_task(RUN_JOB, args=[job_id], queue=broker_name(queue), retry=False)
     except AWAY as error:

@@ -1,8 +1,8 @@
 """Makes a worker take messages from the queue of highest priority, and only when one of its processes is idle.
 
-By default Celery and kombu do not do this. They serve the queues in turn and ignore their priority. With early
-acknowledgement they also fetch one message more than they can start. A more urgent job would then wait for two jobs
-instead of one.
+By default Celery and kombu do not do this. Celery and kombu serve the queues in turn and ignore their priority. With
+early acknowledgement they also fetch one message more than they can start. A more urgent job would then wait for two
+jobs instead of one.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ class FolderTransport(filesystem.Transport):
     def drain_events(self, connection: Any, timeout: float | None = None, **_: Any) -> None:
         """Deliver one message. Raises ``TimeoutError`` if no message arrives in time, or at once if the worker must stop.
 
-        Only between two calls of this method does Celery check whether the worker must stop. Kombu's own version sleeps
-        twice for some seconds, which would delay the stop.
+        Celery checks whether the worker must stop only between two calls of this method. Kombu's own version sleeps
+        twice for a few seconds, which would delay the stop.
         """
         until = None if timeout is None else time.monotonic() + timeout
         channels: Any = self.cycle

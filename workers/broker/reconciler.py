@@ -14,12 +14,14 @@ from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
-# This number is small, so that an urgent job that arrives during a pass does not wait for many other jobs.
+# This number is small: an urgent job may arrive while jobs are submitted, and must not wait for many other
+# jobs.
 AT_ONCE = 50
 
 
 def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
-    """Make one pass. Returns the number of submitted jobs, at most ``AT_ONCE``. Several processes may make passes at the same time."""
+    """Queue the jobs of lost workers again, apply the UWS terms, keep the turns of bulk runs, and submit queued jobs.
+    Returns the number of submitted jobs, at most ``AT_ONCE``. Several processes may do this at the same time."""
     for job_id in catalogue.jobs.give_up_silent(settings.lease_s, settings.max_attempts):
         log.warning("job %s: no heartbeat from its worker; queued again", job_id)
     for job_id in catalogue.uws.end_by_terms():
@@ -55,7 +57,7 @@ class Reconciler:
         self._thread.join()
 
     def wake(self) -> None:
-        """Start a pass now, because there is a job to submit."""
+        """Reconcile now, without waiting for the interval to end, because there is a job to submit."""
         self._wake.set()
 
     @property
@@ -70,7 +72,7 @@ class Reconciler:
             try:
                 submitted = reconcile(self._catalogue, self._app, self._settings)
             except SQLAlchemyError as error:
-                # The database may be restarting; the next pass tries again.
+                # The database may be restarting; the thread tries again after the interval.
                 log.warning("reconciler: the database does not answer: %s", error)
             if submitted < AT_ONCE:
                 self._wake.wait(self._settings.reconcile_s)

@@ -63,7 +63,7 @@ class _Source:
 
 
 def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Outcome:
-    """Deconvolve an image of a bulk run, unless its product exists.
+    """Deconvolve an image of a bulk run. If its product exists already, use this product.
 
     If another job is making the product now, wait for that job and use its product.
     """
@@ -110,7 +110,8 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
         if row is None:
             raise DataError(
                 "no-such-image",
-                f"expected the id of an uploaded image; got {taken.source}, which is not in the catalogue",
+                f"expected the id of an uploaded image; got {taken.source}, which is not in the catalogue: "
+                "upload the image first",
             )
         yield _Source(None, row.id, row.summary, row.filename or "image")
         return
@@ -132,7 +133,8 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
 
 
 def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Source) -> ResolvedDeconvolve:
-    """The deconvolution with its PSF. This is the PSF of the bulk run, or the PSF that its context pins for the image."""
+    """The deconvolution with its PSF. The PSF is that of the bulk run, or the PSF that the context of the run pins
+    for the image."""
     wanted = Deconvolve(
         image_id=source.sha256,
         psf_id=bulk.psf_id,

@@ -28,7 +28,8 @@ def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Sett
     missing = catalogue.bulks.progress.first_not_uploaded(images, owner)
     if missing is not None:
         raise DataError(
-            "no-such-image", f"expected ids of uploaded images; got {missing}, which is not in the catalogue"
+            "no-such-image",
+            f"expected ids of uploaded images; got {missing}, which is not in the catalogue: upload the image first",
         )
     _check_places(request, settings)
     asked = request.model_dump(mode="json", exclude={"images", "context"}) | {"context": context_id}
@@ -55,7 +56,8 @@ def _pinned(request: BulkRequest, catalogue: Catalogue, owner: str) -> tuple[str
         if catalogue.get(PsfRow, request.psf_id, owner) is None:
             raise DataError(
                 "no-such-psf",
-                f"expected the id of a PSF in the catalogue; got {request.psf_id}, which is not in it",
+                f"expected the id of a PSF in the catalogue; got {request.psf_id}, which is not in it: "
+                "list the PSFs with `heliopsf psf list`",
             )
         return request.psf_id, None
     assert request.context is not None

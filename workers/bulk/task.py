@@ -55,8 +55,9 @@ def _stopped_for_quota(context: Context, bulk: BulkRow) -> bool:
     if not usage.full or not work_of(bulk).keeps_products:
         return False
     message = (
-        f"expected room for more products; {usage.used_bytes} of {usage.limit_bytes} bytes of the quota are used: ask the "
-        "operator for a larger quota, then resume the run"
+        f"expected room for more products; {usage.used_bytes} of {usage.limit_bytes} bytes of the quota are used: delete "
+        "products or other bulk runs that you no longer need (`heliopsf product delete`, `heliopsf bulk delete`), or ask "
+        "the operator for a larger quota; then resume the run"
     )
     context.catalogue.bulks.stop_with(
         bulk.id, JobError(fault=Fault.USER, code="quota-exceeded", message=message)

@@ -112,7 +112,7 @@ def _told(session: Session, psfs: Sequence[PsfRow], products: Sequence[ProductRo
 
 
 def _with_successors(session: Session, psfs: Sequence[PsfRow]) -> dict[str, PsfRow]:
-    """These PSFs of one owner and those of their chains of successors, by id."""
+    """These PSFs of one owner, and the PSFs in their chains of successors, by id."""
     known = {psf.id: psf for psf in psfs}
     for _ in range(MOST_SUCCESSORS):
         further = {psf.successor_id for psf in known.values() if psf.successor_id is not None} - known.keys()

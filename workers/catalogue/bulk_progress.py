@@ -123,7 +123,7 @@ class BulkProgress:
             return session.scalars(query).all()
 
     def without_product(self, owner: str, limit: int) -> Sequence[str]:
-        """Ids of the owner's newest uploaded images of which there is no product."""
+        """Ids of the owner's newest uploaded images that have no product."""
         made = exists().where(ProductRow.owner == ImageRow.owner, ProductRow.image_id == ImageRow.id)
         query = select(ImageRow.id).where(ImageRow.owner == owner, ~made)
         query = query.order_by(ImageRow.created_at.desc(), ImageRow.id.desc()).limit(limit)
@@ -137,13 +137,13 @@ class BulkProgress:
             return {one: name for one, name in session.execute(query) if name}
 
     def still_there(self, product_ids: Sequence[str], owner: str) -> frozenset[str]:
-        """Those of these products that have not been deleted."""
+        """The ids in ``product_ids`` whose products have not been deleted."""
         query = select(ProductRow.id).where(ProductRow.owner == owner, ProductRow.id.in_(product_ids))
         with self._database.reading() as session:
             return frozenset(session.scalars(query))
 
     def done_before(self, owner: str, product_id: str, output: str) -> BulkItemRow | None:
-        """An image that is done and whose product ``product_id`` is in the file ``output``, in any bulk run of the owner.
+        """A done image, from any bulk run of the owner, whose product ``product_id`` is in the file ``output``.
 
         None if there is no such image.
         """

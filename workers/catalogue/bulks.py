@@ -34,7 +34,7 @@ NOT_UTF_8, TOO_LONG = "path-not-utf-8", "path-too-long"
 LOST = JobError(
     fault=Fault.INTERNAL,
     code="worker-lost",
-    message="every worker that processed this image was lost; the image is not tried again unless you retry the run",
+    message="every worker that processed this image was lost: retry the run to process the image again",
 )
 
 
@@ -108,7 +108,7 @@ class Bulks:
         return self._set(bulk_id, AT_WORK, phase=BulkPhase.PAUSED)
 
     def resume(self, bulk_id: str) -> bool:
-        """PAUSED, ERROR -> RUNNING, or LISTING if its files are not all listed."""
+        """PAUSED, ERROR -> RUNNING, or LISTING if not all files of the run are listed."""
         now = {"running_since": time.time(), "error": None}
         return self._set(bulk_id, STOPPED, BulkRow.listed, phase=BulkPhase.RUNNING, **now) or self._set(
             bulk_id, STOPPED, BulkRow.listed.is_(False), phase=BulkPhase.LISTING, **now
@@ -119,11 +119,12 @@ class Bulks:
         return self._set(bulk_id, OPEN, phase=BulkPhase.CANCELLED, ended_at=time.time())
 
     def delete(self, bulk_id: str) -> bool:
-        """Delete a run and its images; their products stay. False if there is no such run, or if it is LISTING or RUNNING.
+        """Delete a run and its images; their products stay. Returns False if there is no such run, or if the run is
+        LISTING or RUNNING.
 
-        The run is cancelled first, so that nobody resumes it. Then its images are deleted in batches, and at last the run. Each
-        batch is one transaction, which gives its bytes back to the owner. If this process stops before the end, a cancelled
-        run with fewer images is left; it can be deleted again.
+        The run is cancelled first, so that nobody resumes it. Then its images are deleted in batches, and finally the
+        run. Each batch is one transaction, which also subtracts the bytes of the batch from the owner's count. If
+        this process stops before the end, a cancelled run with fewer images remains; this run can be deleted again.
         """
         ended_at = func.coalesce(BulkRow.ended_at, time.time())
         if not self._set(bulk_id, DELETABLE, phase=BulkPhase.CANCELLED, ended_at=ended_at):
@@ -138,7 +139,8 @@ class Bulks:
         here = BulkItemRow.bulk_id == bulk_id
         next_ones = select(BulkItemRow.position).where(here).order_by(BulkItemRow.position).limit(BATCH)
         with self._database.writing.begin() as session:
-            # The order of locks: the owner, as in all deletions; images; the run, as workers do that record a result.
+            # Locks are taken in this order: first the owner, as in all deletions; then the images; then the
+            # run, as in a worker that records a result.
             add_bytes(session, owner, 0)
             positions = session.scalars(next_ones).all()
             if not positions:
@@ -219,7 +221,7 @@ class Bulks:
     def begin_listing(self, bulk_id: str, lease: Lease) -> bool:
         """Begin to list the files under this lease. Files that a lost worker listed are deleted first.
 
-        False if the lease is lost or the run is not LISTING.
+        Returns False if the lease is lost or the run is not LISTING.
         """
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
@@ -235,7 +237,7 @@ class Bulks:
     def add_listed(
         self, bulk_id: str, lease: Lease, images: Sequence[Listed], quota_mib: int | None = None
     ) -> bool:
-        """Add images to a run. False if another lease now lists the files, or if the run is not LISTING.
+        """Add images to a run. Returns False if another lease now lists the files, or if the run is not LISTING.
 
         quota_mib: as for ``create``.
         """
@@ -250,7 +252,8 @@ class Bulks:
             return True
 
     def end_listing(self, bulk_id: str, lease: Lease) -> bool:
-        """LISTING -> RUNNING, or LISTING -> COMPLETED if no image is left. False under the conditions of ``add_listed``."""
+        """LISTING -> RUNNING, or LISTING -> COMPLETED if no image is left. Returns False under the conditions of
+        ``add_listed``."""
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
             if bulk is None or bulk.phase != BulkPhase.LISTING or bulk.lister != lease.token:
@@ -265,7 +268,7 @@ class Bulks:
     def take(self, bulk_id: str, lease: Lease, max_attempts: int) -> Taken | None:
         """Take an image whose worker was lost, or else the next waiting image.
 
-        None if no image is left, the run is not RUNNING, or the lease is lost. An image that was taken
+        Returns None if no image is left, the run is not RUNNING, or the lease is lost. An image that was taken
         ``max_attempts`` times becomes a failed image.
         """
         while True:
@@ -287,12 +290,13 @@ class Bulks:
                 return Taken(bulk_id, item.position, item.source, item.uploaded, item.attempts, lease)
 
     def release(self, taken: Taken) -> bool:
-        """Give an image back, as if it had not been taken; the attempt does not count. False if the right to it was lost."""
+        """Give an image back, as if it had not been taken; the attempt does not count. Returns False if the worker
+        has lost the right to work on the image."""
         values = {"state": ItemState.WAITING, "attempts": BulkItemRow.attempts - 1, "token": None}
         return bool(self._database.change(update(BulkItemRow).where(*_holding(taken)).values(**values)))
 
     def finish(self, taken: Taken, *, reused: bool, **values: Any) -> bool:
-        """Record that an image is done; False if the right to it was lost."""
+        """Record that an image is done. Returns False if the worker has lost the right to work on the image."""
         done = update(BulkItemRow).where(*_holding(taken)).values(
             state=ItemState.DONE, ended_at=time.time(), token=None, error=None, reused=reused, **values
         )  # fmt: skip
@@ -303,7 +307,7 @@ class Bulks:
             return True
 
     def fail(self, taken: Taken, error: JobError) -> bool:
-        """Record that an image failed; False if the right to it was lost."""
+        """Record that an image failed. Returns False if the worker has lost the right to work on the image."""
         failed = update(BulkItemRow).where(*_holding(taken)).values(
             state=ItemState.FAILED, ended_at=time.time(), token=None, error=error.model_dump(mode="json")
         )  # fmt: skip

@@ -186,7 +186,7 @@ class Catalogue:
             return session.scalars(query.order_by(table.id).limit(MOST_CANDIDATES)).all()
 
     def ids_among(self, table: type[AnyRow], identities: Collection[str], owner: str) -> set[str]:
-        """Those of the ids that the catalogue has."""
+        """The ids in ``identities`` that the catalogue contains."""
         query = select(table.id).where(table.owner == owner, table.id.in_(identities))
         with self._database.reading() as session:
             return set(session.scalars(query))
@@ -245,7 +245,7 @@ SHOWN_DIGITS = (
 
 
 def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:
-    """Give the completed jobs with this result other keys, because their result is deleted.
+    """The result of these completed jobs is deleted, so give the jobs other keys.
 
     An identical request then gets a new job, instead of a job whose result is gone.
     """

@@ -187,7 +187,8 @@ def _given(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRow]
         if row is None:
             raise DataError(
                 "no-such-psf",
-                f"expected the id of a PSF in the catalogue; got {pin.psf_id}, which is not in it",
+                f"expected the id of a PSF in the catalogue; got {pin.psf_id}, which is not in it: "
+                "list the PSFs with `heliopsf psf list`",
             )
         rows.append(_pin(row, pin.validity))
     rows.sort(key=lambda pinned: (pinned.series, pinned.valid_from))

@@ -50,7 +50,7 @@ class Database:
     def now(self) -> ColumnElement[float]:
         """An SQL expression for the time of the database's clock, in seconds since 1970. All machines share this clock.
 
-        It is the time at which the SQL statement began. On SQLite it is rounded to milliseconds.
+        The value is the time at which the SQL statement began. On SQLite it is rounded to milliseconds.
         """
         # PostgreSQL can use an index with this clock, because it is constant within a statement.
         now = (
@@ -64,7 +64,8 @@ class Database:
         """Raise ``sqlalchemy.exc.DatabaseError`` if the file of an SQLite database is damaged. Other databases are not checked."""
         if not self.sqlite:
             return
-        # A new connection, because the other ones keep pages in memory and do not read them again.
+        # A new connection, because the other connections keep pages in memory and do not read these pages
+        # again.
         fresh = create_engine(self.engine.url, poolclass=NullPool)
         with fresh.connect() as connection:
             (found,) = connection.exec_driver_sql(QUICK_CHECK).one()
@@ -80,7 +81,8 @@ class Database:
 
 
 def begins_with(column: InstrumentedAttribute[str], digits: str) -> ColumnElement[bool]:
-    """The condition that an id begins with these hexadecimal digits. It is written so that an index can be used."""
+    """The condition that an id begins with these hexadecimal digits. The condition is written so that the database
+    can use an index."""
     return and_(column >= digits, column < digits + "g")
 
 

@@ -63,12 +63,13 @@ class Jobs:
         estimate: dict[str, Any] | None = None,
         quota_mib: int | None = None,
     ) -> tuple[JobRow, bool]:
-        """Queue a new job, or share the live job of an identical request; also returns whether the job is new.
+        """Queue a new job, or share the job of an identical request that is queued, executing or completed. Returns
+        the job, and whether it is new.
 
         queue: the queue of the new job; None: the default queue of the job's kind. A shared job that waits in a less
-        urgent queue moves to ``queue``. A cancelled job or a job with UWS terms is not shared: the new job then gets a
-        different key. It waits while the other job executes, and then uses the result of the other job, if there is
-        one. quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
+        urgent queue moves to ``queue``. A cancelled job or a job with UWS terms is not shared: the new job then gets
+        a different key. The new job waits while the other job executes. If the other job has a result, the new job
+        then uses this result. quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
         """
         queue = queue or queue_of(kind)
         for _ in range(3):  # between the two statements, the identical job may fail
@@ -97,10 +98,11 @@ class Jobs:
         raise RuntimeError(f"job for request {request_key} neither inserted nor found")
 
     def _shared(self, owner: str, request_key: str) -> tuple[str, JobRow | None]:
-        """Find the live job that an identical request can share; returns its key and the job.
+        """Find the queued, executing or completed job that an identical request can share; returns its key and the job.
 
-        If there is no such job, returns the key for a new job, and None. If an identical job cannot be shared, the key of
-        the new job is computed from the id of that job. Later identical requests then find the new job.
+        If there is no such job, returns the key for a new job, and None instead of a job. If an identical job cannot
+        be shared, the key of the new job is computed from the id of that job. Later identical requests then find the
+        new job.
         """
         key = request_key
         live = select(JobRow, TermsRow.job_id).outerjoin(TermsRow, TermsRow.job_id == JobRow.id)
@@ -139,9 +141,10 @@ class Jobs:
         self._set([JobRow.id == job_id, JobRow.phase == Phase.QUEUED], submitted_at=None)
 
     def claim(self, job_id: str, worker: str) -> Lease | None:
-        """QUEUED -> EXECUTING. Exactly one of the workers that try gets the lease; all others get None.
+        """QUEUED -> EXECUTING. If several workers try, exactly one gets the lease; the others get None.
 
-        While another job with the same result executes, every worker gets None; the job is submitted again later.
+        While another job with the same result executes, every worker gets None; the reconciler submits the job again
+        later.
         """
         lease = Lease(job_id, uuid.uuid4().hex)
         now = self._database.now
@@ -181,11 +184,11 @@ class Jobs:
         )
 
     def heartbeat(self, lease: Lease) -> bool:
-        """Record that the worker is alive; False if the lease is lost or the job was cancelled."""
+        """Record that the worker is alive. Returns False if the lease is lost or the job was cancelled."""
         return self._set([*_held(lease), JobRow.cancel_requested.is_(False)], heartbeat_at=self._database.now)
 
     def progress(self, lease: Lease, stage: str, step: int, steps: int) -> bool:
-        """Store the job's progress and a heartbeat; False if the lease is lost or the job was cancelled.
+        """Store the job's progress and a heartbeat. Returns False if the lease is lost or the job was cancelled.
 
         A job counts its steps several times. A new count begins when the number of steps changes, or when the step is
         smaller than the step before. The row stores the time and the step at which the current count began; the
@@ -203,13 +206,13 @@ class Jobs:
         )
 
     def complete(self, lease: Lease, result_id: str) -> bool:
-        """EXECUTING -> COMPLETED; False if the lease is lost."""
+        """EXECUTING -> COMPLETED. Returns False if the lease is lost."""
         return self._set(
             _held(lease), phase=Phase.COMPLETED, ended_at=self._database.now, result_id=result_id, lease=None
         )
 
     def fail(self, lease: Lease, error: JobError) -> bool:
-        """EXECUTING -> ERROR; False if the lease is lost."""
+        """EXECUTING -> ERROR. Returns False if the lease is lost."""
         return self._set(
             _held(lease),
             phase=Phase.ERROR,
@@ -219,7 +222,7 @@ class Jobs:
         )
 
     def requeue(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED after a transient failure; False if the lease is lost.
+        """EXECUTING -> QUEUED after a transient failure. Returns False if the lease is lost.
 
         The job is submitted again after the waiting time of ``unsubmitted``. A cancelled job is aborted instead.
         """
@@ -227,7 +230,7 @@ class Jobs:
         return self._set(_held(lease), **self._again(), **delay)
 
     def abort(self, lease: Lease) -> bool:
-        """EXECUTING -> ABORTED, when the worker has stopped a cancelled job; False if the lease is lost."""
+        """EXECUTING -> ABORTED, when the worker has stopped a cancelled job. Returns False if the lease is lost."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(True)],
             phase=Phase.ABORTED,
@@ -246,7 +249,8 @@ class Jobs:
         )
 
     def hand_back(self, lease: Lease) -> bool:
-        """EXECUTING -> QUEUED, because the worker stops. The attempt does not count. False if the lease is lost."""
+        """EXECUTING -> QUEUED, because the worker stops. The attempt does not count. Returns False if the lease is
+        lost."""
         return self._set(
             [*_held(lease), JobRow.cancel_requested.is_(False)],
             phase=Phase.QUEUED,
@@ -259,9 +263,9 @@ class Jobs:
     def give_up_silent(self, lease_s: float, max_attempts: int) -> list[str]:
         """Queue the jobs again whose worker has been silent for longer than ``lease_s``; returns the ids of these jobs.
 
-        A cancelled job is aborted instead. A job that was already started ``max_attempts`` times ends in ERROR.
-        If the database's clock was set back, a heartbeat may lie in the future. It then counts as a heartbeat of this
-        moment, so that the lease of a lost worker does not last until the clock has caught up.
+        A cancelled job is aborted instead. A job that was already started ``max_attempts`` times ends in ERROR. If
+        the database's clock was set back, a heartbeat may lie in the future. Such a heartbeat counts as a heartbeat
+        of this moment, so that the lease of a lost worker does not last until the clock has caught up.
         """
         now = self._database.now
         ahead = [JobRow.phase == Phase.EXECUTING, JobRow.heartbeat_at > now + lease_s]
@@ -361,7 +365,7 @@ def no_equal_at_work() -> ColumnElement[bool]:
 
 def is_at_work(phase: InstrumentedAttribute[str]) -> ColumnElement[bool]:
     """The condition that a job executes."""
-    # The phase is a literal in the text of the statement. Only then do the databases use the partial index.
+    # The phase is a literal in the text of the statement. The databases use the partial index only then.
     return phase == literal(Phase.EXECUTING.value, literal_execute=True)
 
 

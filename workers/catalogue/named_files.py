@@ -1,7 +1,8 @@
 """Find the files of all owners to which the database refers.
 
-A row refers to a file if the file's hash appears in any text or JSON column. The search therefore works for all tables
-in the same way. It may find hashes that are not hashes of files, for example the hash of a key. It misses no file.
+A row refers to a file if the file's hash appears in any text or JSON column. The search therefore works for all
+tables in the same way. The search may find hashes that are not hashes of files, for example the hash of a key. It
+misses no file.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class NamedFiles:
         self._database = database
 
     def all(self, *, solutions_from: float = -math.inf) -> Iterator[str]:
-        """Every hash in the database, some of them more than once; rows are read in batches.
+        """Every hash in the database; a hash may occur more than once. Rows are read in batches.
 
         solutions_from: kept solutions that were made before this time are left out.
         """
@@ -50,9 +51,11 @@ class NamedFiles:
                 yield from self._in(table, solutions_from)
 
     def among(self, digests: frozenset[str]) -> frozenset[str]:
-        """Those of a few hashes to which the row of an upload, a PSF, a product, a report or a solution refers.
+        """The hashes in ``digests`` (a few) to which the row of an upload, a PSF, a product, a report or a solution
+        refers.
 
-        Jobs and bulk runs are not searched. They refer to things by id, and every existing thing has a row of its own.
+        Jobs and bulk runs are not searched. Jobs and bulk runs refer to things by id, and every existing thing has a
+        row of its own.
         """
         named: set[str] = set()
         with self._database.reading() as session:
@@ -67,9 +70,8 @@ class NamedFiles:
         return frozenset(named)
 
     def kept(self, table: type[Row]) -> Iterator[Row]:
-        """All rows of a table whose rows refer to files.
-
-        They are read in batches, so that no transaction stays open for long.
+        """All rows of a table that refers to files. The rows are read in batches, so that no transaction stays open
+        for long.
         """
         last: tuple[str, str] | None = None
         while True:

@@ -91,7 +91,8 @@ class Usage:
         assert self.limit_bytes is not None
         return (
             f"expected free room in your quota; {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are used, and "
-            f"{why}: ask the operator for a larger quota"
+            f"{why}: delete products or bulk runs that you no longer need (`heliopsf product delete`, "
+            "`heliopsf bulk delete`), or ask the operator for a larger quota"
         )
 
 
@@ -243,7 +244,7 @@ def check_fits(session: Session, owner: str, count: int, quota_mib: int | None) 
 def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int, *, removable: bool) -> None:
     """Check ``count`` bytes that this transaction has just added to the count.
 
-    If they fit after the oldest kept solutions are removed, these solutions are removed. If they would not fit even
+    If these bytes do not fit, the oldest kept solutions are removed until they fit. If they would not fit even
     without any kept solution, raises OverQuota. removable: whether the bytes are those of a solution. Other
     transactions of the owner wait until this one ends. If several uploads fit one by one but not together, the last
     ones are refused.
@@ -261,7 +262,7 @@ def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int, *, r
 
 
 def _make_room(session: Session, owner: str, missing_bytes: int) -> None:
-    """Remove the owner's oldest solutions until this many bytes are free."""
+    """Remove the owner's oldest solutions until ``missing_bytes`` bytes are free."""
     if missing_bytes <= 0:
         return
     oldest = select(SolutionRow).where(SolutionRow.owner == owner).order_by(SolutionRow.created_at)
@@ -273,7 +274,8 @@ def _make_room(session: Session, owner: str, missing_bytes: int) -> None:
 
 
 def _forget(session: Session, row: SolutionRow) -> None:
-    """Remove a solution and its count, unless another transaction removed or replaced it."""
+    """Remove a solution, and subtract its bytes from the count. If another transaction removed or replaced it, do
+    nothing."""
     same = (
         SolutionRow.owner == row.owner,
         SolutionRow.id == row.id,

@@ -16,7 +16,8 @@ from workers.catalogue.tables import PartRow
 
 @dataclass(frozen=True)
 class Part:
-    """The right to work on a part. A worker that lost it may still store the result, if no other worker has stored one."""
+    """The right to work on a part. A worker that lost this right may still store the result of the part, if no other
+    worker has stored a result."""
 
     owner: str
     request_key: str
@@ -73,11 +74,11 @@ class Parts:
                 return part
 
     def heartbeat(self, part: Part) -> bool:
-        """Renew the lease; False if another worker took the part or the part is done."""
+        """Renew the lease. Returns False if another worker took the part or the part is done."""
         return self._set(_holding(part), heartbeat_at=self._database.now)
 
     def finish(self, part: Part, result: dict[str, Any]) -> bool:
-        """Store the result of a part; False if the part already has a result.
+        """Store the result of a part. Returns False if the part already has a result.
 
         The first result is kept, even if the worker has lost the part, because every worker computes the same result.
         """

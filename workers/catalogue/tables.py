@@ -222,7 +222,8 @@ class ProductRow(Base):
 class JobRow(Base):
     """A job. ``work_key`` is the identity of its result.
 
-    ``request_key`` equals ``work_key``, unless another live job already has that key.
+    ``request_key`` equals ``work_key``. If another job that is queued, executing or completed already has that key,
+    ``request_key`` is a different key.
     """
 
     __tablename__ = "jobs"
@@ -328,7 +329,7 @@ class ReportRow(Base):
 class SolutionRow(Base):
     """The kept solution of a transit.
 
-    It is removed when it is old or its room is needed, because it can be made again.
+    The solution is removed when it is old or when its room is needed, because a job can make it again.
     """
 
     __tablename__ = "solutions"
@@ -355,7 +356,7 @@ class PartRow(Base):
 
 
 class WorkerRow(Base):
-    """A running worker process. It renews its heartbeat and deletes the row when it ends."""
+    """A running worker process. The process renews its heartbeat, and deletes the row when the process ends."""
 
     __tablename__ = "workers"
     name: Mapped[str] = mapped_column(

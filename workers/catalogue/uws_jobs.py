@@ -100,8 +100,9 @@ class UwsJobs:
     ) -> bool:
         """PENDING -> QUEUED with ``parameters``, which were resolved from ``given``.
 
-        False if the job is not PENDING, or if its parameters are no longer ``given``. If an identical request has a live
-        job, this job gets a different key. It waits until the other job ends, and then uses the result of that job.
+        Returns False if the job is not PENDING, or if its parameters are no longer ``given``. If an identical request
+        has a job that is queued, executing or completed, this job gets a different key. This job then waits until the
+        other job ends, and uses the result of the other job.
         """
         for key in (request_key, canonical_hash({"request_key": request_key, "job": job_id})):
             try:

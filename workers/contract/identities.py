@@ -133,7 +133,7 @@ def request_identity(kind: str) -> Callable[[Any], str]:
 
 
 def rerun_identity(request: ResolvedRerun, job_id: str) -> str:
-    """Identity of the report of a rerun. It contains the job's id, so that every rerun is executed."""
+    """Identity of the report of a rerun. The identity contains the job's id, so that every rerun is executed."""
     return canonical_hash({"kind": "rerun", "of": request.of, "id": request.id, "job": job_id})
 
 

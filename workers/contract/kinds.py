@@ -78,7 +78,7 @@ class Kind:
     | identity | function from the resolved parameters to the identity of the result; None: every job makes a new result |
     | resolver | dotted name of the function that resolves the parameters; the default checks the ids and adds the recipe of the diffraction PSF |
     | queue | the queue in which jobs of this kind wait by default |
-    | origin | the origin of the PSFs or products that this kind makes; from the origin a rerun finds the kind to run |
+    | origin | the origin of the PSFs or products that this kind makes; a rerun finds the kind of its job by this origin |
     | needs_room | whether the job starts only if the owner's quota is not full |
     | counted_whole | whether the reported steps count the whole job, so that the time left can be estimated from them |
     | time_advice, memory_advice | advice for a request that needs more than the operator's limits |

@@ -36,5 +36,5 @@ def broker_name(queue: Queue | str) -> str:
 
 
 def queue_of_broker(name: str) -> Queue:
-    """The queue with this name in the broker. Raises ValueError for another name."""
+    """The queue that has this name in the broker. Raises ValueError if no queue has this name."""
     return Queue(name.removeprefix(PREFIX))

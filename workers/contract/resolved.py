@@ -13,7 +13,8 @@ from workers.contract.requests import CrossValidate, GapDiagnose, Identity, PsfB
 
 
 class ResolvedDeconvolve(Parameters):
-    """A deconvolution with the id of its PSF. It also contains the recipe of the PSF, if the PSF may still have to be built."""
+    """A deconvolution with the id of its PSF. If the PSF may still have to be built, the parameters also contain its
+    recipe."""
 
     image_id: Identity
     psf_id: Identity

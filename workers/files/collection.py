@@ -1,4 +1,4 @@
-"""Remove files to which no row of the catalogue refers. A job leaves such files if it is killed before it adds its row.
+"""Remove files that no row of the catalogue refers to. A job leaves such files if it is killed before it adds its row.
 
 Recent files are not removed, because an upload first stores its file and then adds the row that refers to it. An upload
 may also store a file again while the collection removes it, and add the row a little later. Therefore the rows are read
@@ -47,8 +47,8 @@ def collect(
     even_most: bool = False,
     second_look_after_s: float = SECOND_LOOK_AFTER_S,
 ) -> Collected:
-    """Remove files that were last stored more than ``older_than_s`` ago and to which no row, or only the row of an
-    old solution, refers.
+    """Remove files that were last stored more than ``older_than_s`` seconds ago, if no row, or only the row of an old
+    solution, refers to them.
 
     Run only one collection at a time. Raises DataError "nothing-named" if no row refers to any file of the store: the
     database then probably belongs to another store. Raises DataError "most-unnamed" if more than half of the files would
@@ -96,9 +96,10 @@ def _removed(
 ) -> list[Blob]:
     """Remove the files ``old``; returns the removed files.
 
-    A file to which a row refers after the removal is restored.
+    If a row refers to a file after the removal, the file is restored.
     """
-    # First restore files that an earlier, killed collection moved aside, if a row refers to them.
+    # An earlier collection may have been killed after it moved files aside. First restore those files that a
+    # row refers to.
     store.settle(catalogue.named_files.all())
     gone = [blob for blob in old if store.remove(blob.digest, kept_before)]
     put_back = store.settle(catalogue.named_files.all(), after_s=second_look_after_s)

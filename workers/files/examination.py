@@ -1,4 +1,4 @@
-"""Compare the files of the store with what the catalogue says about them."""
+"""Compare the files of the store with the rows of the catalogue."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NAMES: dict[type[Any], str] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """A row of the catalogue whose files are not all good. files: SHA-256 and state of each lost or damaged file."""
+    """A row of the catalogue with a lost or damaged file. files: SHA-256 and state of each lost or damaged file."""
 
     row: Kept
     files: tuple[tuple[str, FileState], ...]
@@ -39,7 +39,7 @@ def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iter
     """Find the rows whose files are lost or damaged.
 
     content: read each file and compare its SHA-256. Otherwise only compare the size of each file with its recorded
-    size, if any. A file to which several rows refer is read once. Raises ``workers.files.store.StoreAway``.
+    size, if any. If several rows refer to a file, the file is read once. Raises ``workers.files.store.StoreAway``.
     """
     states: dict[str, FileState] = {}
     for table in NAMES:

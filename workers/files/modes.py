@@ -20,7 +20,8 @@ _operators_umask: int | None = None  # set once, when the process becomes privat
 def keep_private() -> None:
     """Set the umask so that only the user of this process can read the files and folders that the process makes.
 
-    Commands that work with the data folder call this function first. It also applies to files that libraries make.
+    Commands that work with the data folder call this function first. The umask also applies to files that libraries
+    make.
     """
     global _operators_umask
     before = os.umask(OTHERS)

@@ -61,7 +61,7 @@ class RemoteStore(Store):
     def _content_sha256(self, digest: str) -> str:
         """SHA-256 of the object itself.
 
-        Its copy in the local folder is not used, because it may be good although the object is damaged.
+        The copy in the local folder is not used, because this copy may be good although the object is damaged.
         """
         with self.temporary() as copy:
             with _answering():
@@ -124,10 +124,10 @@ class RemoteStore(Store):
                 yield Blob(name.rsplit("/", 1)[1], int(about["size"]), about["LastModified"].timestamp())
 
     def remove(self, digest: str, kept_before: float) -> bool:
-        """Remove a file, unless it no longer exists or was stored again since ``kept_before``.
+        """Remove a file. If the file was stored again since ``kept_before``, or no longer exists, do nothing.
 
         Returns whether the file was removed. Raises ``StoreAway``. S3 cannot check and remove a file in one step.
-        Therefore a copy is kept aside until ``settle``, in case the file is stored again between the two steps.
+        Therefore a copy is kept until ``settle``: the file may be stored again between the two steps.
         """
         with _answering():
             if not self._is_old(digest, kept_before):
@@ -144,7 +144,7 @@ class RemoteStore(Store):
         return True
 
     def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
-        """As ``Store.settle``, also for copies that were moved aside by a process that was then killed.
+        """As ``Store.settle``, also for copies that a killed process had moved aside.
 
         Raises ``StoreAway``.
         """

@@ -113,8 +113,8 @@ class Store:
     def set_aside(self, digest: str) -> bool:
         """Move a damaged file out of the store, into the folder ``damaged``, where nothing reads it.
 
-        False if the file does not exist, or if its content is good. A good file that is stored at the same moment is
-        kept.
+        Returns False if the file does not exist, or if its content is good. A good file that is stored at the same
+        moment is kept.
         """
         self._damaged.mkdir(exist_ok=True)
         target, aside = self.path(digest), self._damaged / f"{digest}.{uuid.uuid4().hex}"
@@ -207,7 +207,7 @@ class Store:
                 yield Blob(path.name, found.st_size, found.st_mtime)
 
     def remove(self, digest: str, kept_before: float) -> bool:
-        """Remove a file, unless it no longer exists or was stored again since ``kept_before``.
+        """Remove a file. If the file was stored again since ``kept_before``, or no longer exists, do nothing.
 
         Returns whether the file was removed. The file is first moved aside and checked there, so that a file that is
         stored at the same moment is not lost.
@@ -225,7 +225,7 @@ class Store:
         return True
 
     def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
-        """Finish ``remove``: of the files that were moved aside, restore those in ``named`` and delete the others.
+        """Finish ``remove``: of the files that were moved aside, restore the files in ``named`` and delete all others.
 
         If there are such files, ``named`` is read after ``after_s`` seconds. Returns the hashes of the restored files.
         """

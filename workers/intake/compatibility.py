@@ -1,7 +1,8 @@
 """Checks whether an image, a PSF and the options of a deconvolution fit each other, before the job is queued.
 
 These checks use the header cards that the catalogue stores. The job repeats them, with the same functions, on the
-headers of the files. For uploads to earlier versions, which did not store these cards, only the job makes the checks.
+headers of the files. Earlier versions did not store these cards; for files that were uploaded to such a version, only
+the job makes the checks.
 """
 
 from __future__ import annotations
@@ -58,10 +59,8 @@ def noise_of(request: ResolvedDeconvolve, header: Cards) -> NoiseFigures | None:
 
 
 def of_upload(row: PsfRow, instrument: str | None, angstrom: float | None) -> tuple[str | None, float | None]:
-    """The instrument and the wavelength of a PSF.
-
-    If its file does not give them, the request of the upload may have given them.
-    """
+    """The instrument and the wavelength of a PSF: the values in its file, or else the values in the request of its
+    upload."""
     if angstrom is None and row.channel is not None and row.channel.isdecimal():
         angstrom = float(row.channel)
     return instrument or row.instrument, angstrom

@@ -1,4 +1,5 @@
-"""Initial values of the estimates, from ``estimates.json``. They were measured by ``python -m benchmarks.estimates --write``.
+"""Initial values of the estimates, from ``estimates.json``. ``python -m benchmarks.estimates --write`` measured these
+values.
 
 Times in seconds are processor time on one core of a machine of 2026. Times per pixel are in ns, memory per pixel in bytes.
 """
@@ -54,7 +55,7 @@ class Build(_Frozen):
     """The time that a PSF build takes for each spectral line of the bandpass, and the memory that it needs.
 
     A mask is sampled at S^2 points per pixel. ``psfcore.instruments.workload`` counts the points, cells, windows and
-    entries. Suffix _ns: the time for each of them; suffix _bytes: the memory for each of them.
+    entries. Suffix _ns: the time for one point, cell, window or entry; suffix _bytes: the memory for one.
     """
 
     disc_s: float

@@ -1,8 +1,8 @@
 """Estimates the time and memory of a job from the sizes of its inputs, before the job is accepted.
 
 The initial values are in ``workers.intake.cost_model``. The time is then multiplied by a factor that was measured on
-completed jobs of the same kind in this catalogue. A wrong estimate does little harm: a job that takes too long is
-stopped, and memory is not reserved.
+completed jobs of the same kind in this catalogue. A wrong estimate does little harm, because a job that takes too
+long is stopped, and no memory is reserved.
 
 | symbol | name | unit |
 |---|---|---|
@@ -218,7 +218,7 @@ def _linear(
 def _pixels(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> float:
     """Number of pixels of the job's transit.
 
-    If it has no transit: of its image; if it has no image either: of its PSF.
+    If the job has no transit, the number of pixels of its image; if it has no image either, of its PSF.
     """
     if parameters.get("transit_id"):
         transit = catalogue.get(TransitRow, parameters["transit_id"], owner)

@@ -21,10 +21,10 @@ MOST_SEARCHED = 500
 def no_psf(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> DataError:
     """The error "no-psf-for-instrument" for an image with this header summary.
 
-    Its fields: `image` is the name of the telescope. `instruments` are the instruments whose PSF can be built, sorted
-    by how well they agree with the image. `psfs` are PSFs of the catalogue that could fit. `ways` are the possible next
-    steps. In both lists, `same` names the properties that agree with the image; `told` also says which properties
-    differ.
+    The error has these fields: `image` is the name of the telescope. `instruments` are the instruments whose PSF can
+    be built, sorted by how well they agree with the image. `psfs` are PSFs of the catalogue that could fit. `ways`
+    are the possible next steps. In both lists, `same` names the properties that agree with the image; `told` also
+    says which properties differ.
     """
     return unknown_instrument(header, list(_candidates(catalogue, header, owner)))
 

@@ -1,4 +1,5 @@
-"""Finds the one PSF that meets filters or fits the header of an image. If there is not exactly one, the error says why."""
+"""Finds the one PSF that meets filters or fits the header of an image. If no PSF or several PSFs fit, the error says
+why."""
 
 from __future__ import annotations
 

@@ -15,8 +15,8 @@ from workers.versions.series import TOTAL, series_of
 
 @dataclass(frozen=True)
 class ReasonedPsf:
-    """The PSF of a deconvolution. status None: the PSF is not built yet, and name and version are those of the
-    instrument file."""
+    """The PSF of a deconvolution. status None: the PSF is not built yet; name and version are then the name and
+    version of the instrument file."""
 
     id: str
     name: str

@@ -121,7 +121,8 @@ def resolve_rerun(asked: Asked) -> Parameters:
         row = asked.catalogue.get(ProductRow, again.id, asked.owner)
     if row is None:
         raise DataError(
-            f"no-such-{again.of}", f"expected the id of a {again.of} in the catalogue; got {again.id}"
+            f"no-such-{again.of}",
+            f"expected the id of a {again.of} in the catalogue; got {again.id}, which is not in it: list the {again.of}s",
         )
     return made_by(asked.catalogue, row)
 
@@ -149,21 +150,32 @@ def resolved_deconvolution(
 def _image(catalogue: Catalogue, image_id: str, owner: str) -> ImageRow:
     row = catalogue.get(ImageRow, image_id, owner)
     if row is None:
-        raise DataError("no-such-image", f"expected the id of an uploaded image; got {image_id}")
+        raise DataError(
+            "no-such-image",
+            f"expected the id of an uploaded image; got {image_id}, which is not in the catalogue: upload the image first",
+        )
     return row
 
 
 def _transit(catalogue: Catalogue, transit_id: str, owner: str) -> TransitRow:
     row = catalogue.get(TransitRow, transit_id, owner)
     if row is None:
-        raise DataError("no-such-transit", f"expected the id of an uploaded transit; got {transit_id}")
+        raise DataError(
+            "no-such-transit",
+            f"expected the id of an uploaded transit; got {transit_id}, which is not in the catalogue: "
+            "upload the transit first",
+        )
     return row
 
 
 def _psf(catalogue: Catalogue, psf_id: str, owner: str) -> PsfRow:
     row = catalogue.get(PsfRow, psf_id, owner)
     if row is None:
-        raise DataError("no-such-psf", f"expected the id of a PSF in the catalogue; got {psf_id}")
+        raise DataError(
+            "no-such-psf",
+            f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: "
+            "list the PSFs with `heliopsf psf list`",
+        )
     return row
 
 

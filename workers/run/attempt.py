@@ -126,7 +126,7 @@ class Attempt:
     def _end_if_deaf(self) -> None:
         """Wait until the task has stopped. If it does not stop within ``cancel_s``, end the process.
 
-        A paused task cannot notice that it must stop, so its time begins when it continues.
+        A paused task cannot notice that it must stop, so ``cancel_s`` begins when the task continues.
         """
         if self.child is None:
             return

@@ -56,7 +56,8 @@ class Child:
             resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
     def expect_news_within(self, seconds: float) -> None:
-        """End the process after this time, unless this method or ``expect_no_news`` is called before.
+        """End the process after this time. A further call of this method starts the time again; ``expect_no_news``
+        stops it.
 
         The clock runs in a thread that needs no Python code, so it also ends a process whose C code never returns.
         """

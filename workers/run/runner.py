@@ -1,5 +1,5 @@
-"""Runs one job: claims it, sends heartbeats, runs its task and records the outcome. Only this module turns an exception into
-the error of a job."""
+"""Runs one job: claims it, sends heartbeats, runs its task and records the outcome. No other module turns an
+exception into the error of a job."""
 
 from __future__ import annotations
 
@@ -84,7 +84,8 @@ class Runner:
         self._run(lease, on_progress)
 
     def run_next(self, told_id: str, queue: Queue) -> None:
-        """Run the job of a queue whose owner's turn it is. The message of the broker names the job ``told_id``."""
+        """Run the next job of a queue: a job of the owner whose turn it is. The message of the broker names the job
+        ``told_id``."""
         if self._stopping.asked:
             left = self._catalogue.turns.leave_next(told_id, queue)
             log.info("job %s: left in the queue because this worker is stopping", left)
@@ -266,8 +267,8 @@ class Runner:
             log.warning("job %s: could not keep its stage times: %s", job.id, error)
 
     def _guarded(self, job: JobRow, attempt: Attempt, piece: Callable[[], None]) -> JobError | None:
-        """Do one piece of a job that has many pieces, and return the error of the piece. Errors that concern the whole job are
-        raised. The time limit of a job applies to each piece separately.
+        """Do one piece of a job that has many pieces. Returns the error of the piece, or None. Errors that concern
+        the whole job are raised. The time limit of a job applies to each piece separately.
         """
         attempt.started = time.monotonic()
         try:
@@ -327,7 +328,7 @@ class Runner:
         elif is_disk_full(error):  # the disk of the database is full
             self._fail(lease, JobError(fault=Fault.TRANSIENT, code=STORAGE_FULL, message=NO_ROOM))
         else:
-            message = f"expected a temporary failure to pass; {job.attempt} attempts failed ({type(error).__name__}): try again later"
+            message = f"expected a temporary failure to end; {job.attempt} attempts failed ({type(error).__name__}): try again later"
             self._fail(lease, JobError(fault=Fault.TRANSIENT, code="gave-up", message=message))
 
     def _fail(self, lease: Lease, error: JobError) -> None:
@@ -348,7 +349,8 @@ class Runner:
 
 
 def _internal(job: JobRow, error: Exception) -> JobError:
-    """An error of the software. Only the operator's log gets the text of the exception, because it may contain names of files and SQL statements."""
+    """An error of the software. The text of the exception is written only into the operator's log, because this text
+    may contain names of files and SQL statements."""
     message = (
         f"the software failed ({type(error).__name__}): send the job id {job.id} to the operator, whose worker log has "
         "the details"

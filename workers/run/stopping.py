@@ -9,7 +9,7 @@ from multiprocessing.sharedctypes import RawValue
 class Stopping:
     """The stop flag, shared with child processes that are forked later: the parent gets the signal, and a child runs the job.
 
-    The flag is one number in shared memory. It has no lock, because a signal handler writes it.
+    The flag is one number in shared memory. The flag has no lock, because a signal handler writes it.
     """
 
     def __init__(self) -> None:

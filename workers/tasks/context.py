@@ -22,7 +22,7 @@ Result = TypeVar("Result", ProductRow, PsfRow, ReportRow)
 
 
 class TurnOver(Exception):
-    """A turn of a bulk run ends although images are left, so that other jobs can run. The job of the turn is queued
+    """A turn of a bulk run ends before all images are done, so that other jobs can run. The job of the turn is queued
     again as if it had not started."""
 
 
@@ -41,7 +41,7 @@ class Context:
     lease: the lease under which a job takes its pieces.
     times: measures the time of the reported stages. If the pieces of a job report their own stages, the time of these
     stages is measured instead.
-    anew: True for a rerun: compute everything anew, and use no solution that an earlier job kept.
+    anew: True for a rerun: compute everything again, and use no solution that an earlier job kept.
     """
 
     catalogue: Catalogue
@@ -63,9 +63,8 @@ class Context:
         return FitsLimits(max_pixels=self.settings.max_pixels)
 
     def made(self, table: type[Result], identity: str) -> Result | None:
-        """The result of an earlier job; None if there is no such result or if a file of it is lost.
-
-        The task then makes it.
+        """The result of an earlier job; None if there is no such result or if a file of it is lost. If the answer is
+        None, the task makes the result.
         """
         row = self.catalogue.get(table, identity, self.owner)
         return row if row is not None and intact(self.store, row) else None

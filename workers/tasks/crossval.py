@@ -110,7 +110,8 @@ def _one(
 
 
 def _heartbeat(context: Context, part: Part, done: int, folds: int) -> Callable[[str, int, int], None]:
-    """A progress function for a fold. It renews the lease of the part, and raises an exception if the job must stop."""
+    """A progress function for a fold. The function renews the lease of the part, and raises an exception if the job
+    must stop."""
     last = time.monotonic()
 
     def report(_stage: str, _step: int, _steps: int) -> None:

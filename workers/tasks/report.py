@@ -51,7 +51,7 @@ def report(context: Context, parameters: Mapping[str, Any]) -> str:
 def _point() -> Kernel:
     """A diffraction PSF that changes nothing (a point).
 
-    It is used with a given PSF that already contains the diffraction.
+    This PSF is used with a given PSF that already contains the diffraction.
     """
     point = np.zeros((POINT_PX, POINT_PX))
     point[POINT_PX // 2, POINT_PX // 2] = 1.0

@@ -85,7 +85,8 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
     parameters = dict(request.parameters)
     kind = KINDS[request.kind]
     if request.kind == "deconvolve":
-        # This version may give the product another id than the first one has, and may have made it already.
+        # This version may give the product another id than the first product has, and may have made this
+        # product already.
         assert kind.resolved is not None and kind.identity is not None
         hidden.add(kind.identity(kind.resolved.model_validate(parameters)))
     rerun_catalogue = _RerunCatalogue(context.catalogue, frozenset(hidden))

@@ -22,7 +22,7 @@ def series_of(instrument: str | None, channel: str | None, kind: str) -> str | N
 def instrument_of(header: Mapping[str, Any]) -> str | None:
     """The instrument in the summary of an upload's header.
 
-    It is the name of a known instrument, or else the card DETECTOR or INSTRUME, converted by ``word``.
+    The result is the name of a known instrument, or else the card DETECTOR or INSTRUME, converted by ``word``.
     """
     known: str | None = header["instrument"]
     return known or word(header["detector"] or header["instrume"])

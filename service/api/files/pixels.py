@@ -63,8 +63,8 @@ def _part(
         Query(
             ge=1,
             le=LARGEST,
-            description="n: each number of the answer stands for a block of n x n pixels. It is the mean of the finite "
-            "pixels; for `quality` it is the bitwise OR. Blocks at the last rows and columns of the window may be smaller",
+            description="n: each number of the answer stands for a block of n x n pixels. The number is the mean of the finite "
+            "pixels; for `quality`, the bitwise OR. Blocks at the last rows and columns of the window may be smaller",
         ),
     ] = 1,
 ) -> Part:

@@ -76,7 +76,7 @@ class PinView(BaseModel):
 
 
 class ContextView(BaseModel):
-    """A context. It never changes; for other pins, create another context."""
+    """A context. A context never changes; for other pins, create another context."""
 
     id: str = Field(description="SHA-256 of the name and the pins of the context")
     name: str

@@ -31,7 +31,8 @@ Word = Annotated[str, Field(pattern=WORD)]
 
 
 class StatusChange(BaseModel):
-    """A change of a PSF's status: certify a draft, change the range of a certified PSF, or deprecate it."""
+    """A change of a PSF's status: certify a draft, change the range of a certified PSF, or deprecate a certified
+    PSF."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -123,10 +124,11 @@ def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusVi
 
 @router.post("/{psf_id}/status", summary="Certify or deprecate a PSF")
 def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, state: Shared) -> StatusView:
-    """Certify a draft, change the range of a certified PSF, deprecate it, or name the successor of a deprecated PSF.
+    """Certify a draft, change the range of a certified PSF, deprecate a certified PSF, or name the successor of a
+    deprecated PSF.
 
-    The time ranges of the certified PSFs of a series must not overlap. If they would, the answer is 409; the message names the PSF
-    whose range overlaps.
+    The time ranges of the certified PSFs of a series must not overlap. If the range in the request overlaps the range
+    of another certified PSF, the answer is 409; the message names this PSF.
     """
     try:
         with rows_held():

@@ -188,8 +188,8 @@ def get_psf(psf_id: Identity, caller: Reading, state: Shared) -> PsfView:
 def delete_psf(psf_id: Identity, caller: Submitting, state: Shared) -> PsfView:
     """Delete a draft with its files, and return its last description.
 
-    The answer is 409 if the PSF is certified or deprecated, or if a product, a job that has not ended, an open bulk run, a context
-    or another PSF uses it.
+    The answer is 409 if the PSF is certified or deprecated, or if it is used by a product, a job that has not ended,
+    an open bulk run, a context or another PSF.
     """
     try:
         row = state.catalogue.delete_draft(psf_id, caller.owner)

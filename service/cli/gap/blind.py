@@ -90,7 +90,8 @@ def blind(
     synthetic: bool,
     make_only: bool,
 ) -> None:
-    """Test the diagnosis on simulated cases whose effect is withheld from it. Run it again to continue a stopped run."""
+    """Test the diagnosis on simulated cases whose effect is withheld from the diagnosis. To continue a stopped run,
+    repeat the command."""
     from psfcore.blind.case_set import SetPlan, alone_in, make_set
     from psfcore.blind.run_set import run_set
     from psfcore.blind.score_set import write_score

@@ -40,7 +40,7 @@ def list_cached() -> None:
 
 @cache.command("clear", short_help="Remove all PSFs that are kept.")
 def clear() -> None:
-    """Remove all PSFs that are kept. They are built again when they are needed."""
+    """Remove all PSFs that are kept. A PSF is built again when it is needed."""
     with user_errors():
         kept = psf_cache()
         count, removed = len(kept.psfs()), kept.clear()

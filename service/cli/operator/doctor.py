@@ -1,6 +1,6 @@
 """``heliopsf doctor``: checks in one command everything that an operator would check first.
 
-The command changes nothing. It also works if no server and no worker run: a missing part is a finding.
+The command changes nothing. The command also works if no server and no worker run: a missing part is a finding.
 """
 
 from __future__ import annotations

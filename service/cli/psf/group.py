@@ -24,7 +24,7 @@ SECTIONS = {
         "download": Lazy("service.cli.psf.files", "download", "Download a PSF."),
         "upload": Lazy("service.cli.psf.versions", "upload_psf", "Upload a PSF."),
         "certify": Lazy("service.cli.psf.versions", "certify", "Certify a PSF for a range of times."),
-        "deprecate": Lazy("service.cli.psf.versions", "deprecate", "Withdraw a certified PSF."),
+        "deprecate": Lazy("service.cli.psf.versions", "deprecate", "Deprecate a certified PSF."),
         "delete": Lazy("service.cli.psf.versions", "delete_psf", "Delete a draft that nothing uses."),
         "best": Lazy("service.cli.psf.versions", "best", "Find the PSF for an image."),
         "lineage": Lazy("service.cli.psf.versions", "lineage", "Show what a PSF or product was made from."),

@@ -192,7 +192,7 @@ def crossval(
 @PLOT
 @writes_files
 def show(file: Path, plot: Path | None, overwrite: bool) -> None:
-    """Show what the PSF in FILE (FITS) contains: its size, its sum, and the light beyond some radii."""
+    """Show what the PSF in FILE (FITS) contains: its size, its sum, and the light beyond several radii."""
     import numpy as np
 
     from psfcore.fits.psfs import read_psf

@@ -124,7 +124,7 @@ def certify(
 @REASON
 @SERVER
 def deprecate(psf_id: str, successor: str | None, reason: str, server: str | None) -> None:
-    """Withdraw a certified PSF from use, or name the successor of a deprecated PSF."""
+    """Deprecate a certified PSF, so that it is no longer chosen; or name the successor of a deprecated PSF."""
     with user_errors(), remote(server) as service:
         instead_id = None if successor is None else whole_id(service, "psfs", successor)
         said = service.deprecate_psf(psf_id, instead_id, reason=reason)
@@ -140,7 +140,8 @@ def deprecate(psf_id: str, successor: str | None, reason: str, server: str | Non
 def delete_psf(psf_id: str, server: str | None) -> None:
     """Delete a draft with its files.
 
-    A PSF that a product, a job that has not ended, an open bulk run, a context or another PSF uses is not deleted.
+    A PSF is not deleted if it is used by a product, a job that has not ended, an open bulk run, a context or another
+    PSF.
     """
     with user_errors(), remote(server) as service:
         row = service.delete_psf(psf_id)
@@ -217,7 +218,8 @@ COMMANDS = (list_psfs, upload_psf, certify, deprecate, delete_psf, best, lineage
 
 
 def _chosen(service: Client, image: Path, context: str | None) -> dict[str, Any]:
-    """The PSF that a deconvolution of an image would use, and why. Of a PSF that is not built yet, only the entry of the estimate is known."""
+    """The PSF that a deconvolution of an image would use, and why. If the PSF is not built yet, only its entry in the
+    estimate is known."""
     image_id = service.upload_image(image)["id"]
     chosen = service.estimate("deconvolve", image_id=image_id, context=context)["psf"]
     psf = chosen if chosen["status"] is None else service.psf(chosen["id"])

@@ -40,7 +40,7 @@ def address(image_id: str, asked: Sent) -> str:
 
 
 def address_of(parameters: Mapping[str, Any]) -> str:
-    """The page of an image, with the options of a deconvolution. parameters: of its job, as the worker gets them."""
+    """The page of an image, with the options of a deconvolution. parameters: the resolved parameters of its job."""
     method, figures = parameters["method"], parameters.get("noise") or {}
     chosen = parameters.get("picked_for") is None and parameters.get("psf_recipe") is None
     options = {

@@ -273,7 +273,7 @@ def rerun_arrays(report: Report) -> list[Row]:
 
 
 def rerun_makers(report: Report) -> list[Row]:
-    """The properties in which the making of the first and of the new result differ: name, first value, new value."""
+    """The properties that were different when the two results were made: name, first value, new value."""
     first, again = (_flat(report[name]) for name in ("first", "again"))
     names = [*first, *(name for name in again if name not in first)]
     rows = [(name, first.get(name, "-"), again.get(name, "-")) for name in names if name not in NOT_COMPARED]

@@ -32,7 +32,7 @@ router = APIRouter(prefix="/reports/{report_id}", include_in_schema=False)
 
 @router.get("")
 def report(report_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
-    """The report. Its sections are those of the HTML page that can be downloaded."""
+    """The report. It has the same sections as the HTML page that can be downloaded."""
     row = find(state, caller, report_id)
     stored = _stored(state, row)
     said = _said(state, row)

@@ -1,8 +1,9 @@
 """Reads the stored HTML page of a report, so that the same sections are shown inside the pages of the service.
 
 The stored page is self-contained: it includes its style, and its figures as data. A page of the service may contain
-neither inline styles nor data addresses. Therefore this module takes the sections without the style, and the figures as
-separate files. It keeps only the tags and attributes of a short list. Of all other markup it keeps only the text.
+neither inline styles nor data addresses. Therefore this module takes the sections without the style, and the figures
+as separate files. The module keeps the tags and attributes of a short list. Other markup is removed, but its text is
+kept.
 """
 
 from __future__ import annotations

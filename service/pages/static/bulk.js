@@ -67,7 +67,7 @@ function forget(id) {
   say(lost, "This run was deleted. Its products stay.");
 }
 
-/** Read the runs again whose events this page may have missed. */
+/** Read again the runs whose events this page may have missed. */
 async function look() {
   for (const [id, place] of places) {
     if (!OPEN.includes(place.querySelector('[data-part="phase"]').textContent)) continue;

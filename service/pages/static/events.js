@@ -1,5 +1,5 @@
 // The events of all jobs and bulk runs of this owner. All tabs share one connection: a browser opens only six to one
-// server, and one stream a tab would stall the seventh tab. The tab that holds the lock reads the stream, and tells the others.
+// server, so with one stream for each tab, the seventh tab would stall. The tab that holds the lock reads the stream, and tells the others.
 
 import { request } from "./page.js";
 

@@ -8,7 +8,7 @@ export function imageAt(place, length, centre, zoom) {
 
 /**
  * For each device pixel of an axis the first texel of a sheet that it shows, and the end (not shown): an Int32Array of pairs.
- * A device pixel that is larger than a texel shows those whose centres lie in it; a smaller one shows the texel at its centre. Outside
+ * A device pixel that is larger than a texel shows the texels whose centres lie in the device pixel; a smaller one shows the texel at its centre. Outside
  * the sheet both numbers are equal. sheet: {start, step, count}: image coordinate of its first texel, px per texel, texels.
  */
 export function texelRanges(length, centre, zoom, { start, step, count }) {

@@ -71,7 +71,7 @@ const lost = document.getElementById("lost");
 const shown = (id) => places.get(id).querySelector('[data-part="phase"]').textContent;
 const open = () => [...places.keys()].filter((id) => !ENDED.includes(shown(id)));
 
-/** Read the jobs again whose events this page may have missed. */
+/** Read again the jobs whose events this page may have missed. */
 async function look() {
   for (const id of open()) {
     try {

@@ -78,9 +78,9 @@ class Keys:
     ) -> str:
         """Make a key and return it; it cannot be shown again. Raises ValueError for a bad owner or without scopes.
 
-        made_by: id of the key with which it is made. most: the largest number of valid keys of the owner; None: no
-        limit. Raises ``TooManyKeys`` if the owner already has ``most`` valid keys. Otherwise only the newest ``most``
-        of the owner's revoked and expired keys are kept; the older ones are deleted.
+        made_by: id of the key with which the new key is made. most: the largest number of valid keys of the owner;
+        None: no limit. Raises ``TooManyKeys`` if the owner already has ``most`` valid keys. Otherwise only the newest
+        ``most`` of the owner's revoked and expired keys are kept; the older ones are deleted.
         """
         if not OWNER.fullmatch(owner):
             raise ValueError(f"expected an owner of {OWNER_RULE}; got {owner!r}")

@@ -29,7 +29,7 @@ Followable = TypeVar("Followable", bound=JobRow | BulkRow)
 class State:
     """The state of a row.
 
-    A row has changed if its state is not equal to the earlier state. ended_at: None until it ends.
+    A row has changed if its state is not equal to the earlier state. ended_at: None if the row has not ended.
     """
 
     id: str

@@ -17,7 +17,7 @@ from workers.contract.phases import Phase
 from workers.contract.queues import Queue
 
 MOST_COUNTED = 1000
-MOST_READ = 10_000  # of a queue, at most this number of waiting jobs is read, oldest first, to count each owner's jobs
+MOST_READ = 10_000  # at most this number of waiting jobs of a queue is read, oldest first, to count the jobs of each owner
 
 
 class Places:
@@ -27,7 +27,8 @@ class Places:
         self._database = database
 
     def before(self, job: JobRow) -> int | None:
-        """The number of waiting jobs that are expected to start before a job, at most MOST_COUNTED; None unless it is QUEUED."""
+        """The number of waiting jobs that are expected to start before a job, at most MOST_COUNTED; None if the job
+        is not QUEUED."""
         if job.phase != Phase.QUEUED:
             return None
         began = job.created_at if job.started_at is None else job.started_at

@@ -1,9 +1,9 @@
-"""Turns: which waiting job of a queue a worker claims when a message of the broker reaches it.
+"""Turns: which waiting job of a queue a worker claims when the worker gets a message of the broker.
 
 The broker delivers messages in the order in which jobs were submitted. If each message started the job that it names,
-one owner's many jobs would delay the single job of another. Therefore a message is only the right to start one job of
-its queue, and the database determines which job. There are as many messages as waiting jobs, so every job starts. If
-messages are lost, the reconciler submits the jobs that still wait again. A message has no effect if no job waits.
+one owner's many jobs would delay the single job of another. Therefore a message only allows a worker to start one job
+of a queue; the database determines which job. There are as many messages as waiting jobs, so every job starts. If
+messages are lost, the reconciler submits the waiting jobs again. A message has no effect if no job waits.
 """
 
 from __future__ import annotations
@@ -24,13 +24,15 @@ class Turns:
         self._database, self._jobs = database, jobs
 
     def claim_next(self, told_id: str, queue: Queue, worker: str) -> Lease | None:
-        """Claim the job of a queue whose owner's turn it is; None if no job of the queue can start now.
+        """Claim the next job of a queue: a job of the owner whose turn it is. Returns None if no job of the queue can
+        start now.
 
-        A message of the broker is the right to start one job of its queue; ``told_id`` is the job that it names. The
-        owner whose jobs of this queue were claimed least recently comes first, so that the many jobs of one owner do not
-        delay the single job of another. Of an owner's jobs, the oldest comes first; for a job that was handed back, the
-        time of its last start is used instead of its creation time. The number of an owner's running jobs has no
-        influence: otherwise an owner with one long running job would wait until no other owner has a waiting job.
+        A message of the broker allows a worker to start one job of a queue; ``told_id`` is the job that the message
+        names. The owner whose jobs of this queue were claimed least recently comes first, so that the many jobs of
+        one owner do not delay the single job of another. Of an owner's jobs, the oldest comes first; for a job that
+        was handed back, the time of its last start is used instead of its creation time. The number of running jobs
+        of an owner does not matter. Otherwise an owner with one long running job would wait until no other owner has
+        a waiting job.
         """
         while (job_id := self._next(told_id, queue)) is not None:
             lease = self._jobs.claim(job_id, worker)
@@ -48,8 +50,8 @@ class Turns:
     ) -> Lease | None:
         """Claim a short job of a queue, to run it while a longer job pauses; None if there is no such job.
 
-        seconds, memory_mib: largest estimated time and memory of the job. not_of: an owner whose jobs are not claimed.
-        One message of the broker is then left over; it has no effect.
+        seconds, memory_mib: largest estimated time and memory of the job. not_of: an owner whose jobs are not
+        claimed. One message of the broker then remains; this message has no effect.
         """
         short = [
             JobRow.owner != (not_of or ""),
@@ -95,8 +97,9 @@ def _owners(queue: Queue) -> Select[str]:
 def _oldest(owner: str, told_id: str, queue: Queue) -> Select[str]:
     """The owner's oldest job that could start now.
 
-    The server has recorded that the broker received the job, and the retry of the job is not delayed. Or the job is
-    ``told_id``: the broker can deliver an id before the server has recorded its submission.
+    A job can start if the server has recorded that the broker received the job, and if no retry of the job is
+    delayed. These conditions do not apply to the job ``told_id``: the broker may deliver its id before the server has
+    recorded the submission.
     """
     received = and_(JobRow.submitted_at.is_not(None), JobRow.delayed.is_(False))
     # Not no_equal_at_work(): that condition is tested for each waiting job, of which there may be many thousands.

@@ -137,7 +137,7 @@ class CachedPsfs:
 
 
 def recipes_in(kind: str, resolved: Mapping[str, Any]) -> list[PsfBuild]:
-    """The recipes of the PSFs that a job builds unless the catalogue contains them. resolved: the job's resolved
+    """The recipes of the PSFs that a job builds if the catalogue does not contain them. resolved: the job's resolved
     parameters."""
     if kind == "psf-build":
         return [PsfBuild.model_validate(resolved)]

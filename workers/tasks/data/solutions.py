@@ -3,8 +3,8 @@
 The fit, the cross-validation, the report and the gap diagnosis of a transit begin with the same inversion. The first
 job keeps its solution, and later jobs of the same owner read it: a new inversion would give the same values, bit for
 bit. The identity of a solution contains everything that determines the solution, and the versions of the software and
-its libraries, so that the provenance of a result stays true. It does not contain the number of threads, which changes
-no result.
+its libraries, so that the provenance of a result stays true. The identity does not contain the number of threads,
+because this number changes no result.
 
 A kept solution only saves time. If it cannot be read or kept, the job inverts the transit itself and continues.
 """
@@ -59,8 +59,8 @@ def solved(
 ) -> Solution:
     """The solution of a transit: the kept solution of the owner, or else a new solution, which is then kept.
 
-    transit: as ``load_transit`` returns it for the request; only its noise may be replaced. A rerun computes anew and keeps
-    nothing. Raises DataError as ``psfcore.scatter.inversion.invert`` does.
+    transit: as ``load_transit`` returns it for the request; only its noise may be replaced. A rerun computes a new
+    solution and does not keep it. Raises DataError as ``psfcore.scatter.inversion.invert`` does.
     """
     identity = solution_identity(request, transit, shape, start)
     kept = None if context.anew else _kept(context, identity, transit)

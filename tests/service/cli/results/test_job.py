@@ -60,7 +60,10 @@ def test_a_job_is_found_waited_for_and_its_product_fetched_by_short_ids(
     assert command("product", "delete", short(product)) == f"product {short(product)} is deleted\n"
     assert "no product yet" in command("product", "list")
     gone = command("product", "delete", short(product), code=1)
-    assert f"{short(product)}: no product of yours has an id that begins so; `heliopsf product list`" in gone
+    assert (
+        f"{short(product)}: no product of yours has an id that begins with these digits; `heliopsf product list`"
+        in gone
+    )
     said = f"product {short(product)} was deleted; the same request makes it again\n"
     assert command("job", "wait", short(job)).endswith(f"job {short(job)}: {said}")
     assert said in command("job", "list") and said in command("job", "show", job)
@@ -97,7 +100,9 @@ def test_jobs_are_cancelled_and_a_wait_for_several_ends_with_1_if_one_failed(
     told = command("job", "wait", short(stopped), short(fine), code=1)
     assert f"job {short(stopped)}: ABORTED" in told
     assert f"job {short(fine)}: product" in told
-    assert "no job of yours has an id that begins so" in command("job", "wait", "01234567", code=1)
+    assert "no job of yours has an id that begins with these digits" in command(
+        "job", "wait", "01234567", code=1
+    )
 
 
 @pytest.mark.parametrize("identity", ["0123456", "../../metrics", "x" * 12])
