@@ -119,8 +119,7 @@ def kernel_folder(usual: Path, home: Path | None = None) -> str:
 
 
 def trusted(path: Path) -> bool:
-    """Whether nobody can change a file or folder except this user, the administrator, and users who can change this
-    module.
+    """Whether only this user, the administrator, and users who can change this module can change a file or folder.
 
     The folders above it are checked too, because a user who can rename one of them can replace it by another folder.
     """

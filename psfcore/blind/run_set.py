@@ -191,7 +191,8 @@ def _diagnose(made: BlindSet, number: int, command: Sequence[str], longest_s: fl
 def _compute_ideal(
     made: BlindSet, number: int, command: Sequence[str], keep: bool, longest_s: float, progress: Progress
 ) -> None:
-    """Compute what an ideal observer of a case could know, unless it is known. Then remove the images without noise.
+    """Compute what an ideal observer could know about a case, if ideal.json is missing. Then remove the images without
+    noise.
 
     keep: keep these images. If the computation fails, the images are kept too.
     """

@@ -178,7 +178,7 @@ class _OneWavelength:
         self.kernels: dict[str, Kernel] = {}
 
     def make(self, name: str, progress: Progress) -> None:
-        """Compute one component; those that it depends on must exist."""
+        """Compute one component. The components from which it is computed must exist already."""
         progress(0, 1)
         makers: dict[str, Callable[[Progress], Kernel]] = {
             AIRY: self._airy,

@@ -86,7 +86,8 @@ def design_study(
     *,
     flare_px: int = FLARE_PX,
 ) -> DesignStudy:
-    """Compute every combination of pitch and wire at the entrance of `instrument`, and its own first entrance mesh.
+    """Compute every combination of pitch and wire at the entrance of `instrument`, and also the first entrance mesh of
+    the instrument.
 
     Raises DataError "bad-design" for no mesh or more than 400 meshes, for a wire that is not narrower than every pitch,
     and for a flare smaller than 1 px.

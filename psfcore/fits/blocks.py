@@ -308,7 +308,7 @@ def _check_image(header: Header, limits: FitsLimits) -> None:
 
 
 def _check_plain(header: Header) -> None:
-    """Raise HeaderError unless the data of an image are its pixels alone (FITS standard 4.0, section 7.1.1)."""
+    """Raise HeaderError if the data of an image contain more than its pixels (FITS standard 4.0, section 7.1.1)."""
     for key, value in (("PCOUNT", 0), ("GCOUNT", 1)):
         card_count(header, key, smallest=value, largest=value, default=value)
 
@@ -337,7 +337,11 @@ def _data_bytes(header: Header, hdu: int) -> int:
     if axes == 0:
         return 0
     if hdu == 0 and card_flag(header, "GROUPS"):
-        raise HeaderError("random-groups", "expected an image; got random groups (GROUPS = T)")
+        message = (
+            "expected an image in a primary array or an image extension; got random groups (GROUPS = T): write the "
+            "image into a primary array without the card GROUPS"
+        )
+        raise HeaderError("random-groups", message)
     elements = math.prod(card_count(header, f"NAXIS{axis}") for axis in range(1, axes + 1))
     groups, extra = card_count(header, "GCOUNT", default=1), card_count(header, "PCOUNT", default=0)
     size = abs(bitpix) // 8 * groups * (extra + elements)

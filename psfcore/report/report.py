@@ -266,7 +266,9 @@ def _held_out_kernels(solution: Solution, missing: list[Missing]) -> Callable[[i
     kernels = []
     try:
         if not parts:
-            raise DataError("too-few-images", f"expected at least 6 images for held-out folds; got {images}")
+            raise DataError(
+                "too-few-images", f"expected at least 6 images for held-out folds; got {images}: add images"
+            )
         for k, fold in enumerate(parts):
             once = tuple(int(n in set(fold.fitted)) for n in range(images))
             step = shared_step(solution, FoldSample(0, k, once, fold.held_out))

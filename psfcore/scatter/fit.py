@@ -342,7 +342,7 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
 
 
 def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:
-    """The PSF of a fit on the full reach, with its components DIFFRACTION and SCATTER."""
+    """The fitted PSF, on the full reach (2048 px x 2048 px), with its components DIFFRACTION and SCATTER."""
     return Psf(
         kernel=fit.kernel,
         name=name,

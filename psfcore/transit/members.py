@@ -77,7 +77,7 @@ def archive_kind(start: bytes) -> Literal["zip", "tar", "gzip"] | None:
 
 
 def _starts_like(start: bytes, known: bytes) -> bool:
-    """True if `start` begins with `known`, or `known` with `start`."""
+    """True if `start` begins with `known`, or if `known` begins with `start`."""
     return start.startswith(known) or known.startswith(start)
 
 
@@ -299,7 +299,7 @@ class _TarInput:
 
 
 def _check_pax_records(text: bytes) -> None:
-    """Raise DataError "archive-broken" unless a pax header consists of records "length key=value\\n".
+    """Raise DataError "archive-broken" if a pax header contains anything but records "length key=value\\n".
 
     On some other texts, such as long runs of digits, the regular expressions of tarfile need quadratic time and memory
     (CVE-2024-6232).

@@ -223,8 +223,8 @@ def _on_disc(place: Place, rows: Places, columns: Places) -> PixelMask:
 def _scale(exposure: Exposure, donor: Exposure, here: tuple[Places, Places]) -> float:
     """The scale s of Eq. (1): the brightness of the frame divided by the brightness of the donor.
 
-    It is measured near the gaps. If there are too few pixels near them, it is measured in the whole image; if there are
-    too few again, it is 1.
+    The scale is measured near the gaps. If too few pixels near the gaps can be used, the scale is measured in the whole
+    image. If too few pixels can be used in the whole image, the scale is 1.
     """
     wanted = np.zeros(exposure.pixels.shape, dtype=bool)
     wanted[here] = True

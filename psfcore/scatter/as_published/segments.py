@@ -61,9 +61,9 @@ def shells_as_published(reach_px: float = FULL_REACH_PX) -> Floats:
 def fine_shells(reach_px: float = FULL_REACH_PX, growth: float = 0.03) -> Floats:
     """The edges of shells from 0.5 px to `reach_px`, in px.
 
-    The inner shells are 1 px wide. Farther out, the width of a shell is `growth` times its radius. These shells are
-    slightly wider than that, so that the last one ends at `reach_px`. Raises ValueError if `reach_px` is not above 1.5, or
-    if `growth` is not above 0.
+    The inner shells are 1 px wide. Farther out, the width of a shell is `growth` times its radius. The outer shells are
+    widened slightly, so that the last shell ends at `reach_px`. Raises ValueError if `reach_px` is not above 1.5, or if
+    `growth` is not above 0.
     """
     if not (reach_px > 1.5 and growth > 0):
         raise ValueError(f"expected a reach above 1.5 px and a growth above 0; got {reach_px} and {growth}")
@@ -288,7 +288,7 @@ def _between(edges_px: tuple[float, ...], radius_px: Floats) -> NDArray[np.int32
 def _sector(shape: tuple[int, int], sectors: int) -> NDArray[np.int32]:
     """The index of the sector of each pixel [y, x].
 
-    It follows from the angle of the pixel about [ny // 2, nx // 2], from +x towards +y.
+    The index follows from the angle of the pixel about [ny // 2, nx // 2], from +x towards +y.
     """
     dy = np.arange(shape[0], dtype=np.float64) - shape[0] // 2
     dx = np.arange(shape[1], dtype=np.float64) - shape[1] // 2
