@@ -271,7 +271,7 @@ The deviations above 0.3 have three reasons:
   within the pixel, by factors of 0.6 to 1.5: of the first orders at 94 A (at 8.99 px), and of the orders at 131 A and 304 A beyond 100 px. The integrated
   equations deviate from heliopsf by at most {smooth_10:.2f} at 10 px and {smooth_100:.2f} at 100 px.
 
-The meshes of heliopsf are two-dimensional, so that they also have orders between the arms, which aiapy does not have. These orders hold 0.9 % of the light of each mesh.
+The meshes of heliopsf are two-dimensional. Therefore its PSFs also have orders between the arms; the PSFs of aiapy do not. These orders hold 0.9 % of the light of each mesh.
 
 ## One image deconvolved by both
 

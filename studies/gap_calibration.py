@@ -111,7 +111,8 @@ def required(truth: Mapping[str, Any]) -> Names:
 
 
 def calibrated(cases: Sequence[Case], about: Mapping[str, Any]) -> Calibration:
-    """The calibration from these cases. Cases whose true cause has no weight, because its refit failed, have a share of 0."""
+    """The calibration from these cases. If the refit of a true cause failed, the true cause has no weight, and its
+    share is 0."""
 
     def loss(log_temperature: float) -> float:
         shares = [case.true_share(float(np.exp(log_temperature))) for case in cases]

@@ -123,7 +123,7 @@ class BlindSet:
         if not self.seals_file.is_file():
             return {}
         found: dict[int, str] = {}
-        # If the last line has no line end, a power failure cut it. Its case is made again.
+        # If the last line has no line end, a power failure cut the line. The case of this line is made again.
         for line in self.seals_file.read_text("utf-8").rpartition("\n")[0].splitlines():
             try:
                 entry = json.loads(line)

@@ -142,7 +142,7 @@ def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
     """The residual that an effect leaves without the other effects of the case, after a refit, to first order.
 
     left_alone_pct: the residual in percent, rms over images. left_alone_chi2: the sum over images of (residual /
-    noise)^2, where residual and noise are those of the disc means.
+    noise)^2, with the residual and the noise of the disc mean.
     """
     noise = left["refitted"]["noise_pct"]
     shown = sum((pct / noise[str(n)]) ** 2 for n, pct in by_itself.by_image_pct.items() if str(n) in noise)

@@ -17,8 +17,8 @@ discs after a refit, percent, rms over images. left_after_refit_pct: the residua
 is missing, the score uses the value of the ideal observer. Further keys are kept. The truth gets a "kind" and is sealed
 like the truth of a drawn case.
 
-The code of the simulator is executed. Its name comes from the person who runs the command. If the code raises an error,
-the error becomes a DataError that names the line of the code.
+The code of the simulator is executed. Only the person who runs the command can name this code. If the code raises an
+error, the error becomes a DataError that names the line of the code.
 """
 
 from __future__ import annotations

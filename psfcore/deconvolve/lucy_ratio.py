@@ -26,7 +26,8 @@ from psfcore.convolution.fft_kernels import LANES, forward, inverse
 from psfcore.deconvolve.problem import Problem, first_estimate
 from psfcore.errors import DataError
 
-# Smallest value of a model pixel, as a fraction of the brightest pixel (the "floor"). It is the resolution of float32;
+# Smallest value of a model pixel, as a fraction of the brightest pixel (the "floor"). The floor is the
+# resolution of float32;
 # smaller values are dominated by the rounding of the transform. The floor also avoids denormal numbers, which are slow.
 FLOOR_OF_MAXIMUM = 2.0**-23
 # An estimate below this fraction of the floor is set to 0.

@@ -140,8 +140,8 @@ def run(
     if stop == "discrepancy" and not (noise_known and found.count):
         raise DataError(
             "no-noise-model",
-            "expected photon gain, read noise and valid pixels away from the edges, which stopping by discrepancy needs; "
-            "at least one of them is missing",
+            "expected photon gain, read noise and valid pixels away from the edges, because the stopping rule discrepancy "
+            "needs them; at least one is missing: give the noise figures, or use the stopping rule fixed",
         )
     for step in range(1, steps + 1):
         iteration.measure()

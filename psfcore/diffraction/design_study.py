@@ -9,8 +9,8 @@ distinguished. With f = 1 - wire / pitch:
     share outside the order (0, 0) = 1 - f^2                                                         Eq. (2)
 
 The light beyond a radius (1 - encircled energy) is computed from the pattern of mesh_series. This pattern is for a
-square pupil as wide as the aperture, without mount, filter wheel or scatter. It is normalised to the light on the full
-reach.
+square pupil as wide as the aperture, without mount, filter wheel or scatter. The pattern is normalised to the light on
+the full reach.
 
 | symbol | name | unit |
 |---|---|---|

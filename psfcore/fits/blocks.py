@@ -5,8 +5,8 @@ Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sect
 cards NAXISn, BITPIX, PCOUNT and GCOUNT. heliopsf uses the first two-dimensional image of a file: a plain image HDU, or
 a tile-compressed image in a binary table with ZIMAGE = T. `first_image` ignores everything after that image.
 
-If the whole file is compressed (.fits.gz), the reader must decompress data in order to skip them. It therefore checks
-every declared size first and limits the number of decompressed bytes.
+If the whole file is compressed (.fits.gz), the reader must decompress data in order to skip them. The reader therefore
+checks every declared size first and limits the number of decompressed bytes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ _BITPIX = (8, 16, 32, 64, -32, -64)
 _SKIP_BYTES = 1 << 20
 _MANY_AXES = 10  # if an image has this number of axes or more, the message does not write out their indices
 END_CARD = b"END" + b" " * 77
-# astropy also ends a header at a card such as "END x". It would then read the file in another way than this module.
+# astropy also ends a header at a card such as "END x". astropy would then read the file in another way than
+# this module.
 _DAMAGED_END = re.compile(rb"END[^A-Z0-9_-]")
 _KNOWN_STARTS = (
     (b"\x00\x00\x00\x0cjP", "a JPEG 2000 file"),

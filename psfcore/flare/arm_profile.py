@@ -163,10 +163,10 @@ class FlareComparison:
 def flare_centre(difference: Plane, usable: Flags, usable_before: Flags) -> tuple[int, int]:
     """Position (x, y) of the flare, px.
 
-    It is the middle of the largest patch of pixels that are unusable in the flare image but usable in the image before.
-    If there is no such patch, it is the brightest pixel of the smoothed difference. usable, usable_before: True for the
-    usable pixels of the flare image and of the image before. Raises DataError "flare-no-light" if no pixel became
-    brighter.
+    The position is the middle of the largest patch of pixels that are unusable in the flare image but usable in the
+    image before. If there is no such patch, the position is the brightest pixel of the smoothed difference. usable,
+    usable_before: True for the usable pixels of the flare image and of the image before. Raises DataError
+    "flare-no-light" if no pixel became brighter.
     """
     labels, count = ndimage.label(~usable & usable_before, structure=np.ones((3, 3)))
     if count:

@@ -1,4 +1,4 @@
-"""Make a report on a PSF and its transit from one inversion. It contains the results that a publication shows.
+"""Make a report on a PSF and its transit from one inversion. The report contains the results that a publication shows.
 
 Source: Hofmeister et al., The point-spread function of HRI_EUV, sections "Inversion results", "Accuracy and robustness"
 and "Evaluation". The PSF is fitted to all images once. The fit of every fold differs from this fit by a small step. The

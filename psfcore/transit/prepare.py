@@ -2,7 +2,7 @@
 
 Paper (Hofmeister et al.), section "The observations": images are normalised by their exposure time, and saturated
 pixels are replaced by the pixels of the unsaturated image that is nearest in time. Here this image must have the same
-pointing, because the scene moves on the detector with the pointing. Its values are scaled:
+pointing, because the scene moves on the detector with the pointing. The values of the other image are scaled:
 
     s = median of I_i / I_j over the bright pixels near the gap, unsaturated in both    Eq. (1)
     I_i(gap) = s I_j(gap)                                                               Eq. (2)

@@ -3,16 +3,16 @@
     x <- x + w (y - H x),   x_0 = y      Eq. (1)
 
 The paper recommends this method for a bright source near an edge. Eq. (1) converges to H x = y even if H moves light
-out of the field. The method therefore restores the part of a pixel's light that falls outside the field. It must also
-take account of the light that enters from outside. If the scene is assumed to be zero beyond the field, the pixels
-along the edge become a third too bright (`python -m studies.edges`). Therefore, by default, the mirror image of the
-field continues the scene beyond the field. If the field is much smaller than the PSF, the margin makes it possible to
-use the whole PSF.
+out of the field. The method therefore restores the part of a pixel's light that falls outside the field. The method
+must also take account of the light that enters from outside. If the scene is assumed to be zero beyond the field, the
+pixels along the edge become a third too bright (`python -m studies.edges`). Therefore, by default, the mirror image of
+the field continues the scene beyond the field. If the field is much smaller than the PSF, the margin makes it possible
+to use the whole PSF.
 
 The method is linear: negative pixels are used unchanged, and the result may be negative. A masked pixel (w = 0) keeps
 its first estimate. Let T be the Fourier transform of the PSF at one frequency. After n steps, the noise at this
-frequency is the noise of the image times the sum over j = 0 .. n of (1 - T)^j. It grows without limit if
-abs(1 - T) > 1.
+frequency is the noise of the image times the sum over j = 0 .. n of (1 - T)^j. The noise grows without limit if abs(1 -
+T) > 1.
 
 | symbol | name | unit |
 |---|---|---|
