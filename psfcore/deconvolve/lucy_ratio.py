@@ -45,7 +45,10 @@ def light_above_floor(problem: Problem) -> Single:
     """
     domain = problem.domain
     if not (domain.pixels[domain.trusted] > 0).any():
-        raise DataError("no-signal", "expected at least one trusted pixel above zero; got none")
+        raise DataError(
+            "no-signal",
+            "expected at least one trusted pixel above zero; got none: use another image or the method linear",
+        )
     estimate = first_estimate(problem)
     return np.maximum(estimate, np.float32(FLOOR_OF_MAXIMUM * float(estimate.max())))
 

@@ -112,10 +112,12 @@ class _GzipSource:
             return self._stream.read(count)
         except EOFError:
             raise HeaderError(
-                "truncated-gzip", "expected a complete gzip stream; it ends too early"
+                "truncated-gzip", "expected a complete gzip stream; it ends too early: copy the file again"
             ) from None
         except (OSError, zlib.error) as error:
-            raise HeaderError("bad-gzip", f"expected a readable gzip stream; got: {error}") from None
+            raise HeaderError(
+                "bad-gzip", f"expected a readable gzip stream; got: {error}: copy the file again"
+            ) from None
 
     def skip(self, count: int) -> int:
         there = 0
@@ -159,7 +161,10 @@ def enter_data(source: Source, hdu: int, limits: FitsLimits) -> Header:
     for number in range(hdu + 1):
         raw = _read_header(source, limits.max_header_bytes, limits, first=number == 0)
         if raw is None:
-            raise HeaderError("truncated-data", f"expected {hdu + 1} HDUs; the file ends after {number}")
+            raise HeaderError(
+                "truncated-data",
+                f"expected {hdu + 1} HDUs; the file ends after {number}: copy the file again",
+            )
         header = _parse(raw, number)
         if number < hdu:
             _pass_data(source, header, number, limits, last=False)
@@ -207,9 +212,11 @@ def _no_image(kinds: list[str]) -> HeaderError:
             f"hdus = fits.open('FILE'); hdus[{hdu}].data = hdus[{hdu}].data[{first}]; hdus.writeto('NEW')",
         )
     if "line" in kinds:
-        return HeaderError("not-2d", f"{wanted}; got an image of one axis")
+        return HeaderError("not-2d", f"{wanted}; got an image of one axis: store the image with two axes")
     if "table" in kinds:
-        return HeaderError("table-only", f"{wanted}; got only tables ({_counted(kinds)})")
+        return HeaderError(
+            "table-only", f"{wanted}; got only tables ({_counted(kinds)}): use a file with an image"
+        )
     return HeaderError("no-image", f"{wanted}; got {_counted(kinds)}, and none has data with two axes")
 
 
@@ -230,7 +237,8 @@ def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) 
         if end is not None:
             return bytes(raw)
         if len(block) < BLOCK_BYTES:
-            message = f"expected an END card; the file stops after {len(raw)} bytes of this header"
+            got = f"the file stops after {len(raw)} bytes of this header"
+            message = f"expected an END card; {got}: copy the file again"
             raise HeaderError("truncated-header", message)
     message = f"expected at most {limits.max_header_bytes} bytes of headers, each with an END card; got more"
     raise HeaderError("header-too-long", message)
@@ -253,7 +261,8 @@ def _check_start(block: bytes) -> None:
         raise HeaderError("empty-file", "expected a FITS file; got a gzip file with no content")
     if block.startswith(b"SIMPLE"[: len(block)]) and len(block) < 9:
         raise HeaderError(
-            "truncated-header", f"expected a FITS header; the file stops after {len(block)} bytes"
+            "truncated-header",
+            f"expected a FITS header; the file stops after {len(block)} bytes: copy the file again",
         )
     got = next((name for start, name in _KNOWN_STARTS if block.startswith(start)), None)
     if got is None:
@@ -323,7 +332,8 @@ def _pass_data(source: Source, header: Header, hdu: int, limits: FitsLimits, *, 
         raise HeaderError("too-many-bytes", message)
     there = source.skip(size)
     if there < size:
-        message = f"expected {size} bytes of data in HDU {hdu}, as its header declares; got {there}"
+        wanted = f"expected {size} bytes of data in HDU {hdu}, as its header declares"
+        message = f"{wanted}; got {there}: copy the file again"
         raise HeaderError("truncated-data", message)
     if not last:
         source.skip(-size % BLOCK_BYTES)

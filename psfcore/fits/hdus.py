@@ -88,7 +88,8 @@ def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
         raise
     except PIXEL_TROUBLE as error:
         _raise_if_storage(error)
-        message = f"expected readable pixels in {part} of {Path(path).name}; got: {error!s:.120}"
+        wanted = f"expected readable pixels in {part} of {Path(path).name}"
+        message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
         raise DataError("unreadable-pixels", message) from None
 
 

@@ -103,14 +103,19 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
     if valid.size == 0:
         finite = (image.mask & MaskBit.NONFINITE) == 0
         if not finite.any():
-            raise DataError("all-nan", "expected finite pixels; got only NaN, infinite or BLANK")
+            raise DataError(
+                "all-nan", "expected finite pixels; got only NaN, infinite or BLANK: use another image"
+            )
         level = image.pixels[finite].min()
         raise DataError(
-            "all-saturated", f"expected pixels below saturation; all finite pixels are at {level:g} or above"
+            "all-saturated",
+            f"expected pixels below saturation; all finite pixels are at {level:g} or above: check the level",
         )
     smallest, largest = float(valid.min()), float(valid.max())
     if largest <= 0:
-        raise DataError("no-signal", f"expected pixels above zero; the largest is {largest:g}")
+        raise DataError(
+            "no-signal", f"expected pixels above zero; the largest is {largest:g}: use another image"
+        )
     if smallest == largest and stored_as_integer and largest in _FULL_SCALES:
         message = f"expected pixels below saturation; all pixels are {largest:g}, the largest value of an A/D converter"
         raise DataError("all-saturated", message)

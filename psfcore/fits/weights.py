@@ -66,7 +66,8 @@ def _check_pixels(path: Path, summary: HeaderSummary, limits: FitsLimits) -> Non
     if not is_peak(centre, largest):
         raise DataError(
             "psf-not-centred",
-            f"expected the largest weight, {largest:.3g}, at [y, x] = {(ny // 2, nx // 2)}; there is {centre:.3g}",
+            f"expected the largest weight, {largest:.3g}, at [y, x] = {(ny // 2, nx // 2)}; got {centre:.3g} there: "
+            "shift the PSF so that its peak is in this pixel",
         )
 
 

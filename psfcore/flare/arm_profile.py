@@ -174,7 +174,10 @@ def flare_centre(difference: Plane, usable: Flags, usable_before: Flags) -> tupl
         return round(float(x.mean())), round(float(y.mean()))
     smooth = ndimage.gaussian_filter(np.where(usable & usable_before, difference, 0.0), 1.0)
     if not smooth.max() > 0:
-        raise DataError("flare-no-light", "expected pixels brighter than in the image before; got none")
+        raise DataError(
+            "flare-no-light",
+            "expected pixels brighter than in the image before; got none: check the order of the two images",
+        )
     row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
     return int(column), int(row)
 

@@ -148,11 +148,15 @@ def opened(path: Path, limits: ArchiveLimits) -> Iterator[OpenArchive]:
             if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
                 raise  # an error of the disk, not of the archive
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise DataError("archive-broken", f"expected an intact archive; got: {reason:.120}") from None
+            raise DataError(
+                "archive-broken", f"expected an intact archive; got: {reason:.120}: pack or copy it again"
+            ) from None
 
 
 def _truncated() -> DataError:
-    return DataError("archive-broken", "expected a complete archive; got one that ends too early")
+    return DataError(
+        "archive-broken", "expected a complete archive; got one that ends too early: pack or copy it again"
+    )
 
 
 # --- zip --------------------------------------------------------------------------------------------------
