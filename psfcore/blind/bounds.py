@@ -27,8 +27,9 @@ hypothesis with fewer effects, and Eq. (3). A right answer need not name every t
 effect beside the others with a probability of one half or more, this effect counts as an effect of the truth, and a
 rival must explain this effect too.
 
-If the true effect is not in the library, every hypothesis of the library counts as a simpler one. The observer names
-"unknown" if all of them are excluded. On clean data the ideal observer names an effect with the probability LEVEL.
+If the true effect is not in the library, every hypothesis of the library counts as a simpler hypothesis. The observer
+names "unknown" if all of them are excluded. On clean data the ideal observer names an effect with the probability
+LEVEL.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ report is copied to the set when it is complete. A case that has a report is not
 failure is written to run.json, and the next run tries the case again.
 
 A further process computes what an ideal observer could know about the case, from its images without noise. These images stay
-in the set; the diagnosis runs elsewhere and is told no path of the set.
+in the set; the diagnosis runs elsewhere and gets no path of the set.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Run:
-    """One diagnosis: its wall time, its largest memory and its exit status. error: the reason if it gave no report."""
+    """One diagnosis: its wall time, its largest memory and its exit status. error: the reason if the diagnosis gave no
+    report."""
 
     case: int
     wall_s: float

@@ -74,7 +74,8 @@ class Ratio:
 
 @compiled(fastmath=_SUMS)
 def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Replace H x, raised to `floor` where it is smaller, by Eq. (1); sum (y - H x)^2 / variance over judged pixels."""
+    """Replace H x, raised to `floor` where it is smaller, by Eq. (1). Add up (y - H x)^2 / variance over the judged
+    pixels."""
     nx = light.shape[1]
     zero = np.float32(0.0)
     least = np.float32(1e-30)

@@ -2,8 +2,8 @@
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "The instrument", prints radii and distances that
 are not consistent: with them the detector is far out of focus. This module solves for the separation of the mirrors.
-The focus is most sensitive to this length, because the secondary magnifies an error of it. All other lengths keep their
-printed values, and the result states by how much the separation was shifted.
+The focus is most sensitive to this length, because the secondary magnifies an error of this length. All other lengths
+keep their printed values, and the result states by how much the separation was shifted.
 
 Rays near the axis meet on the detector where y(L) = 0 in Eq. (1) of light_path:
 

@@ -46,8 +46,8 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Route:
-    """The decision which components of the entrance are in the transformed mask. str() gives the decision and its
-    reason."""
+    """Which components of the entrance the transformed mask contains. str() gives this decision and the reason for
+    it."""
 
     samples: int
     mask: bool

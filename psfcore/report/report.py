@@ -227,7 +227,7 @@ def _check_scale(transit: Transit, psf: Psf) -> None:
 def _names_images(psf: Psf, transit: Transit) -> bool:
     """Whether a PSF's history contains the SHA-256 of an image of a transit.
 
-    The lines of the history are joined first, because FITS can break them anywhere.
+    The lines of the history are joined first, because FITS can break a text anywhere.
     """
     history = "".join(str(line) for line in psf.provenance.get("history", ()))
     return any(transit.sha256.get(frame.file, "-") in history for frame in transit.frames)

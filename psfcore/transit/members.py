@@ -248,8 +248,9 @@ class _TarInput:
 
     tarfile trusts the sizes in headers. It reads a pax header or a GNU long name of any size in one read. It follows any
     number of such headers by recursion, and it collects the maps of sparse files without a limit. Here all headers of
-    one member together may have at most _MAX_HEADER_BYTES, which limits all three. Seeking backwards is refused, because a
-    .tar.gz would be decompressed again from its start. tarfile does not seek backwards if members are read in order.
+    one member together may have at most _MAX_HEADER_BYTES. This bounds memory and time in all three cases. Seeking
+    backwards is refused, because a .tar.gz would be decompressed again from its start. tarfile does not seek backwards
+    if members are read in order.
 
     size: the size of a file in which data can be skipped by seeking. None: skipped data is read, and counted too.
     """

@@ -59,7 +59,7 @@ class Exposure:
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """The numbers of saturated and of not finite pixels of one frame, and how their values were replaced.
+    """The numbers of saturated and of non-finite pixels of one frame, and the ways in which their values were replaced.
 
     from_frames: pixels with a value from another frame. from_neighbours: pixels with the median of pixels near them.
     unfilled: saturated pixels that no other frame of the pointing can fill; they keep their values.

@@ -100,7 +100,7 @@ class _BasicIterative(Iteration):
 def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """Compute `new` by Eq. (1) and transform its rows.
 
-    Also sum (change)^2 and x^2 over all pixels, and (y - H x)^2 / variance over judged pixels.
+    Add up (change)^2 and x^2 over all pixels, and (y - H x)^2 / variance over the judged pixels.
     """
     nx = x.shape[1]
     zero, least = np.float32(0.0), np.float32(1e-30)

@@ -136,9 +136,9 @@ def free_fit(
 ) -> SubsetFits:
     """The free fit of Eq. (2): coefficients, (subsets kept, segments), as fractions of the light per pixel.
 
-    towards: the coefficients that the prior favours; shells that no equation constrains keep them. The prior is weak: if
-    a shell doubles or vanishes, the misfit grows as much as if one equation were wrong by its scale. Default: the prior
-    favours zero for all shells, with PRIOR_WEIGHT.
+    towards: the coefficients that the prior favours; shells that no equation constrains keep these coefficients. The
+    prior is weak: if a shell doubles or vanishes, the misfit grows as much as if one equation were wrong by its scale.
+    Default: the prior favours zero for all shells, with PRIOR_WEIGHT.
     """
     prior_at = np.zeros_like(counts) if towards is None else towards
     light = prior_at * counts
