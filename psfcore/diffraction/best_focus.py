@@ -103,7 +103,8 @@ def paraxial_separation_mm(path: LightPath) -> float:
         found = f"{separation_mm:g} mm" if f2 != length else "no finite separation"
         raise DataError(
             "no-focus",
-            f"expected mirrors that can focus on the detector at a positive separation; got {found}",
+            f"expected mirrors that can focus on the detector at a positive separation; got {found}: "
+            "correct their radii or distances in the instrument file",
         )
     return separation_mm
 
@@ -152,7 +153,8 @@ def _sharpest(waves: _WithoutWheel, at_primary: Wave, paraxial_mm: float) -> flo
     if abs(separation_mm - paraxial_mm) > 0.95 * SEARCH_MM:
         raise DataError(
             "no-focus",
-            f"expected best focus within {SEARCH_MM} mm of the paraxial separation {paraxial_mm:.3f} mm; got no maximum there",
+            f"expected best focus within {SEARCH_MM} mm of the paraxial separation {paraxial_mm:.3f} mm; got no maximum "
+            "there: correct the radii or distances of the mirrors in the instrument file",
         )
     return separation_mm
 

@@ -106,7 +106,8 @@ class _GzipSource:
         self._left -= count
         if self._left < 0:
             raise HeaderError(
-                "too-many-bytes", "expected decompressed data within the size limit; got more bytes"
+                "too-many-bytes",
+                "expected decompressed data within the size limit; got more bytes: use a smaller file",
             )
         try:
             return self._stream.read(count)
@@ -136,7 +137,7 @@ def open_source(path: Path, limits: FitsLimits) -> Iterator[Source]:
         start = file.read(2)
         file.seek(0)
         if not start:
-            raise HeaderError("empty-file", "expected a FITS file; got an empty file")
+            raise HeaderError("empty-file", "expected a FITS file; got an empty file: copy the file again")
         if start == b"\x1f\x8b":
             yield _GzipSource(file, limits.max_pixels * 16 + limits.max_hdus * limits.max_header_bytes)
         else:
@@ -217,7 +218,10 @@ def _no_image(kinds: list[str]) -> HeaderError:
         return HeaderError(
             "table-only", f"{wanted}; got only tables ({_counted(kinds)}): use a file with an image"
         )
-    return HeaderError("no-image", f"{wanted}; got {_counted(kinds)}, and none has data with two axes")
+    return HeaderError(
+        "no-image",
+        f"{wanted}; got {_counted(kinds)}, and none has data with two axes: use a file with an image",
+    )
 
 
 def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:
@@ -258,7 +262,9 @@ def _check_start(block: bytes) -> None:
     if block.startswith(b"SIMPLE  ="):
         return
     if not block:
-        raise HeaderError("empty-file", "expected a FITS file; got a gzip file with no content")
+        raise HeaderError(
+            "empty-file", "expected a FITS file; got a gzip file with no content: copy the file again"
+        )
     if block.startswith(b"SIMPLE"[: len(block)]) and len(block) < 9:
         raise HeaderError(
             "truncated-header",

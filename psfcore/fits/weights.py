@@ -30,7 +30,8 @@ def check_is_psf(path: str | os.PathLike[str], summary: HeaderSummary, limits: F
     """
     if summary.content == PRODUCT:
         raise DataError(
-            "image-as-psf", "expected a PSF; the header (PSFID) says that the file is a deconvolved image"
+            "image-as-psf",
+            "expected a PSF; the header (PSFID) says that the file is a deconvolved image: name the file of a PSF",
         )
     if summary.codec is None:
         _check_pixels(Path(path), summary, limits)
