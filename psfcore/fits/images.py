@@ -93,7 +93,9 @@ def _saturation_level(
         elif exposure_s is not None:
             levels.append(saturation_dn / exposure_s)
         else:
-            wanted = "expected XPOSURE or EXPTIME in the header, to convert a saturation level from DN to DN/s"
+            wanted = (
+                "expected XPOSURE or EXPTIME in the header, to convert a saturation level from DN to DN/s"
+            )
             message = f"{wanted}; got neither: add one of them"
             raise DataError("no-exposure", message)
     return min(levels, default=None)
