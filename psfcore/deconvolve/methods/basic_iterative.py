@@ -11,8 +11,8 @@ to use the whole PSF.
 
 The method is linear: negative pixels are used unchanged, and the result may be negative. A masked pixel (w = 0) keeps
 its first estimate. Let T be the Fourier transform of the PSF at one frequency. After n steps, the noise at this
-frequency is the noise of the image times the sum over j = 0 .. n of (1 - T)^j. The noise grows without limit if abs(1 -
-T) > 1.
+frequency is the noise of the image times the sum over j = 0 .. n of (1 - T)^j. The noise grows without limit if
+abs(1 - T) > 1.
 
 | symbol | name | unit |
 |---|---|---|

@@ -129,8 +129,7 @@ def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _smooth_rows(x, correction, new, smoothing, softening, dark, sums, start, stop):  # type: ignore[no-untyped-def]
-    """Compute `new` by Eq. (1) on rows [start, stop). Set values below `dark` to 0. Add up (change)^2 and x^2 by
-    row."""
+    """Compute `new` by Eq. (1) on rows [start, stop). Set values below `dark` to 0. Sum (change)^2 and x^2 by row."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for row in range(start, stop):
         moved, total = 0.0, 0.0
