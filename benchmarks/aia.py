@@ -242,12 +242,12 @@ PAGE = """# AIA beside aiapy
 each PSF sums to 1. Deviations beyond 0.1 degrees, 0.1 px or 0.3 percentage points are bold.
 
 aiapy adds every diffraction order to 4096 x 4096 px. The command evaluates the same equations near each order only, with the numbers of aiapy
-(`filter_mesh_parameters`). With the orders -1 to 1 it was compared with aiapy itself: the sum of all absolute deviations is {deviation:.0e} of the light.
+(`filter_mesh_parameters`). With the orders -1 to 1, this evaluation was compared with aiapy itself: the sum of all absolute deviations is {deviation:.0e} of the light.
 
 ## Arms and orders
 
 The angles (degrees) and the spacing (px) are measured in both PSFs, from the centroids of orders 4 to 9 and 12 to 20 of each arm. aiapy has four separate arms. An
-instrument file has two square meshes, whose arms are 90 degrees apart; the measured arms (Grigis et al. 2012) deviate from that by up to 0.12 degrees.
+instrument file has two square meshes, whose arms are 90 degrees apart; the measured arms (Grigis et al. 2012) deviate from 90 degrees by up to 0.12 degrees.
 
 | channel | arms, heliopsf | arms, aiapy | largest deviation | spacing, heliopsf | spacing, aiapy | largest deviation |
 |---|---|---|---|---|---|---|
@@ -255,8 +255,8 @@ instrument file has two square meshes, whose arms are 90 degrees apart; the meas
 
 ## Light beyond a radius
 
-In percent of the light. `aiapy, integrated` are the equations of aiapy with each order integrated over the pixels. `aperture` is the part of heliopsf's aperture
-(a ring of 200 mm with an obscuration of 80 mm) alone, which aiapy does not have.
+The table gives percentages of all light. For `aiapy, integrated`, each order of the equations of aiapy is integrated over the pixels. `aperture` is the light that the
+aperture alone diffracts beyond the radius (a ring of 200 mm with an obscuration of 80 mm); aiapy leaves out the aperture.
 
 | channel | radius (px) | heliopsf | aiapy | deviation | aiapy, integrated | aperture |
 |---|---|---|---|---|---|---|
@@ -264,14 +264,14 @@ In percent of the light. `aiapy, integrated` are the equations of aiapy with eac
 
 The deviations above 0.3 have three reasons:
 
-- At 2 px: diffraction by the aperture, up to 1 % of the light, is in heliopsf only.
+- At 2 px: only heliopsf contains the diffraction by the aperture, up to 1 % of the light.
 - At 2 px: the orders of the focal-plane mesh are 0.2 px to 0.7 px apart. In heliopsf, an order is narrower than a pixel; in aiapy it is a Gaussian with a full width of
   0.8 px. Orders near the circle are therefore counted on different sides of it: at 304 A the third order is at 2.01 px.
-- At 10 px and 100 px: aiapy evaluates the Gaussian of each order at the centres of the pixels and not over their area. The light of an order then depends on its place
+- At 10 px and 100 px: aiapy evaluates the Gaussian of each order at the centres of the pixels and does not integrate it over their area. The light of an order then depends on its place
   within the pixel, by factors of 0.6 to 1.5: of the first orders at 94 A (at 8.99 px), and of the orders at 131 A and 304 A beyond 100 px. The integrated
   equations deviate from heliopsf by at most {smooth_10:.2f} at 10 px and {smooth_100:.2f} at 100 px.
 
-The meshes of heliopsf are two-dimensional, so that they also have orders between the arms, which aiapy does not have. They hold 0.9 % of the light of each mesh.
+The meshes of heliopsf are two-dimensional. Therefore its PSFs also have orders between the arms; the PSFs of aiapy do not. These orders hold 0.9 % of the light of each mesh.
 
 ## One image deconvolved by both
 

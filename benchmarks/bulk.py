@@ -45,8 +45,8 @@ MARK = b"BENCH   =              1000000"
 
 
 def make_archive(folder: Path, images: int, size: int) -> Path:
-    """Write images of one scene that differ in one header card, so that no two files are equal; returns the PSF's
-    file."""
+    """Write images of one scene. Each image has its own value of one header card, so that no two files are equal.
+    Returns the file of the PSF."""
     instrument = load_instrument("hri_euv")
     psf = build_psf(instrument, threads=os.cpu_count() or 1)
     write_psf(folder / "psf.fits", psf, instrument_file=b"")

@@ -4,9 +4,9 @@
 
 By default it fits 30 images of 512 px and prints the time as a ratio to 1 F (see benchmarks/deconvolution.py). It also
 fits nine images of 256 px with both solvers. The reference solver uses SciPy transforms in float64 and all images in
-every round. It computes every scene from the beginning in thirty steps, and the derivatives by finite differences of
-the whole model. --full also fits 126 images of 2048 px and prints the peak memory. The first run with --full writes 4
-GB into DIR (default: the temporary folder).
+every round. For each set of parameters it reconstructs every scene anew, with thirty steps of Richardson's iteration.
+It computes the derivatives by finite differences of the whole model. --full also fits 126 images of 2048 px and prints
+the peak memory. The first run with --full writes 4 GB into DIR (default: the temporary folder).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def reference_curve(solution: Solution) -> NDArray[np.float64]:
             x = transit.frames[n].pixels.astype(np.float64)
             for _ in range(
                 SCENE_STEPS
-            ):  # Richardson's iteration; the transform of the PSF is between 0.3 and 1
+            ):  # Richardson's iteration. It converges, because the transform of the PSF is between 0.3 and 1
                 x = x + (transit.frames[n].pixels - convolver.apply(x))
             x[solution.sky.dark[n]] = 0.0
             out.append(np.asarray(convolver.apply(x))[solution.sky.dark[n]])

@@ -2,8 +2,9 @@
 
 There are 51,660 targets: 410 about each of 126 positions along a transit in 2048 px images. Sums are over the 50
 published shells, over the same shells divided into 12 sectors, and over fine shells. 1 F is defined in
-`benchmarks.deconvolution`. A plain look-up and one convolution per shell are too slow for all targets. They are timed on
-a part, scaled, and compared with the running sums on that part.
+`benchmarks.deconvolution`. A plain look-up and one convolution per shell are too slow for all targets. Both methods are
+timed on a part of the targets, and the times are scaled to all targets. On that part, their sums are compared with the
+running sums.
 """
 
 from __future__ import annotations

@@ -4,8 +4,9 @@ The benchmark needs Chromium. No other program should run on the machine. Three 
 
 - first page: the first product after the start. The service loads its numerical libraries, and the browser prepares its
   drawing.
-- first sight and all pixels: a product of 2048 px of which the service has not yet decoded a plane. The time is from
-  the begin of the navigation to the first frame after the overview, or after all pixels, were drawn.
+- first sight and all pixels: a product of 2048 px. The service has not yet decoded any plane of this product. Both
+  times begin with the navigation. "First sight" ends with the first frame after the overview was drawn, "all pixels"
+  with the first frame after all pixels were drawn.
 - a blink: the time from the key to the end of the drawing on the graphics card. Without a graphics card, Chromium draws
   with the processor.
 
@@ -48,7 +49,7 @@ BLINK_MS = """async () => {
 
 
 def moment(page: Page, name: str) -> float:
-    """The time at which the page recorded the event `name`, in seconds after the begin of the navigation."""
+    """The time at which the page recorded the event `name`, in seconds after the start of the navigation."""
     for _ in range(600):
         found = page.evaluate(TIME_OF, name)
         if found is not None:

@@ -1,11 +1,11 @@
 """Compile kernels (fast functions) with numba and keep them on disk. Several processes may compile at the same time.
 
-numba's own cache is not safe when several processes compile. It keeps the machine code of a function in numbered
-files; it reads, changes and writes the index of these files without a lock; and it names symbols by a counter of the
-process. Two processes can compile two kernels of the same name at once, for example FFT passes of two lengths
+numba's own cache is not safe when several processes compile. This cache keeps the machine code of a function in
+numbered files; it reads, changes and writes the index of these files without a lock; and it names symbols by a counter
+of the process. Two processes can compile two kernels of the same name at once, for example FFT passes of two lengths
 (`fft_kernels`). Both may then write file number 1 or use the same symbol. One kernel is then called in place of the
-other, and the transforms are wrong without any error message. The cache in this module has no index. The name of a
-file is a hash of what was compiled, and a function that is defined inside another function gets a unique name.
+other, and the transforms are wrong without any error message. The cache in this module has no index. The name of a file
+is a hash of what was compiled, and a function that is defined inside another function gets a unique name.
 
 numba also does not notice when a kernel calls a function of another file and that file changes. In this module, every
 kernel depends on all source files that define kernels. If a power failure left a kernel file incomplete, the file is
@@ -119,8 +119,7 @@ def kernel_folder(usual: Path, home: Path | None = None) -> str:
 
 
 def trusted(path: Path) -> bool:
-    """Whether nobody can change a file or folder except this user, the administrator, and users who can change this
-    module.
+    """Whether only this user, the administrator, and users who can change this module can change a file or folder.
 
     The folders above it are checked too, because a user who can rename one of them can replace it by another folder.
     """

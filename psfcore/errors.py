@@ -60,8 +60,8 @@ def module_of_extra(extra: str, module: str) -> Any:
 
 
 def together(errors: Sequence[DataError]) -> DataError:
-    """Combine the errors of several files into one error, with all messages, and with the type and code of the
-    first."""
+    """Combine the errors of several files into one error. It has all messages, and the type and code of the first
+    error."""
     first = errors[0]
     if len(errors) == 1:
         return first

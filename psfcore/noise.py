@@ -69,6 +69,7 @@ def dn_per_unit(image: Image) -> float:
     if (image.unit or "").replace(" ", "").lower() != "dn/s":
         return 1.0
     if image.exposure_s is None:
-        message = "expected XPOSURE or EXPTIME in the header, to compute the noise of an image in DN/s; got neither of them"
+        wanted = "expected XPOSURE or EXPTIME in the header, to compute the noise of an image in DN/s"
+        message = f"{wanted}; got neither: add one of them"
         raise DataError("no-exposure", message)
     return image.exposure_s

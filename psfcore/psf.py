@@ -108,8 +108,11 @@ def _check_centre(kernel: Kernel) -> None:
     if not is_peak(float(kernel[centre]), float(kernel.max())):
         peak = np.unravel_index(int(kernel.argmax()), kernel.shape)
         found = tuple(int(p) for p in peak)
-        hint = " (the corner origin of a Fourier transform: shift the PSF first)" if found == (0, 0) else ""
-        raise DataError("psf-not-centred", f"expected the peak at [y, x] = {centre}; got {found}{hint}")
+        hint = " (the corner origin of a Fourier transform)" if found == (0, 0) else ""
+        raise DataError(
+            "psf-not-centred",
+            f"expected the peak at [y, x] = {centre}; got {found}{hint}: shift the PSF so that its peak is at {centre}",
+        )
 
 
 def crop_centred(kernel: Kernel, shape: tuple[int, int]) -> Kernel:

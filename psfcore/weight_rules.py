@@ -18,7 +18,7 @@ CENTRE_TOLERANCE = (
 
 
 def check_weights(smallest: float, largest: float, total: float) -> None:
-    """Raise DataError "psf-negative" or "psf-sum" unless the weights are at least 0 and their sum is in the allowed range."""
+    """Raise DataError "psf-negative" if a weight is negative, and "psf-sum" if the sum is outside the allowed range."""
     if smallest < -1e-12 * max(largest, 0.0):
         raise DataError("psf-negative", f"expected weights >= 0; the smallest is {smallest:.3g}")
     if not SMALLEST_SUM < total <= LARGEST_SUM:

@@ -32,7 +32,7 @@ def whole_path(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_file(target: Path) -> Iterator[BinaryIO]:
-    """Open a temporary file beside `target`. It replaces `target` when its whole content is on the disk.
+    """Open a temporary file beside `target`. This file replaces `target` when its whole content is on the disk.
 
     A killed process leaves its temporary file behind; its name ends with `PARTIAL`. Raises OSError.
     """

@@ -1,7 +1,8 @@
 """`python -m studies.edges`: errors of a deconvolved field along its edges, by method and treatment of edges.
 
-A scene of 2048 px is convolved with a PSF, noise is added, and the whole image is deconvolved. Its middle is the reference
-without edges. The same pixels are cut out and deconvolved alone, and compared with the reference in bands along the edges:
+A scene of 2048 px is convolved with a PSF, noise is added, and the whole image is deconvolved. The middle of the result
+is the reference without edges. The same pixels of the image are cut out and deconvolved alone. Both results are
+compared in bands along the edges of the cut-out:
 
     bias = sum(x) / sum(x_ref) - 1,    deviation = sum(abs(x - x_ref)) / sum(x_ref),    in percent     Eq. (1)
 

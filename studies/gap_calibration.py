@@ -4,9 +4,10 @@
 
 The command makes a blind set (`psfcore.blind`), computes the posterior of every case with full refits, and stores it in
 DIR. From the probabilities of the true causes it computes the temperature and the threshold. It prints how often the
-answer sets contain the true cause, and how large they are. For this, each half of the cases is tested with the
-calibration by the other half. With --write it writes psfcore/gap/verdict/calibration.json. The seed must not be used to
-test the diagnosis. The command continues where it was interrupted; one case takes about 15 s of one processor core.
+answer sets contain the true cause, and how large they are. For this test, the calibration from one half of the cases is
+applied to the other half, and the reverse. With --write it writes psfcore/gap/verdict/calibration.json. The seed must
+not be used to test the diagnosis. The command continues where it was interrupted; one case takes about 15 s of one
+processor core.
 """
 
 from __future__ import annotations
@@ -110,7 +111,8 @@ def required(truth: Mapping[str, Any]) -> Names:
 
 
 def calibrated(cases: Sequence[Case], about: Mapping[str, Any]) -> Calibration:
-    """The calibration from these cases. Cases whose true cause has no weight, because its refit failed, have a share of 0."""
+    """The calibration from these cases. If the refit of a true cause failed, the true cause has no weight, and its
+    share is 0."""
 
     def loss(log_temperature: float) -> float:
         shares = [case.true_share(float(np.exp(log_temperature))) for case in cases]
@@ -124,7 +126,7 @@ def calibrated(cases: Sequence[Case], about: Mapping[str, Any]) -> Calibration:
 def table(cases: Sequence[Case], coverage: float = COVERAGE) -> list[str]:
     """The lines of a table: how often the answer set contains the true cause, and its mean size.
 
-    Each half of the cases is tested with the calibration by the other half.
+    The calibration from one half of the cases is applied to the other half, and the reverse.
     """
     tested: list[tuple[Case, bool, int]] = []
     for half in (0, 1):

@@ -4,11 +4,11 @@
     python -m studies.transits --bands | --shapes
 
 Each seed has its own power law, scenes, ephemeris and noise. The output compares the cumulative curve of the total PSF
-with the truth, and the rms of its errors with the photon bound. It also lists the pulls, the errors of the position of
-the occulter, and the errors of the curve for images without noise and with exact positions. Options add the published
-recipe and stretched scatter. --bands: only compare the bands of cross-validations with the truth. --shapes: only
-compare shapes of scatter by their residuals in held-out images, and compare the light of a free fit near the centre
-with the power law; the truth is a power law.
+with the truth, and the rms of its errors with the photon bound. The output also lists the pulls, the errors of the
+position of the occulter, and the errors of the curve for images without noise and with exact positions. Options add the
+published recipe and stretched scatter. --bands: only compare the bands of cross-validations with the truth. --shapes:
+only compare shapes of scatter by their residuals in held-out images, and compare the light of a free fit near the
+centre with the power law; the truth is a power law.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""The blind set: simulated transits that test the gap diagnosis. Their effects are withheld from the diagnosis.
+"""The blind set: simulated transits that test the gap diagnosis. The effects in these transits are withheld from the
+diagnosis.
 
 Each case is simulated, and its truth is sealed by a hash. A process that sees only the images diagnoses the case. Then the
 reports are compared with the truths. A further process computes from images without noise what an ideal observer could know.

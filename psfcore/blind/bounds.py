@@ -23,12 +23,13 @@ For one rival this is Phi(sqrt(lambda) / 2). For M rivals at equal distances it 
 alternatives, a maximum of Gaussian variables (Green and Swets, Signal Detection Theory and Psychophysics, 1966, chapter
 2). Hypotheses with more effects than the truth are left out: they contain the truth, or are less probable. Hypotheses
 that a right answer may name (`scoring`) are left out too. The bound is the smallest of these values: Eq. (2) for each
-hypothesis with fewer effects, and Eq. (3). A right answer need not name every true effect. An effect that it need not
-name counts as an effect of the truth if Eq. (2) finds this effect beside the others with a probability of one half or
-more. A rival must then explain it too.
+hypothesis with fewer effects, and Eq. (3). A right answer need not name every true effect. If Eq. (2) finds such an
+effect beside the others with a probability of one half or more, this effect counts as an effect of the truth, and a
+rival must explain this effect too.
 
-If the true effect is not in the library, every hypothesis of the library counts as a simpler one. The observer names
-"unknown" if all of them are excluded. On clean data the ideal observer names an effect with the probability LEVEL.
+If the true effect is not in the library, every hypothesis of the library counts as a simpler hypothesis. The observer
+names "unknown" if all of them are excluded. On clean data the ideal observer names an effect with the probability
+LEVEL.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ def known(ideal: dict[str, Any], required: Sequence[str], true: Sequence[str], *
 
 
 def _shown(left: dict[Effects, tuple[float, float]], required: Effects, true: Effects, among: int) -> Effects:
-    """The true effects that count: all, if the data also show those that are not required; otherwise the required ones."""
+    """The true effects that count: the required effects, and also the other true effects if the data show them."""
     if required == true or required not in left or true not in left:
         return required
     gain = sum(left[required]) - sum(left[true])

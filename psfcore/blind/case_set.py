@@ -46,8 +46,9 @@ Progress = Callable[[str], None]
 class SetPlan:
     """The plan of a set. cases: number of cases. first: the number of the first case.
 
-    simulator: a file or module whose cases the set consists of (`simulator`); empty: cases are drawn. The other fields are those
-    of `draw_case`; a simulator gets only seed, size_px and images.
+    simulator: the file or module of a user's simulator, which makes the cases of the set (`psfcore.blind.simulator`);
+    empty: cases are drawn. The other fields are parameters of `draw_case`; a simulator gets only seed, size_px and
+    images.
     """
 
     cases: int
@@ -74,7 +75,7 @@ LOCK = "lock"  # the file by which a run locks the folder of its set
 
 @dataclass(frozen=True)
 class _Attempt:
-    """The attempt to make one case. seal: empty if it failed. why_not: the reason of a failure."""
+    """One attempt to make a case. seal: empty if the attempt failed. why_not: the reason why the attempt failed."""
 
     case: int
     seconds: float
@@ -101,11 +102,11 @@ class BlindSet:
         return self.case_folder(number) / "report.json"
 
     def expected(self, number: int) -> Path:
-        """The folder with the images of a case without noise: `make_case.write_expected`."""
+        """The folder with the noise-free transits of a case, which `make_case.write_expected` writes."""
         return self.case_folder(number) / "expected"
 
     def ideal(self, number: int) -> Path:
-        """The file with what an ideal observer of a case could know."""
+        """The file that states what an ideal observer could know about a case."""
         return self.case_folder(number) / "ideal.json"
 
     def truth_file(self, number: int) -> Path:
@@ -122,7 +123,7 @@ class BlindSet:
         if not self.seals_file.is_file():
             return {}
         found: dict[int, str] = {}
-        # If the last line has no line end, a power failure cut it. Its case is made again.
+        # If the last line has no line end, a power failure cut the line. The case of this line is made again.
         for line in self.seals_file.read_text("utf-8").rpartition("\n")[0].splitlines():
             try:
                 entry = json.loads(line)
@@ -170,11 +171,12 @@ def make_set(
     processes: int = 1,
     progress: Progress = lambda line: None,
 ) -> tuple[BlindSet, dict[int, str]]:
-    """Make and seal the missing cases of a set. Returns the set, and the reasons why cases could not be made, by number.
+    """Make and seal the missing cases of a set. Two results: the set, and for each case that could not be made, the
+    reason.
 
-    scenes: images [y, x] in DN/s, from which scenes are cut. Raises DataError "other-set" if the folder contains a set that
-    was made with another plan, other scenes or another simulator, "bad-seals", "bad-simulator", and the errors of `draw_case`.
-    All of these are raised before the first case is made.
+    scenes: images [y, x] in DN/s, from which scenes are cut. Raises DataError "other-set" if the folder contains a set
+    that was made with another plan, other scenes or another simulator. Also raises "bad-seals", "bad-simulator" and the
+    errors of `draw_case`. All errors are raised before the first case is made.
     """
     made = BlindSet(folder)
     _remember(made, plan, scenes)
@@ -248,7 +250,7 @@ def alone_in(folder: Path) -> Iterator[None]:
         except BlockingIOError as error:
             raise DataError(
                 "set-in-use",
-                f"expected a folder that no other run uses; {folder} is in use. Wait until that run ends",
+                f"expected a folder that no other run uses; another run uses {folder}: wait until it ends",
             ) from error
         yield
 

@@ -5,14 +5,15 @@ The same seed and number always give the same case. An effect is known if the ga
 - 8 are clean: they have no effect;
 - 9 have one known effect; every known effect occurs once before any occurs again;
 - 4 have one unknown effect, in turn as well;
-- 3 have two known effects: two that are drawn at random, a strong one beside a changing Sun (`scene_evolution`), and two strong
-  ones. Strong effects beside a changing Sun also occur in turn.
+- 3 have two known effects. The first has two effects that are drawn at random; the second has a strong effect and a
+  changing Sun (`scene_evolution`); the third has two strong effects. The strong effects beside a changing Sun are taken
+  in turn.
 
 The target of an effect is the residual that this effect alone should leave in the discs after a refit of the PSF. It is
-drawn log-uniformly from USUAL_PCT, for a strong effect from STRONG_PCT. Every fourth case with one known effect is
-strong too. An effect whose largest plausible strength leaves less than its target gets this strength. The Sun beside a
-strong effect has no target, because the discs hardly show its changes; their relative rms is drawn log-uniformly from
-SUN_RMS.
+drawn log-uniformly from USUAL_PCT, for a strong effect from STRONG_PCT. In every fourth case with one known effect,
+this effect is strong. If the largest plausible strength of an effect leaves less than the target, the effect gets this
+strength. A changing Sun beside a strong effect has no target, because the discs hardly show the changes of the Sun. The
+relative rms of these changes is drawn log-uniformly from SUN_RMS.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ DRAW = 2  # raise it when the same seed and number give another case
 _BLOCK = (CLEAN,) * 8 + (SINGLE,) * 9 + (PAIR,) * 3 + (FOREIGN,) * 4
 USUAL_PCT, STRONG_PCT = (0.5, 10.0), (10.0, 30.0)
 SUN_RMS = (0.02, 0.3)
-_STRONG_SINGLES = 4  # one in this number of cases with one known effect is strong
+_STRONG_SINGLES = 4  # one case in this number of cases with one known effect has a strong effect
 _SUN = "scene_evolution"
 _BESIDE_SUN = tuple(name for name in KNOWN if name != _SUN)
 _BUILT_SHARE = 0.5  # fraction of cases with the diffraction PSF of the instrument

@@ -98,7 +98,7 @@ class LinearEstimator:
         )
 
     def clean_left_pct(self) -> dict[int, float]:
-        """Eq. (1) for every image without effects, after the refit, percent, by image number."""
+        """e_i of Eq. (1) for every image without effects, after the refit: percent, by image number."""
         fitted = self._refitted({n: disc.residual for n, disc in enumerate(self._discs)})
         return {n: self._percent(n, residual) for n, residual in fitted.items()}
 

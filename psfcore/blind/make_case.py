@@ -8,7 +8,7 @@
 
 Most effects have a target: the residual (percent) that the effect should leave in the discs after a refit of the PSF.
 The strength of the effect is set to reach this target, but at most to the largest plausible strength. Then the residual
-that the effect really leaves is measured; the truth states it.
+that the effect really leaves is measured and stored in the truth.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def _left_alone(by_itself: Left, left: dict[str, Any]) -> dict[str, float]:
     """The residual that an effect leaves without the other effects of the case, after a refit, to first order.
 
     left_alone_pct: the residual in percent, rms over images. left_alone_chi2: the sum over images of (residual /
-    noise)^2, where residual and noise are those of the disc means.
+    noise)^2, with the residual and the noise of the disc mean.
     """
     noise = left["refitted"]["noise_pct"]
     shown = sum((pct / noise[str(n)]) ** 2 for n, pct in by_itself.by_image_pct.items() if str(n) in noise)
@@ -241,7 +241,7 @@ def write_transit(made: Made, plan: Plan, folder: Path) -> None:
 
 
 def write_expected(made: Made, plan: Plan, folder: Path) -> None:
-    """Write the transits without noise of a case into new folders inside `folder`. A clean case has none."""
+    """Write the noise-free transits of a case into new folders inside `folder`. A clean case has none."""
     for name, noise_free in made.expected.items():
         shots = zip(noise_free.rates, plan.shots, strict=True)
         exposures = [rate * shot.exposure_s for rate, shot in shots]

@@ -1,7 +1,7 @@
 """A picture of the score of a blind set: the confusion matrix, and the power.
 
-The power is the fraction of cases in which the diagnosis notices, or names, the effect. It is drawn against the residual
-that the effect leaves in the discs.
+The power is the fraction of cases in which the diagnosis notices, or names, the effect. The power is drawn against the
+residual that the effect leaves in the discs.
 """
 
 from __future__ import annotations

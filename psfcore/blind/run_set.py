@@ -5,7 +5,7 @@ report is copied to the set when it is complete. A case that has a report is not
 failure is written to run.json, and the next run tries the case again.
 
 A further process computes what an ideal observer could know about the case, from its images without noise. These images stay
-in the set; the diagnosis runs elsewhere and is told no path of the set.
+in the set; the diagnosis runs elsewhere and gets no path of the set.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Run:
-    """One diagnosis: its wall time, its largest memory and its exit status. error: the reason if it gave no report."""
+    """One diagnosis: its wall time, its largest memory and its exit status. error: the reason if the diagnosis gave no
+    report."""
 
     case: int
     wall_s: float
@@ -191,7 +192,8 @@ def _diagnose(made: BlindSet, number: int, command: Sequence[str], longest_s: fl
 def _compute_ideal(
     made: BlindSet, number: int, command: Sequence[str], keep: bool, longest_s: float, progress: Progress
 ) -> None:
-    """Compute what an ideal observer of a case could know, unless it is known. Then remove the images without noise.
+    """Compute what an ideal observer could know about a case, if ideal.json is missing. Then remove the images without
+    noise.
 
     keep: keep these images. If the computation fails, the images are kept too.
     """

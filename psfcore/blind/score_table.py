@@ -10,9 +10,7 @@ refit of the PSF. The answer of a report is the set of effects that the verdict 
 | inconclusive on clean data | clean | the verdict is `inconclusive`; these cases are also false alarms |
 | answer contains the truth, >= 2 % | known effects and pairs with 2 % left or more | the answer contains the true effect. For a pair it must contain both effects; an effect that leaves less than 1 % alone is not required if the other leaves more |
 | the same, >= 1 % | known effects and pairs with 1 % left or more | as above; a case with the verdict `inconclusive` counts one half |
-| the same, shown by the discs | cases of the 2 % row in which the chi2 of the disc means, with no effect in the model,
-is SHOWN_CHI2 or more. For a pair, the same must hold for each required effect alone, to first order | the answer
-contains the truth |
+| the same, shown by the discs | cases of the 2 % row in which the chi2 of the disc means, with no effect in the model, is SHOWN_CHI2 or more. For a pair, the same must hold for each required effect alone, to first order | the answer contains the truth |
 | first effect is the true one | single known effects, 2 % or more | the first entry of the report's `effects` is the true effect |
 | one wrong effect named with confidence | all | the verdict is `attributed`, and names one effect that is not true. For clean cases and unknown effects every name is wrong. The verdicts `tie` and `inconclusive` express doubt and do not count |
 | mean number of named effects | cases of the 2 % row with an answer | number of effects in the answer |

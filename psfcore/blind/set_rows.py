@@ -12,8 +12,7 @@ they were computed.
 | right and alone / ideal observer | cases with an ideal observer, and clean cases | the sets that are right and alone, divided by the number that is expected of the ideal observer |
 | clean data: set without [] | clean | no member is [] |
 | one wrong effect alone in the set | all | the only member names effects, none of which is true |
-| not in the library: unknown in the set | effects that are not in the library; one row counts cases with a
-noncentrality of SEEN or more, the next row cases with a rival of SEEN or more | a member is ["unknown"] |
+| not in the library: unknown in the set | effects that are not in the library; one row counts cases with a noncentrality of SEEN or more, the next row cases with a rival of SEEN or more | a member is ["unknown"] |
 | strong effects | cases with STRONG_PCT left or more | a member covers the truth |
 """
 

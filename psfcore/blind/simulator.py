@@ -2,11 +2,12 @@
 
     make_case(*, seed, number, size_px, images, transit, expected) -> truth
 
-seed: the seed of the set. number: the number of the case. Equal values must give the same case. size_px: the width of
-the square images. images: the number of images. transit: an empty folder, into which the function writes the transit
-(`docs/transits.md`) and nothing else, because the diagnosis sees it. expected: a folder that does not exist. For the
-ideal observer, the function may write two further transits into the folders `with_effects` and `without_effects` of
-`expected`. Their images contain no noise, but they state the same noise figures. truth is
+seed: the seed of the set. number: the number of the case. Equal seeds and numbers must give equal cases. size_px: the
+width of the square images. images: the number of images. transit: an empty folder, into which the function writes the
+transit (`docs/transits.md`) and nothing else, because the diagnosis sees it. expected: a folder that does not exist.
+For the ideal observer, the function may write two further transits into the folders `with_effects` and
+`without_effects` of `expected`. Their images contain no noise, but their `transit.json` contains the same noise figures
+as the transit with noise. truth is
 
     {"effects": [{"name": "ghost", "strength": 0.02, "left_alone_pct": 3.1}, ...], "left_after_refit_pct": 3.1}
 
@@ -14,10 +15,10 @@ effects: at most two; none in a clean case. Effects of the gap library have the 
 is not in the library. All other keys are optional. left_alone_pct: the residual that this effect alone leaves in the
 discs after a refit, percent, rms over images. left_after_refit_pct: the residual that all effects together leave; if it
 is missing, the score uses the value of the ideal observer. Further keys are kept. The truth gets a "kind" and is sealed
-like any other.
+like the truth of a drawn case.
 
-The code of the simulator is executed. Its name comes from the person who runs the command. The code may raise any error; it then
-becomes a DataError that names the line.
+The code of the simulator is executed. Only the person who runs the command can name this code. If the code raises an
+error, the error becomes a DataError that names the line of the code.
 """
 
 from __future__ import annotations

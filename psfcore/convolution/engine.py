@@ -35,8 +35,8 @@ from psfcore.convolution.fft_kernels import LANES, Plan, forward, good_length, i
 from psfcore.errors import DataError
 
 BLOCK_ROWS = 2 * LANES
-# Largest imaginary part of the transfer function of a symmetric PSF, as a share of the sum of weights. It is smaller
-# than the float32 rounding of the transfer function.
+# Largest imaginary part of the transfer function of a symmetric PSF, as a share of the sum of weights. This
+# limit is smaller than the float32 rounding of the transfer function.
 SYMMETRIC_TO = 1e-7
 # Chunks per thread for small and for large images. To start a chunk takes about as long as to process one or two small
 # blocks.

@@ -60,7 +60,7 @@ class Additive(Iteration):
 
 @compiled(fastmath={"contract", "reassoc"})
 def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Replace H x by w (y - H x), where y is NaN if w is 0; sum (y - H x)^2 / variance over judged pixels."""
+    """Replace H x by w (y - H x), where y is NaN if w is 0. Add up (y - H x)^2 / variance over the judged pixels."""
     nx = observed.shape[1]
     zero, least = np.float32(0.0), np.float32(1e-30)
     z = buffer.reshape((-1, 2, LANES))
@@ -87,7 +87,7 @@ def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums,
 
 @compiled(fastmath={"contract", "reassoc"})
 def _add_rows(spectrum, x, again, moved, total, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Compute x <- x + G w (y - H x), Eq. (1); sum (change)^2 and x^2 for each block."""
+    """Compute x <- x + G w (y - H x), Eq. (1). Add up (change)^2 and x^2 for each block."""
     nx = x.shape[1]
     zero = np.float32(0.0)
     z = buffer.reshape((-1, 2, LANES))

@@ -132,11 +132,16 @@ def lay_out(image: Image, *, edges: Edges, margin_px: int) -> Domain:
     if edges not in EDGES:
         raise DataError("bad-edges", f"expected edges to be one of {', '.join(EDGES)}; got {edges}")
     if not image.valid.any():
-        raise DataError("all-masked", "expected at least one pixel that is not masked; all pixels are masked")
+        raise DataError(
+            "all-masked",
+            "expected at least one pixel that is not masked; all pixels are masked: check the mask",
+        )
     finite = (image.mask & MaskBit.NONFINITE) == 0
     scale = float(np.abs(image.pixels[finite]).max())
     if scale == 0:
-        raise DataError("no-signal", "expected at least one pixel other than zero; all are zero")
+        raise DataError(
+            "no-signal", "expected at least one pixel other than zero; all are zero: use another image"
+        )
     # Divide in float64: float32 cannot hold numbers such as 1e-300 and 1e300.
     scaled = np.where(finite, image.pixels, 0.0) / scale
     margin = 0 if edges == "zero" else margin_px

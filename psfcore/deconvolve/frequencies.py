@@ -6,8 +6,8 @@ After n steps, the method has multiplied the amplitude of the image at this freq
     A_n = A_(n-1) + G (1 - T A_(n-1)),   A_0 = 1        Eq. (1)
 
 The method multiplies the rms of uncorrelated noise by the root of the mean of abs(A)^2 over all frequencies. This
-holds away from edges and masked pixels. T varies smoothly from frequency to frequency. Therefore only every
-k-th frequency along y is used; k is 2, 3, 4 or 8, depending on the length of the transform.
+factor holds away from edges and masked pixels. T varies smoothly from frequency to frequency. Therefore only every k-th
+frequency along y is used; k is 2, 3, 4 or 8, depending on the length of the transform.
 
 | symbol | name |
 |---|---|

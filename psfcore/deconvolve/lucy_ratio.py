@@ -26,7 +26,8 @@ from psfcore.convolution.fft_kernels import LANES, forward, inverse
 from psfcore.deconvolve.problem import Problem, first_estimate
 from psfcore.errors import DataError
 
-# Smallest value of a model pixel, as a fraction of the brightest pixel (the "floor"). It is the resolution of float32;
+# Smallest value of a model pixel, as a fraction of the brightest pixel (the "floor"). The floor is the
+# resolution of float32;
 # smaller values are dominated by the rounding of the transform. The floor also avoids denormal numbers, which are slow.
 FLOOR_OF_MAXIMUM = 2.0**-23
 # An estimate below this fraction of the floor is set to 0.
@@ -44,7 +45,10 @@ def light_above_floor(problem: Problem) -> Single:
     """
     domain = problem.domain
     if not (domain.pixels[domain.trusted] > 0).any():
-        raise DataError("no-signal", "expected at least one trusted pixel above zero; got none")
+        raise DataError(
+            "no-signal",
+            "expected at least one trusted pixel above zero; got none: use another image or the method linear",
+        )
     estimate = first_estimate(problem)
     return np.maximum(estimate, np.float32(FLOOR_OF_MAXIMUM * float(estimate.max())))
 
@@ -70,7 +74,8 @@ class Ratio:
 
 @compiled(fastmath=_SUMS)
 def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Replace H x, raised to `floor` where it is smaller, by Eq. (1); sum (y - H x)^2 / variance over judged pixels."""
+    """Replace H x, raised to `floor` where it is smaller, by Eq. (1). Add up (y - H x)^2 / variance over the judged
+    pixels."""
     nx = light.shape[1]
     zero = np.float32(0.0)
     least = np.float32(1e-30)

@@ -109,8 +109,10 @@ class Iteration:
     The engine's spectrum carries the data from call to call:
 
     - Before `measure` it holds the transformed rows of the estimate x: call `engine.rows_forward(x)` at the start.
-    - `measure` computes H x from it, stores the sums of chi2 in `judgement.sums`, and leaves the input of `update` in it.
-    - `update` makes the next x from it. Unless `last` is true, it leaves the transformed rows of the new x in it.
+    - `measure` computes H x from these rows, stores the sums of chi2 in `judgement.sums`, and leaves the input of
+      `update` in the spectrum.
+    - `update` computes the next x from this input. If `last` is false, it leaves the transformed rows of the next x in
+      the spectrum.
     """
 
     def measure(self) -> None:
@@ -138,8 +140,8 @@ def run(
     if stop == "discrepancy" and not (noise_known and found.count):
         raise DataError(
             "no-noise-model",
-            "expected photon gain, read noise and valid pixels away from the edges, which stopping by discrepancy needs; "
-            "at least one of them is missing",
+            "expected photon gain, read noise and valid pixels away from the edges, because the stopping rule discrepancy "
+            "needs them; at least one is missing: give the noise figures, or use the stopping rule fixed",
         )
     for step in range(1, steps + 1):
         iteration.measure()

@@ -39,7 +39,10 @@ class Assessed:
 
 @dataclass(frozen=True)
 class Work:
-    """One deconvolution. The method runs for the image, and again for each noise realisation and each possible PSF.
+    """One deconvolution of one image.
+
+    The method runs for the image. If errors are requested, it runs again for each noise realisation and for each
+    variant of the PSF within its errors.
 
     psf: the PSF on the image's pixels. method: the name of a method. parameters: the parameters of this method.
     """
@@ -67,9 +70,9 @@ class Work:
     ) -> ErrorPlanes | None:
         """The error planes from `draws` noise realisations; None for 0 realisations.
 
-        possible_psfs: returns variants of the PSF within its errors, on the image's pixels; empty if the errors are not
-        known. begin(stage, steps) is called when a stage begins, and returns the progress function of the stage. Raises
-        DataError "no-noise-figures".
+        possible_psfs: function that returns variants of the PSF within its errors, on the image's pixels. It returns no
+        PSF if the errors are not known. begin(stage, steps) is called when a stage begins, and returns the progress
+        function of the stage. Raises DataError "no-noise-figures".
         """
         if not draws:
             return None

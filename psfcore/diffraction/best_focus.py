@@ -2,8 +2,8 @@
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "The instrument", prints radii and distances that
 are not consistent: with them the detector is far out of focus. This module solves for the separation of the mirrors.
-The focus is most sensitive to this length, because the secondary magnifies an error of it. All other lengths keep their
-printed values, and the result states by how much the separation was shifted.
+The focus is most sensitive to this length, because the secondary magnifies an error of this length. All other lengths
+keep their printed values, and the result states by how much the separation was shifted.
 
 Rays near the axis meet on the detector where y(L) = 0 in Eq. (1) of light_path:
 
@@ -103,7 +103,8 @@ def paraxial_separation_mm(path: LightPath) -> float:
         found = f"{separation_mm:g} mm" if f2 != length else "no finite separation"
         raise DataError(
             "no-focus",
-            f"expected mirrors that can focus on the detector at a positive separation; got {found}",
+            f"expected mirrors that can focus on the detector at a positive separation; got {found}: "
+            "correct their radii or distances in the instrument file",
         )
     return separation_mm
 
@@ -152,7 +153,8 @@ def _sharpest(waves: _WithoutWheel, at_primary: Wave, paraxial_mm: float) -> flo
     if abs(separation_mm - paraxial_mm) > 0.95 * SEARCH_MM:
         raise DataError(
             "no-focus",
-            f"expected best focus within {SEARCH_MM} mm of the paraxial separation {paraxial_mm:.3f} mm; got no maximum there",
+            f"expected best focus within {SEARCH_MM} mm of the paraxial separation {paraxial_mm:.3f} mm; got no maximum "
+            "there: correct the radii or distances of the mirrors in the instrument file",
         )
     return separation_mm
 

@@ -46,8 +46,8 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Route:
-    """The decision which components of the entrance are in the transformed mask. str() gives the decision and its
-    reason."""
+    """Which components of the entrance the transformed mask contains. str() gives this decision and the reason for
+    it."""
 
     samples: int
     mask: bool
@@ -178,7 +178,7 @@ class _OneWavelength:
         self.kernels: dict[str, Kernel] = {}
 
     def make(self, name: str, progress: Progress) -> None:
-        """Compute one component; those that it depends on must exist."""
+        """Compute one component. The components from which it is computed must exist already."""
         progress(0, 1)
         makers: dict[str, Callable[[Progress], Kernel]] = {
             AIRY: self._airy,

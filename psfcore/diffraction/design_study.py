@@ -9,8 +9,8 @@ distinguished. With f = 1 - wire / pitch:
     share outside the order (0, 0) = 1 - f^2                                                         Eq. (2)
 
 The light beyond a radius (1 - encircled energy) is computed from the pattern of mesh_series. This pattern is for a
-square pupil as wide as the aperture, without mount, filter wheel or scatter. It is normalised to the light on the full
-reach.
+square pupil as wide as the aperture, without mount, filter wheel or scatter. The pattern is normalised to the light on
+the full reach.
 
 | symbol | name | unit |
 |---|---|---|
@@ -86,7 +86,8 @@ def design_study(
     *,
     flare_px: int = FLARE_PX,
 ) -> DesignStudy:
-    """Compute every combination of pitch and wire at the entrance of `instrument`, and its own first entrance mesh.
+    """Compute every combination of pitch and wire at the entrance of `instrument`, and also the first entrance mesh of
+    the instrument.
 
     Raises DataError "bad-design" for no mesh or more than 400 meshes, for a wire that is not narrower than every pitch,
     and for a flare smaller than 1 px.

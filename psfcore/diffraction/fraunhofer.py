@@ -216,8 +216,8 @@ class _Transforms:
         return _completed(self.total, self.symmetry)
 
     def _along_y(self, s: int) -> range:
-        """The values of t that must be computed for one s: all, half of them, or only those up to s, as the symmetry
-        allows."""
+        """The values of t that must be computed for one s. The symmetry of the mask decides whether these are all
+        values, the first half, or the values up to s."""
         half = self.samples // 2
         return range({NO_SYMMETRY: self.samples, MIRROR: half, MIRROR_AND_TRANSPOSE: s + 1}[self.symmetry])
 
@@ -273,8 +273,8 @@ def _turns(place: int, samples: int, size: int) -> float:
 
 
 def _phases(turns: float, cells: int, size: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-    """exp(-2 pi i turns (m + k n) / n) as a product of two factors: the values of the first for each m, of the second
-    for each k."""
+    """exp(-2 pi i turns (m + k n) / n) as a product of two factors. Two results: the first factor for each m, and the
+    second factor for each k."""
     within = np.exp(-2j * np.pi * turns * np.arange(size) / size)
     of_period = np.exp(-2j * np.pi * turns * np.arange(math.ceil(cells / size)))
     return within.astype(np.complex64), of_period.astype(np.complex64)

@@ -265,8 +265,8 @@ def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
 def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]
     """Write the open share of each cell into `strip`.
 
-    It is the product of the open shares of the cell in the meshes, in the opening (outline 0) and in all other
-    outlines.
+    The open share of a cell is the product of its open shares in the meshes, in the opening (outline 0) and in all
+    other outlines.
     """
     rows, cells = strip.shape
     area = np.zeros(cells + 2)
@@ -315,7 +315,8 @@ def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
 def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-untyped-def]
     """Apply one outline to the cells from `start` to `stop` - 1. inside: the share of their area inside the outline.
 
-    Outline 0, the opening, sets their open share; every other outline is opaque and reduces it.
+    Outline 0, the opening, sets the open share of these cells. Every other outline is opaque and reduces the open
+    share.
     """
     covered = np.float32(min(abs(inside), 1.0))
     if outline == 0:

@@ -17,8 +17,8 @@ PE is the percentage error of a pixel. Differences from the paper:
   denominator and would bias the residual high.
 
 Errors contain the photon and read noise of the image, propagated through Eq. (1). They do not contain the error of the
-PSF. Errors of means are exact (`noise_transfer`). Errors of single pixels come from noise realisations; their noise
-follows from the observed intensity, but for the pixels of D from the simulated intensity.
+PSF. Errors of means are exact (`noise_transfer`). Errors of single pixels come from noise realisations. The variance of
+the noise in a realisation follows from the observed intensity, but in the pixels of D from the simulated intensity.
 
 | symbol | name | unit |
 |---|---|---|
@@ -84,10 +84,10 @@ def evaluate(
     """Simulate the light in every occulter of a transit, and compare it with the observed light.
 
     psf_for_frame: returns the total PSF [y, x] for the index of an image, centre at [n // 2, n // 2]. A PSF is prepared
-    only once for all images for which this function returns the same array object. The neighbours in time of an image
-    help to locate its occulter. They are reconstructed with the PSF of that image, so that an image of one fold never
-    depends on the PSF of another fold. noise_realisations: number of noise realisations for each image; they give the
-    superposed maps of noise alone. seed: random seed of these realisations.
+    only once for all images for which this function returns the same array object. The images before and after an image
+    help to locate its occulter. These images are reconstructed with the PSF of the evaluated image, so that an image of
+    one fold never depends on the PSF of another fold. noise_realisations: number of noise realisations for each image;
+    they give the superposed maps of noise alone. seed: random seed of these realisations.
 
     Raises DataError "no-occulter" if no image can be evaluated.
     """

@@ -44,8 +44,8 @@ class FrameEvaluation:
     """Observed and simulated light in the occulter of one image, DN/s.
 
     observed, simulated: intensities of the dark pixels, in the order of `dark`. noise_dn_s: standard error of the mean
-    difference of the dark pixels. centre_noise_dn_s: this error for the dark pixels at the centre; nan if there are no such
-    pixels. along_x, along_y: slices; None for most images.
+    of simulated minus observed over the dark pixels. centre_noise_dn_s: the same error for the dark pixels at the
+    centre; nan if there are no such pixels. along_x, along_y: slices; None for most images.
     """
 
     index: int

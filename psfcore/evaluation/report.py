@@ -39,7 +39,8 @@ LEAST_TREND_FRAMES = 3
 
 @dataclass(frozen=True)
 class Summary:
-    """Errors of the images of one pointing, in percent of the observed mean unless the name contains another unit.
+    """Errors of the images of one pointing. The unit is percent of the observed mean, or the unit in the name of a
+    field.
 
     fov: the pointing; None: all pointings. mean_noise_pct: standard error of the mean from image noise. noise_pct: the rms
     that image noise alone would cause. gap_pct: the rms with the noise subtracted in quadrature. centre_...: the same

@@ -113,8 +113,8 @@ def compare_shapes_by_errors(
 ) -> ShapesByErrors:
     """Compare the softened power law of `solution` with both stretched shapes and with free shells.
 
-    seed: random seed of the bootstrap. Raises DataError "unknown-shape" if `solution` has another shape, "too-few-frames"
-    if there are too few images for two folds, and the errors of `invert` and `evaluate`.
+    seed: random seed of the bootstrap. Raises DataError "unknown-shape" if `solution` has another shape,
+    "too-few-images" for fewer than six images, and the errors of `invert` and `evaluate`.
     """
     if solution.inversion.shape.name != SOFTENED_POWER_LAW.name:
         raise DataError(
@@ -174,7 +174,7 @@ def _fold_samples(images: int) -> tuple[FoldSample, ...]:
     parts = folds(images)
     if not parts:
         raise DataError(
-            "too-few-frames", f"expected at least 6 images for held-out folds; got {images}: add images"
+            "too-few-images", f"expected at least 6 images for held-out folds; got {images}: add images"
         )
     return tuple(
         FoldSample(0, k, tuple(int(n in fold.fitted) for n in range(images)), fold.held_out)
@@ -186,7 +186,7 @@ def held_out_kernels(solution: Solution) -> KernelOf:
     """For each image index, the total PSF [y, x] fitted without that image.
 
     Each fold takes one step from the fit to all images (`psfcore.scatter.validation.cross_validation.shared_step`). Raises
-    DataError "too-few-frames" if there are too few images for two folds.
+    DataError "too-few-images" for fewer than six images.
     """
     samples, at = _fold_samples(len(solution.transit.frames)), solution.inversion.coordinates
     kernels = [solution.total.kernel(at + shared_step(solution, sample)) for sample in samples]

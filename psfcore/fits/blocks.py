@@ -5,8 +5,8 @@ Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sect
 cards NAXISn, BITPIX, PCOUNT and GCOUNT. heliopsf uses the first two-dimensional image of a file: a plain image HDU, or
 a tile-compressed image in a binary table with ZIMAGE = T. `first_image` ignores everything after that image.
 
-If the whole file is compressed (.fits.gz), the reader must decompress data in order to skip them. It therefore checks
-every declared size first and limits the number of decompressed bytes.
+If the whole file is compressed (.fits.gz), the reader must decompress data in order to skip them. The reader therefore
+checks every declared size first and limits the number of decompressed bytes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ _BITPIX = (8, 16, 32, 64, -32, -64)
 _SKIP_BYTES = 1 << 20
 _MANY_AXES = 10  # if an image has this number of axes or more, the message does not write out their indices
 END_CARD = b"END" + b" " * 77
-# astropy also ends a header at a card such as "END x". It would then read the file in another way than this module.
+# astropy also ends a header at a card such as "END x". astropy would then read the file in another way than
+# this module.
 _DAMAGED_END = re.compile(rb"END[^A-Z0-9_-]")
 _KNOWN_STARTS = (
     (b"\x00\x00\x00\x0cjP", "a JPEG 2000 file"),
@@ -105,16 +106,19 @@ class _GzipSource:
         self._left -= count
         if self._left < 0:
             raise HeaderError(
-                "too-many-bytes", "expected decompressed data within the size limit; got more bytes"
+                "too-many-bytes",
+                "expected decompressed data within the size limit; got more bytes: use a smaller file",
             )
         try:
             return self._stream.read(count)
         except EOFError:
             raise HeaderError(
-                "truncated-gzip", "expected a complete gzip stream; it ends too early"
+                "truncated-gzip", "expected a complete gzip stream; it ends too early: copy the file again"
             ) from None
         except (OSError, zlib.error) as error:
-            raise HeaderError("bad-gzip", f"expected a readable gzip stream; got: {error}") from None
+            raise HeaderError(
+                "bad-gzip", f"expected a readable gzip stream; got: {error}: copy the file again"
+            ) from None
 
     def skip(self, count: int) -> int:
         there = 0
@@ -133,7 +137,7 @@ def open_source(path: Path, limits: FitsLimits) -> Iterator[Source]:
         start = file.read(2)
         file.seek(0)
         if not start:
-            raise HeaderError("empty-file", "expected a FITS file; got an empty file")
+            raise HeaderError("empty-file", "expected a FITS file; got an empty file: copy the file again")
         if start == b"\x1f\x8b":
             yield _GzipSource(file, limits.max_pixels * 16 + limits.max_hdus * limits.max_header_bytes)
         else:
@@ -158,7 +162,10 @@ def enter_data(source: Source, hdu: int, limits: FitsLimits) -> Header:
     for number in range(hdu + 1):
         raw = _read_header(source, limits.max_header_bytes, limits, first=number == 0)
         if raw is None:
-            raise HeaderError("truncated-data", f"expected {hdu + 1} HDUs; the file ends after {number}")
+            raise HeaderError(
+                "truncated-data",
+                f"expected {hdu + 1} HDUs; the file ends after {number}: copy the file again",
+            )
         header = _parse(raw, number)
         if number < hdu:
             _pass_data(source, header, number, limits, last=False)
@@ -206,10 +213,15 @@ def _no_image(kinds: list[str]) -> HeaderError:
             f"hdus = fits.open('FILE'); hdus[{hdu}].data = hdus[{hdu}].data[{first}]; hdus.writeto('NEW')",
         )
     if "line" in kinds:
-        return HeaderError("not-2d", f"{wanted}; got an image of one axis")
+        return HeaderError("not-2d", f"{wanted}; got an image of one axis: store the image with two axes")
     if "table" in kinds:
-        return HeaderError("table-only", f"{wanted}; got only tables ({_counted(kinds)})")
-    return HeaderError("no-image", f"{wanted}; got {_counted(kinds)}, and none has data with two axes")
+        return HeaderError(
+            "table-only", f"{wanted}; got only tables ({_counted(kinds)}): use a file with an image"
+        )
+    return HeaderError(
+        "no-image",
+        f"{wanted}; got {_counted(kinds)}, and none has data with two axes: use a file with an image",
+    )
 
 
 def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:
@@ -229,7 +241,8 @@ def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) 
         if end is not None:
             return bytes(raw)
         if len(block) < BLOCK_BYTES:
-            message = f"expected an END card; the file stops after {len(raw)} bytes of this header"
+            got = f"the file stops after {len(raw)} bytes of this header"
+            message = f"expected an END card; {got}: copy the file again"
             raise HeaderError("truncated-header", message)
     message = f"expected at most {limits.max_header_bytes} bytes of headers, each with an END card; got more"
     raise HeaderError("header-too-long", message)
@@ -249,10 +262,13 @@ def _check_start(block: bytes) -> None:
     if block.startswith(b"SIMPLE  ="):
         return
     if not block:
-        raise HeaderError("empty-file", "expected a FITS file; got a gzip file with no content")
+        raise HeaderError(
+            "empty-file", "expected a FITS file; got a gzip file with no content: copy the file again"
+        )
     if block.startswith(b"SIMPLE"[: len(block)]) and len(block) < 9:
         raise HeaderError(
-            "truncated-header", f"expected a FITS header; the file stops after {len(block)} bytes"
+            "truncated-header",
+            f"expected a FITS header; the file stops after {len(block)} bytes: copy the file again",
         )
     got = next((name for start, name in _KNOWN_STARTS if block.startswith(start)), None)
     if got is None:
@@ -308,7 +324,7 @@ def _check_image(header: Header, limits: FitsLimits) -> None:
 
 
 def _check_plain(header: Header) -> None:
-    """Raise HeaderError unless the data of an image are its pixels alone (FITS standard 4.0, section 7.1.1)."""
+    """Raise HeaderError if the data of an image contain more than its pixels (FITS standard 4.0, section 7.1.1)."""
     for key, value in (("PCOUNT", 0), ("GCOUNT", 1)):
         card_count(header, key, smallest=value, largest=value, default=value)
 
@@ -322,7 +338,8 @@ def _pass_data(source: Source, header: Header, hdu: int, limits: FitsLimits, *, 
         raise HeaderError("too-many-bytes", message)
     there = source.skip(size)
     if there < size:
-        message = f"expected {size} bytes of data in HDU {hdu}, as its header declares; got {there}"
+        wanted = f"expected {size} bytes of data in HDU {hdu}, as its header declares"
+        message = f"{wanted}; got {there}: copy the file again"
         raise HeaderError("truncated-data", message)
     if not last:
         source.skip(-size % BLOCK_BYTES)
@@ -337,7 +354,11 @@ def _data_bytes(header: Header, hdu: int) -> int:
     if axes == 0:
         return 0
     if hdu == 0 and card_flag(header, "GROUPS"):
-        raise HeaderError("random-groups", "expected an image; got random groups (GROUPS = T)")
+        message = (
+            "expected an image in a primary array or an image extension; got random groups (GROUPS = T): write the "
+            "image into a primary array without the card GROUPS"
+        )
+        raise HeaderError("random-groups", message)
     elements = math.prod(card_count(header, f"NAXIS{axis}") for axis in range(1, axes + 1))
     groups, extra = card_count(header, "GCOUNT", default=1), card_count(header, "PCOUNT", default=0)
     size = abs(bitpix) // 8 * groups * (extra + elements)

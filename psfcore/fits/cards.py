@@ -27,7 +27,8 @@ class Cards(Protocol):
 
 @cache
 def card_trouble() -> tuple[type[Exception], ...]:
-    """Exceptions that astropy raises for a damaged card. The kind of damage determines which of them it raises."""
+    """Exceptions that astropy raises for a damaged card. The kind of damage determines which exception astropy
+    raises."""
     from astropy.io.fits.verify import VerifyError
 
     return VerifyError, ValueError, TypeError, IndexError, OverflowError

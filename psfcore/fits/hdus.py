@@ -28,7 +28,8 @@ from psfcore.whole_files import probe
 
 _CHECKSUM_COMMENT = "computed when the file was written"
 _RIGHT = 1  # astropy returns this value if the checksum card exists and its value is correct
-# Exceptions that astropy raises for a damaged data unit. The position of the damage decides which one it raises.
+# Exceptions that astropy raises for a damaged data unit. The position of the damage decides which exception
+# astropy raises.
 PIXEL_TROUBLE = (
     CfitsioException,  # raised when RICE decoding fails; astropy has no public name for it
     VerifyError,
@@ -87,7 +88,8 @@ def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
         raise
     except PIXEL_TROUBLE as error:
         _raise_if_storage(error)
-        message = f"expected readable pixels in {part} of {Path(path).name}; got: {error!s:.120}"
+        wanted = f"expected readable pixels in {part} of {Path(path).name}"
+        message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
         raise DataError("unreadable-pixels", message) from None
 
 
@@ -144,7 +146,8 @@ def as_written(hdu: Any) -> bool:
 def write_hdus(path: str | Path, hdus: list[Any]) -> None:
     """Write HDUs with checksums, but without a date of writing.
 
-    Raises OSError, with the system's error number if the file still cannot be written after the failure.
+    Raises OSError. If the system refuses to write, for example because the disk is full, the error has the system's
+    error number.
     """
     hdus[0].header["EXTEND"] = True
     for hdu in hdus:

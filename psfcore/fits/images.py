@@ -93,7 +93,10 @@ def _saturation_level(
         elif exposure_s is not None:
             levels.append(saturation_dn / exposure_s)
         else:
-            message = "expected XPOSURE or EXPTIME in the header, to convert a saturation level from DN to DN/s; got neither of them"
+            wanted = (
+                "expected XPOSURE or EXPTIME in the header, to convert a saturation level from DN to DN/s"
+            )
+            message = f"{wanted}; got neither: add one of them"
             raise DataError("no-exposure", message)
     return min(levels, default=None)
 
@@ -103,16 +106,22 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
     if valid.size == 0:
         finite = (image.mask & MaskBit.NONFINITE) == 0
         if not finite.any():
-            raise DataError("all-nan", "expected finite pixels; got only NaN, infinite or BLANK")
+            raise DataError(
+                "all-nan", "expected finite pixels; got only NaN, infinite or BLANK: use another image"
+            )
         level = image.pixels[finite].min()
         raise DataError(
-            "all-saturated", f"expected pixels below saturation; all finite pixels are at {level:g} or above"
+            "all-saturated",
+            f"expected pixels below saturation; all finite pixels are at {level:g} or above: check the level",
         )
     smallest, largest = float(valid.min()), float(valid.max())
     if largest <= 0:
-        raise DataError("no-signal", f"expected pixels above zero; the largest is {largest:g}")
+        raise DataError(
+            "no-signal", f"expected pixels above zero; the largest is {largest:g}: use another image"
+        )
     if smallest == largest and stored_as_integer and largest in _FULL_SCALES:
-        message = f"expected pixels below saturation; all pixels are {largest:g}, the largest value of an A/D converter"
+        found = f"all pixels are {largest:g}, the largest value of an A/D converter"
+        message = f"expected pixels below saturation; {found}: use another image"
         raise DataError("all-saturated", message)
 
 

@@ -205,7 +205,8 @@ def _read_extras(
                 elif hdu.name == "FIT":
                     fitted = _read_fitted(hdu)
     except PIXEL_TROUBLE as error:
-        message = f"expected readable extensions in {Path(path).name}; got: {error!s:.120}"
+        wanted = f"expected readable extensions in {Path(path).name}"
+        message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
         raise DataError("unreadable-pixels", message) from None
     return components, provenance, fitted
 

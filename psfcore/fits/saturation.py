@@ -15,8 +15,8 @@ should not exceed m:
 
 If P is below MASKED_BELOW, the pixels with the largest value are masked as saturated. If it is only below
 DOUBTED_BELOW, they may be saturated, and the image gets a warning. The test does not depend on the unit, because values
-that are equal stay equal after a division by the exposure time. The test cannot find saturated pixels whose values a
-flat field or an interpolation made different from each other.
+that are equal stay equal after a division by the exposure time. If a flat field or an interpolation made the values of
+saturated pixels different from each other, the test cannot find these pixels.
 
 | symbol | name | unit |
 |---|---|---|

@@ -30,7 +30,8 @@ def check_is_psf(path: str | os.PathLike[str], summary: HeaderSummary, limits: F
     """
     if summary.content == PRODUCT:
         raise DataError(
-            "image-as-psf", "expected a PSF; the header (PSFID) says that the file is a deconvolved image"
+            "image-as-psf",
+            "expected a PSF; the header (PSFID) says that the file is a deconvolved image: name the file of a PSF",
         )
     if summary.codec is None:
         _check_pixels(Path(path), summary, limits)
@@ -66,7 +67,8 @@ def _check_pixels(path: Path, summary: HeaderSummary, limits: FitsLimits) -> Non
     if not is_peak(centre, largest):
         raise DataError(
             "psf-not-centred",
-            f"expected the largest weight, {largest:.3g}, at [y, x] = {(ny // 2, nx // 2)}; there is {centre:.3g}",
+            f"expected the largest weight, {largest:.3g}, at [y, x] = {(ny // 2, nx // 2)}; got {centre:.3g} there: "
+            "shift the PSF so that its peak is in this pixel",
         )
 
 

@@ -87,8 +87,8 @@ class FlareFit:
     box [y, x]: light of the flare. simulated: s_u. rms_pct: root mean square of 100 (s_u / d_u - 1) over the distances
     with d_u > 0. chi2_per_distance: the sum in Eq. (2) divided by the number of distances; None if the noise is unknown.
     reduced_chi2: the same sum divided by the degrees of freedom (number of distances - number of used pixels of the box
-    + 1 for the constraint). matched: mean s divided by mean d at 60 to 70 px. matched_noise_pct: the noise of this mean
-    d, in percent of it; the constraint treats this mean as exact.
+    + 1 for the constraint). matched: mean s divided by mean d at 60 to 70 px. matched_noise_pct: the noise of mean d,
+    in percent of mean d; the constraint treats mean d as exact.
     """
 
     box: Plane
@@ -163,10 +163,10 @@ class FlareComparison:
 def flare_centre(difference: Plane, usable: Flags, usable_before: Flags) -> tuple[int, int]:
     """Position (x, y) of the flare, px.
 
-    It is the middle of the largest patch of pixels that are unusable in the flare image but usable in the image before.
-    If there is no such patch, it is the brightest pixel of the smoothed difference. usable, usable_before: True for the
-    usable pixels of the flare image and of the image before. Raises DataError "flare-no-light" if no pixel became
-    brighter.
+    The position is the middle of the largest patch of pixels that are unusable in the flare image but usable in the
+    image before. If there is no such patch, the position is the brightest pixel of the smoothed difference. usable,
+    usable_before: True for the usable pixels of the flare image and of the image before. Raises DataError
+    "flare-no-light" if no pixel became brighter.
     """
     labels, count = ndimage.label(~usable & usable_before, structure=np.ones((3, 3)))
     if count:
@@ -174,7 +174,10 @@ def flare_centre(difference: Plane, usable: Flags, usable_before: Flags) -> tupl
         return round(float(x.mean())), round(float(y.mean()))
     smooth = ndimage.gaussian_filter(np.where(usable & usable_before, difference, 0.0), 1.0)
     if not smooth.max() > 0:
-        raise DataError("flare-no-light", "expected pixels brighter than in the image before; got none")
+        raise DataError(
+            "flare-no-light",
+            "expected pixels brighter than in the image before; got none: check the order of the two images",
+        )
     row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
     return int(column), int(row)
 

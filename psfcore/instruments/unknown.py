@@ -1,5 +1,5 @@
-"""The error for an image whose PSF is not known. It names the PSFs that could fit, and the possible next steps
-("ways").
+"""The error for an image whose PSF is not known. It names the PSFs that could fit, and the steps that the user can take
+next ("ways").
 
 This module imports no numerical library, so that the web process can import it.
 """
@@ -33,7 +33,7 @@ WAYS = (
     },
 )
 # Publications that help with telescopes without an instrument file (docs/instruments.md). Each entry: a word of the
-# cards TELESCOP, INSTRUME or DETECTOR, the way that the publication makes possible, and a sentence.
+# cards TELESCOP, INSTRUME or DETECTOR, the step ("way") with which the publication helps, and a sentence.
 PUBLISHED = (
     ("xrt", "upload", "SolarSoft has PSFs of XRT as FITS files (hinode/xrt/idl/util/XRT*.PSF560.fits)"),
     ("trace", "fit", "DeForest et al. (2009) used the transit of Venus of 2004 for TRACE 171"),
@@ -59,9 +59,9 @@ def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, An
     """The error "no-psf-for-instrument" for an image with this header summary (`psfcore.fits.header.HeaderSummary` as a table).
 
     Its fields: `image` is the name of the telescope. `instruments` are the instruments whose PSF can be built, sorted
-    by how well they agree with the image. `psfs` are the given PSFs, which could fit. `ways` are the possible next
-    steps. For an instrument, `same` names the properties that agree with the image; `told` also says which properties
-    differ.
+    by how well they agree with the image. `psfs` are the given PSFs, which could fit. `ways` are the steps that the
+    user can take next. For an instrument, `same` names the properties that agree with the image; `told` also says which
+    properties differ.
     """
     named = " ".join(str(header[key]) for key in ("telescop", "instrume", "detector") if header[key])
     channel = channel_of(None, header["wavelnth"])
@@ -86,9 +86,9 @@ def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, An
 
 
 def _ways(header: Mapping[str, Any]) -> list[dict[str, str]]:
-    """The possible next steps.
+    """The steps that the user can take next.
 
-    If a publication makes a step possible for this telescope, the text of the step names it.
+    If a publication helps with a step for this telescope, the text of the step names the publication.
     """
     seen = _words_of(header)
     published = {way: sentence for word, way, sentence in PUBLISHED if word in seen}

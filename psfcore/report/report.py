@@ -1,4 +1,4 @@
-"""Make a report on a PSF and its transit from one inversion. It contains the results that a publication shows.
+"""Make a report on a PSF and its transit from one inversion. The report contains the results that a publication shows.
 
 Source: Hofmeister et al., The point-spread function of HRI_EUV, sections "Inversion results", "Accuracy and robustness"
 and "Evaluation". The PSF is fitted to all images once. The fit of every fold differs from this fit by a small step. The
@@ -227,7 +227,7 @@ def _check_scale(transit: Transit, psf: Psf) -> None:
 def _names_images(psf: Psf, transit: Transit) -> bool:
     """Whether a PSF's history contains the SHA-256 of an image of a transit.
 
-    The lines of the history are joined first, because FITS can break them anywhere.
+    The lines of the history are joined first, because FITS can break a text anywhere.
     """
     history = "".join(str(line) for line in psf.provenance.get("history", ()))
     return any(transit.sha256.get(frame.file, "-") in history for frame in transit.frames)
@@ -266,7 +266,9 @@ def _held_out_kernels(solution: Solution, missing: list[Missing]) -> Callable[[i
     kernels = []
     try:
         if not parts:
-            raise DataError("too-few-images", f"expected at least 6 images for held-out folds; got {images}")
+            raise DataError(
+                "too-few-images", f"expected at least 6 images for held-out folds; got {images}: add images"
+            )
         for k, fold in enumerate(parts):
             once = tuple(int(n in set(fold.fitted)) for n in range(images))
             step = shared_step(solution, FoldSample(0, k, once, fold.held_out))

@@ -107,10 +107,10 @@ class TransitFit:
     """The complete fit of a transit.
 
     kernel, scatter: total PSF and scatter kernel [y, x] on the full reach. curve, diffuse_curve: C(R) of the total PSF
-    and of the scatter kernel. free: the free fit of shells; None for shapes that are not isotropic. shapes: the compared
-    shapes; empty unless the softened power law was fitted. published, published_alone: the published recipe and its
-    variants with one corrected bias, if requested. limits: sentences about quantities that these data do not determine,
-    and about signs that the fit is unreliable.
+    and of the scatter kernel. free: the free fit of shells; None for shapes that are not isotropic. shapes: the
+    compared shapes; empty if the fitted shape is not the softened power law. published, published_alone: the published
+    recipe and its variants with one corrected bias, if requested. limits: sentences about quantities that these data do
+    not determine, and about signs that the fit is unreliable.
     """
 
     transit: Transit
@@ -342,7 +342,7 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
 
 
 def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:
-    """The PSF of a fit on the full reach, with its components DIFFRACTION and SCATTER."""
+    """The fitted PSF, on the full reach (2048 px x 2048 px), with its components DIFFRACTION and SCATTER."""
     return Psf(
         kernel=fit.kernel,
         name=name,

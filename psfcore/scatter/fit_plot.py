@@ -40,7 +40,7 @@ def fit_png(fit: TransitFit, path: str | Path) -> None:
 def fit_figure(fit: TransitFit) -> Figure:
     """Draw six panels.
 
-    They show the diffuse weight and the light beyond each distance, the first guess, the residuals by time and by
+    The panels show the diffuse weight and the light beyond each distance, the first guess, the residuals by time and by
     position, and the convergence.
     """
     figure = Figure(

@@ -20,7 +20,7 @@ CURVE_RADII_PX = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0)
 class TotalPsf:
     """Computes total PSFs that share one diffraction PSF.
 
-    They lie on a square whose edge is twice the longer edge of the field, at most the edge of the full reach.
+    The total PSFs lie on a square whose edge is twice the longer edge of the field, at most the edge of the full reach.
     diffraction: weights [y, x], sum 1 on its own grid. field_shape: (ny, nx) of the images.
     """
 

@@ -10,11 +10,12 @@ photon noise and read noise.
 
 The information that one pixel contains about m is taken as 1 / var(m). An estimator that is linear in the pixel values
 cannot use more. An estimator that uses the full likelihood can use slightly more: at most t / (g m), which is the
-information of the photon count without read noise. This limit exceeds 1 / var(m) by the factor 1 + r^2 / (g m t). For g = 6 DN, r = 2 DN and 2.5 photons (m t = 15 DN) the factor is 94 / 90, about 4 % more.
+information of the photon count without read noise. This limit exceeds 1 / var(m) by the factor 1 + r^2 / (g m t).
+For g = 6 DN, r = 2 DN and 2.5 photons (m t = 15 DN) the factor is 94 / 90, about 4 % more.
 
 The data for the scatter are the fully dark pixels of every image: their four corners lie within the occulter's radius.
-The bound and the fit do not use the pixels around the disc as data. The fit estimates the scene from them; here the
-scene is given. The data for the position of an occulter are the pixels whose centres lie at most 5 px beyond its
+The bound and the fit do not use the pixels around the disc as data. The fit estimates the scene from these pixels; here
+the scene is given. The data for the position of an occulter are the pixels whose centres lie at most 5 px beyond its
 radius; the PSF is given. In high-only images, pixels that clip are left out.
 
 | symbol | name | unit |

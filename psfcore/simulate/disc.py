@@ -98,7 +98,7 @@ class Behind:
     def hidden_slopes(self, place: Place) -> tuple[Plane, Plane]:
         """The derivatives of ``hidden`` with respect to the disc's x and y, DN/s per px.
 
-        They are central differences between positions 0.001 px to either side.
+        The derivatives are central differences between positions 0.001 px to either side.
         """
         return self._slope(place, _PLACE_STEP_PX, 0.0), self._slope(place, 0.0, _PLACE_STEP_PX)
 

@@ -63,7 +63,7 @@ class TrueSky:
     def true_scene_and_beyond(self, index: int) -> Plane:
         """The scene of image `index` without the light that the occulter hides.
 
-        It is plan.margin_px larger than the field on each side.
+        The result is plan.margin_px larger than the field on each side.
         """
         scene = self.scenes[self.plan.shots[index].pointing].copy()
         around = self.behind[index]

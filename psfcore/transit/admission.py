@@ -24,7 +24,7 @@ _WHERE = (
 
 @dataclass(frozen=True)
 class ArchiveLimits:
-    """Bounds on what an archive may contain.
+    """Limits for the number and the sizes of the files in an archive.
 
     max_files: members of any kind, including hidden files. max_bytes: unpacked bytes of all members.
     max_member_bytes: unpacked bytes of one member. max_ratio: unpacked bytes divided by the bytes of the archive. This

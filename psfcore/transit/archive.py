@@ -43,7 +43,7 @@ class ArchiveContents:
 
 
 def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
-    """List an archive. It reads transit.json and the first bytes of every other file, and writes nothing.
+    """List an archive. The function reads transit.json and the first bytes of every other file, and writes nothing.
 
     A .zip has a table of contents, and in a .tar the data can be skipped. A .tar.gz must be decompressed from start to
     end, within the limits.
@@ -78,7 +78,7 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
 
     If all files are in one folder of the archive, that folder's name is dropped. Hidden files, files that operating
     systems add, and files of folders beside the transit's files are skipped.
-    If it raises an error, it first removes all files that it wrote. It raises OSError, and these DataErrors:
+    If the function fails, it first removes all files that it wrote. Raises OSError, and these DataErrors:
 
     - "not-an-archive" if the file is neither a .zip nor a .tar nor a .tar.gz;
     - "archive-climbs" if a name leads out of the folder;

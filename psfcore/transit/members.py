@@ -77,7 +77,7 @@ def archive_kind(start: bytes) -> Literal["zip", "tar", "gzip"] | None:
 
 
 def _starts_like(start: bytes, known: bytes) -> bool:
-    """True if `start` begins with `known`, or `known` with `start`."""
+    """True if `start` begins with `known`, or if `known` begins with `start`."""
     return start.startswith(known) or known.startswith(start)
 
 
@@ -148,11 +148,15 @@ def opened(path: Path, limits: ArchiveLimits) -> Iterator[OpenArchive]:
             if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
                 raise  # an error of the disk, not of the archive
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise DataError("archive-broken", f"expected an intact archive; got: {reason:.120}") from None
+            raise DataError(
+                "archive-broken", f"expected an intact archive; got: {reason:.120}: pack or copy it again"
+            ) from None
 
 
 def _truncated() -> DataError:
-    return DataError("archive-broken", "expected a complete archive; got one that ends too early")
+    return DataError(
+        "archive-broken", "expected a complete archive; got one that ends too early: pack or copy it again"
+    )
 
 
 # --- zip --------------------------------------------------------------------------------------------------
@@ -244,8 +248,9 @@ class _TarInput:
 
     tarfile trusts the sizes in headers. It reads a pax header or a GNU long name of any size in one read. It follows any
     number of such headers by recursion, and it collects the maps of sparse files without a limit. Here all headers of
-    one member together may have at most _MAX_HEADER_BYTES, which limits all three. Seeking backwards is refused, because a
-    .tar.gz would be decompressed again from its start. tarfile does not seek backwards if members are read in order.
+    one member together may have at most _MAX_HEADER_BYTES. This bounds memory and time in all three cases. Seeking
+    backwards is refused, because a .tar.gz would be decompressed again from its start. tarfile does not seek backwards
+    if members are read in order.
 
     size: the size of a file in which data can be skipped by seeking. None: skipped data is read, and counted too.
     """
@@ -299,7 +304,7 @@ class _TarInput:
 
 
 def _check_pax_records(text: bytes) -> None:
-    """Raise DataError "archive-broken" unless a pax header consists of records "length key=value\\n".
+    """Raise DataError "archive-broken" if a pax header contains anything but records "length key=value\\n".
 
     On some other texts, such as long runs of digits, the regular expressions of tarfile need quadratic time and memory
     (CVE-2024-6232).

@@ -84,11 +84,11 @@ class FoundPlace:
 
     @property
     def seen(self) -> bool:
-        """Whether an occulter may be there.
+        """Whether the patch may contain an occulter.
 
-        It is False in three cases: depth is below LEAST_DEPTH by more than DOUBT_SIGMAS standard errors; the search ended
-        at its limit LARGEST_SHIFT_PX; or the simulation does not describe the patch and the position differs from the
-        ephemeris by more than DOUBT_SIGMAS standard errors of the ephemeris.
+        The result is False in three cases: depth is below LEAST_DEPTH by more than DOUBT_SIGMAS standard errors; the
+        search ended at its limit LARGEST_SHIFT_PX; or the simulation does not describe the patch and the position
+        differs from the ephemeris by more than DOUBT_SIGMAS standard errors of the ephemeris.
         """
         return self.within_reach and self.depth + DOUBT_SIGMAS * self.depth_sigma >= LEAST_DEPTH
 

@@ -2,7 +2,7 @@
 
 Paper (Hofmeister et al.), section "The observations": images are normalised by their exposure time, and saturated
 pixels are replaced by the pixels of the unsaturated image that is nearest in time. Here this image must have the same
-pointing, because the scene moves on the detector with the pointing. Its values are scaled:
+pointing, because the scene moves on the detector with the pointing. The values of the other image are scaled:
 
     s = median of I_i / I_j over the bright pixels near the gap, unsaturated in both    Eq. (1)
     I_i(gap) = s I_j(gap)                                                               Eq. (2)
@@ -59,7 +59,7 @@ class Exposure:
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """The numbers of saturated and of not finite pixels of one frame, and how their values were replaced.
+    """The numbers of saturated and of non-finite pixels of one frame, and the ways in which their values were replaced.
 
     from_frames: pixels with a value from another frame. from_neighbours: pixels with the median of pixels near them.
     unfilled: saturated pixels that no other frame of the pointing can fill; they keep their values.
@@ -223,8 +223,8 @@ def _on_disc(place: Place, rows: Places, columns: Places) -> PixelMask:
 def _scale(exposure: Exposure, donor: Exposure, here: tuple[Places, Places]) -> float:
     """The scale s of Eq. (1): the brightness of the frame divided by the brightness of the donor.
 
-    It is measured near the gaps. If there are too few pixels near them, it is measured in the whole image; if there are
-    too few again, it is 1.
+    The scale is measured near the gaps. If too few pixels near the gaps can be used, the scale is measured in the whole
+    image. If too few pixels can be used in the whole image, the scale is 1.
     """
     wanted = np.zeros(exposure.pixels.shape, dtype=bool)
     wanted[here] = True

@@ -188,7 +188,7 @@ class BrighterFatter(Effect):
     """Collected charge repels new charge into fainter neighbouring pixels. Not in the library.
 
     strength: the signal that moves from the brighter to the fainter of two neighbouring pixels, divided by the
-    difference of the two pixels. It holds for two pixels with a mean of 1000 DN.
+    difference of the two pixels. This ratio holds for two pixels with a mean of 1000 DN.
     """
 
     name: ClassVar[str] = "brighter_fatter"

@@ -121,7 +121,8 @@ def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel
 
 @cache
 def _pupil(name: str, size: int) -> Kernel:
-    """The diffraction PSF of an instrument without its entrance mesh, on fine pixels. The result is kept: it takes seconds."""
+    """The diffraction PSF of an instrument without its entrance mesh, on fine pixels. The result is kept, because the
+    computation takes seconds."""
     fine = _with_fine_pixels(load_instrument(name))
     built = min(size, _LARGEST_BUILT_PX)
     parts = [build_psf(fine, size=built, component=part).kernel for part in ("MOUNT", "FILTER_WHEEL")]

@@ -255,7 +255,8 @@ class MeshPitch(Effect):
 class FieldDependentScatter(Effect):
     """The total scatter depends on the position of the source in the field.
 
-    Its relative change is the sum of a linear term, which is `strength` at the edge of the field, and a quadratic term.
+    The relative change of the total scatter is the sum of a linear and a quadratic term. The linear term is `strength`
+    at the edge of the field.
     """
 
     angle_deg: float = 0.0

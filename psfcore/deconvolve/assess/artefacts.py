@@ -1,7 +1,7 @@
 """Signs of artefacts: structures that a deconvolution made and that are not on the Sun.
 
-There are four signs. A comparison with the image before deconvolution ("the image before") shows that they cannot be
-real:
+There are four signs. A comparison with the image before deconvolution ("the image before") shows that these signs
+cannot be real:
 
     hole        x < 0.02 y (or x <= 0) in a pixel with y > 5 sigma                             Eq. (1)
     overshoot   x > (y + 5 sigma) / h0: no scene without negative light can give this,

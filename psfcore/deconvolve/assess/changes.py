@@ -119,7 +119,10 @@ def measure_changes(
     counted = counted_pixels(image, result, edge_px)
     before, after = image.pixels[counted], result[counted]
     if before.size == 0 or before.sum() <= 0:
-        raise DataError("no-signal", "expected trusted pixels with light outside the edge band; got none")
+        raise DataError(
+            "no-signal",
+            "expected trusted pixels with light outside the edge band; got none: use a larger image",
+        )
     positive = before > 0
     change = _change_pct(before[positive], after[positive])
     sigma = None

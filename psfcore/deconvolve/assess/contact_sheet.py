@@ -269,7 +269,8 @@ def _short(name: str) -> str:
 
 
 def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[str, Any]:
-    """Summary of all images: the number that a person should inspect, and medians and extremes of the changes."""
+    """Summary of all images: the number of images that a person should inspect, and medians and extremes of the
+    changes."""
     out: dict[str, Any] = {
         "images": len(treated),
         "failures": len(failures),

@@ -3,15 +3,15 @@
     x <- x + w (y - H x),   x_0 = y      Eq. (1)
 
 The paper recommends this method for a bright source near an edge. Eq. (1) converges to H x = y even if H moves light
-out of the field. The method therefore restores the part of a pixel's light that falls outside the field. It must also
-take account of the light that enters from outside. If the scene is assumed to be zero beyond the field, the pixels
-along the edge become a third too bright (`python -m studies.edges`). Therefore, by default, the mirror image of the
-field continues the scene beyond the field. If the field is much smaller than the PSF, the margin makes it possible to
-use the whole PSF.
+out of the field. The method therefore restores the part of a pixel's light that falls outside the field. The method
+must also take account of the light that enters from outside. If the scene is assumed to be zero beyond the field, the
+pixels along the edge become a third too bright (`python -m studies.edges`). Therefore, by default, the mirror image of
+the field continues the scene beyond the field. If the field is much smaller than the PSF, the margin makes it possible
+to use the whole PSF.
 
 The method is linear: negative pixels are used unchanged, and the result may be negative. A masked pixel (w = 0) keeps
 its first estimate. Let T be the Fourier transform of the PSF at one frequency. After n steps, the noise at this
-frequency is the noise of the image times the sum over j = 0 .. n of (1 - T)^j. It grows without limit if
+frequency is the noise of the image times the sum over j = 0 .. n of (1 - T)^j. The noise grows without limit if
 abs(1 - T) > 1.
 
 | symbol | name | unit |
@@ -100,7 +100,7 @@ class _BasicIterative(Iteration):
 def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """Compute `new` by Eq. (1) and transform its rows.
 
-    Also sum (change)^2 and x^2 over all pixels, and (y - H x)^2 / variance over judged pixels.
+    Add up (change)^2 and x^2 over all pixels, and (y - H x)^2 / variance over the judged pixels.
     """
     nx = x.shape[1]
     zero, least = np.float32(0.0), np.float32(1e-30)

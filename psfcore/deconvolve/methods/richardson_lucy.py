@@ -118,7 +118,7 @@ def agreed(problem: Problem) -> Single:
 
 @compiled(fastmath=_SUMS)
 def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Compute x <- x * correction, Eq. (1); set values below `dark` to 0; sum (change)^2 and x^2 for each block."""
+    """Compute x <- x * correction, Eq. (1). Set values below `dark` to 0. Add up (change)^2 and x^2 for each block."""
     nx = estimate.shape[1]
     zero = np.float32(0.0)
     z = buffer.reshape((-1, 2, LANES))

@@ -6,11 +6,10 @@ Eq. (1) is the step of `richardson_lucy`, with the same masks and edges, and wit
 neighbouring pixels. k is the weight of the penalty. A fit to the noise increases the penalty by more than it decreases
 chi2, so further steps do not amplify the noise. We simulated HRI_EUV images with 100 photons in a quiet pixel. After 20
 steps, the rms error of this method is 157 DN/s in an image of 512 px, and 92 DN/s at 1024 px. The rms error of plain
-Richardson-Lucy is 169 and 130 DN/s, and with its best number of steps, which is not known for real images, 166 and
-112 DN/s.
-Structures that are as faint as the noise are lost too. Use this method for pictures and for finding features. Do not
-use it for the photometry of small spots: they stay smoothed even without noise, and the forward differences shift them
-by up to 0.002 px.
+Richardson-Lucy is 169 and 130 DN/s after 20 steps. After its best number of steps, it is 166 and 112 DN/s, but for real
+images this number is not known. Structures that are as faint as the noise are lost too. Use this method for pictures
+and for finding features. Do not use it for the photometry of small spots: they stay smoothed even without noise, and
+the forward differences shift them by up to 0.002 px.
 
 |grad x| is the root of a sum of squares: of the two forward differences, and of SOFTENING times x. Differences below a
 tenth of the light are therefore smoothed only weakly. The paper has no softening. Without it, the step overshoots
@@ -130,7 +129,7 @@ def _direction(x, row, column, softening):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _smooth_rows(x, correction, new, smoothing, softening, dark, sums, start, stop):  # type: ignore[no-untyped-def]
-    """Compute `new` by Eq. (1) on rows [start, stop); set values below `dark` to 0; sum (change)^2 and x^2 by row."""
+    """Compute `new` by Eq. (1) on rows [start, stop). Set values below `dark` to 0. Sum (change)^2 and x^2 by row."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for row in range(start, stop):
         moved, total = 0.0, 0.0

@@ -37,7 +37,7 @@ class Heap(Protocol):
 
 
 def check_tiles(rows: NDArray[np.void], image: Compression, heap: Heap) -> None:
-    """Raise DataError "bad-tile" or "tile-too-large" unless every tile holds exactly its pixels.
+    """Raise DataError "bad-tile" or "tile-too-large" if a tile does not hold exactly its pixels.
 
     rows: the rows of the table as stored. A broken gzip stream raises OSError, EOFError or zlib.error.
     """

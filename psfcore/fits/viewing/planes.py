@@ -1,9 +1,9 @@
 """Keeps decoded planes of FITS files for some time, so that a plane is decoded only once for many requests of a viewer.
 
-A decoded plane is stored in a file without a name in the folder of temporary files. It is not an array in memory,
-because many slow clients may read different planes at the same time. The system's page cache keeps the pixels in memory
-as long as there is room. The disk space becomes free when the plane is no longer kept and nobody reads it. This module
-loads no numerical library; only the decoding needs one.
+A decoded plane is stored in a file without a name in the folder of temporary files. The plane is not kept as an array
+in memory, because many slow clients may read different planes at the same time. The system's page cache keeps the
+pixels in memory as long as there is room. The disk space becomes free when the plane is no longer kept and nobody reads
+it. This module loads no numerical library; only the decoding needs one.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Cut a window out of a decoded plane, and reduce it to blocks of pixels, some rows at a time.
 
-With the step n, each pixel of the answer represents a block of n x n pixels of the window. Its value is the mean of the
-finite pixels of the block, or NaN if no pixel is finite. For a plane of bits, its value is the bitwise OR of the
-pixels. Blocks at the upper edges of the window may contain fewer pixels.
+With the step n, each pixel of the answer represents a block of n x n pixels of the window. The value of this pixel is
+the mean of the finite pixels of the block, or NaN if no pixel is finite. For a plane of bits, the value is the bitwise
+OR of the pixels. Blocks at the upper edges of the window may contain fewer pixels.
 """
 
 from __future__ import annotations

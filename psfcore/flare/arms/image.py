@@ -81,7 +81,7 @@ def smooth(plane: Plane, usable: Flags, width_px: float) -> Plane:
 
 
 def expected_light(image: Plane, reference: Plane | None, usable: Flags) -> Plane:
-    """The light (DN, smoothed) whose photon noise is in the difference: the image, plus the reference if it is
+    """The light (DN, smoothed) that causes the photon noise of the difference: the image, plus the reference if it is
     given."""
     counts = image if reference is None else image + reference
     return smooth(np.nan_to_num(counts), usable, 2.0)

@@ -142,7 +142,7 @@ def select_pixels(
 
 
 def check_enough_orders(arm: NDArray[np.intp], arms: int) -> None:
-    """Raise DataError "too-few-peaks" unless each arm has at least NEEDED_ORDERS_AN_ARM orders."""
+    """Raise DataError "too-few-peaks" if an arm has fewer than NEEDED_ORDERS_AN_ARM orders."""
     count = np.bincount(arm, minlength=arms)
     if count.min() < NEEDED_ORDERS_AN_ARM:
         wanted = f"at least {NEEDED_ORDERS_AN_ARM} orders above {ORDER_SIGMA:g} sigma on each arm"

@@ -32,8 +32,8 @@ def search_arms(
     """Return first values of the angles (degrees) and of the spacing (px).
 
     Along an arm, the orders are brighter than the pixels beside the arm and brighter than the pixels between the
-    orders. The returned spacing is the spacing at which, on the found arms, the orders exceed the pixels between them
-    most.
+    orders. At the returned spacing, the orders on the found arms are brighter than the pixels between the orders by the
+    largest amount.
     """
     degrees = np.arange(-90.0, 90.0, _SEARCH_STEP_DEG)
     lit, seen = _along_lines(_contrast(difference, usable), usable, centre, degrees, radii_px)

@@ -136,9 +136,9 @@ def free_fit(
 ) -> SubsetFits:
     """The free fit of Eq. (2): coefficients, (subsets kept, segments), as fractions of the light per pixel.
 
-    towards: the coefficients that the prior favours; shells that no equation constrains keep them. The prior is weak: if
-    a shell doubles or vanishes, the misfit grows as much as if one equation were wrong by its scale. Default: the prior
-    favours zero for all shells, with PRIOR_WEIGHT.
+    towards: the coefficients that the prior favours; shells that no equation constrains keep these coefficients. The
+    prior is weak: if a shell doubles or vanishes, the misfit grows as much as if one equation were wrong by its scale.
+    Default: the prior favours zero for all shells, with PRIOR_WEIGHT.
     """
     prior_at = np.zeros_like(counts) if towards is None else towards
     light = prior_at * counts
@@ -233,9 +233,9 @@ def _solve_free(
 ) -> tuple[Vector, float]:
     """Solve Eq. (2) for the light n_S psf_S of each shell, with a prior for shells that no equation constrains.
 
-    The paper has no prior. It is needed because no occulted pixel is close enough to the edge of the disc to separate the
-    innermost shells from the centre. Without a prior, the fit assigns these shells more light than there is (a fraction
-    of 1.3 in the first round on simulated transits).
+    The paper has no prior. A prior is needed because no occulted pixel is close enough to the edge of the disc to
+    separate the innermost shells from the centre. Without a prior, the fit assigns these shells more light than there
+    is (a fraction of 1.3 in the first round on simulated transits).
     """
     used = (counts > 0) & (np.linalg.norm(matrix, axis=0) > 0)
     out = towards.copy()

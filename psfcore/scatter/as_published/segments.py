@@ -61,9 +61,9 @@ def shells_as_published(reach_px: float = FULL_REACH_PX) -> Floats:
 def fine_shells(reach_px: float = FULL_REACH_PX, growth: float = 0.03) -> Floats:
     """The edges of shells from 0.5 px to `reach_px`, in px.
 
-    The inner shells are 1 px wide. Farther out, the width of a shell is `growth` times its radius. These shells are
-    slightly wider than that, so that the last one ends at `reach_px`. Raises ValueError if `reach_px` is not above 1.5, or
-    if `growth` is not above 0.
+    The inner shells are 1 px wide. Farther out, the width of a shell is `growth` times its radius. The outer shells are
+    widened slightly, so that the last shell ends at `reach_px`. Raises ValueError if `reach_px` is not above 1.5, or if
+    `growth` is not above 0.
     """
     if not (reach_px > 1.5 and growth > 0):
         raise ValueError(f"expected a reach above 1.5 px and a growth above 0; got {reach_px} and {growth}")
@@ -108,9 +108,9 @@ class _Nodes:
 class Segments:
     """Concentric shells, each divided into `sectors` sectors (1: isotropic).
 
-    edges_px: edges of the shells, increasing; the first is above 0. Only pixels of the reach grid count. Its shape is
-    (reach_grid_px, reach_grid_px), its centre [n // 2, n // 2]. Raises ValueError if an edge is 0 or negative, if the
-    edges do not increase, or if `sectors` is below 1.
+    edges_px: edges of the shells, increasing; the first is above 0. Only pixels of the reach grid count. The shape of
+    this grid is (reach_grid_px, reach_grid_px), and its centre is at [n // 2, n // 2]. Raises ValueError if an edge is
+    0 or negative, if the edges do not increase, or if `sectors` is below 1.
     """
 
     edges_px: tuple[float, ...]
@@ -215,7 +215,8 @@ class Segments:
 
     @cached_property
     def _shell_of_square(self) -> NDArray[np.int32]:
-        """The shell of each integer r^2 (px^2), which is the index; -1 at the centre and outside all shells."""
+        """Element r^2 (px^2, an integer) is the shell of the pixels at the distance r; -1 at the centre and outside all
+        shells."""
         corner = 2 * (self.reach_grid_px // 2) ** 2
         return _between(self.edges_px, np.sqrt(np.arange(corner + 1)))
 
@@ -230,7 +231,7 @@ class Segments:
         return label.astype(np.int32)
 
     def _ring_of_square(self, exact_px: float, width: float) -> NDArray[np.int64]:
-        """The ring of each integer r^2 (px^2), which is the index.
+        """Element r^2 (px^2, an integer) is the ring of the pixels at the distance r.
 
         Below `exact_px`, every distance has its own ring. Farther out, the width of a ring is `width` times r. No ring
         crosses the edge of a shell.
@@ -288,7 +289,7 @@ def _between(edges_px: tuple[float, ...], radius_px: Floats) -> NDArray[np.int32
 def _sector(shape: tuple[int, int], sectors: int) -> NDArray[np.int32]:
     """The index of the sector of each pixel [y, x].
 
-    It follows from the angle of the pixel about [ny // 2, nx // 2], from +x towards +y.
+    The index follows from the angle of the pixel about [ny // 2, nx // 2], from +x towards +y.
     """
     dy = np.arange(shape[0], dtype=np.float64) - shape[0] // 2
     dx = np.arange(shape[1], dtype=np.float64) - shape[1] // 2

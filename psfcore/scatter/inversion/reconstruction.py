@@ -141,8 +141,8 @@ class _SceneFields(Sequence[NDArray[np.float32]]):
 def dark_pixels(frame: Frame, found: FoundPlace) -> Pixels:
     """Rows and columns of the pixels that are certainly dark.
 
-    They lie fully within the disc, with a margin for the uncertainty of the disc's position. Pixels that were filled in are
-    excluded. If the centre of the disc lies outside the image, no pixel counts as dark.
+    These pixels lie fully within the disc, with a margin for the uncertainty of the disc's position. Pixels that were
+    filled in are excluded. If the centre of the disc lies outside the image, no pixel counts as dark.
     """
     shape = (frame.pixels.shape[0], frame.pixels.shape[1])
     place = found.place

@@ -90,7 +90,7 @@ class Inversion:
     def chi2_per_pixel(self) -> float:
         """chi2 of all dark pixels divided by the degrees of freedom.
 
-        It is about 1 if photon and read noise explain the residuals.
+        The result is about 1 if photon and read noise explain the residuals.
         """
         pixels = sum(frame.dark[0].size for frame in self.frames)
         return sum(frame.chi2 for frame in self.frames) / (pixels - self.coordinates.size)

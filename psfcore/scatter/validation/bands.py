@@ -63,7 +63,7 @@ class ShellBands:
     def near_centre(self) -> Excess:
         """The excess within NEAR_CENTRE_PX.
 
-        It includes all shells that contain only pixels up to this distance.
+        This excess includes all shells that contain only pixels up to this distance.
         """
         beyond = np.sqrt(NEAR_CENTRE_PX**2 + 1)
         return self.excess(int(np.flatnonzero(self.edges_px[1:] < beyond)[-1]))

@@ -212,8 +212,8 @@ def exact_fit(
 ) -> FoldFit:
     """The PSF of one sample, from a separate fit, and the residuals of the held-out images with this PSF.
 
-    solution: the fit to all images. progress: called before each image is processed, so that a worker can report that it
-    is alive, and can stop. Raises the errors of `shared_fits` and `invert`.
+    solution: the fit to all images. progress: called before each image is processed, so that a worker can send a
+    heartbeat or stop the fit. Raises the errors of `shared_fits` and `invert`.
     """
     shape = solution.inversion.shape
     start = solution.inversion.coordinates + shared_step(solution, sample)

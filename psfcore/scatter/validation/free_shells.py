@@ -1,9 +1,9 @@
 """Fit scatter without a formula: fit the light of each shell minus the light that the formula puts in this shell.
 
-Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Results". It compares a free fit with the power
-law for all samples of the cross-validation. Near a fitted PSF, both fits are steps of the same linear problem, Eq. (4) of
-`psfcore.scatter.inversion.inversion`. That module also defines H, G, D and r; w are the weights 1 / v of its Eq. (3). The
-unknown d contains, for each shell, the light of the free fit minus the light of the formula:
+Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Results". That section compares a free fit
+with the power law for all samples of the cross-validation. Near a fitted PSF, both fits are steps of the same linear
+problem, Eq. (4) of `psfcore.scatter.inversion.inversion`. That module also defines H, G, D and r; w are the weights 1 /
+v of its Eq. (3). The unknown d contains, for each shell, the light of the free fit minus the light of the formula:
 
     r = D [H D G c d + noise],   c_S = A_S / n_S - B                              Eq. (1)
     minimise over d >= -l   sum w (r - J d)^2 + sum ((d - d_f) / s)^2,   J = D H D G c   Eq. (2)

@@ -10,7 +10,7 @@ decrease of chi2 (to first order):
     gain = sum over folds f of (2 d . v_h - d . A_h d),   d = q_f - q                        Eq. (2)
 
 The reported gain is the gain of the shape minus the gain of the softened power law, which is refitted in the same folds.
-It can be negative: a parameter that fits noise makes the prediction of held-out images worse.
+The reported gain can be negative: a parameter that fits noise makes the prediction of held-out images worse.
 
 | symbol | name |
 |---|---|

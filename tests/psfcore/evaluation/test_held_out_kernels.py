@@ -37,7 +37,7 @@ def test_every_image_has_the_psf_of_the_fold_that_holds_it_out() -> None:
 def test_too_few_images_are_refused() -> None:
     transit = noise_free(sky())
     few = dataclasses.replace(solved(), transit=dataclasses.replace(transit, frames=transit.frames[:5]))
-    with pytest.raises(DataError, match=r"too-few-frames.*at least 6 images.*got 5"):
+    with pytest.raises(DataError, match=r"too-few-images.*at least 6 images.*got 5"):
         held_out_kernels(few)
 
 

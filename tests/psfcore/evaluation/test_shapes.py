@@ -92,5 +92,5 @@ def test_other_shapes_and_few_images_are_refused() -> None:
     with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*knee"):
         compare_shapes_by_errors(dataclasses.replace(solved(), inversion=knee))
     few = dataclasses.replace(solved().transit, frames=solved().transit.frames[:5])
-    with pytest.raises(DataError, match=r"too-few-frames.*got 5"):
+    with pytest.raises(DataError, match=r"too-few-images.*got 5"):
         compare_shapes_by_errors(dataclasses.replace(solved(), transit=few))
