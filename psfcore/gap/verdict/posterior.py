@@ -35,6 +35,7 @@ Kind = Literal["none", "single", "pair", "triple", "unknown"]
 
 NONE: Names = ()
 UNKNOWN: Names = ("unknown",)  # no effect may have this name
+LIKE = "like"  # no order of the discrepancy has this name
 KINDS: tuple[Kind, ...] = ("none", "single", "pair", "triple", "unknown")
 # Prior probabilities of the kinds. With a probability of one half there is no gap, or its cause is not in the library.
 PRIOR: Mapping[Kind, float] = {"none": 0.35, "single": 0.4, "pair": 0.09, "triple": 0.01, "unknown": 0.15}
@@ -49,7 +50,7 @@ def kind_of(names: Names) -> Kind:
 
 def resembling(name: str) -> Names:
     """The alternative of `UNKNOWN` that the cause resembles this effect."""
-    return (*UNKNOWN, name)
+    return (*UNKNOWN, LIKE, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +58,8 @@ class Posterior:
     """The weights of all hypotheses.
 
     log_weights: ln of prior times evidence of each hypothesis, up to a common constant. visible_error: `Weighed.visible_error`
-    by hypothesis. alternatives: the logarithms of the weights of the alternatives of which `UNKNOWN` consists: the orders of
-    a discrepancy, or `resembling`.
+    by hypothesis. alternatives: the logarithms of the weights of the alternatives of which `UNKNOWN` consists. Their names
+    begin with "unknown"; the orders of a discrepancy follow, or LIKE and the name of an effect.
     """
 
     log_weights: dict[Names, float]
@@ -67,9 +68,9 @@ class Posterior:
 
     @property
     def orders(self) -> dict[Names, float]:
-        """The probability of each alternative if the cause is unknown."""
+        """The probability of each alternative if the cause is unknown, by its name without "unknown"."""
         whole = logsumexp(list(self.alternatives.values()))
-        return {names: math.exp(weight - whole) for names, weight in self.alternatives.items()}
+        return {names[1:]: math.exp(weight - whole) for names, weight in self.alternatives.items()}
 
     def probabilities(self, temperature: float = 1.0) -> dict[Names, float]:
         """The probability of each hypothesis, the most probable first. temperature: divides the logarithms of the weights."""
@@ -125,7 +126,7 @@ def posterior(model: LinearModel) -> Posterior:
     weighed = {names: weigh(likelihood, evidence, names) for names in _hypotheses(evidence.effects)}
     weighed |= _triples(likelihood, evidence, weighed, evidence.effects)
     unknown = {
-        orders: likelihood.weigh([columns])
+        (*UNKNOWN, *orders): likelihood.weigh([columns])
         for orders in ALTERNATIVES
         if (columns := further.columns(orders, evidence.size))
     }

@@ -18,7 +18,7 @@ ORDERS: dict[Names, float] = {("x",): 0.7, ("time",): 0.3}
 
 def posterior_of(shares: Mapping[Names, float]) -> Posterior:
     logs = {names: math.log(share) for names, share in shares.items()}
-    return Posterior(logs, {}, {orders: math.log(share) for orders, share in ORDERS.items()})
+    return Posterior(logs, {}, {(*UNKNOWN, *orders): math.log(share) for orders, share in ORDERS.items()})
 
 
 def judged(
