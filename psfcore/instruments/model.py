@@ -220,9 +220,13 @@ class Instrument(Checked):
         ]
         total = sum(line.weight for line in self.bandpass)
         wrong += [
-            Fault(("bandpass", k, "weight"), f"expected at least {_LEAST:g} of the sum of all weights", line.weight)
+            Fault(
+                ("bandpass", k, "weight"),
+                f"expected at least {_LEAST:g} of the sum of all weights",
+                line.weight,
+            )
             for k, line in enumerate(self.bandpass)
-            if not _LEAST <= line.weight / total
+            if line.weight < _LEAST * total
         ]
         if wrong:
             raise BadValues(wrong)

@@ -149,7 +149,9 @@ def test_spectral_lines_are_the_normalised_bandpass_or_the_one_wavelength() -> N
 
 def test_a_spectral_line_that_is_too_weak_to_be_normalised_is_refused() -> None:
     lines = "".join(f"[[bandpass]]\nwavelength_angstrom = 171.0\nweight = {w}\n" for w in ("1e8", "0.01"))
-    with pytest.raises(DataError, match=r"bandpass\.1\.weight: expected at least 1e-09 of the sum of all weights"):
+    with pytest.raises(
+        DataError, match=r"bandpass\.1\.weight: expected at least 1e-09 of the sum of all weights"
+    ):
         parse_instrument(SMALL_INSTRUMENT + lines, "mine.toml")
     kept = parse_instrument(SMALL_INSTRUMENT + lines.replace("1e8", "1e6"), "mine.toml")
     assert kept.spectral_lines[1].weight == pytest.approx(1e-8)
