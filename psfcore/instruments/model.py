@@ -226,7 +226,7 @@ class Instrument(Checked):
                 line.weight,
             )
             for k, line in enumerate(self.bandpass)
-            if not _LEAST <= line.weight / total
+            if line.weight < _LEAST * total
         ]
         if wrong:
             raise BadValues(wrong)
