@@ -34,7 +34,6 @@ Vector = NDArray[np.float64]
 LIKELY = (
     0.02  # likely relative size of a coefficient; the likelihood also tries a tenth and ten times this size
 )
-RELATED = 0.3  # relative error of the template of an effect that a cause outside the library resembles
 DEGREE = 3
 DETECTOR = ("x", "y")
 OF_DISCS = (*DETECTOR, "time", "intensity", "exposure", "pointing", "radius", "azimuth")

@@ -135,24 +135,17 @@ class Likelihood:
         self._further = 0.0 if further is None else further.width
         self._blocks = list(_pointings(model, errors))
         self._log_det = (0.0, 0.0)  # of discs and blocks without any effect
-        self._parts((), np.zeros(len(self._base)), np.zeros(0), 0.0)
+        self._parts((), np.zeros(len(self._base)), np.zeros(0))
         self._stiffness = 2 / max(model.scale_error, 1e-3) ** 2
 
     def weigh(
-        self,
-        effects: Sequence[Sequence[int]],
-        *,
-        trials: float = 1.0,
-        subtracted: Sequence[float] = (),
-        template_error: float | None = None,
+        self, effects: Sequence[Sequence[int]], *, trials: float = 1.0, subtracted: Sequence[float] = ()
     ) -> Weighed:
         """Weigh the hypothesis that some effects act. effects: the columns of each effect.
 
         trials: the number of templates among which the templates of the effects were chosen. subtracted: the amounts
         that a full refit subtracted from the images, by column; the fitted values are then the remaining amounts.
-        template_error: the relative error of every template; None: TEMPLATE_ERROR.
         """
-        error = TEMPLATE_ERROR if template_error is None else template_error
         groups = [list(group) for group in effects]
         out = dict(zip((c for g in groups for c in g), subtracted, strict=True)) if len(subtracted) else {}
         theta = np.zeros(len(self._base) + sum(len(group) for group in groups))
@@ -160,7 +153,7 @@ class Likelihood:
         for _ in range(ROUNDS + sum(len(group) for group in groups)):
             columns = [c for group in groups for c in group]
             taken = np.array([out.get(c, 0.0) for c in columns])
-            parts = self._parts(groups, theta, taken, error)
+            parts = self._parts(groups, theta, taken)
             after, scales = self._fit(parts, columns, taken)
             acting = after[len(self._base) :] + taken
             below = [
@@ -185,7 +178,7 @@ class Likelihood:
     def normal(self, columns: Sequence[int]) -> Matrix:
         """The normal matrix of some columns for noise alone, with PSF, scenes and brightness free: no template error, no prior."""
         first = len(self._base)
-        parts = self._parts([list(columns)], np.zeros(first + len(columns)), np.zeros(len(columns)), 0.0)
+        parts = self._parts([list(columns)], np.zeros(first + len(columns)), np.zeros(len(columns)))
         whole = _together(parts, (1.0, 1.0))[0]
         across = whole[:first, first:]
         return np.asarray(
@@ -205,7 +198,7 @@ class Likelihood:
         first = len(self._base)
         theta = np.concatenate([np.zeros(first), np.asarray(values, dtype=np.float64)])
         nothing = np.zeros(len(columns))
-        parts = self._parts([list(columns)], theta, nothing, TEMPLATE_ERROR)
+        parts = self._parts([list(columns)], theta, nothing)
         found, scales = self._fit(parts, columns, nothing)
         prior = np.diag(self._prior(columns, SCALES[-1]))
         covariance = scaled_inverse(_together(parts, scales)[0] + prior, weakest=WEAKEST)
@@ -315,9 +308,7 @@ class Likelihood:
             )
         return seen
 
-    def _parts(
-        self, groups: Sequence[Sequence[int]], theta: Vector, taken: Vector, error: float
-    ) -> tuple[_Part, _Part]:
+    def _parts(self, groups: Sequence[Sequence[int]], theta: Vector, taken: Vector) -> tuple[_Part, _Part]:
         columns = [*self._base, *(c for group in groups for c in group)]
         whole = theta + np.append(np.zeros(len(self._base)), taken)
         spans, first = [], len(self._base)
@@ -330,13 +321,13 @@ class Likelihood:
             covariance = covariance.copy()
             diagonal = np.arange(covariance.shape[1])
             for change in changes:
-                covariance += error**2 * change[:, :, None] * change[:, None, :]
-                covariance[:, diagonal, diagonal] += (error * change) ** 2
+                covariance += TEMPLATE_ERROR**2 * change[:, :, None] * change[:, None, :]
+                covariance[:, diagonal, diagonal] += (TEMPLATE_ERROR * change) ** 2
         lower = np.linalg.cholesky(covariance)
         design = np.concatenate([self._jacobian[:, :, columns], self._residual], axis=2)
         white = np.linalg.solve(lower, design).reshape(-1, design.shape[2])
         log_det = 2 * float(np.log(np.einsum("dcc->dc", lower)).sum())
-        blocks = [pointing.part(columns, spans, error) for pointing in self._blocks]
+        blocks = [pointing.part(columns, spans) for pointing in self._blocks]
         size = len(columns) + 1
         measured = self._evidence.numbers_of(columns)
         in_blocks = sum(part.more for part in blocks)
@@ -371,15 +362,10 @@ class _Pointing:
     brightness: Matrix
     errors: Planes
 
-    def part(
-        self, columns: Sequence[int], effects: Sequence[tuple[list[int], Vector]], error: float
-    ) -> _Part:
-        """Normal equations of some columns. effects: the columns of each effect, and the values that set its template error.
-
-        error: the relative error of every template.
-        """
+    def part(self, columns: Sequence[int], effects: Sequence[tuple[list[int], Vector]]) -> _Part:
+        """Normal equations of some columns. effects: the columns of each effect, and the values that set its template error."""
         images, blocks = self.level.shape
-        changes = [error * (self.errors[..., group] @ values) for group, values in effects]
+        changes = [TEMPLATE_ERROR * (self.errors[..., group] @ values) for group, values in effects]
         changes = [change for change in changes if change.any()]
         variance = self.variance + sum((change**2 for change in changes), np.zeros_like(self.variance))
         weight = np.where(self.free, 1 / variance, 0.0)

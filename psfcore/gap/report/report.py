@@ -18,7 +18,7 @@ from psfcore.gap.evidence.discrepancy import WORDS
 from psfcore.gap.evidence.effect_fits import EffectFit
 from psfcore.gap.verdict.closure import Interval
 from psfcore.gap.verdict.correction import Corrected
-from psfcore.gap.verdict.posterior import LIKE, NONE, UNKNOWN, Names
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names
 from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement
 from psfcore.scatter.inversion import Inversion
 
@@ -106,9 +106,7 @@ def looks_like(judged: Judgement) -> list[tuple[str, float]]:
 
 
 def order_words(orders: Names) -> str:
-    """A change along some orders of the data, or one that resembles an effect, as text."""
-    if orders[0] == LIKE:
-        return f"a change that resembles {orders[1].replace('_', ' ')}"
+    """A change along some orders of the data, as text."""
     if len(orders) > MOST_ORDERS:
         return "a change along many orders of the data"
     return "a change that varies with " + " and ".join(WORDS[order] for order in orders)

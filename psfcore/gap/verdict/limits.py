@@ -245,7 +245,7 @@ class _Limits:
             _Hypothesis(
                 np.array([number[c] for c in columns]),
                 scales * np.full(len(columns), LIKELY),
-                math.log(prior["unknown"] / (len(orders) + len(evidence.effects)) / prior["none"]),
+                math.log(prior["unknown"] / len(orders) / prior["none"]),
             )
             for columns in orders
         ]

@@ -1,16 +1,14 @@
 """The posterior: a probability for every hypothesis about the cause of the gap.
 
 The hypotheses are: no effect acts (`NONE`); one effect of the library acts; two effects act together; three effects act
-together, of which two are the most probable pair; a cause outside the library acts (`UNKNOWN`). A cause outside the
-library changes the data along their orders (`evidence.discrepancy`), or it resembles an effect of the library: its
-change is that of the effect with a relative error of RELATED. `evidence.likelihood` computes the evidence E of each
-hypothesis:
+together, of which two are the most probable pair; a cause outside the library acts (`UNKNOWN`, `evidence.discrepancy`).
+`evidence.likelihood` computes the evidence E of each hypothesis:
 
     p(h) ~ prior(kind of h) / (number of hypotheses of this kind) * E(h)              Eq. (1)
 
 The linear model holds only for a small effect. A full refit of a hypothesis therefore gives this hypothesis a new
 evidence. If a single effect was refitted, all pairs with this effect get a new evidence too, and so do the triples of the
-most probable of these pairs and the cause that resembles this effect.
+most probable of these pairs.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.discrepancy import ALTERNATIVES, RELATED, discrepancy
+from psfcore.gap.evidence.discrepancy import ALTERNATIVES, discrepancy
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Likelihood, Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
@@ -35,7 +33,6 @@ Kind = Literal["none", "single", "pair", "triple", "unknown"]
 
 NONE: Names = ()
 UNKNOWN: Names = ("unknown",)  # no effect may have this name
-LIKE = "like"  # no order of the discrepancy has this name
 KINDS: tuple[Kind, ...] = ("none", "single", "pair", "triple", "unknown")
 # Prior probabilities of the kinds. With a probability of one half there is no gap, or its cause is not in the library.
 PRIOR: Mapping[Kind, float] = {"none": 0.35, "single": 0.4, "pair": 0.09, "triple": 0.01, "unknown": 0.15}
@@ -43,14 +40,9 @@ PRIOR: Mapping[Kind, float] = {"none": 0.35, "single": 0.4, "pair": 0.09, "tripl
 
 def kind_of(names: Names) -> Kind:
     """The kind of a hypothesis."""
-    if names[:1] == UNKNOWN:
+    if names == UNKNOWN:
         return "unknown"
     return KINDS[min(len(names), 3)]
-
-
-def resembling(name: str) -> Names:
-    """The alternative of `UNKNOWN` that the cause resembles this effect."""
-    return (*UNKNOWN, LIKE, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,19 +50,12 @@ class Posterior:
     """The weights of all hypotheses.
 
     log_weights: ln of prior times evidence of each hypothesis, up to a common constant. visible_error: `Weighed.visible_error`
-    by hypothesis. alternatives: the logarithms of the weights of the alternatives of which `UNKNOWN` consists. Their names
-    begin with "unknown"; the orders of a discrepancy follow, or LIKE and the name of an effect.
+    by hypothesis. orders: the probability of each alternative of the discrepancy if the cause is unknown.
     """
 
     log_weights: dict[Names, float]
     visible_error: dict[Names, float]
-    alternatives: dict[Names, float]
-
-    @property
-    def orders(self) -> dict[Names, float]:
-        """The probability of each alternative if the cause is unknown, by its name without "unknown"."""
-        whole = logsumexp(list(self.alternatives.values()))
-        return {names[1:]: math.exp(weight - whole) for names, weight in self.alternatives.items()}
+    orders: dict[Names, float]
 
     def probabilities(self, temperature: float = 1.0) -> dict[Names, float]:
         """The probability of each hypothesis, the most probable first. temperature: divides the logarithms of the weights."""
@@ -81,16 +66,11 @@ class Posterior:
 
     def with_evidence(self, evidence: Mapping[Names, Weighed], effects: int) -> Posterior:
         """The same posterior with a new evidence for the given hypotheses. effects: the number of effects in the library."""
-        named = {names: w for names, w in evidence.items() if kind_of(names) != "unknown"}
-        weights = {names: w.log_evidence + _log_prior(names, effects) for names, w in named.items()}
-        errors = {names: w.visible_error for names, w in named.items()}
-        alternatives = dict(self.alternatives)
-        prior = _log_prior(UNKNOWN, effects) - math.log(max(len(alternatives), 1))
-        for names in evidence.keys() & alternatives:
-            alternatives[names] = evidence[names].log_evidence + prior
-        if alternatives:
-            weights[UNKNOWN] = float(logsumexp(list(alternatives.values())))
-        return Posterior(self.log_weights | weights, self.visible_error | errors, alternatives)
+        weights = {names: w.log_evidence + _log_prior(names, effects) for names, w in evidence.items()}
+        errors = {names: w.visible_error for names, w in evidence.items()}
+        return replace(
+            self, log_weights=self.log_weights | weights, visible_error=self.visible_error | errors
+        )
 
 
 def without_idle(probabilities: Mapping[Names, float]) -> dict[Names, float]:
@@ -102,13 +82,11 @@ def without_idle(probabilities: Mapping[Names, float]) -> dict[Names, float]:
     """
     out = dict(probabilities)
     for names in sorted(probabilities, key=len, reverse=True):
-        if kind_of(names) not in ("pair", "triple"):
-            continue
         fewer = [part for n in range(1, len(names)) for part in itertools.combinations(names, n)]
+        # A hypothesis whose refit failed is missing.
         likelier = max(
             (part for part in fewer if part in out), key=lambda part: probabilities[part], default=None
         )
-        # A hypothesis whose refit failed is missing.
         if likelier is not None and probabilities[names] <= probabilities[likelier]:
             out[likelier] += out.pop(names)
     return _sorted(out)
@@ -125,17 +103,19 @@ def posterior(model: LinearModel) -> Posterior:
     likelihood = Likelihood(model, further.directions)
     weighed = {names: weigh(likelihood, evidence, names) for names in _hypotheses(evidence.effects)}
     weighed |= _triples(likelihood, evidence, weighed, evidence.effects)
-    unknown = {
-        (*UNKNOWN, *orders): likelihood.weigh([columns])
+    orders = {
+        orders: likelihood.weigh([columns]).log_evidence
         for orders in ALTERNATIVES
         if (columns := further.columns(orders, evidence.size))
     }
-    unknown |= {
-        resembling(effect.name): weigh(likelihood, evidence, (effect.name,), template_error=RELATED)
-        for effect in evidence.effects
-    }
-    return Posterior({}, {}, dict.fromkeys(unknown, 0.0)).with_evidence(
-        weighed | unknown, len(evidence.effects)
+    logs = np.array(list(orders.values()))
+    whole = float(logsumexp(logs))
+    count = len(evidence.effects)
+    return Posterior(
+        {names: w.log_evidence + _log_prior(names, count) for names, w in weighed.items()}
+        | {UNKNOWN: whole - math.log(logs.size) + _log_prior(UNKNOWN, count)},
+        {names: w.visible_error for names, w in weighed.items()},
+        dict(zip(orders, np.exp(logs - whole).tolist(), strict=True)),
     )
 
 
@@ -174,11 +154,7 @@ def at_refit(
     others = [e.name for e in effects if e.name not in names] if len(names) == 1 else []
     pairs = [_in_order((*names, other), effects) for other in others]
     found = {one: weigh(likelihood, refit.evidence, one, taken) for one in (names, *pairs)}
-    if len(names) > 1:
-        return found
-    found |= _triples(likelihood, refit.evidence, found, effects, taken)
-    found[resembling(names[0])] = weigh(likelihood, refit.evidence, names, taken, template_error=RELATED)
-    return found
+    return found | _triples(likelihood, refit.evidence, {one: found[one] for one in pairs}, effects, taken)
 
 
 def _with_blocks_of(before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]]) -> Evidence:
@@ -208,13 +184,8 @@ def weigh(
     evidence: Evidence,
     names: Names,
     taken: Mapping[str, Sequence[float]] | None = None,
-    *,
-    template_error: float | None = None,
 ) -> Weighed:
-    """Weigh the hypothesis that the effects `names` act together.
-
-    taken: as in `at_refit`. template_error: as in `Likelihood.weigh`.
-    """
+    """Weigh the hypothesis that the effects `names` act together. taken: as in `at_refit`."""
     by_name = {effect.name: effect for effect in evidence.effects}
     # An effect that is fitted for each pointing may have fewer or more changes than parameters.
     columns = [
@@ -227,10 +198,7 @@ def weigh(
         for value in before.get(name, (0.0,) * len(some))
     ]
     return likelihood.weigh(
-        columns,
-        trials=math.prod(by_name[name].trials for name in names),
-        subtracted=subtracted,
-        template_error=template_error,
+        columns, trials=math.prod(by_name[name].trials for name in names), subtracted=subtracted
     )
 
 

@@ -19,7 +19,7 @@ from psfcore.gap.report.report import (
     percent_words,
 )
 from psfcore.gap.verdict.limits import Alike
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, resembling
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN
 from tests.psfcore.gap.report.judged import (
     HOLDS_FOR,
     OFFSET,
@@ -155,10 +155,6 @@ def test_what_the_gap_looks_like_is_said_only_if_its_cause_may_be_unknown(verdic
         first, second = report["looks_like"]  # the third pattern is too improbable
         assert first["form"] == "a change that varies with the position along detector x and the pointing"
         assert (first["probability"], second["probability"]) == pytest.approx((0.8, 0.15))
-
-
-def test_a_cause_that_resembles_an_effect_is_told_with_the_name_of_the_effect() -> None:
-    assert order_words(resembling("flat_field_residual")[1:]) == "a change that resembles flat field residual"
 
 
 SAID = {

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence, gather
-from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.library.detector import EFFECTS
 from psfcore.gap.verdict.posterior import (
@@ -18,7 +17,6 @@ from psfcore.gap.verdict.posterior import (
     _with_blocks_of,
     kind_of,
     posterior,
-    resembling,
     without_idle,
 )
 from psfcore.scatter.inversion import Solution
@@ -71,29 +69,6 @@ def test_every_third_effect_is_weighed_beside_the_most_probable_pair(solution: S
     best = max(pairs, key=lambda names: found.log_weights[names])
     assert len(triples) == len(evidence.effects) - 2 and all(set(best) < set(names) for names in triples)
     assert all(names == tuple(e.name for e in evidence.effects if e.name in names) for names in triples)
-
-
-def test_a_cause_outside_the_library_may_resemble_an_effect(evidence: Evidence) -> None:
-    """The change of every cell differs from that of an offset by a factor of its own, so that no effect describes it."""
-    offset = strong_offset(evidence)
-    rng = np.random.default_rng(4)
-    discs = tuple(
-        replace(disc, residual=disc.residual * rng.uniform(0.5, 1.5, disc.residual.size))
-        for disc in offset.evidence.discs
-    )
-    model = replace(offset, evidence=replace(offset.evidence, discs=discs))
-    exact, near = posterior(offset), posterior(model)
-    key = resembling("dark_offset")
-    assert kind_of(key) == "unknown" and UNKNOWN not in near.alternatives
-    assert sum(near.orders.values()) == pytest.approx(1.0)
-    assert exact.probabilities()[UNKNOWN] < 0.01
-    assert (
-        near.alternatives[key] - near.log_weights[OFFSET]
-        > exact.alternatives[key] - exact.log_weights[OFFSET] + 10
-    )
-    # A new evidence of an alternative is a part of the hypothesis "unknown".
-    again = near.with_evidence({key: Weighed(1e4, (), np.zeros(0), 0.0)}, len(evidence.effects))
-    assert again.orders[key[1:]] == pytest.approx(1.0) and next(iter(again.probabilities())) == UNKNOWN
 
 
 def test_after_a_failed_refit_a_pair_without_any_weight_counts_to_its_other_effect() -> None:
