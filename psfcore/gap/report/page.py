@@ -277,7 +277,7 @@ def _residuals_caption(report: Report) -> str:
 def _which(found: Diagnosis, report: Report) -> list[Part]:
     said = {
         "none": "Most probably there is no gap. An effect that is in the answer set or in the table may still act, but too weakly for these data.",
-        "unknown": "No effect of the library and no pair of effects is in the answer set. A smooth change of the data that no effect describes is more probable.",
+        "unknown": "No effect of the library, alone or together with others, is in the answer set. A change of the data that no effect describes is more probable.",
         "inconclusive": "These data do not decide between the hypotheses of the answer set.",
         "tie": f"Tied: {tied_words(found.judgement)}. All these effects are in the answer set.",
     }
@@ -304,7 +304,7 @@ def _hypotheses_table(report: Report) -> Table:
     return Table(
         ["hypothesis", "probability", "in the answer set"],
         rows,
-        f"The most probable hypotheses about the cause (at most {MOST_HYPOTHESES}). A pair of effects is listed only if it is more probable than each of its effects alone.",
+        f"The most probable hypotheses about the cause (at most {MOST_HYPOTHESES}). Two or three effects together are listed only if they are more probable than fewer of them.",
     )
 
 
@@ -321,7 +321,7 @@ def _effects_figure(report: Report) -> Figure:
         effects_png(report),
         f"The effects of the library, the most probable first (at most {MOST_EFFECTS}). Each bar is the closure by one effect: the fraction of the gap in "
         "held-out images that disappears when the effect is added to the model. The line is its 90 % interval; an arrow marks where the chart cuts it. Blue: the named effects, or the tied effects. A wrong effect may also close much of a gap, so the probability decides. "
-        "The probability in the row of an effect is the probability that it acts, alone or with another effect. In the row of a pair, both effects act.",
+        "The probability in the row of an effect is the probability that it acts, alone or with others. In the row of several effects, all of them act.",
         "Bars of held-out closure by effect",
     )
 

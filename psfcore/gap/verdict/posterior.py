@@ -1,12 +1,14 @@
 """The posterior: a probability for every hypothesis about the cause of the gap.
 
-The hypotheses are: no effect acts (`NONE`); one effect of the library acts; two effects act together; a cause outside
-the library acts (`UNKNOWN`, `evidence.discrepancy`). `evidence.likelihood` computes the evidence E of each hypothesis:
+The hypotheses are: no effect acts (`NONE`); one effect of the library acts; two effects act together; three effects act
+together, of which two are the most probable pair; a cause outside the library acts (`UNKNOWN`, `evidence.discrepancy`).
+`evidence.likelihood` computes the evidence E of each hypothesis:
 
     p(h) ~ prior(kind of h) / (number of hypotheses of this kind) * E(h)              Eq. (1)
 
 The linear model holds only for a small effect. A full refit of a hypothesis therefore gives this hypothesis a new
-evidence. If a single effect was refitted, all pairs with this effect get a new evidence too.
+evidence. If a single effect was refitted, all pairs with this effect get a new evidence too, and so do the triples of the
+most probable of these pairs.
 """
 
 from __future__ import annotations
@@ -27,20 +29,20 @@ from psfcore.gap.evidence.likelihood import Likelihood, Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 
 Names = tuple[str, ...]
-Kind = Literal["none", "single", "pair", "unknown"]
+Kind = Literal["none", "single", "pair", "triple", "unknown"]
 
 NONE: Names = ()
 UNKNOWN: Names = ("unknown",)  # no effect may have this name
-KINDS: tuple[Kind, ...] = ("none", "single", "pair", "unknown")
+KINDS: tuple[Kind, ...] = ("none", "single", "pair", "triple", "unknown")
 # Prior probabilities of the kinds. With a probability of one half there is no gap, or its cause is not in the library.
-PRIOR: Mapping[Kind, float] = {"none": 0.35, "single": 0.4, "pair": 0.1, "unknown": 0.15}
+PRIOR: Mapping[Kind, float] = {"none": 0.35, "single": 0.4, "pair": 0.09, "triple": 0.01, "unknown": 0.15}
 
 
 def kind_of(names: Names) -> Kind:
     """The kind of a hypothesis."""
     if names == UNKNOWN:
         return "unknown"
-    return KINDS[min(len(names), 2)]
+    return KINDS[min(len(names), 3)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,19 +74,21 @@ class Posterior:
 
 
 def without_idle(probabilities: Mapping[Names, float]) -> dict[Names, float]:
-    """The probabilities, with the improbable pairs merged into single effects.
+    """The probabilities, with the improbable pairs and triples merged into hypotheses with fewer effects.
 
-    If a pair is less probable than one of its effects alone, its probability is added to that effect: the data then do
-    not show the second effect. A single effect in the result means this effect alone, or together with an effect that
-    the data do not show.
+    If a hypothesis is less probable than one of its effects alone, or than two of its three effects, its probability is
+    added to that hypothesis: the data then do not show the other effect. A hypothesis in the result means these effects
+    alone, or together with an effect that the data do not show.
     """
     out = dict(probabilities)
-    for names, share in probabilities.items():
-        if kind_of(names) == "pair":
-            alone = [(name,) for name in names if (name,) in probabilities]  # a failed refit leaves one out
-            likelier = max(alone, key=lambda one: probabilities[one], default=None)
-            if likelier is not None and share <= probabilities[likelier]:
-                out[likelier] += out.pop(names)
+    for names in sorted(probabilities, key=len, reverse=True):
+        fewer = [part for n in range(1, len(names)) for part in itertools.combinations(names, n)]
+        # A hypothesis whose refit failed is missing.
+        likelier = max(
+            (part for part in fewer if part in out), key=lambda part: probabilities[part], default=None
+        )
+        if likelier is not None and probabilities[names] <= probabilities[likelier]:
+            out[likelier] += out.pop(names)
     return _sorted(out)
 
 
@@ -98,6 +102,7 @@ def posterior(model: LinearModel) -> Posterior:
     further = discrepancy(evidence)
     likelihood = Likelihood(model, further.directions)
     weighed = {names: weigh(likelihood, evidence, names) for names in _hypotheses(evidence.effects)}
+    weighed |= _triples(likelihood, evidence, weighed, evidence.effects)
     orders = {
         orders: likelihood.weigh([columns]).log_evidence
         for orders in ALTERNATIVES
@@ -112,6 +117,23 @@ def posterior(model: LinearModel) -> Posterior:
         {names: w.visible_error for names, w in weighed.items()},
         dict(zip(orders, np.exp(logs - whole).tolist(), strict=True)),
     )
+
+
+def _triples(
+    likelihood: Likelihood,
+    evidence: Evidence,
+    weighed: Mapping[Names, Weighed],
+    effects: Sequence[Effect],
+    taken: Mapping[str, Sequence[float]] | None = None,
+) -> dict[Names, Weighed]:
+    """Weigh the triples that contain the most probable pair. taken: as in `at_refit`."""
+    pairs = [names for names in weighed if kind_of(names) == "pair"]
+    if not pairs:
+        return {}
+    best = max(pairs, key=lambda names: weighed[names].log_evidence)
+    others = [effect.name for effect in effects if effect.name not in best]
+    triples = [_in_order((*best, other), effects) for other in others]
+    return {names: weigh(likelihood, evidence, names, taken) for names in triples}
 
 
 def at_refit(
@@ -131,7 +153,8 @@ def at_refit(
     likelihood = Likelihood(refit)
     others = [e.name for e in effects if e.name not in names] if len(names) == 1 else []
     pairs = [_in_order((*names, other), effects) for other in others]
-    return {one: weigh(likelihood, refit.evidence, one, taken) for one in (names, *pairs)}
+    found = {one: weigh(likelihood, refit.evidence, one, taken) for one in (names, *pairs)}
+    return found | _triples(likelihood, refit.evidence, {one: found[one] for one in pairs}, effects, taken)
 
 
 def _with_blocks_of(before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]]) -> Evidence:
@@ -189,6 +212,6 @@ def _in_order(names: Names, effects: Sequence[Effect]) -> Names:
 
 
 def _log_prior(names: Names, effects: int) -> float:
-    count = {"none": 1, "single": effects, "pair": math.comb(effects, 2), "unknown": 1}
+    count = {"single": effects, "pair": math.comb(effects, 2), "triple": math.comb(effects, 3)}
     kind = kind_of(names)
-    return math.log(PRIOR[kind] / max(count[kind], 1))
+    return math.log(PRIOR[kind] / max(count.get(kind, 1), 1))

@@ -1,9 +1,9 @@
 """The settled posterior: the linear model is replaced by full refits where it is not exact enough.
 
 A plausible hypothesis is refitted if an error of its template (`likelihood.TEMPLATE_ERROR`) would be visible in the
-data. The most probable hypothesis comes first. Before a pair is refitted, the more probable of its effects is refitted
-alone, for two reasons: this refit also gives the evidence of all pairs with this effect; and a strong effect that is
-not linear can make a pair look more probable than the effect alone. The refits end when no plausible hypothesis needs a
+data. The most probable hypothesis comes first. Before several effects are refitted together, the most probable of them is
+refitted alone, for two reasons: this refit also gives the evidence of all pairs with this effect; and a strong effect
+that is not linear can make a pair look more probable than the effect alone. The refits end when no plausible hypothesis needs a
 refit, or after MOST_REFITS refits.
 """
 

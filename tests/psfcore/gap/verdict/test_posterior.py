@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.library.detector import EFFECTS
 from psfcore.gap.verdict.posterior import (
     NONE,
     UNKNOWN,
@@ -18,6 +19,7 @@ from psfcore.gap.verdict.posterior import (
     posterior,
     without_idle,
 )
+from psfcore.scatter.inversion import Solution
 from tests.psfcore.gap.linear_models import with_residuals
 
 OFFSET: Names = ("dark_offset",)
@@ -48,6 +50,25 @@ def test_a_pair_that_the_data_do_not_show_counts_to_its_effect() -> None:
     assert found == {("a",): pytest.approx(0.55), ("b", "c"): 0.3, NONE: 0.1, ("b",): 0.05, ("c",): 0.0}
     assert list(found) == [("a",), ("b", "c"), NONE, ("b",), ("c",)]
     assert [kind_of(names) for names in (NONE, UNKNOWN, *found)][:3] == ["none", "unknown", "single"]
+
+
+def test_a_triple_that_the_data_do_not_show_counts_to_two_of_its_effects() -> None:
+    a, ab, abc, bcd = ("a",), ("a", "b"), ("a", "b", "c"), ("b", "c", "d")
+    assert [kind_of(names) for names in (a, ab, abc)] == ["single", "pair", "triple"]
+    found = without_idle({NONE: 0.05, a: 0.1, ab: 0.4, abc: 0.2, bcd: 0.25})
+    assert found == {ab: pytest.approx(0.6), bcd: 0.25, a: 0.1, NONE: 0.05}
+    assert without_idle({NONE: 0.1, a: 0.5, ab: 0.1, abc: 0.3}) == {a: pytest.approx(0.9), NONE: 0.1}
+
+
+def test_every_third_effect_is_weighed_beside_the_most_probable_pair(solution: Solution) -> None:
+    evidence = gather(solution, EFFECTS[:4])
+    assert [effect.name for effect in evidence.effects][:1] == ["dark_offset"]
+    both = replace(with_residuals(evidence, {"dark_offset": 300.0}), scale_error=0.1)
+    found = posterior(both)
+    pairs, triples = ([n for n in found.log_weights if kind_of(n) == kind] for kind in ("pair", "triple"))
+    best = max(pairs, key=lambda names: found.log_weights[names])
+    assert len(triples) == len(evidence.effects) - 2 and all(set(best) < set(names) for names in triples)
+    assert all(names == tuple(e.name for e in evidence.effects if e.name in names) for names in triples)
 
 
 def test_after_a_failed_refit_a_pair_without_any_weight_counts_to_its_other_effect() -> None:
