@@ -156,7 +156,7 @@ def test_images_inputs_and_provenance_are_listed() -> None:
             "Most probably there is no gap. An effect that is in the answer set or in the table may still act",
         ),
         ("attributed", "To confirm the named effects, take a dark exposure"),
-        ("unknown", "No effect of the library and no pair of effects is in the answer set"),
+        ("unknown", "No effect of the library, alone or together with others, is in the answer set"),
         ("inconclusive", "These data do not decide between the hypotheses of the answer set"),
         ("tie", "Tied: dark offset or gain mismatch."),
     ],

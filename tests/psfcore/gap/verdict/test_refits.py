@@ -29,13 +29,15 @@ def made() -> Refits:
     return Refits(View(found().solution), found().model)
 
 
-def test_a_refit_weighs_its_effect_and_all_pairs_with_it(made: Refits) -> None:
+def test_a_refit_weighs_its_effect_all_pairs_with_it_and_the_triples_of_the_best_pair(made: Refits) -> None:
     weighed = made.weighed(OFFSET)
     assert weighed is not None
     others = {e.name for e in found().evidence.effects} - set(OFFSET)
     pairs = {frozenset((*OFFSET, name)) for name in others}
-    assert {frozenset(names) for names in weighed} == {frozenset(OFFSET), *pairs}
-    assert set(weighed) <= set(posterior(found().model).log_weights)  # the names of a pair keep their order
+    best = max((names for names in weighed if len(names) == 2), key=lambda names: weighed[names].log_evidence)
+    triples = {frozenset((*best, name)) for name in others - set(best)}
+    assert {frozenset(names) for names in weighed} == {frozenset(OFFSET), *pairs, *triples} and triples
+    assert set(weighed) <= set(posterior(found().model).log_weights)  # the names keep their order
     (fit,) = made.made
     value, sigma = fit.parameters("dark_offset")["offset"]
     assert value == pytest.approx(OFFSET_DN, abs=4 * sigma)
