@@ -85,7 +85,7 @@ class KeyView(BaseModel):
 
     @classmethod
     def of(cls, row: KeyRow) -> KeyView:
-        """The view of a row."""
+        """The description of a key, from its row in the catalogue. It does not contain the secret key."""
         names = ("id", "owner", "label", "created_at", "expires_at", "revoked_at", "last_used_at", "made_by")
         shown = {name: getattr(row, name) for name in names}
         return cls(scopes=list(map(Scope, row.scopes)), state=_state(row), **shown)

@@ -96,7 +96,7 @@ def short(identity: str) -> str:
 
 
 def date(seconds: float | None) -> Markup | str:
-    """A time, seconds since 1970, as a date of UTC; a script may show it in the reader's zone."""
+    """Date and time in UTC, as a `<time>` element; "-" for None. seconds: seconds since 1970."""
     if seconds is None:
         return "-"
     moment = datetime.fromtimestamp(seconds, UTC)

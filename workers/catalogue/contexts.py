@@ -31,7 +31,7 @@ _SHORT_ID = re.compile(SHORT_ID)
 
 @dataclass(frozen=True)
 class Pin:
-    """A PSF for a range of times. validity None: the range for which the PSF is certified."""
+    """A PSF for a range of observation times. validity: this range; None: the range for which the PSF is certified."""
 
     psf_id: str
     validity: Validity | None = None

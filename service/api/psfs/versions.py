@@ -62,7 +62,7 @@ class PsfView(BaseModel):
 
     @classmethod
     def of(cls, row: PsfRow) -> PsfView:
-        """The view of a row."""
+        """The description of a PSF, from its row in the catalogue."""
         here = f"/v1/psfs/{row.id}"
         return cls(
             id=row.id,

@@ -83,7 +83,10 @@ def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: st
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 @DATA
 def list_keys(as_json: bool, data: Path | None) -> None:
-    """List all keys by their ids, including expired and revoked keys."""
+    """List all keys, oldest first, including expired and revoked keys.
+
+    The list shows the ids, not the secret keys.
+    """
     with opened_catalogue(data) as catalogue:
         rows = catalogue.keys.all()
     if as_json:

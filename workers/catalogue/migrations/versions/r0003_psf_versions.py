@@ -164,7 +164,7 @@ def _fill(connection: sa.Connection) -> None:
 def _said(
     owner: str, identity: str, instrument: str | None, origin: str, details: dict[str, Any]
 ) -> dict[str, Any]:
-    """Channel, kind and line of a row."""
+    """The new columns of one PSF: its channel, kind, line and status. `of` and `key` are its owner and id."""
     wavelength = details.get("wavelength_angstrom")
     channel = CHANNELS.get(instrument or "") if wavelength is None else str(round(wavelength))
     parameters = (details.get("provenance") or {}).get("parameters") or {}
