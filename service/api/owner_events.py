@@ -99,8 +99,11 @@ class Watch(Generic[Followable]):
         return news, replace(self, place=place, known=known | dict.fromkeys(self.named.intersection(gone)))
 
     def _expected(self) -> set[str]:
-        """Ids of rows whose state must be known after each look: the rows that had not ended, the ``after_end`` rows
-        that ended last, and the rows that the request names."""
+        """The ids of the rows that each look at the database must read again.
+
+        They are: the rows that had not ended at the last look; the ``after_end`` rows that ended last; the rows that
+        the request names.
+        """
         not_ended = {one for one, state in self.known.items() if state and state.ended_at is None}
         return not_ended.union(self._ended_last(self.known), self.named)
 

@@ -146,8 +146,11 @@ class _Run:
             yield first
 
     def _begin(self, image: Path) -> _Begun | Outcome:
-        """Upload an image and submit its job. No job is submitted if the product is in the folder, or if an earlier
-        image makes the same product."""
+        """Upload an image and submit its job.
+
+        No job is submitted if the folder already contains the product, or if the job of an earlier image makes the
+        same product.
+        """
         with image.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         image_id = _patiently(lambda: self._service.image_id(image, sha256))

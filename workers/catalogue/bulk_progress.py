@@ -22,7 +22,7 @@ PACE_S, PACE_IMAGES = 3600.0, 500
 
 @dataclass(frozen=True)
 class Pace:
-    """taken: images that workers process now. images_an_hour: images that ended per hour; None if not known."""
+    """The speed of a bulk run. taken: number of images that workers process now. images_an_hour: None if not known."""
 
     taken: int
     images_an_hour: float | None
@@ -30,7 +30,7 @@ class Pace:
 
 @dataclass(frozen=True)
 class Reason:
-    """Failed images of a run whose errors have the same code. example: the first such image in the order of the run."""
+    """The failed images of a run with the same error code. images: their number. example: the first of them in the run."""
 
     code: str
     images: int

@@ -28,8 +28,8 @@ def decode_plane(path: str | Path, name: str, limits: FitsLimits, target: Binary
     """Write the pixels of a plane to ``target`` as little-endian float32, in the order of the FITS file (row 0 first).
 
     NaN stays NaN. name: IMAGE for the first 2-D image of the file, or the name of a plane of a product, for example
-    "quality". Returns the shape and the unit of the plane. Raises HeaderError for an unusable header; DataError "unreadable-pixels", "bad-tile", "tile-too-large" or
-    "no-such-plane".
+    "quality". Returns the shape and the unit of the plane. Raises HeaderError for an unusable header; DataError
+    "unreadable-pixels", "bad-tile", "tile-too-large" or "no-such-plane".
     """
     if name == IMAGE:
         with opened_image(path, read_summary(path, limits)) as hdu:

@@ -153,7 +153,7 @@ async def upload_psf(
 
 
 def _made_here(state: Shared, caller: Caller, digest: str) -> PsfRow | None:
-    """The caller's PSF that a job made and whose file has this SHA-256; None if there is none."""
+    """The caller's PSF whose file has this SHA-256, if a job made this PSF; otherwise None."""
     # At most two PSFs have the same file: the PSF that a job made, and an upload of it.
     rows = state.catalogue.page(PsfRow, owner=caller.owner, limit=2, file_sha256=digest)
     return next((row for row in rows if row.id != digest), None)
