@@ -69,7 +69,10 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
 
 
 def _history(found: Diagnosis, added: Corrected) -> dict[str, Any]:
-    """For the provenance: the added effects, their parameters with errors, the gap without and with them, and the input files."""
+    """The added effects, their parameters with errors, the gap without and with these effects, and the input files.
+
+    This goes into the provenance of the corrected PSF.
+    """
     return {
         "effects": [effect.name for effect in added.effects],
         "effect_in_kernel": [effect.name for effect in added.effects if effect.stage == "optics"],
@@ -105,7 +108,10 @@ def _kernel(added: Corrected) -> Kernel:
 
 
 class _Point(View):
-    """The view of one image: a point source in the centre of a field as large as the full reach, convolved with the PSF."""
+    """A view with one image: a point source in the centre of the field, convolved with the PSF.
+
+    The field is as large as the full reach.
+    """
 
     @cached_property
     def scenes(self) -> Sequence[Field]:

@@ -252,7 +252,10 @@ def linear_model_of(
 
 
 def _favoured(model: LinearModel, found: Judgement) -> list[str]:
-    """The axes of the most probable effects. Empty if the verdict is `none`, or if no hypothesis names an effect."""
+    """The axes along which the effects of the best hypothesis vary.
+
+    Empty if the verdict is `none`, or if no hypothesis names an effect.
+    """
     if found.verdict == "none" or found.best is None:
         return []
     return [axis for effect in model.evidence.effects if effect.name in found.best for axis in effect.axes]
@@ -261,7 +264,10 @@ def _favoured(model: LinearModel, found: Judgement) -> list[str]:
 def _limits(
     model: LinearModel, calibration: Calibration, coverage: float, refits: Sequence[Corrected]
 ) -> Limits:
-    """The limits of all effects. For an effect that was refitted, excluded_95 comes from the best refit that contains it."""
+    """The limits of all effects.
+
+    If full refits contain an effect, its excluded_95 comes from the best of these refits.
+    """
     found = limits(model, threshold=calibration.threshold(coverage), temperature=calibration.temperature)
     for fit in reversed(refits):
         for effect in fit.effects:
@@ -271,7 +277,8 @@ def _limits(
 
 
 def _fits(model: LinearModel, found: Judgement) -> tuple[EffectFit, ...]:
-    """The linear fits of all effects, the most probable first, then of the pairs that are best or decide the verdict."""
+    """The linear fits of all single effects, the most probable first; then of the pairs that are the best hypothesis or
+    a named hypothesis."""
     effects = {effect.name: effect for effect in model.evidence.effects}
     ordered = sorted(effects, key=lambda name: -found.effects.get(name, 0.0))
     singles = [(name,) for name in ordered]
@@ -286,9 +293,10 @@ def _shrinking(
     refits: Sequence[Corrected],
     rng: np.random.Generator,
 ) -> tuple[dict[str, Shrinking], HeldOut | None, HeldOut | None]:
-    """Three results: the closure of every fit; held-out residuals without any effect; those with the best effects.
+    """Three results: the closure of every fit; the held-out residuals without any effect; the held-out residuals with the
+    effects of the best hypothesis.
 
-    If an effect has a full refit, its closure is computed with the model of that refit.
+    If effects have a full refit, their closure is computed with the model of that refit.
     """
     schemes = (time_blocks(model), pointings(model))
     before = [hold_out(model, (), scheme) for scheme in schemes]
@@ -322,7 +330,7 @@ def _held_out_by(model: LinearModel, scheme: Sequence[Fold]) -> HeldOut | None:
 
 
 def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:
-    """The result of the full refit if it covers the same images as the linear model; otherwise the result of the linear model."""
+    """The result of the full refit (`real`) if it holds out the same images as the linear model; otherwise `linear`."""
     same = real is not None and linear is not None and real.images == linear.images
     return real if same else linear
 

@@ -212,7 +212,10 @@ class Instrument(Checked):
     scatter: Scatter | None = None
 
     def check(self) -> None:
-        """WAVELNTH of the table [match] is a number, its other keys are texts. No spectral line is too weak to be normalised."""
+        """Check that WAVELNTH of the table [match] is a number and its other keys are texts.
+
+        Check also that no spectral line is so weak that its weight cannot be normalised.
+        """
         wrong = [
             Fault(("match", key), f"expected {'a number' if key == 'WAVELNTH' else 'a text'}", value)
             for key, value in self.match.items()

@@ -191,7 +191,10 @@ def _frame_guess(frame: Frame, place: Place) -> FrameGuess:
 
 
 def _surroundings(frame: Frame, place: Place) -> tuple[Flat, Flat, Flat]:
-    """The pixels of a square around the shell (one axis), without filled pixels; and their x and y from the disc's centre."""
+    """The pixels of a square around the disc, without filled pixels, and their x and y relative to the disc's centre.
+
+    All three arrays have one axis.
+    """
     reach = place.radius_px + EDGE_PX + SHELL_PX + 2
     ny, nx = frame.pixels.shape
     top, bottom = (min(max(int(place.y_px + side * reach), 0), ny) for side in (-1, 1))

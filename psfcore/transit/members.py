@@ -82,7 +82,10 @@ def _starts_like(start: bytes, known: bytes) -> bool:
 
 
 class Member:
-    """A file in an archive. folder: its folder there. gate: counts the unpacked bytes; None: they are counted already."""
+    """A file in an archive. folder: the folder of the file in the archive.
+
+    gate: counts the unpacked bytes; None if another object counts them.
+    """
 
     def __init__(self, file: Admitted, size_bytes: int, stream: IO[bytes], gate: Gate | None = None) -> None:
         self.folder, self.name, self.size_bytes = file.folder, file.name, size_bytes

@@ -159,8 +159,10 @@ def is_psf_id(psf: str) -> bool:
 
 
 def whole_id(service: Operations, things: str, identity: str) -> str:
-    """The whole id of a thing from its first digits. things: the part of the address that names the type, such as
-    "psfs"."""
+    """Find the whole id of a PSF, product, job, ... from the first digits of the id.
+
+    things: the type as it is written in the address, for example "psfs".
+    """
     if len(identity) == DIGITS:
         return identity
     found: str = service.get(f"/v1/{things}/{identity}")["id"]

@@ -109,7 +109,10 @@ _tellers: list[_Teller] = []  # of the open blocks of ``progress_bar``, the inne
 
 @contextmanager
 def progress_bar() -> Iterator[Report]:
-    """Show the progress of the ``with`` block and the time left in its stage: on a terminal a bar, otherwise a line every 10 s."""
+    """Show the progress of a ``with`` block and the time left in its stage.
+
+    A terminal shows a bar; otherwise a line is written every 10 s.
+    """
     teller = _Teller(bar=sys.stderr.isatty())
     _tellers.append(teller)
     try:

@@ -56,7 +56,11 @@ class BulkProgress:
         return None
 
     def pace(self, bulk: BulkRow) -> Pace:
-        """Images that workers process now, and images that ended per hour since the run was last started or resumed."""
+        """The speed of a run: the images that workers process now, and the images that ended per hour.
+
+        The rate is computed from the last ``PACE_S`` seconds, or from the time since the run was last started or resumed
+        if that is shorter; and from at most the last ``PACE_IMAGES`` images.
+        """
         until = bulk.ended_at or time.time()
         since = max(bulk.running_since or bulk.created_at, until - PACE_S)
         ended = select(BulkItemRow.ended_at).where(

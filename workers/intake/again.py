@@ -37,7 +37,7 @@ TABLES: dict[Result, type[Any]] = {
 
 
 def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
-    """Queue a completed job again if its result was deleted or a file of the result is lost. Returns whether it was queued."""
+    """Queue a completed job again if its result was deleted or a file of the result is lost; True if it was queued."""
     table = TABLES.get(KINDS[job.kind].result)
     if job.phase != Phase.COMPLETED or table is None or job.result_id is None:
         return False

@@ -64,7 +64,10 @@ class Orders:
     number: NDArray[np.intp]
 
     def planes(self) -> list[tuple[NDArray[np.intp], Plane]]:
-        """For each order: the indices of its pixels, and an orthonormal basis of weighted planes on these pixels [pixel, 3]."""
+        """For each order with at least 3 pixels: the indices of its pixels, and a basis [pixel, 3].
+
+        The basis is orthonormal. It spans the functions that are linear in x and y on these pixels, divided by sigma.
+        """
         found = []
         by_order = np.argsort(self.nearest, kind="stable")
         for pixels in np.split(by_order, np.cumsum(np.bincount(self.nearest))[:-1]):

@@ -176,7 +176,10 @@ class Likelihood:
         return self._weighed(parts, theta, scales, columns, taken, trials)
 
     def normal(self, columns: Sequence[int]) -> Matrix:
-        """The normal matrix of some columns for noise alone, with PSF, scenes and brightness free: no template error, no prior."""
+        """The normal matrix of some columns if the only error is noise: without template error and without prior.
+
+        PSF, scenes and brightness are free parameters.
+        """
         first = len(self._base)
         parts = self._parts([list(columns)], np.zeros(first + len(columns)), np.zeros(len(columns)))
         whole = _together(parts, (1.0, 1.0))[0]

@@ -98,7 +98,10 @@ class UnoccultedBlocks:
         return max(float(np.sqrt(np.mean(spread))), LEAST_GAIN) if spread else WIDEST_GAIN
 
     def equations(self, columns: Sequence[int], images: Sequence[int] | None = None) -> UnoccultedEquations:
-        """Normal equations of these columns from some images (None: all images). Scene and brightness are free parameters."""
+        """The normal equations of these columns. images: the images to use; None: all.
+
+        Scene and brightness are free parameters.
+        """
         chosen = (
             np.flatnonzero(self.part) if images is None else np.array([n for n in images if self.part[n]])
         )
@@ -223,7 +226,7 @@ def not_compared(solution: Solution, n: int) -> NDArray[np.bool_]:
 
 
 def unocculted_blocks(view: View, columns: int, progress: Progress) -> UnoccultedBlocks:
-    """The blocks of all images. columns: the number of columns; their `errors` are zero, and the caller sets them."""
+    """The blocks of all images. columns: the number of columns of `errors`. `errors` is zero; the caller fills it in."""
     solution = view.solution
     transit = solution.transit
     levels, variance, free, means = [], [], [], []

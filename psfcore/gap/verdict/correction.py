@@ -194,7 +194,10 @@ def _fit_remaining(
     model: LinearModel,
     progress: Progress,
 ) -> _Remaining:
-    """Fit what remains of the effects. out: the current parameters. in_images: whether the parameter was subtracted."""
+    """Fit the effects to images from which these effects were already subtracted.
+
+    out: the current parameters. in_images: for each parameter, whether its change was subtracted from the images.
+    """
     evidence = _with_noise_of(model.evidence, gather(view.solution, held, view=view, progress=progress))
     again = replace(model, evidence=evidence)
     left = fit_effects(again, evidence.effects, any_sign=True)
@@ -296,7 +299,7 @@ def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
 
 
 def _acting(effect: Effect, found: EffectFit, effects: int) -> Effect:
-    """The effect with only those parameters that the fit `found` contains. effects: the number of effects in the fit."""
+    """The effect with only the parameters that the fit `found` contains. effects: the number of effects in the fit."""
     labels = [p.name if effects == 1 else f"{effect.name}.{p.name}" for p in effect.parameters]
     return _with_part(effect, [k for k, label in enumerate(labels) if label in found.values])
 

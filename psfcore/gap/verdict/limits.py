@@ -110,7 +110,7 @@ class EffectLimits:
 
 @dataclass(frozen=True)
 class Alike:
-    """Two effects that these data cannot tell apart. would_separate: an observation that would tell them apart."""
+    """Two effects that these data cannot tell apart. would_separate: an observation that could tell them apart."""
 
     pair: tuple[str, str]
     distance: float
@@ -480,7 +480,10 @@ def _quantile_of_sum(cumulants: Matrix, probability: float) -> Vector:
 
 
 def _first_found(margin: Callable[[Vector], Vector], unit: float, most: float) -> float | None:
-    """The smallest strength, up to `most`, whose margin is at least 0; None if there is none. unit: the error of the strength."""
+    """The smallest strength, up to `most`, for which `margin` is at least 0; None if `margin` stays below 0.
+
+    unit: the error of the strength.
+    """
     if most <= WEAKEST_TRIED * unit:
         return None
     tried = np.geomspace(WEAKEST_TRIED * unit, min(STRONGEST_TRIED * unit, most), TRIED)

@@ -93,7 +93,11 @@ class Refits:
         return self._made[names]
 
     def _start(self, effects: Sequence[Effect]) -> EffectFit:
-        """The linear fit from which a refit starts. If an effect would lose all its parameters, the fit keeps all parameters."""
+        """The linear fit from which a refit starts.
+
+        The fit leaves out parameters with the wrong sign or with too little gain. If it leaves out all parameters of an
+        effect, it is repeated with all parameters.
+        """
         start = fit_effects(self._model, effects)
         kept = set(start.step.columns)
         if all(kept.intersection(self._model.evidence.columns[effect.name]) for effect in effects):

@@ -146,7 +146,10 @@ def _curve(values: Vector) -> Matrix | None:
 
 
 def _kinds(values: Vector) -> Matrix | None:
-    """Indicators of each kind of image but the first, minus their mean: (kinds - 1, images). None if there is only one kind."""
+    """For each value that occurs, except the smallest: 1 for the images with this value, otherwise 0; minus the mean.
+
+    Returns an array (values - 1, images); None if all images have the same value.
+    """
     kinds = np.unique(values)
     if kinds.size < 2:
         return None
