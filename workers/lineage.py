@@ -23,7 +23,7 @@ Type = Literal["product", "psf", "image", "transit", "report", "instrument-file"
 
 
 class Made(BaseModel):
-    """How a thing was made. A field is null if it was not recorded at that time."""
+    """How a product, PSF, ... was made. A field is null if it was not recorded when the job ran."""
 
     created_at: float
     name: str | None = None
@@ -39,7 +39,7 @@ class Made(BaseModel):
 
 
 class Ancestor(BaseModel):
-    """A thing, and the things that it was made from (its parents)."""
+    """A product, PSF, report, image, transit or instrument file, and its parents: the entries from which it was made."""
 
     type: Type
     id: str = Field(description="id; for an upload or an instrument file the SHA-256 of its bytes")
@@ -55,12 +55,12 @@ class Ancestor(BaseModel):
 
 
 def lineage(catalogue: Catalogue, row: ProductRow | PsfRow) -> Ancestor:
-    """A thing and its ancestors: at most MOST_DEEP generations and MOST_THINGS things."""
+    """A product or PSF and its ancestors: at most MOST_DEEP generations and MOST_THINGS entries."""
     return _Walk(catalogue, row.owner).of_row(row, 0)
 
 
 def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
-    """The parameters of the job that made a thing, so that this job can run again.
+    """The parameters of the job that made a product or PSF; with them, the job can run again.
 
     Raises ``DataError`` "not-made-here" for an upload, "parameters-unknown" if the parameters were not recorded, and
     "parameters-outdated" if this version of the software does not accept them.

@@ -212,7 +212,7 @@ def _compute_ideal(
 
 
 def _filled(command: Sequence[str], paths: Mapping[str, Path]) -> list[str]:
-    """A command with paths in place of its marks."""
+    """Replace every mark in a command by its path. paths: the path for each mark."""
     filled = list(command)
     for mark, path in paths.items():
         filled = [part.replace(mark, str(path)) for part in filled]

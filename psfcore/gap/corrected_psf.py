@@ -122,12 +122,12 @@ class _Point(View):
 
     @cached_property
     def expected(self) -> Sequence[Field]:
-        """The image of the point source, which is the PSF."""
+        """The images: there is only the image of the point source, and this image is the PSF."""
         return [frame.pixels for frame in self.solution.transit.frames]
 
     @cached_property
     def pointing_means(self) -> list[Field]:
-        """The mean image of the only pointing, which is the PSF."""
+        """The mean images of the pointings. There is only one pointing with one image: the PSF."""
         return list(self.expected)
 
     def occulted_scene(self, n: int) -> Lanes:
@@ -135,7 +135,7 @@ class _Point(View):
         return self.solution.optics.lanes(self.scenes[n])
 
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
-        """The point source, times `weight` at its position, convolved with dH (`slope`)."""
+        """The point source, multiplied by `weight` at its position, and convolved with dH (`slope`)."""
         point = slope.lanes(self.scenes[n] if weight is None else self.scenes[n] * weight)
         return slope.field(slope.convolve(point))
 

@@ -65,7 +65,7 @@ class NewKey(BaseModel):
         return self
 
     def end(self, now: float) -> float | None:
-        """The end of the key, seconds since 1970; None if no end is asked for."""
+        """The time at which the key expires, seconds since 1970; None if the request does not limit the life of the key."""
         return self.expires_at if self.lasts_days is None else now + self.lasts_days * DAY_S
 
 

@@ -97,7 +97,7 @@ class BulkProgress:
             return session.scalars(query.order_by(BulkItemRow.position).limit(limit)).all()
 
     def reasons(self, bulk_id: str) -> list[Reason]:
-        """The first ``MOST_EXPLAINED`` failed images by the code of their error, the most frequent code first."""
+        """The errors of the first ``MOST_EXPLAINED`` failed images, grouped by error code; the most frequent code first."""
         failed = (BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.FAILED)
         code = BulkItemRow.error["code"].as_string().label("code")
         # PostgreSQL groups by a column of a subquery, but not by an expression with a parameter.

@@ -83,7 +83,7 @@ class Evidence:
         return tuple(disc.index for disc in self.discs)
 
     def unocculted_equations(self, images: Sequence[int] | None = None) -> UnoccultedEquations:
-        """The normal equations of all columns, from the unocculted blocks of some images (None: all images)."""
+        """The normal equations of all columns from the unocculted blocks. images: the images to use; None: all."""
         return self.all_unocculted if images is None else self.unocculted.equations(range(self.size), images)
 
     @cached_property
@@ -228,7 +228,7 @@ def _image_info(frame: Frame, found: FoundPlace, distance_px: float) -> ImageInf
 
 
 def _testable(evidence: Evidence) -> Evidence:
-    """The evidence without those effects that change neither a disc nor a block; they become untestable."""
+    """Remove the effects that change neither a disc nor a block, and list them as untestable."""
     untestable, columns = dict(evidence.untestable), dict(evidence.columns)
     for name, here in evidence.columns.items():
         cells = max(float(np.abs(disc.jacobian[list(here)]).max()) for disc in evidence.discs)

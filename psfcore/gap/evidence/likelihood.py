@@ -102,7 +102,7 @@ class _Part:
     more: float
 
     def chi2(self, theta: Vector) -> float:
-        """chi2 at some parameters."""
+        """chi2 for the parameters `theta`."""
         long = np.append(-theta, 1.0)
         return max(float(long @ self.bordered @ long), 0.0) + self.more
 
@@ -230,7 +230,7 @@ class Likelihood:
         return size, fixed
 
     def _prior(self, columns: Sequence[int], scale: float) -> Vector:
-        """1 / variance of the prior of the coordinates of the PSF (0: no prior) and of some columns."""
+        """1 / variance of the prior, for the coordinates of the PSF and then for these columns. 0: no prior, as for the PSF."""
         size, fixed = (one[list(columns)] for one in self._widths)
         return np.append(np.zeros(len(self._base)), (size * np.where(fixed, 1.0, scale)) ** -2.0)
 
@@ -395,7 +395,7 @@ class _Pointing:
 
 
 def _pointings(model: LinearModel, errors: Planes) -> list[_Pointing]:
-    """The blocks of every pointing in which at least LEAST_IMAGES images show a block."""
+    """For every pointing: the blocks that at least LEAST_IMAGES images show; pointings without such blocks are left out."""
     blocks = model.evidence.unocculted
     found = []
     for pointing in np.unique(blocks.pointing):

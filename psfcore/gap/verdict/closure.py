@@ -80,7 +80,7 @@ class HeldOut:
     deviance: Mapping[tuple[int, ...], float] = field(default_factory=dict)
 
     def of(self, images: Sequence[int]) -> HeldOut:
-        """The same results for some of the images, without the deviance of the folds."""
+        """The results for these images only. The deviance is left out, because it belongs to folds."""
         at = {image: k for k, image in enumerate(self.images)}
         here = [at[image] for image in images]
         return HeldOut(

@@ -158,7 +158,7 @@ def add_to_model(
 
 
 def _by_effect(effects: Sequence[Effect], values: Vector) -> dict[str, tuple[float, ...]]:
-    """Values of the parameters of some effects, by the name of the effect."""
+    """Split the list of values: for the name of each effect, the values of its parameters."""
     found, first = {}, 0
     for effect in effects:
         last = first + len(effect.parameters)
@@ -273,7 +273,7 @@ def with_library(
 
 
 def hold(effect: Effect, view: View) -> Effect:
-    """The effect with the result of its search, for example a position, fixed for these images."""
+    """The effect without its search: the result of the search, for example a position, is fixed for these images."""
     return effect if effect.held is None else effect.held(view)
 
 

@@ -251,7 +251,7 @@ class _Limits:
         ]
 
     def _hypothesis(self, effect: Effect, kept: Sequence[int] | None = None) -> _Hypothesis:
-        """An effect as a hypothesis. kept: the numbers of the parameters that act; None: all."""
+        """The hypothesis that an effect acts alone. kept: indices of the parameters that the hypothesis contains; None: all."""
         columns = self._columns[effect.name]
         part = np.arange(len(columns)) if kept is None else np.array(kept)
         likely = np.array([effect.parameters[k].likely for k in part])
@@ -266,7 +266,7 @@ class _Limits:
     # --- strengths that would be found ------------------------------------------------------------------
 
     def parameters(self, effect: Effect, need: _Need, observed: bool) -> tuple[ParameterLimits, ...]:
-        """The limits of every parameter of an effect; of its rms, if it is a random field."""
+        """The limits of every parameter of an effect. If the effect is a random field: the limits of its rms."""
         if effect.field:
             return (self._of_field(effect, need, observed),)
         excluded = self._excluded(effect) if observed else [None] * self._of[effect.name].size

@@ -31,7 +31,7 @@ class Refits:
         self.failures: list[str] = []
 
     def weighed(self, names: Names) -> Mapping[Names, Weighed] | None:
-        """The evidence at the refit of a hypothesis (`posterior.at_refit`); None if the refit failed."""
+        """The evidence of hypotheses, computed at the refit of `names` (`posterior.at_refit`); None if the refit failed."""
         made = self._fit(names)
         if made is None:
             return None
@@ -47,7 +47,7 @@ class Refits:
         return tuple(fit for fit in self._made.values() if fit is not None)
 
     def of(self, hypotheses: Sequence[Names]) -> tuple[Corrected, ...]:
-        """The refits of some hypotheses, in this order, without those that failed."""
+        """The refits of these hypotheses, in this order. Failed refits are left out."""
         fits = (self._fit(names) for names in hypotheses)
         return tuple(fit for fit in fits if fit is not None)
 

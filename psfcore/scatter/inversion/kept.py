@@ -43,7 +43,7 @@ _HEADER_BYTES = 4096  # no .npy header is longer
 
 @dataclass(frozen=True)
 class _FrameLight:
-    """The single numbers of a FrameFit. Its arrays and its frame are stored elsewhere."""
+    """The scalar values of a FrameFit. Other files contain its arrays and its frame."""
 
     observed: float
     expected: float

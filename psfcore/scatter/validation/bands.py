@@ -70,7 +70,7 @@ class ShellBands:
 
     @property
     def largest(self) -> Excess:
-        """The excess that is largest relative to its error."""
+        """The excess with the largest ratio of its absolute value to its error."""
         return self.excess(int(np.argmax(np.abs(self.excess_pct[2] / self.excess_sigma))))
 
     def to_json(self) -> dict[str, Any]:

@@ -26,7 +26,7 @@ class Duration(click.ParamType):
     name = "duration"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Seconds of a text such as 30d."""
+        """Convert a text such as 30d to seconds."""
         parts = re.fullmatch(r"([0-9]{1,5})([hdw])", str(value))
         if parts is None or not int(parts[1]):
             self.fail(f"expected a duration such as 12h, 30d or 8w; got {value!r}", param, ctx)

@@ -75,12 +75,12 @@ class Plot:
 
 
 def written(value: float | None) -> str:
-    """A number as the table shows it; empty if there is none."""
+    """A number as the table shows it; empty if the number is None or not finite."""
     return "" if value is None or not isfinite(value) else f"{value:.{DIGITS}g}"
 
 
 def around(values: Sequence[float], sigma: Sequence[float] | None) -> tuple[Numbers | None, Numbers | None]:
-    """The ends of a band of one standard error around values; None without errors."""
+    """Lower and upper ends of a band of one standard error around values; None and None if there are no errors."""
     if sigma is None:
         return None, None
     pairs = list(zip(values, sigma, strict=True))
