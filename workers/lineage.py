@@ -1,6 +1,6 @@
 """Lineage of a product or a PSF: inputs, parameters, versions and jobs, back to the uploads.
 
-The lineage of a thing was recorded when the thing was made. A parent that was deleted later is still listed, by its id.
+The lineage of a product or PSF was recorded when it was made. A parent that was deleted later is still listed, by its id.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def _job_of(row: ProductRow | PsfRow, parameters: dict[str, Any]) -> ResolvedRer
 
 
 def _origin(row: ProductRow | PsfRow) -> str:
-    """The origin of a thing, as ``workers.contract.kinds`` names it."""
+    """The origin of a product or PSF, as ``workers.contract.kinds`` names it."""
     if isinstance(row, ProductRow):
         return "deconvolved"
     if row.origin == "built":
@@ -169,7 +169,7 @@ class _Walk:
 
 
 def _parents(row: ProductRow | PsfRow) -> list[tuple[Type, str]]:
-    """Type and id of each thing that a thing was made from."""
+    """Type and id of each input from which a product or PSF was made."""
     if isinstance(row, ProductRow):
         return [("image", row.image_id), ("psf", row.psf_id)]
     provenance = _provenance(row)

@@ -133,11 +133,10 @@ def diagnose(
 
     start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit: whether to
     make full refits with the named effects in the model. seed: seeds the simulation and the bootstrap of the intervals.
-    solution: a solution of this transit, shape and start that was made before, or a function that makes it; None: `invert`.
+    solution: an existing solution of this transit, shape and start, or a function that makes it; None: `invert` makes it.
     If the noise measured in the images differs from the noise that the transit states, the solution must be made with
     the measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError
-    "bad-library" if
-        the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
+    "bad-library" if the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
     """
     if not library:
         raise DataError("bad-library", "expected a library with at least one effect; got none: add an effect")

@@ -120,7 +120,7 @@ CONTEXT = click.option(
 
 
 def id_argument(name: str = "identity", *, several: bool = False) -> Callable[[Command], Command]:
-    """The argument that names a thing of the service by its id, or by the first digits of its id."""
+    """The argument for the id of a PSF, product, job, ... The first digits of the id are enough."""
     return click.argument(
         name, type=ID, metavar="ID..." if several else "ID", nargs=-1 if several else 1, required=True
     )
@@ -170,7 +170,7 @@ def whole_id(service: Operations, things: str, identity: str) -> str:
 
 
 def whole_ids(service: Operations, things: str, identities: Sequence[str]) -> list[str]:
-    """The whole ids of several things."""
+    """Find the whole id for each of these ids, as `whole_id` does."""
     return [whole_id(service, things, identity) for identity in identities]
 
 

@@ -146,5 +146,5 @@ def percent(value: float | None) -> str:
 
 
 def page_of(address: str) -> str:
-    """The page of a thing at an address of the interface: ``/v1/products/ID`` has the page ``/products/ID``."""
+    """The address of the page for an address of the API: ``/products/ID`` for ``/v1/products/ID``."""
     return address.removeprefix("/v1")

@@ -54,8 +54,8 @@ class AffectedProducts:
     def page(self, owner: str, *, superseded: bool, limit: int, after: Place | None = None) -> list[Affected]:
         """Products that were made with deprecated PSFs. superseded: only PSFs that have a successor.
 
-        A join would sort all products of a PSF before it returned the first one. Therefore this method makes several
-        queries, which read only the rows that they return.
+        The method makes several queries, each of which reads only the rows that it returns. A single query with a join
+        would be slower: it would sort all products of a PSF first.
         """
         found: list[Affected] = []
         with self._database.reading() as session:

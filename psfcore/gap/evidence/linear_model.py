@@ -159,9 +159,9 @@ class LinearModel:
         return frozenset(column for name in fields for column in self.evidence.columns[name])
 
     def pull_of_prior(self, step: Step, taken_out: Vector) -> Vector:
-        """The amount by which the prior reduces the fitted values if it also applies to amounts that were subtracted before.
+        """How much smaller the fitted values become if the prior also applies to the amounts that were subtracted before the fit.
 
-        taken_out: the subtracted amounts, by column of the fit.
+        taken_out: the subtracted amounts, for each column of the fit.
         """
         return np.asarray(step.covariance @ (self._prior[list(step.columns)] * taken_out))
 

@@ -109,7 +109,7 @@ def _motion(view: View) -> Sequence[Change]:
 def _evolution(view: View) -> Sequence[Change]:
     """The changes of the Sun within each pointing, measured in the unocculted field. Each is scaled to a relative rms of 1.
 
-    Two changes: one that is linear in time, and the rest of the change that is smooth in time. The discs do not show these
+    Two changes: the part that is linear in time, and the other part that is smooth in time. The discs do not show these
     changes, because the scene of each image is reconstructed from the image itself.
     """
     frames = view.solution.transit.frames

@@ -339,8 +339,8 @@ class _Limits:
     def _excluded_rms(self, effect: Effect, likely: Vector) -> float | None:
         """The 95 % quantile of the standard deviation t of the coefficients of a random field, for a constant prior of t.
 
-        With the eigenvalues l of S N S for t = 1, and the scores z in units of their noise without the field, ln L(t) is
-        sum of (z^2 t^2 l / (1 + t^2 l) - ln(1 + t^2 l)) / 2.
+        ln L(t) is the sum of (z^2 t^2 l / (1 + t^2 l) - ln(1 + t^2 l)) / 2. l are the eigenvalues of S N S for t = 1. z are
+        the scores in units of their noise without the field.
         """
         columns = self._columns[effect.name]
         found, covariance = self._likelihood.fitted(columns, np.zeros(len(columns)).tolist())
