@@ -77,7 +77,7 @@ class Diagnosis:
 
     Three values of the gap: before_refit, with the PSF that was fitted together with the named effects, but without these
     effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear
-        fits of all effects, the most probable first, then of the pairs that are best or decide the verdict. p_value:
+    fits of all single effects, the most probable first; then of the pairs that are best or decide the verdict. p_value:
     the p-value of the gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by their
     label. corrected: the full refits with the named effects; the refit with the best effects comes first. residual,
     residual_after: the residuals of held-out images without and with the best effects. cautions: sentences on

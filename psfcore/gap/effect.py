@@ -38,8 +38,8 @@ class EffectParameter:
 class Change:
     """The change of the images by one unit of one parameter: change(n, images) is the change of image n, [y, x] in DN/s.
 
-    images: for the discs, the model images of the transit, each with its own brightness; for the unocculted field, the mean
-    image of the pointing, for each image. unocculted: whether the change differs between images of one pointing, so that
+    images: one image [y, x] for each image of the transit. To compute the change of the discs, these are the model images.
+    To compute the change of the unocculted field, they are the mean images of the pointings. unocculted: whether the change differs between images of one pointing, so that
     the unocculted field shows it. disc: whether the discs show the change. numbers: how many numbers were measured in the
     unocculted field to build this change; each of them costs the effect as much as a parameter.
     """

@@ -366,7 +366,11 @@ class _Pointing:
     errors: Planes
 
     def part(self, columns: Sequence[int], effects: Sequence[tuple[list[int], Vector]]) -> _Part:
-        """Normal equations of some columns. effects: the columns of each effect, and the values that set its template error."""
+        """The normal equations of these columns.
+
+        effects: for each effect, its columns and the values of its parameters. The template error is proportional to
+        these values.
+        """
         images, blocks = self.level.shape
         changes = [TEMPLATE_ERROR * (self.errors[..., group] @ values) for group, values in effects]
         changes = [change for change in changes if change.any()]

@@ -171,8 +171,8 @@ def _by_effect(effects: Sequence[Effect], values: Vector) -> dict[str, tuple[flo
 class _Remaining:
     """A fit to images from which a part of the effects was subtracted.
 
-    model: the linear model at this fit. left: the linear fit of what remains of the effects. theta: the parameters,
-    subtracted and remaining parts added. start: the coordinates of the PSF for the next round, as in `_stepped`.
+    model: the linear model at this fit. left: the linear fit of the remaining part of the effects. theta: the
+    parameters: the subtracted part plus the remaining part. start: the coordinates of the PSF for the next round, as in `_stepped`.
     """
 
     model: LinearModel

@@ -420,7 +420,7 @@ def _odds_of(
 ) -> Callable[[Vector], Vector]:
     """A function of the strength: Eq. (2) with the 1 - FOUND quantile of q_h.
 
-    change: the columns of N of the parameters that act: one column for a fixed change, several for a random field.
+    change: the columns of N that belong to the true effect: one column for a fixed change, several for a random field.
     gained: the gain of ln L by a decrease of chi2.
     """
     inner = normal[np.ix_(hypothesis.columns, hypothesis.columns)]

@@ -74,7 +74,9 @@ class _Part:
 
 @lru_cache(maxsize=MOST_KEPT)
 def read_stored(path: Path, figures_at: str) -> StoredPage:
-    """The stored page of a report. figures_at: the address of its figures, without their number. Raises OSError.
+    """The stored page of a report. Raises OSError.
+
+    figures_at: the beginning of the addresses of the figures; "/" and the number of the figure follow.
 
     A file of the store never changes, so its content can be kept in memory.
     """
