@@ -1,6 +1,7 @@
 """Lineage of a product or a PSF: inputs, parameters, versions and jobs, back to the uploads.
 
-The lineage of a product or PSF was recorded when it was made. A parent that was deleted later is still listed, by its id.
+The lineage of a product or PSF was recorded when it was made. A parent that was deleted later is still listed, by its
+id.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class Made(BaseModel):
 
 
 class Ancestor(BaseModel):
-    """A product, PSF, report, image, transit or instrument file, and its parents: the entries from which it was made."""
+    """A product, PSF, report, image, transit or instrument file, and its parents: the entries from which it was
+    made."""
 
     type: Type
     id: str = Field(description="id; for an upload or an instrument file the SHA-256 of its bytes")

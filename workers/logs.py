@@ -29,7 +29,8 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
 def bind(**about: str) -> None:
-    """Add ``request``, ``job`` or ``owner`` to all later log lines of this thread or asynchronous task (`contextvars`)."""
+    """Add ``request``, ``job`` or ``owner`` to all later log lines of this thread or asynchronous task
+    (`contextvars`)."""
     _ABOUT.set({**_ABOUT.get(), **about})
 
 

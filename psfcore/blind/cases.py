@@ -181,7 +181,8 @@ def _in_turn(seed: int, count: int, names: Sequence[str], stream: int) -> str:
 
 
 def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:
-    """The default transit with random changes: it may be upside down, and tracks, brightness and noise are different."""
+    """The default transit with random changes: it may be upside down, and tracks, brightness and noise are
+    different."""
     plan = default_plan(
         images,
         size_px,

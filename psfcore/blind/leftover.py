@@ -120,7 +120,8 @@ class LinearEstimator:
         )
 
     def _column(self, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
-        """One column of A: the direct change of the dark pixels, minus the change that the deconvolved scene causes in them."""
+        """One column of A: the direct change of the dark pixels, minus the change that the deconvolved scene causes in
+        them."""
         changed = slope.convolve(lit)
         scene = _blanked(self._optics.invert_once(changed), dark)
         return pick(changed, dark) - pick(self._optics.convolve(scene), dark)

@@ -159,7 +159,8 @@ class Engine:
         self.run(work, self.row_blocks)
 
     def columns(self, *, adjoint: bool) -> None:
-        """Transform the columns, multiply by the transfer function, and transform back. adjoint: multiply by its conjugate."""
+        """Transform the columns, multiply by the transfer function, and transform back. adjoint: multiply by its
+        conjugate."""
         self.multiply_columns(self.transfer, conjugate=adjoint)
 
     def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:

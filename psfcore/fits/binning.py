@@ -14,7 +14,8 @@ from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
 
 
 class Sampled(Protocol):
-    """The properties of a PSF that are compared with an image header, to decide whether PSF and image have matching pixels.
+    """The properties of a PSF that are compared with an image header, to decide whether PSF and image have matching
+    pixels.
 
     `psfcore.psf.Psf` has these properties.
     """

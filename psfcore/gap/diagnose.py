@@ -131,12 +131,12 @@ def diagnose(
 ) -> Diagnosis:
     """Fit a transit and diagnose the residuals of the fit.
 
-    start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit: whether to
-    make full refits with the named effects in the model. seed: seeds the simulation and the bootstrap of the intervals.
-    solution: an existing solution of this transit, shape and start, or a function that makes it; None: `invert` makes it.
-    If the noise measured in the images differs from the noise that the transit states, the solution must be made with
-    the measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError
-    "bad-library" if the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
+    start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit:
+    whether to make full refits with the named effects in the model. seed: seeds the simulation and the bootstrap of
+    the intervals. solution: an existing solution of this transit, shape and start, or a function that makes it; None:
+    `invert` makes it. If the noise measured in the images differs from the noise that the transit states, the solution
+    must be made with the measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of` and `invert`,
+    DataError "bad-library" if the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
     """
     if not library:
         raise DataError("bad-library", "expected a library with at least one effect; got none: add an effect")
@@ -292,8 +292,8 @@ def _shrinking(
     refits: Sequence[Corrected],
     rng: np.random.Generator,
 ) -> tuple[dict[str, Shrinking], HeldOut | None, HeldOut | None]:
-    """Three results: the closure of every fit; the held-out residuals without any effect; the held-out residuals with the
-    effects of the best hypothesis.
+    """Three results: the closure of every fit; the held-out residuals without any effect; the held-out residuals with
+    the effects of the best hypothesis.
 
     If effects have a full refit, their closure is computed with the model of that refit.
     """

@@ -38,10 +38,11 @@ class EffectParameter:
 class Change:
     """The change of the images by one unit of one parameter: change(n, images) is the change of image n, [y, x] in DN/s.
 
-    images: one image [y, x] for each image of the transit. To compute the change of the discs, these are the model images.
-    To compute the change of the unocculted field, they are the mean images of the pointings. unocculted: whether the change differs between images of one pointing, so that
-    the unocculted field shows it. disc: whether the discs show the change. numbers: how many numbers were measured in the
-    unocculted field to build this change; each of them costs the effect as much as a parameter.
+    images: one image [y, x] for each image of the transit. To compute the change of the discs, these are the model
+    images. To compute the change of the unocculted field, they are the mean images of the pointings. unocculted:
+    whether the change differs between images of one pointing, so that the unocculted field shows it. disc: whether the
+    discs show the change. numbers: how many numbers were measured in the unocculted field to build this change; each
+    of them costs the effect as much as a parameter.
     """
 
     change: Callable[[int, Sequence[Field]], Field]

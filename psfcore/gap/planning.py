@@ -64,7 +64,8 @@ class Planned:
 
     @property
     def pointings(self) -> list[dict[str, Any]]:
-        """For each pointing: its number, its view (the part of the Sun), the number of images, and the exposure times, s."""
+        """For each pointing: its number, its view (the part of the Sun), the number of images, and the exposure times,
+        s."""
         rows = []
         for pointing in self.plan.pointings:
             shots = [shot for shot in self.plan.shots if shot.pointing == pointing]

@@ -108,7 +108,8 @@ def _draw_weights(axes: Any, fit: TransitFit) -> None:
 
 
 def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
-    """Three arrays: distance (px), mean weight in the ring at this distance, standard error of the logarithm of the weight.
+    """Three arrays: distance (px), mean weight in the ring at this distance, standard error of the logarithm of the
+    weight.
 
     The error is computed to first order from the covariance of the fit.
     """

@@ -249,7 +249,8 @@ def _through(kernel: Kernel, patch: Plane) -> Plane:
 
 
 def _window(sky: TrueSky, index: int) -> Window:
-    """The part of the field around the occulter, as slices. It contains all pixels from which the position is measured."""
+    """The part of the field around the occulter, as slices. It contains all pixels from which the position is
+    measured."""
     place, size = sky.plan.place(index), sky.plan.size_px
     half = int(np.ceil(place.radius_px + PLACE_MARGIN_PX)) + 1
     row, column = int(np.rint(place.y_px)), int(np.rint(place.x_px))

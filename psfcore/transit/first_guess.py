@@ -83,9 +83,9 @@ class PointingGuess:
 class FirstGuess:
     """The first guess from all images, in the order of time, and from all pointings.
 
-    best_pointing: the most homogeneous pointing. share, share_spread: mean and standard deviation of the ratio over the
-    images of this pointing and the three estimators. radius_px: the mean radius of the disc in these images. The ratio is
-    1 - encircled energy at radius_px, as a fraction.
+    best_pointing: the most homogeneous pointing. share, share_spread: mean and standard deviation of the ratios of all
+    images of this pointing and all three estimators. radius_px: the mean radius of the disc in these images. The ratio
+    is 1 - encircled energy at radius_px, as a fraction.
     """
 
     frames: tuple[FrameGuess, ...]

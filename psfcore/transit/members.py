@@ -255,7 +255,8 @@ class _TarInput:
     backwards is refused, because a .tar.gz would be decompressed again from its start. tarfile does not seek backwards
     if members are read in order.
 
-    size: the size of a file in which data can be skipped by seeking. None: skipped data is read, and counted too.
+    size: the size of the file, if data can be skipped by seeking. None: data cannot be skipped by seeking, so skipped
+    data is also read and counted.
     """
 
     def __init__(self, file: BinaryIO, gate: Gate, size: int | None = None) -> None:

@@ -249,7 +249,7 @@ class _SimulatedDisc:
 
 @dataclass(frozen=True)
 class _Solved:
-    """The minimum of Eq. (2). at: x, y, scale and level. normal: the inverse covariance of these four."""
+    """The minimum of Eq. (2). at: x, y, scale and level. normal: the inverse of the covariance of these values."""
 
     at: NDArray[np.float64]
     normal: NDArray[np.float64]

@@ -65,7 +65,8 @@ class NewKey(BaseModel):
         return self
 
     def end(self, now: float) -> float | None:
-        """The time at which the key expires, seconds since 1970; None if the request does not limit the life of the key."""
+        """The time at which the key expires, seconds since 1970; None if the request does not limit the life of the
+        key."""
         return self.expires_at if self.lasts_days is None else now + self.lasts_days * DAY_S
 
 

@@ -215,7 +215,8 @@ def _products_in(folder: Path) -> _Found:
 
 
 def _patiently(ask: Callable[[], _Answer]) -> _Answer:
-    """The answer to a request. The request is repeated while the service is busy or the caller's rate limit is used up."""
+    """The answer to a request. The request is repeated while the service is busy or the caller's rate limit is used
+    up."""
     give_up_at = time.monotonic() + PATIENCE_S
     while True:
         try:

@@ -30,7 +30,8 @@ class Pace:
 
 @dataclass(frozen=True)
 class Reason:
-    """The failed images of a run with the same error code. images: their number. example: the first of them in the run."""
+    """The failed images of a run with the same error code. images: their number. example: the first of them in the
+    run."""
 
     code: str
     images: int
@@ -58,8 +59,8 @@ class BulkProgress:
     def pace(self, bulk: BulkRow) -> Pace:
         """The speed of a run: the images that workers process now, and the images that ended per hour.
 
-        The rate is computed from the last ``PACE_S`` seconds, or from the time since the run was last started or resumed
-        if that is shorter; and from at most the last ``PACE_IMAGES`` images.
+        The rate is computed from the last ``PACE_S`` seconds, or from the time since the run was last started or
+        resumed if that is shorter; and from at most the last ``PACE_IMAGES`` images.
         """
         until = bulk.ended_at or time.time()
         since = max(bulk.running_since or bulk.created_at, until - PACE_S)
@@ -97,7 +98,8 @@ class BulkProgress:
             return session.scalars(query.order_by(BulkItemRow.position).limit(limit)).all()
 
     def reasons(self, bulk_id: str) -> list[Reason]:
-        """The errors of the first ``MOST_EXPLAINED`` failed images, grouped by error code; the most frequent code first."""
+        """The errors of the first ``MOST_EXPLAINED`` failed images, grouped by error code; the most frequent code
+        first."""
         failed = (BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.FAILED)
         code = BulkItemRow.error["code"].as_string().label("code")
         # PostgreSQL groups by a column of a subquery, but not by an expression with a parameter.

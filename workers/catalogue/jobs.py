@@ -98,7 +98,8 @@ class Jobs:
         raise RuntimeError(f"job for request {request_key} neither inserted nor found")
 
     def _shared(self, owner: str, request_key: str) -> tuple[str, JobRow | None]:
-        """Find the queued, executing or completed job that this request can share; returns the key and the row of that job.
+        """Find the queued, executing or completed job that this request can share; returns the key and the row of that
+        job.
 
         If there is no such job, returns the key for a new job, and None instead of a job. If an identical job cannot
         be shared, the key of the new job is computed from the id of that job. Later identical requests then find the

@@ -164,7 +164,8 @@ class _Bases:
     slope_y: NDArray[np.float64]
 
     def stamps(self, source: Plane, *, slope: str = "") -> NDArray[np.float64]:
-        """The values of S on the box of each order [order, y, x]. slope: "x" or "y" for the derivative along this axis."""
+        """The values of S on the box of each order [order, y, x]. slope: "x" or "y" for the derivative along this
+        axis."""
         along_x = self.slope_x if slope == "x" else self.x
         along_y = self.slope_y if slope == "y" else self.y
         return np.asarray(along_y @ source @ along_x.transpose(0, 2, 1))

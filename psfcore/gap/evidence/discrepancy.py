@@ -154,7 +154,8 @@ def _of_discs(evidence: Evidence) -> dict[str, list[Matrix]]:
 
 
 def _of_blocks(evidence: Evidence) -> dict[str, list[Matrix]]:
-    """The changes of the unocculted blocks for each order (a property such as time or exposure) and for each block alone.
+    """The changes of the unocculted blocks for each order (a property such as time or exposure) and for each block
+    alone.
 
     An order has one array (images, blocks), DN/s, for each coefficient.
     """
@@ -184,7 +185,8 @@ def _of_blocks(evidence: Evidence) -> dict[str, list[Matrix]]:
 
 
 def _that_vary(found: dict[str, list[Matrix]]) -> dict[str, list[Matrix]]:
-    """Remove the arrays that are zero everywhere, because the data do not vary along them, and orders without any array."""
+    """Remove the arrays that are zero everywhere, because the data do not vary along them, and orders without any
+    array."""
     kept = {name: [plane for plane in planes if plane.any()] for name, planes in found.items()}
     return {name: planes for name, planes in kept.items() if planes}
 

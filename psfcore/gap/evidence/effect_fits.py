@@ -115,9 +115,10 @@ def _p_value(model: LinearModel, columns: Sequence[int], gain: float, trials: fl
 
 
 def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
-    """The column of a fit that gains least, among the columns that gain less than their measured numbers cost.
+    """Find the columns whose gain is smaller than the cost of their measured numbers. Return the one with the smallest
+    gain.
 
-    None if every column gains at least as much as its measured numbers cost.
+    None if there is no such column.
     """
     columns = step.columns[len(model.evidence.base) :]
     idle = {}

@@ -161,8 +161,8 @@ def gather(
 def _changes(
     view: View, library: Sequence[Effect]
 ) -> tuple[list[Change], dict[str, tuple[int, ...]], dict[str, str]]:
-    """Three results: the changes by all testable effects, in one list; for each of these effects, the indices of its changes
-    in the list; for each other effect, the reason why it cannot be tested."""
+    """Three results: the changes by all testable effects, in one list; for each of these effects, the indices of its
+    changes in the list; for each other effect, the reason why it cannot be tested."""
     changes: list[Change] = []
     columns: dict[str, tuple[int, ...]] = {}
     untestable: dict[str, str] = {}
@@ -196,7 +196,8 @@ def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
 
 
 class _Distance:
-    """The mean distance r from which light scatters into a disc, weighted with the light that comes from each distance."""
+    """The mean distance r from which light scatters into a disc, weighted with the light that comes from each
+    distance."""
 
     def __init__(self, view: View) -> None:
         kernel, solution = view.kernel, view.solution

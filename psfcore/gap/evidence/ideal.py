@@ -179,7 +179,8 @@ def _at_places_of(clean: Solution, solution: Solution) -> Solution:
 
 
 def _sampling_residuals(evidence: Evidence, solution: Solution, clean: Solution) -> list[Vector]:
-    """For every disc: the residuals of the image without the effect, in the same cells as with the effect (cells,), DN/s."""
+    """For every disc: the residuals of the image without the effect, in the same cells as with the effect (cells,),
+    DN/s."""
     sky = clean.sky.copy()
     sky.dark = solution.sky.dark
     same_pixels = replace(clean, sky=sky)

@@ -230,7 +230,8 @@ class Likelihood:
         return size, fixed
 
     def _prior(self, columns: Sequence[int], scale: float) -> Vector:
-        """1 / variance of the prior, for the coordinates of the PSF and then for these columns. 0: no prior, as for the PSF."""
+        """1 / variance of the prior, for the coordinates of the PSF and then for these columns. 0: no prior, as for
+        the PSF."""
         size, fixed = (one[list(columns)] for one in self._widths)
         return np.append(np.zeros(len(self._base)), (size * np.where(fixed, 1.0, scale)) ** -2.0)
 
@@ -399,7 +400,8 @@ class _Pointing:
 
 
 def _pointings(model: LinearModel, errors: Planes) -> list[_Pointing]:
-    """For every pointing: the blocks that at least LEAST_IMAGES images show; pointings without such blocks are left out."""
+    """For every pointing: the blocks that at least LEAST_IMAGES images show; pointings without such blocks are left
+    out."""
     blocks = model.evidence.unocculted
     found = []
     for pointing in np.unique(blocks.pointing):

@@ -159,14 +159,16 @@ class LinearModel:
         return frozenset(column for name in fields for column in self.evidence.columns[name])
 
     def pull_of_prior(self, step: Step, taken_out: Vector) -> Vector:
-        """How much smaller the fitted values become if the prior also applies to the amounts that were subtracted before the fit.
+        """How much smaller the fitted values become if the prior also applies to the amounts that were subtracted
+        before the fit.
 
         taken_out: the subtracted amounts, for each column of the fit.
         """
         return np.asarray(step.covariance @ (self._prior[list(step.columns)] * taken_out))
 
     def learned(self, columns: Sequence[int]) -> Vector:
-        """l of Eq. (3) for the columns of random fields in `columns`. The other columns of `columns` and the PSF are refitted."""
+        """l of Eq. (3) for the columns of random fields in `columns`. The other columns of `columns` and the PSF are
+        refitted."""
         field = [column for column in columns if column in self.of_fields]
         if not field:
             return np.zeros(0)

@@ -83,7 +83,8 @@ def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
 
 
 def _held(name: str, changes: Callable[[View], Sequence[Change]]) -> Effect:
-    """The effect of this name, without its search. changes: the changes for the result of the search, which stays fixed."""
+    """The effect of this name, without its search. changes: the changes for the result of the search, which stays
+    fixed."""
     sought = next(effect for effect in EFFECTS if effect.name == name)
     return replace(sought, changes=changes, held=None)
 

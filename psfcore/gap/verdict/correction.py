@@ -172,7 +172,8 @@ class _Remaining:
     """A fit to images from which a part of the effects was subtracted.
 
     model: the linear model at this fit. left: the linear fit of the remaining part of the effects. theta: the
-    parameters: the subtracted part plus the remaining part. start: the coordinates of the PSF for the next round, as in `_stepped`.
+    parameters: the subtracted part plus the remaining part. start: the coordinates of the PSF for the next round, as
+    in `_stepped`.
     """
 
     model: LinearModel

@@ -251,7 +251,8 @@ class _Limits:
         ]
 
     def _hypothesis(self, effect: Effect, kept: Sequence[int] | None = None) -> _Hypothesis:
-        """The hypothesis that an effect acts alone. kept: indices of the parameters that the hypothesis contains; None: all."""
+        """The hypothesis that an effect acts alone. kept: indices of the parameters that the hypothesis contains;
+        None: all."""
         columns = self._columns[effect.name]
         part = np.arange(len(columns)) if kept is None else np.array(kept)
         likely = np.array([effect.parameters[k].likely for k in part])
@@ -339,8 +340,8 @@ class _Limits:
     def _excluded_rms(self, effect: Effect, likely: Vector) -> float | None:
         """The 95 % quantile of the standard deviation t of the coefficients of a random field, for a constant prior of t.
 
-        ln L(t) is the sum of (z^2 t^2 l / (1 + t^2 l) - ln(1 + t^2 l)) / 2. l are the eigenvalues of S N S for t = 1. z are
-        the scores in units of their noise without the field.
+        ln L(t) is the sum of (z^2 t^2 l / (1 + t^2 l) - ln(1 + t^2 l)) / 2. l are the eigenvalues of S N S for t = 1.
+        z are the scores in units of their noise without the field.
         """
         columns = self._columns[effect.name]
         found, covariance = self._likelihood.fitted(columns, np.zeros(len(columns)).tolist())

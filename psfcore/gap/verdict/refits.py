@@ -31,7 +31,8 @@ class Refits:
         self.failures: list[str] = []
 
     def weighed(self, names: Names) -> Mapping[Names, Weighed] | None:
-        """The evidence of hypotheses, computed at the refit of `names` (`posterior.at_refit`); None if the refit failed."""
+        """The evidence of hypotheses, computed at the refit of `names` (`posterior.at_refit`); None if the refit
+        failed."""
         made = self._fit(names)
         if made is None:
             return None

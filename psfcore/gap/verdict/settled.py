@@ -27,7 +27,8 @@ Refit = Callable[[Names], "Mapping[Names, Weighed] | None"]
 
 
 def settled_posterior(model: LinearModel, refit: Refit | None) -> tuple[Posterior, tuple[Names, ...]]:
-    """Two results: the posterior after the full refits, and the hypotheses whose refit failed. The posterior excludes these.
+    """Two results: the posterior after the full refits, and the hypotheses whose refit failed. The posterior excludes
+    these.
 
     refit: makes the full refit of a hypothesis. If it is None, the posterior is that of the linear model.
     """

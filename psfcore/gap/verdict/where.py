@@ -61,10 +61,11 @@ def where(
 ) -> tuple[Axis, ...]:
     """All axes, the strongest first. Significant axes come before the others; then the share decides.
 
-    favoured: the axes of the best effect. They come first if they explain at least the fraction AS_GOOD of what the best axis
-    explains, because more data than the position on the track identified this effect. explained: the fit of an effect that explains the gap.
-    If `explained` is given, the shares are computed from the part of the residuals that this effect explains. This part is
-    computed from the fitted model, so it does not contain the pixel noise of the residuals.
+    favoured: the axes of the best effect. They come first if they explain at least the fraction AS_GOOD of what the
+    best axis explains, because more data than the position on the track identified this effect. explained: the fit of
+    an effect that explains the gap. If `explained` is given, the shares are computed from the part of the residuals
+    that this effect explains. This part is computed from the fitted model, so it does not contain the pixel noise of
+    the residuals.
     """
     designs = _designs(model.evidence)
     cells, unocculted = _of_cells(model, designs), _of_unocculted(model, designs)

@@ -63,13 +63,12 @@ LEAST_OF_MEAN = 0.5
 class Choices:
     """The four biases of the published fit. True: as published. False: corrected.
 
-    weighed_by_observed: each equation is divided by its own noisy intensity; the fitted light in faint discs is then too low.
-    Corrected: each equation is divided by the noise expected at the disc's mean.
-    added: the scatter kernel is added to the diffraction PSF, Eq. (1) of `equations`. Corrected: kernel and diffraction
-    PSF are convolved, so the ring sums are computed from the diffracted scene. counted_on_array: the unscattered light
-    is 1 minus the scatter summed over the array of the diffraction PSF. Corrected: the sum covers the full reach.
-    whole_disc_blanked: all pixels whose centres lie within the radius are set to zero. Corrected: only the fully dark
-    pixels are set to zero.
+    weighed_by_observed: each equation is divided by its own noisy intensity; the fitted light in faint discs is then
+    too low. Corrected: each equation is divided by the noise expected at the disc's mean. added: the scatter kernel is
+    added to the diffraction PSF, Eq. (1) of `equations`. Corrected: kernel and diffraction PSF are convolved, so the
+    ring sums are computed from the diffracted scene. counted_on_array: the unscattered light is 1 minus the scatter
+    summed over the array of the diffraction PSF. Corrected: the sum covers the full reach. whole_disc_blanked: all
+    pixels whose centres lie within the radius are set to zero. Corrected: only the fully dark pixels are set to zero.
     """
 
     weighed_by_observed: bool = True

@@ -177,7 +177,8 @@ class _Members:
     def _array(
         self, name: str, dtype: np.dtype[Any], shape: tuple[int | None, ...], most: int | None = None
     ) -> NDArray[Any]:
-        """Read an array, and check its type and shape. None in `shape` allows any length, but at most `most` bytes in all."""
+        """Read an array, and check its type and shape. None in `shape` allows any length, but at most `most` bytes in
+        all."""
         sizes = [n for n in shape if n is not None]
         limit = int(np.prod(sizes)) * dtype.itemsize if most is None else most
         with self._open(f"{name}.npy", limit + _HEADER_BYTES) as member:

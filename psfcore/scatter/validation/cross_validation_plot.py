@@ -120,7 +120,7 @@ def draw_curve(axes: Axes, bands: Bands) -> None:
 
 
 def draw_totals(axes: Axes, bands: Bands) -> None:
-    """Draw a histogram of the total of scatter (percent of all light) of all fits."""
+    """Draw a histogram of the scatter totals (percent of all light) of all fits."""
     axes.hist(100 * bands.totals, bins=min(25, max(5, bands.totals.size // 4)), color=FORMULA)
     axes.set(
         xlabel="Diffusely scattered light (%)", ylabel="Number of fits", title="Scattered light, all fits"

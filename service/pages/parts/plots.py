@@ -108,8 +108,8 @@ def shown_radii(radii: Sequence[float], least: float = 0.0) -> list[int]:
 def light_beyond_plot(curves: Mapping[str, Mapping[str, Any]], title: str = "Light beyond a radius") -> Plot:
     """1 - encircled energy of components or PSFs, in percent.
 
-    curves: the curves by label. Each curve has ``radii_px``, ``pct`` and ``sigma`` (a list, or None). All curves have the
-    same radii.
+    curves: the curves by label. Each curve has ``radii_px``, ``pct`` and ``sigma`` (a list, or None). All curves have
+    the same radii.
     """
     radii = next(iter(curves.values()))["radii_px"]
     places = shown_radii(radii)

@@ -171,7 +171,8 @@ class _Reader(HTMLParser):
         )
 
     def _picture(self, given: dict[str, str]) -> Markup:
-        """An image whose file is served from an address; nothing for an image that is not inside the page."""
+        """An `<img>` element with the address of a figure of the page. Empty if the stored page does not contain the
+        image data."""
         source = given.get("src", "")
         if not source.startswith(PICTURE):
             return Markup("")
