@@ -133,7 +133,8 @@ def _provenance(row: PsfRow) -> dict[str, Any]:
 
 
 class _Walk:
-    """One walk through a lineage. A thing that occurs twice is listed twice, but its parents are listed only once."""
+    """One walk through a lineage. If an entry occurs twice, it is listed twice, but its parents are listed only
+    once."""
 
     def __init__(self, catalogue: Catalogue, owner: str) -> None:
         self._catalogue, self._owner = catalogue, owner

@@ -298,7 +298,7 @@ def parse_instrument(text: str, label: str) -> Instrument:
 
 
 def _said(error: BadValues) -> str:
-    """The first fault in one line, and the number of the others."""
+    """The first fault in one line, and how many further faults there are."""
     first, more = error.faults[0], len(error.faults) - 1
     key = ".".join(map(str, first.key)) or "file"
     # If the fault concerns a whole table, its text already says what was given. A missing key has no value.

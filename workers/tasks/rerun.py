@@ -34,7 +34,7 @@ Thing = ProductRow | PsfRow
 
 
 class _RerunCatalogue(Catalogue):
-    """The catalogue with some rows hidden, as if they had not been made yet.
+    """The catalogue without the rows in `hidden`, so that a task makes them again.
 
     Added rows go into the list ``made``, not into the database.
     """

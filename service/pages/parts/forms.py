@@ -29,7 +29,7 @@ def text(form: Sent, name: str) -> str:
 
 
 def filled(form: Sent, *names: str) -> dict[str, str]:
-    """The fields with a text; the others keep their defaults."""
+    """The fields that are not empty. Empty fields are left out, so that they get their defaults."""
     return {name: text(form, name) for name in names if text(form, name)}
 
 
