@@ -49,7 +49,7 @@ _PSFS = sa.table(
 
 
 def upgrade() -> None:
-    """Add the new columns, tables and indexes, and fill them from the existing rows."""
+    """Add the new columns, tables and indexes. Fill in channel, kind, line and status of the existing PSFs."""
     for table, replaced in REPLACED.items():
         for column in replaced:
             op.drop_index(f"ix_{table}_{column}", table)
@@ -143,7 +143,7 @@ def _new_tables() -> None:
 
 
 def _fill(connection: sa.Connection) -> None:
-    """Fill in channel, kind and line of the existing PSFs. Rows are read in batches, because their details are long."""
+    """Fill in channel, kind, line and status of the existing PSFs. Rows are read in batches, because their details are long."""
     key = sa.tuple_(_PSFS.c.owner, _PSFS.c.id)
     columns = (_PSFS.c.owner, _PSFS.c.id, _PSFS.c.instrument, _PSFS.c.origin, _PSFS.c.details)
     after = ("", "")
