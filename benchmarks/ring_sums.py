@@ -1,10 +1,10 @@
 """`python -m benchmarks.ring_sums [--quick]`: time three methods for sums of images over shells, as ratios to 1 F.
 
-There are 51,660 targets: 410 about each of 126 positions along a transit in 2048 px images. Sums are over the 50
-published shells, over the same shells divided into 12 sectors, and over fine shells. 1 F is defined in
-`benchmarks.deconvolution`. A plain look-up and one convolution per shell are too slow for all targets. Both methods are
-timed on a part of the targets, and the times are scaled to all targets. On that part, their sums are compared with the
-running sums.
+The sums are computed about 51,660 target pixels: the 410 pixels nearest to each of 126 positions of the occulter along
+a transit, in images of 2048 px. Sums are over the 50 published shells, over the same shells divided into 12 sectors,
+and over fine shells. 1 F is defined in `benchmarks.deconvolution`. Two of the methods, the plain look-up and one
+convolution for each shell, are too slow for all targets. They are timed on a part of the targets, and the times are
+scaled to all targets. On that part, their sums are compared with those of the third method, the running sums.
 """
 
 from __future__ import annotations

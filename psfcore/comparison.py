@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 class Comparison:
     """The differences between two arrays.
 
-    same: equal bit for bit. largest_relative: the largest difference divided by the largest absolute value of the
-    first array; None if the shapes differ, or if one array is finite where the other is not.
+    same: whether the arrays are equal bit for bit. largest_relative: the largest difference divided by the largest
+    absolute value of the first array; None if the shapes differ, or if one array is finite where the other is not.
     values_that_differ: number of differing values; None if the shapes differ. sha256: hashes of the two arrays, see
     ``array_sha256``.
     """

@@ -357,7 +357,7 @@ def _says_more(record: logging.LogRecord) -> bool:
 def local_service(*, gap_effects: str = "") -> Iterator[LocalService]:
     """A local service on a temporary folder, with the user's cache of built PSFs.
 
-    gap_effects: as the setting of this name.
+    gap_effects: files and modules that add effects to the library, as in the setting HELIOPSF_GAP_EFFECTS.
     """
     with TemporaryDirectory(prefix="heliopsf-") as folder:
         service = LocalService(Settings.apart(Path(folder), gap_effects=gap_effects), psf_cache())

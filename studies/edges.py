@@ -101,7 +101,10 @@ def _image(pixels: NDArray[np.float64]) -> Image:
 def main() -> None:
     seeds = tuple(map(int, sys.argv[1:])) or SEEDS
     psf, cache = study_psf(), EngineCache(8)
-    print(f"{'method':<30}{'edges':<12}{'seed':>5}   bias, % at 0-2, 2-20, 20-64 px    deviation, %")
+    print(
+        f"{'method':<30}{'edges':<12}{'seed':>5}   "
+        "bias, % (0-2, 2-20, 20-64 px from the edge)    deviation, % (same bands)"
+    )
     for seed in seeds:
         for row in rows(seed, psf, cache, methods=tuple(method_names()), ways=EDGES):
             figures = [" ".join(f"{v:8.2f}" for v in part) for part in (row.bias_pct, row.deviation_pct)]

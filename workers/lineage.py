@@ -1,6 +1,7 @@
 """Lineage of a product or a PSF: inputs, parameters, versions and jobs, back to the uploads.
 
-The lineage of a thing was recorded when the thing was made. A parent that was deleted later is still listed, by its id.
+The lineage of a product or PSF was recorded when it was made. A parent that was deleted later is still listed, by its
+id.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Type = Literal["product", "psf", "image", "transit", "report", "instrument-file"
 
 
 class Made(BaseModel):
-    """How a thing was made. A field is null if it was not recorded at that time."""
+    """How a product, PSF, ... was made. A field is null if it was not recorded when the job ran."""
 
     created_at: float
     name: str | None = None
@@ -39,7 +40,8 @@ class Made(BaseModel):
 
 
 class Ancestor(BaseModel):
-    """A thing, and the things that it was made from (its parents)."""
+    """A product, PSF, report, image, transit or instrument file, and its parents: the entries from which it was
+    made."""
 
     type: Type
     id: str = Field(description="id; for an upload or an instrument file the SHA-256 of its bytes")
@@ -55,12 +57,12 @@ class Ancestor(BaseModel):
 
 
 def lineage(catalogue: Catalogue, row: ProductRow | PsfRow) -> Ancestor:
-    """A thing and its ancestors: at most MOST_DEEP generations and MOST_THINGS things."""
+    """A product or PSF and its ancestors: at most MOST_DEEP generations and MOST_THINGS entries."""
     return _Walk(catalogue, row.owner).of_row(row, 0)
 
 
 def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
-    """The parameters of the job that made a thing, so that this job can run again.
+    """The parameters of the job that made a product or PSF; with them, the job can run again.
 
     Raises ``DataError`` "not-made-here" for an upload, "parameters-unknown" if the parameters were not recorded, and
     "parameters-outdated" if this version of the software does not accept them.
@@ -107,7 +109,7 @@ def _job_of(row: ProductRow | PsfRow, parameters: dict[str, Any]) -> ResolvedRer
 
 
 def _origin(row: ProductRow | PsfRow) -> str:
-    """The origin of a thing, as ``workers.contract.kinds`` names it."""
+    """The origin of a product or PSF, as ``workers.contract.kinds`` names it."""
     if isinstance(row, ProductRow):
         return "deconvolved"
     if row.origin == "built":
@@ -131,7 +133,8 @@ def _provenance(row: PsfRow) -> dict[str, Any]:
 
 
 class _Walk:
-    """One walk through a lineage. A thing that occurs twice is listed twice, but its parents are listed only once."""
+    """One walk through a lineage. If an entry occurs twice, it is listed twice, but its parents are listed only
+    once."""
 
     def __init__(self, catalogue: Catalogue, owner: str) -> None:
         self._catalogue, self._owner = catalogue, owner
@@ -169,7 +172,7 @@ class _Walk:
 
 
 def _parents(row: ProductRow | PsfRow) -> list[tuple[Type, str]]:
-    """Type and id of each thing that a thing was made from."""
+    """Type and id of each input from which a product or PSF was made."""
     if isinstance(row, ProductRow):
         return [("image", row.image_id), ("psf", row.psf_id)]
     provenance = _provenance(row)

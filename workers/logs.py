@@ -29,13 +29,14 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
 def bind(**about: str) -> None:
-    """Add ``request``, ``job`` or ``owner`` to all further lines of this context."""
+    """Add ``request``, ``job`` or ``owner`` to all later log lines of this thread or asynchronous task
+    (`contextvars`)."""
     _ABOUT.set({**_ABOUT.get(), **about})
 
 
 @contextmanager
 def bound(**about: str) -> Iterator[None]:
-    """Add these values to all lines that are written in the ``with`` block."""
+    """Add these values to all log lines that are written in the ``with`` block."""
     token = _ABOUT.set({**_ABOUT.get(), **about})
     try:
         yield

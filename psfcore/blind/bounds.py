@@ -92,7 +92,11 @@ def known(ideal: dict[str, Any], required: Sequence[str], true: Sequence[str], *
 
 
 def _shown(left: dict[Effects, tuple[float, float]], required: Effects, true: Effects, among: int) -> Effects:
-    """The true effects that count: the required effects, and also the other true effects if the data show them."""
+    """The true effects that the ideal observer can find.
+
+    They are all true effects if the observer can exclude, with a probability of at least 0.5, that only the required
+    effects act. Otherwise they are only the required effects.
+    """
     if required == true or required not in left or true not in left:
         return required
     gain = sum(left[required]) - sum(left[true])
@@ -105,7 +109,8 @@ def excluded(lam: float, among: int) -> float:
 
 
 def best_of(lams: Sequence[float]) -> float:
-    """Eq. (3): the probability that the truth leaves less chi2 than every rival. 1 without rivals."""
+    """Eq. (3): the probability that the chi2 that the truth leaves is smaller than that of every rival; 1 without
+    rivals."""
     if not lams:
         return 1.0
     above = _U[:, None] + np.sqrt(np.asarray(lams, dtype=np.float64) / 2)

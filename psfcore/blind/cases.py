@@ -59,8 +59,8 @@ class Case:
 
     kind: one of KINDS. law, glass: the true scatter and the known part of the PSF. effects: the effects, at their
     nominal strengths. target_pct: the residual that each effect alone should leave in the discs after a refit, percent;
-    None: the strength of the effect is already set. headroom: the saturation level divided by the brightest pixel;
-    None: no saturation.
+    None: the strength of the effect is already set. headroom: the saturation level divided by the value of the
+    brightest pixel; None: no pixel saturates.
     """
 
     number: int
@@ -97,8 +97,9 @@ def draw_case(
 ) -> Case:
     """Case `number` (from 0) of a set.
 
-    only: names of effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction: half
-    of the cases have the diffraction PSF of the instrument, and the others a synthetic one; False: all have a synthetic one.
+    only: names of effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction:
+    True: half of the cases have the diffraction PSF of the instrument, and half a synthetic diffraction PSF. False: all
+    cases have a synthetic diffraction PSF.
     left_pct: the residuals (percent) that an effect should leave in the discs after a refit. The values are used in
     turn, each for all names of `only`. Empty: the residuals are drawn at random; for the names of `only` they are drawn
     from USUAL_PCT. Raises DataError "unknown-effect", "bad-plan".
@@ -180,7 +181,8 @@ def _in_turn(seed: int, count: int, names: Sequence[str], stream: int) -> str:
 
 
 def _plan(size_px: int, images: int, rng: np.random.Generator) -> Plan:
-    """The default transit, with random changes: upside down or not, shifted tracks, another brightness and other noise."""
+    """The default transit with random changes: it may be upside down, and tracks, brightness and noise are
+    different."""
     plan = default_plan(
         images,
         size_px,

@@ -4,8 +4,8 @@
 
 S is the scene, h is the part of S that the occulter hides, and P is the convolution with the PSF. "binned" averages the fine
 pixels of each detector pixel; the other names are methods of `effects.effect.Effect`. Because P is linear, the scene of a
-pointing is convolved only once. For each image, only the difference between the scene of the image and the scene of the
-pointing is convolved.
+pointing is convolved only once. For each image, only the difference between its scene with the occulter (S - h) and the
+scene of its pointing is convolved.
 """
 
 from __future__ import annotations

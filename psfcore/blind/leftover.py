@@ -54,8 +54,8 @@ class Left:
     """The residual that an effect leaves in the discs, percent, rms over images.
 
     The fields with "clean" in their names contain the residual of images without any effect. The sampling of these
-    images on pixels causes this residual. by_image_pct: the residual that the effect leaves after the refit, with its
-    sign, by image number.
+    images on pixels causes this residual. by_image_pct: for each image number, the residual after the refit,
+    with its sign.
     """
 
     before_refit_pct: float
@@ -120,7 +120,8 @@ class LinearEstimator:
         )
 
     def _column(self, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
-        """One column of A: the direct change of the dark pixels, minus their change through the deconvolved scene."""
+        """One column of A: the direct change of the dark pixels, minus the change that the deconvolved scene causes in
+        them."""
         changed = slope.convolve(lit)
         scene = _blanked(self._optics.invert_once(changed), dark)
         return pick(changed, dark) - pick(self._optics.convolve(scene), dark)

@@ -67,11 +67,12 @@ def run_set(
 ) -> list[Run]:
     """Diagnose the cases that have no report yet. Returns one run for each of these cases, in the order of `numbers`.
 
-    command: a program and its arguments; {transit} and {report} stand for the paths. processes: number of diagnoses at the
-    same time. ideal: a program, and its arguments, that computes what an ideal observer could know; {expected} and {ideal}
-    stand for the paths. Empty: this is not computed. If this program fails, the diagnosis is not affected, and the next
-    run tries the program again. keep: whether to keep the images of a case after their use. longest_s: a process that
-    takes longer is killed. Raises DataError "bad-command", "bad-seals", and "not-sealed" if a case has no seal.
+    command: a program and its arguments; {transit} and {report} stand for the paths. processes: number of diagnoses at
+    the same time. ideal: a program and its arguments; it computes what an ideal observer could know. {expected} and
+    {ideal} stand for the paths. If `ideal` is empty, no program is run. If the program fails, the diagnosis is not
+    affected, and the next run tries the program again. keep: whether to keep the images of a case after their use.
+    longest_s: a process that takes longer is killed. Raises DataError "bad-command", "bad-seals", and "not-sealed" if
+    a case has no seal.
     """
     _check(command, ("{transit}", "{report}"))
     if ideal:
@@ -212,7 +213,7 @@ def _compute_ideal(
 
 
 def _filled(command: Sequence[str], paths: Mapping[str, Path]) -> list[str]:
-    """A command with paths in place of its marks."""
+    """Replace every mark in a command by its path. paths: the path for each mark."""
     filled = list(command)
     for mark, path in paths.items():
         filled = [part.replace(mark, str(path)) for part in filled]

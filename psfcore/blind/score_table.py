@@ -198,9 +198,10 @@ def _axis_row(single: Sequence[Judged]) -> Row:
 
 
 def _confusion(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
-    """The confusion matrix: the number of cases for each truth (row) and each first named effect (column).
+    """The confusion matrix: the number of cases for each truth (row) and each answer (column).
 
-    If a report names no effect, the column is its verdict.
+    The column is the first effect of the answer; for a pair, it is a true effect, if the answer contains one. If the
+    answer is empty, the column is the verdict.
     """
     table: dict[str, Counter[str]] = {}
     for case in judged:

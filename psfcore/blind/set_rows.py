@@ -9,7 +9,7 @@ they were computed.
 |---|---|---|
 | set covers the truth: all, clean, single, pair, not in the library | all, or of one kind | a member covers the truth |
 | mean number of members | all; cases with a noncentrality of SEEN or more | number of members of the set |
-| right and alone / ideal observer | cases with an ideal observer, and clean cases | the sets that are right and alone, divided by the number that is expected of the ideal observer |
+| right and alone / ideal observer | cases with an ideal observer, and clean cases | the number of sets that are right and alone, divided by the number expected of the ideal observer (the sum of `bounds.Known.alone`) |
 | clean data: set without [] | clean | no member is [] |
 | one wrong effect alone in the set | all | the only member names effects, none of which is true |
 | not in the library: unknown in the set | effects that are not in the library; one row counts cases with a noncentrality of SEEN or more, the next row cases with a rival of SEEN or more | a member is ["unknown"] |

@@ -159,11 +159,15 @@ class Engine:
         self.run(work, self.row_blocks)
 
     def columns(self, *, adjoint: bool) -> None:
-        """Transform the columns, multiply by the transfer function (adjoint: its conjugate), and transform back."""
+        """Transform the columns, multiply by the transfer function, and transform back. adjoint: multiply by its
+        conjugate."""
         self.multiply_columns(self.transfer, conjugate=adjoint)
 
     def multiply_columns(self, transfer: Single, *, conjugate: bool = False) -> None:
-        """As ``columns``, but multiply by a given filter, or its conjugate, in the layout of the transfer function."""
+        """As ``columns``, but with a given filter. transfer: the filter, in the same layout as the transfer function.
+
+        conjugate: multiply by the complex conjugate of the filter.
+        """
         kernel = _columns_real if transfer.shape[2] == 1 else _columns_complex
         sign = np.float32(-1.0 if conjugate else 1.0)
 
@@ -231,8 +235,10 @@ class Engine:
 
     @property
     def transfer_scale(self) -> int:
-        """The product of the lengths of the transforms. The transfer function is divided by it, so that no transform
-        needs a scale factor."""
+        """The product of the lengths of the transforms.
+
+        The transfer function is divided by this product, so the transforms need no scale factor.
+        """
         return self.row_plan.length * self.column_plan.length
 
     def _transfer_function(self, kernel: NDArray[np.floating], first: tuple[int, int]) -> Single:
@@ -268,7 +274,7 @@ class Engine:
 def _wrapped_rows(
     kernel: NDArray[np.floating], first: tuple[int, int], shape: tuple[int, int], rows: slice
 ) -> Single:
-    """The given rows of a periodic plane that contains the kernel, with its centre at [0, 0], and zeros elsewhere."""
+    """The given rows of a periodic plane: the kernel with its centre at [0, 0], and zeros in all other pixels."""
     (ky, kx), (fy, fx), (ly, lx) = kernel.shape, first, shape
     out = np.zeros((rows.stop - rows.start, lx), np.float32)
     split = min(kx, max(0, -fx))

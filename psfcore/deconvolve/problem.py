@@ -65,8 +65,9 @@ def pose(
 ) -> Problem:
     """Check the input and prepare a problem.
 
-    edges: the default of the method, used if `conditions.edges` is None. margin_share: sets the default width of the
-    margin (`margin_for`): a pixel at the edge may get at most this fraction of its light from beyond the margin. Raises
+    edges: the default of the method, used if `conditions.edges` is None. margin_share: largest fraction of
+    its light that a pixel at the edge may get from beyond the margin; `margin_for` computes the default width of the
+    margin from this fraction. Raises
     DataError: "bad-steps", "bad-stop", "bad-edges", "all-masked", "no-signal", "plate-scale-mismatch", "no-exposure".
     """
     check_steps(steps, stop)

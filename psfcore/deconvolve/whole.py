@@ -56,7 +56,7 @@ class Work:
     def run(
         self, image: Image | None = None, psf: Psf | None = None, progress: Progress | None = None
     ) -> Deconvolved:
-        """Run the method. image: None, or another image of the same shape. psf: None, or another PSF."""
+        """Run the method. image: replaces `self.image`; it must have the same shape. psf: replaces `self.psf`."""
         conditions = replace(self.conditions, progress=progress)
         return method_named(self.method)(image or self.image, psf or self.psf, conditions, **self.parameters)
 

@@ -256,7 +256,11 @@ class _Transforms:
 
 
 def _completed(total: NDArray[np.float64], symmetry: str) -> NDArray[np.float64]:
-    """Add the positions that were left out: they are mirror images of the computed ones."""
+    """Add the intensities for the positions (s, t) that were left out.
+
+    They are mirror images of the computed intensities. If the mask equals its transpose, they also include the
+    transpose of the computed intensities.
+    """
     n = len(total)
     mirror = (2 * (n // 2) - np.arange(n)) % n
     if symmetry == MIRROR_AND_TRANSPOSE:

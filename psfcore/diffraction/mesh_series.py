@@ -160,7 +160,10 @@ def _cells(
 def _first_of_each_cell(
     edges: NDArray[np.float64], light: NDArray[np.float64], spacing_px: float
 ) -> NDArray[np.intp]:
-    """Combine fine cells into cells by their width and light; return the index of the first fine cell of each cell."""
+    """Combine fine cells into larger cells, by the width and light of the fine cells.
+
+    Returns the index of the first fine cell of each larger cell.
+    """
     half = max(spacing_px, 1.0) / 2
     below = np.concatenate(([0.0], np.cumsum(light)))
     middle = (edges[1:] + edges[:-1]) / 2

@@ -164,7 +164,7 @@ class _FrameSimulator:
     def noise_alone(
         self, n: int, dark: Pixels, simulated: NDArray[np.float32], rng: np.random.Generator
     ) -> Vector:
-        """s - y of the pixels in D, DN/s, from Eq. (1), for a perfect PSF and one noise realisation of the image."""
+        """Eq. (1) for a perfect PSF and one noise realisation of the image: s - y of the pixels in D, DN/s."""
         frame, optics = self.transit.frames[n], self.optics
         expected = frame.pixels.astype(np.float64)
         expected[dark] = simulated[dark]

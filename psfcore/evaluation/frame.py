@@ -111,7 +111,8 @@ class FrameEvaluation:
         return 100 * self.centre_noise_dn_s / self.observed_dn_s
 
     def residual_against_pct(self, plane: NDArray[np.floating]) -> float:
-        """The residual, in percent, with another image [y, x] in place of the observation, for example one without noise."""
+        """The residual, in percent, against another image [y, x] instead of the observation, for example a noise-free
+        image."""
         wanted = float(np.mean(plane[self.dark], dtype=np.float64))
         return 100 * (self.simulated_dn_s - wanted) / wanted
 

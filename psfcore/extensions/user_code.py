@@ -63,7 +63,10 @@ def module_in_file(path: Path, prefix: str) -> ModuleType:
 
 @contextmanager
 def named_errors(source: str, bad: Bad) -> Iterator[None]:
-    """Turn every error that the code of a source raises into the error of `bad`, which names the line."""
+    """Run user code; if it raises an error other than DataError, raise the error that `bad` makes.
+
+    source: the file or module of the code. The message names the line of the code.
+    """
     try:
         yield
     except DataError:

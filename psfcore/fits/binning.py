@@ -14,7 +14,11 @@ from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
 
 
 class Sampled(Protocol):
-    """The properties of a PSF that determine for which pixels it is valid. `psfcore.psf.Psf` has them."""
+    """The properties of a PSF that are compared with an image header, to decide whether PSF and image have matching
+    pixels.
+
+    `psfcore.psf.Psf` has these properties.
+    """
 
     @property
     def name(self) -> str: ...

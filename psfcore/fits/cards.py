@@ -27,8 +27,7 @@ class Cards(Protocol):
 
 @cache
 def card_trouble() -> tuple[type[Exception], ...]:
-    """Exceptions that astropy raises for a damaged card. The kind of damage determines which exception astropy
-    raises."""
+    """All types of exception that astropy raises for damaged cards. The type depends on the kind of damage."""
     from astropy.io.fits.verify import VerifyError
 
     return VerifyError, ValueError, TypeError, IndexError, OverflowError

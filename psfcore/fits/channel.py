@@ -22,7 +22,10 @@ _TO_ALLOW = "set other_channel (--other-channel)"
 
 
 class Origin(Protocol):
-    """The properties of a PSF that determine for which images it is valid. `psfcore.psf.Psf` has them."""
+    """The properties of a PSF that are compared with an image header, to decide whether both are of the same channel.
+
+    `psfcore.psf.Psf` has these properties.
+    """
 
     @property
     def name(self) -> str: ...

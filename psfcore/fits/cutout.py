@@ -111,7 +111,7 @@ class _Rows:
         return self.size * self._pixel_bytes
 
     def read(self, file: BinaryIO) -> Iterator[bytes]:
-        """The pixels as they are stored, some rows at a time."""
+        """The pixels with the type and byte order of the file, a few rows at a time."""
         ny, nx = self.shape
         top, left = ny // 2 - self.size // 2, nx // 2 - self.size // 2
         piece = bytearray()

@@ -166,7 +166,7 @@ def _masked(image: Image, level: float) -> NDArray[np.uint8]:
 
 
 def _missing_from(image: Image, mask: NDArray[np.uint8]) -> str | None:
-    """A warning if NSATPIX counts saturated pixels, but the image has none; otherwise None."""
+    """A warning if NSATPIX is above 0 but the mask contains no saturated pixel; otherwise None."""
     counted = optional_number(image.header, "NSATPIX") or 0
     if counted == 0 or np.any(mask & MaskBit.SATURATED):
         return None

@@ -302,7 +302,7 @@ def explained_share(
     *,
     variance: Plane | None = None,
 ) -> float:
-    """The share of the changes around the flare that the stray light of the flare explains:
+    """The share of the changes around the flare that is explained by the stray light of the flare:
 
         1 - (sum (s - d)^2 - sum e^2) / (sum d^2 - sum e^2)
 

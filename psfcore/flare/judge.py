@@ -72,7 +72,10 @@ def judge_on_flare(
 
 
 def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
-    """Both images [y, x], 0 where a pixel has no value, and their unit: per second if the exposures are known."""
+    """Both images [y, x] in the same unit, and this unit: per second if the exposure times are known.
+
+    Pixels without a value become 0.
+    """
     if flaring.pixels.shape != before.pixels.shape:
         shapes = f"{flaring.pixels.shape} and {before.pixels.shape}"
         raise DataError(

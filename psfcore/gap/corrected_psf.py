@@ -69,7 +69,10 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
 
 
 def _history(found: Diagnosis, added: Corrected) -> dict[str, Any]:
-    """For the provenance: the added effects, their parameters with errors, the gap without and with them, and the input files."""
+    """The added effects, their parameters with errors, the gap without and with these effects, and the input files.
+
+    This goes into the provenance of the corrected PSF.
+    """
     return {
         "effects": [effect.name for effect in added.effects],
         "effect_in_kernel": [effect.name for effect in added.effects if effect.stage == "optics"],
@@ -105,7 +108,10 @@ def _kernel(added: Corrected) -> Kernel:
 
 
 class _Point(View):
-    """The view of one image: a point source in the centre of a field as large as the full reach, convolved with the PSF."""
+    """A view with one image: a point source in the centre of the field, convolved with the PSF.
+
+    The field is as large as the full reach.
+    """
 
     @cached_property
     def scenes(self) -> Sequence[Field]:
@@ -116,12 +122,12 @@ class _Point(View):
 
     @cached_property
     def expected(self) -> Sequence[Field]:
-        """The image of the point source, which is the PSF."""
+        """The images: there is only the image of the point source, and this image is the PSF."""
         return [frame.pixels for frame in self.solution.transit.frames]
 
     @cached_property
     def pointing_means(self) -> list[Field]:
-        """The mean image of the only pointing, which is the PSF."""
+        """The mean images of the pointings. There is only one pointing with one image: the PSF."""
         return list(self.expected)
 
     def occulted_scene(self, n: int) -> Lanes:
@@ -129,7 +135,7 @@ class _Point(View):
         return self.solution.optics.lanes(self.scenes[n])
 
     def blurred(self, n: int, slope: Blur, weight: Field | None = None) -> Field:
-        """The point source, times `weight` at its position, convolved with dH (`slope`)."""
+        """The point source, multiplied by `weight` at its position, and convolved with dH (`slope`)."""
         point = slope.lanes(self.scenes[n] if weight is None else self.scenes[n] * weight)
         return slope.field(slope.convolve(point))
 

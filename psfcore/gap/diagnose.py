@@ -77,7 +77,7 @@ class Diagnosis:
 
     Three values of the gap: before_refit, with the PSF that was fitted together with the named effects, but without these
     effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear
-        fits of all effects, the most probable first, then of the pairs that are best or decide the verdict. p_value:
+    fits of all single effects, the most probable first; then of the pairs that are best or decide the verdict. p_value:
     the p-value of the gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by their
     label. corrected: the full refits with the named effects; the refit with the best effects comes first. residual,
     residual_after: the residuals of held-out images without and with the best effects. cautions: sentences on
@@ -131,13 +131,12 @@ def diagnose(
 ) -> Diagnosis:
     """Fit a transit and diagnose the residuals of the fit.
 
-    start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit: whether to
-    make full refits with the named effects in the model. seed: seeds the simulation and the bootstrap of the intervals.
-    solution: a solution of this transit, shape and start that was made before, or a function that makes it; None: `invert`.
-    If the noise measured in the images differs from the noise that the transit states, the solution must be made with
-    the measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of` and `invert`, DataError
-    "bad-library" if
-        the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
+    start: the coordinates of the shape from which the fit starts (None: the default start of the shape). refit:
+    whether to make full refits with the named effects in the model. seed: seeds the simulation and the bootstrap of
+    the intervals. solution: an existing solution of this transit, shape and start, or a function that makes it; None:
+    `invert` makes it. If the noise measured in the images differs from the noise that the transit states, the solution
+    must be made with the measured noise. Raises the errors of `psfcore.scatter.inversion.solution_of` and `invert`,
+    DataError "bad-library" if the library is empty, "bad-coverage", and "bad-effects" if an added effect fails.
     """
     if not library:
         raise DataError("bad-library", "expected a library with at least one effect; got none: add an effect")
@@ -252,7 +251,10 @@ def linear_model_of(
 
 
 def _favoured(model: LinearModel, found: Judgement) -> list[str]:
-    """The axes of the most probable effects. Empty if the verdict is `none`, or if no hypothesis names an effect."""
+    """The axes along which the effects of the best hypothesis vary.
+
+    Empty if the verdict is `none`, or if no hypothesis names an effect.
+    """
     if found.verdict == "none" or found.best is None:
         return []
     return [axis for effect in model.evidence.effects if effect.name in found.best for axis in effect.axes]
@@ -261,7 +263,10 @@ def _favoured(model: LinearModel, found: Judgement) -> list[str]:
 def _limits(
     model: LinearModel, calibration: Calibration, coverage: float, refits: Sequence[Corrected]
 ) -> Limits:
-    """The limits of all effects. For an effect that was refitted, excluded_95 comes from the best refit that contains it."""
+    """The limits of all effects.
+
+    If full refits contain an effect, its excluded_95 comes from the best of these refits.
+    """
     found = limits(model, threshold=calibration.threshold(coverage), temperature=calibration.temperature)
     for fit in reversed(refits):
         for effect in fit.effects:
@@ -271,7 +276,8 @@ def _limits(
 
 
 def _fits(model: LinearModel, found: Judgement) -> tuple[EffectFit, ...]:
-    """The linear fits of all effects, the most probable first, then of the pairs that are best or decide the verdict."""
+    """The linear fits of all single effects, the most probable first; then of the pairs that are the best hypothesis or
+    a named hypothesis."""
     effects = {effect.name: effect for effect in model.evidence.effects}
     ordered = sorted(effects, key=lambda name: -found.effects.get(name, 0.0))
     singles = [(name,) for name in ordered]
@@ -286,9 +292,10 @@ def _shrinking(
     refits: Sequence[Corrected],
     rng: np.random.Generator,
 ) -> tuple[dict[str, Shrinking], HeldOut | None, HeldOut | None]:
-    """Three results: the closure of every fit; held-out residuals without any effect; those with the best effects.
+    """Three results: the closure of every fit; the held-out residuals without any effect; the held-out residuals with
+    the effects of the best hypothesis.
 
-    If an effect has a full refit, its closure is computed with the model of that refit.
+    If effects have a full refit, their closure is computed with the model of that refit.
     """
     schemes = (time_blocks(model), pointings(model))
     before = [hold_out(model, (), scheme) for scheme in schemes]
@@ -322,7 +329,7 @@ def _held_out_by(model: LinearModel, scheme: Sequence[Fold]) -> HeldOut | None:
 
 
 def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:
-    """The result of the full refit if it covers the same images as the linear model; otherwise the result of the linear model."""
+    """The result of the full refit (`real`) if it holds out the same images as the linear model; otherwise `linear`."""
     same = real is not None and linear is not None and real.images == linear.images
     return real if same else linear
 

@@ -38,10 +38,11 @@ class EffectParameter:
 class Change:
     """The change of the images by one unit of one parameter: change(n, images) is the change of image n, [y, x] in DN/s.
 
-    images: for the discs, the model images of the transit, each with its own brightness; for the unocculted field, the mean
-    image of the pointing, for each image. unocculted: whether the change differs between images of one pointing, so that
-    the unocculted field shows it. disc: whether the discs show the change. numbers: how many numbers were measured in the
-    unocculted field to build this change; each of them costs the effect as much as a parameter.
+    images: one image [y, x] for each image of the transit. To compute the change of the discs, these are the model
+    images. To compute the change of the unocculted field, they are the mean images of the pointings. unocculted:
+    whether the change differs between images of one pointing, so that the unocculted field shows it. disc: whether the
+    discs show the change. numbers: how many numbers were measured in the unocculted field to build this change; each
+    of them costs the effect as much as a parameter.
     """
 
     change: Callable[[int, Sequence[Field]], Field]
@@ -57,8 +58,8 @@ class Effect:
     cause: a sentence for the report. settled_by: an observation that would confirm the effect, or exclude it. axes: names of
     the axes of the report along which the effect varies.
     changes(view): one change for each parameter. An effect that is fitted for each pointing may return fewer or more
-    changes than it has parameters. Changes and parameters are then paired in order; those without a partner are not
-    fitted. why_not(view): the reason why these data cannot show the effect; None if they can.
+    changes than it has parameters. In this case, changes and parameters are paired in order. A change or parameter
+    without a partner is not fitted. why_not(view): the reason why these data cannot show the effect; None if they can.
     trials: the approximate number of positions or templates among which the effect searches; a larger number lowers its
     evidence. held(view): for an effect that searches for a position or a template, the same effect with the result of
     the search fixed. field: whether the parameters describe a random field, in which each parameter is about as large

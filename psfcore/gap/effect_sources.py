@@ -26,5 +26,5 @@ def sha256_of_source(source: str) -> str:
 
 
 def bad_effects(source: str, what: str) -> DataError:
-    """The error about added effects. what: what is wrong with them."""
+    """The error "bad-effects" of an added file or module. what: a description of the mistake."""
     return DataError("bad-effects", f"effects of {source}: {what}")

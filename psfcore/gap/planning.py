@@ -64,7 +64,8 @@ class Planned:
 
     @property
     def pointings(self) -> list[dict[str, Any]]:
-        """For each pointing: its number, what it shows, the number of images, and the exposure times in s."""
+        """For each pointing: its number, its view (the part of the Sun), the number of images, and the exposure times,
+        s."""
         rows = []
         for pointing in self.plan.pointings:
             shots = [shot for shot in self.plan.shots if shot.pointing == pointing]
@@ -185,7 +186,7 @@ def _noise_free(plan: Plan, scatter: ScatterTruth, diffraction: Kernel, seed: in
 
 
 def _without_measured(model: LinearModel) -> LinearModel:
-    """The model without those effects whose form is measured in the images: there are no images yet."""
+    """Remove the effects whose form is measured in the images, because a plan has no images yet."""
     evidence = model.evidence
     measured = {e.name for e in evidence.effects if evidence.numbers_of(evidence.columns[e.name])}
     effects = tuple(effect for effect in evidence.effects if effect.name not in measured)

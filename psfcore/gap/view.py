@@ -132,7 +132,10 @@ class View:
 
     @cached_property
     def _scene_sums(self) -> dict[int, tuple[Vector, Vector]]:
-        """For each pointing: the sum of its scenes, without the pixels around each disc, and the number of scenes summed in each pixel."""
+        """For each pointing: the sum of its scenes, and for each pixel the number of scenes in this sum.
+
+        The pixels around the disc of an image do not count.
+        """
         solution = self.solution
         sums: dict[int, tuple[Vector, Vector]] = {}
         for n, frame in enumerate(solution.transit.frames):

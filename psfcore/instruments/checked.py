@@ -127,13 +127,13 @@ def _annotations_of(cls: Any) -> dict[str, Any]:
 
 
 def annotations_of(cls: type[Checked]) -> dict[str, Any]:
-    """The annotations of a class by key, with their limits."""
+    """The type annotations of a class, by key. They include the limits of the values."""
     known: Any = cls  # for mypy, the classes of a dataclass_transform are not hashable
     return _annotations_of(known)
 
 
 def _accepted(annotation: Any, value: Any, key: tuple[str | int, ...]) -> Any:
-    """The value, converted to its annotation. Raises BadValues."""
+    """Check a value against its type annotation, and convert it to this type. Raises BadValues."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         for limit in arguments[1:]:

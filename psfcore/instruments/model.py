@@ -212,7 +212,10 @@ class Instrument(Checked):
     scatter: Scatter | None = None
 
     def check(self) -> None:
-        """WAVELNTH of the table [match] is a number, its other keys are texts. No spectral line is too weak to be normalised."""
+        """Check that WAVELNTH of the table [match] is a number and its other keys are texts.
+
+        Check also that no spectral line is so weak that its weight cannot be normalised.
+        """
         wrong = [
             Fault(("match", key), f"expected {'a number' if key == 'WAVELNTH' else 'a text'}", value)
             for key, value in self.match.items()
@@ -295,7 +298,7 @@ def parse_instrument(text: str, label: str) -> Instrument:
 
 
 def _said(error: BadValues) -> str:
-    """The first fault in one line, and the number of the others."""
+    """The first fault in one line, and how many further faults there are."""
     first, more = error.faults[0], len(error.faults) - 1
     key = ".".join(map(str, first.key)) or "file"
     # If the fault concerns a whole table, its text already says what was given. A missing key has no value.

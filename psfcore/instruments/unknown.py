@@ -134,7 +134,7 @@ def same_as_image(
 def agreement_with_image(
     same: Sequence[str], channel: str | None, plate_scale_arcsec: float | None, header: Mapping[str, Any]
 ) -> str:
-    """A text that says in which properties a PSF and an image agree and differ: "same telescope, but another channel".
+    """A text that compares a PSF with an image, for example "same telescope, but another channel".
 
     same: the result of `same_as_image`.
     """

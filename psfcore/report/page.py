@@ -77,7 +77,7 @@ def _observed(evaluation: Evaluation, how: str) -> list[Part]:
             [_summary_row(s, evaluation) for s in summaries(evaluation)],
             "Residuals by pointing; the last row is for all images. The error of the mean comes from image noise. The "
             "error of the rms is its sampling error for this number of images. Noise: the rms expected from noise alone. "
-            "Largest: the residual with the largest absolute value of any image.",
+            "Largest: the residual of the image whose residual has the largest absolute value.",
         ),
         Figure(
             slices_png(evaluation),

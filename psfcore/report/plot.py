@@ -104,7 +104,10 @@ def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
 
 
 def _folds_of(report: PsfReport, name: str) -> tuple[Vector, NDArray[np.float64]] | None:
-    """Radii, and the bands of the folds minus the fitted curve of a component; None if there are no folds."""
+    """Two arrays: radii, and the bands of the folds minus the fitted curve of a component.
+
+    None if there is no cross-validation or it has no bands of this component.
+    """
     if report.cross is None:
         return None
     bands = report.cross.bands

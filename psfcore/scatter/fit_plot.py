@@ -108,7 +108,11 @@ def _draw_weights(axes: Any, fit: TransitFit) -> None:
 
 
 def _fitted_weights(fit: TransitFit) -> tuple[Vector, Vector, Vector]:
-    """Distance (px), mean weight in a ring at that distance, and the first-order standard error of its logarithm."""
+    """Three arrays: distance (px), mean weight in the ring at this distance, standard error of the logarithm of the
+    weight.
+
+    The error is computed to first order from the covariance of the fit.
+    """
     shape, at = fit.inversion.shape, fit.inversion.coordinates
 
     def rings(kernel: Vector) -> tuple[Vector, Vector]:

@@ -128,7 +128,10 @@ class Shape:
         return np.array([p.coordinate(values.get(p.name, p.start)) for p in self.parameters])
 
     def shortened(self, step: Vector) -> tuple[Vector, bool]:
-        """Shorten a step until no coordinate changes by more than its largest step; True if the step was not shortened."""
+        """Shorten a step if it changes a coordinate by more than the largest step of this coordinate.
+
+        Returns the step, and True if it was not shortened.
+        """
         largest = np.array([p.largest_step for p in self.parameters])
         too_far = float((np.abs(step) / largest).max())
         return (step, True) if too_far <= 1 else (step / too_far, False)

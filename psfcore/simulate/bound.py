@@ -243,13 +243,14 @@ def _seen(scene: Plane, kernel: Kernel, margin_px: int, threads: int) -> Plane:
 
 
 def _through(kernel: Kernel, patch: Plane) -> Plane:
-    """A patch convolved with a kernel; the result covers the same pixels as the patch."""
+    """Convolve a patch with a kernel. The result covers the same pixels as the patch."""
     shape = (patch.shape[0], patch.shape[1])
     return np.asarray(Convolver(kernel, shape, dtype=np.float64).apply(patch), dtype=np.float64)
 
 
 def _window(sky: TrueSky, index: int) -> Window:
-    """The slices of the field around the occulter, with all pixels that serve to measure its position."""
+    """The part of the field around the occulter, as slices. It contains all pixels from which the position is
+    measured."""
     place, size = sky.plan.place(index), sky.plan.size_px
     half = int(np.ceil(place.radius_px + PLACE_MARGIN_PX)) + 1
     row, column = int(np.rint(place.y_px)), int(np.rint(place.x_px))

@@ -60,7 +60,7 @@ def _half_segment(x: Plane, r: float) -> Plane:
 
 
 def fully_dark(place: Place, first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """True for pixels [y, x] whose four corners all lie inside the disc. first, shape: as in covered_share."""
+    """True for pixels [y, x] whose four corners all lie inside the disc. first, shape: see covered_share."""
     y = np.abs(first[0] + np.arange(shape[0]) - place.y_px) + 0.5
     x = np.abs(first[1] + np.arange(shape[1]) - place.x_px) + 0.5
     return np.asarray(np.hypot(x[None, :], y[:, None]) <= place.radius_px)

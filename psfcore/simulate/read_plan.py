@@ -32,7 +32,11 @@ _INTERVAL_S = 60.0  # time between two images, if their times are not stated
 
 @dataclass(frozen=True)
 class PlanFile:
-    """What a file states. known_psf: the file of the known part of the PSF, if there is one. instrument: its name, if stated."""
+    """The content of a plan file. known_psf: the file with the known part of the PSF. instrument: the name of the
+    instrument.
+
+    Both are None if the plan file does not state them.
+    """
 
     plan: Plan
     known_psf: Path | None = None

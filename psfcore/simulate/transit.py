@@ -111,9 +111,9 @@ def simulate(
     """A transit of `plan`. Its PSF is `scatter` convolved with `diffraction`. Equal arguments give equal results.
 
     diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: random seed of the scenes, the ephemeris errors
-    and the noise. scene_seed: the seed of the scenes, if it differs from `seed`. scenes: a scene for each pointing,
-    used instead of a synthetic one, in the form that drawn_scene and scene_from_image of psfcore.simulate.pointings
-    return. imitated: the instrument whose keywords the headers get. Raises DataError "bad-diffraction", "bad-scene".
+    and the noise. scene_seed: the seed of the scenes, if it differs from `seed`. scenes: for each pointing, a scene
+    to use instead of a synthetic scene, as drawn_scene and scene_from_image of psfcore.simulate.pointings return it.
+    imitated: the instrument whose keywords the headers get. Raises DataError "bad-diffraction", "bad-scene".
     """
     of_scenes = seed if scene_seed is None else scene_seed
     sky = true_sky(plan, scatter, diffraction, of_scenes, scenes=scenes, threads=threads)

@@ -113,7 +113,8 @@ def _changes(psf: Psf, radii: Vector, threads: int) -> dict[str, tuple[list[Vect
 
 
 def _read_off(changes: list[Kernel], radii: Vector) -> tuple[list[Vector], list[Vector]]:
-    """For each change of the kernel: the change of E at the radii, and the change of the mean weight of each ring."""
+    """Two lists with one entry for each change of the kernel: the change of E at the radii; the change of the mean
+    weight of each ring."""
     within = [encircled_energy(change, radii) for change in changes]
     return within, [radial_profile(change)[1] for change in changes]
 

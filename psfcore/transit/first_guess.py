@@ -83,9 +83,9 @@ class PointingGuess:
 class FirstGuess:
     """The first guess from all images, in the order of time, and from all pointings.
 
-    best_pointing: the most homogeneous pointing. share, share_spread: mean and standard deviation of the ratio over the
-    images of this pointing and the three estimators. radius_px: the mean radius of the disc in these images. The ratio is
-    1 - encircled energy at radius_px, as a fraction.
+    best_pointing: the most homogeneous pointing. share, share_spread: mean and standard deviation of the ratios of all
+    images of this pointing and all three estimators. radius_px: the mean radius of the disc in these images. The ratio
+    is 1 - encircled energy at radius_px, as a fraction.
     """
 
     frames: tuple[FrameGuess, ...]
@@ -191,7 +191,10 @@ def _frame_guess(frame: Frame, place: Place) -> FrameGuess:
 
 
 def _surroundings(frame: Frame, place: Place) -> tuple[Flat, Flat, Flat]:
-    """The pixels of a square around the shell (one axis), without filled pixels; and their x and y from the disc's centre."""
+    """The pixels of a square around the disc, without filled pixels, and their x and y relative to the disc's centre.
+
+    All three arrays have one axis.
+    """
     reach = place.radius_px + EDGE_PX + SHELL_PX + 2
     ny, nx = frame.pixels.shape
     top, bottom = (min(max(int(place.y_px + side * reach), 0), ny) for side in (-1, 1))

@@ -82,7 +82,10 @@ def _starts_like(start: bytes, known: bytes) -> bool:
 
 
 class Member:
-    """A file in an archive. folder: its folder there. gate: counts the unpacked bytes; None: they are counted already."""
+    """A file in an archive. folder: the folder of the file in the archive.
+
+    gate: counts the unpacked bytes; None if another object counts them.
+    """
 
     def __init__(self, file: Admitted, size_bytes: int, stream: IO[bytes], gate: Gate | None = None) -> None:
         self.folder, self.name, self.size_bytes = file.folder, file.name, size_bytes
@@ -252,7 +255,8 @@ class _TarInput:
     backwards is refused, because a .tar.gz would be decompressed again from its start. tarfile does not seek backwards
     if members are read in order.
 
-    size: the size of a file in which data can be skipped by seeking. None: skipped data is read, and counted too.
+    size: the size of the file, if data can be skipped by seeking. None: data cannot be skipped by seeking, so skipped
+    data is also read and counted.
     """
 
     def __init__(self, file: BinaryIO, gate: Gate, size: int | None = None) -> None:

@@ -225,7 +225,7 @@ def find_occulter(
 def _shares(
     chosen: Sequence[int], frames: Sequence[Frame], window: Window, noise: Noise
 ) -> NDArray[np.float64]:
-    """The weights of the neighbours in their mean, sum 1; long exposures have larger weights."""
+    """The weights of the neighbouring images in their mean. The sum is 1; long exposures have larger weights."""
     level = np.mean([frames[k].pixels[window].mean(dtype=np.float64) for k in chosen])
     weight = np.array(
         [1 / float(noise.variance(np.array(max(level, 0.0)), frames[k].exposure_s)) for k in chosen]
@@ -249,7 +249,7 @@ class _SimulatedDisc:
 
 @dataclass(frozen=True)
 class _Solved:
-    """The minimum of Eq. (2). at: x, y, scale and level. normal: the inverse covariance of these four."""
+    """The minimum of Eq. (2). at: x, y, scale and level. normal: the inverse of the covariance of these values."""
 
     at: NDArray[np.float64]
     normal: NDArray[np.float64]

@@ -67,7 +67,7 @@ class BulkView(BaseModel):
 
     @classmethod
     def of(cls, row: BulkRow, state: Shared) -> BulkView:
-        """The view of a row."""
+        """The description of a bulk run, from its row in the catalogue."""
         pace = state.catalogue.bulks.progress.pace(row)
         here = f"/v1/bulk/{row.id}"
         left = row.total - row.done - row.failed
@@ -113,7 +113,7 @@ class BulkLine(BaseModel):
 
     @classmethod
     def of(cls, row: BulkRow) -> BulkLine:
-        """The view of a row in a list."""
+        """The description of a bulk run for a list, from its row in the catalogue."""
         return cls(
             id=row.id,
             name=row.name,
@@ -137,7 +137,7 @@ class Failed(BaseModel):
 
     @classmethod
     def of(cls, row: BulkItemRow) -> Failed:
-        """The view of a row."""
+        """The description of a failed image of a bulk run, from its row in the catalogue."""
         return cls(
             position=row.position,
             source=row.source,

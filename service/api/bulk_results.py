@@ -79,7 +79,7 @@ class Result(BaseModel):
 
     @classmethod
     def of(cls, row: BulkItemRow) -> Result:
-        """The view of a row."""
+        """The result of one image of a bulk run, from its row in the catalogue."""
         assert row.statistics is not None
         told: dict[str, Any] = {"seconds": None, "kernel_seconds": None, **row.statistics}
         own = {name: getattr(row, name) for name in cls.model_fields if hasattr(row, name)}

@@ -33,7 +33,7 @@ class ImageView(BaseModel):
 
     @classmethod
     def of(cls, row: ImageRow) -> ImageView:
-        """The view of a row."""
+        """The description of an image, from its row in the catalogue."""
         return cls(
             id=row.id, created_at=row.created_at, bytes=row.bytes, filename=row.filename, header=row.summary
         )

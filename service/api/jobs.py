@@ -81,7 +81,10 @@ class JobView(BaseModel):
 
     @classmethod
     def of(cls, row: JobRow, waiting_before: int | None = None, *, result_deleted: bool = False) -> JobView:
-        """The view of a row of the catalogue. waiting_before: None if it was not counted."""
+        """The description of a job, from its row in the catalogue.
+
+        waiting_before: number of jobs that wait before this job; None if they were not counted.
+        """
         return cls(
             id=row.id,
             kind=row.kind,
@@ -212,7 +215,7 @@ def cancel_job(job_id: JobId, caller: Submitting, state: Shared) -> JobView:
 
 
 def _view(row: JobRow, state: Shared) -> JobView:
-    """The view of a job, with ``waiting_before`` and ``result_deleted``."""
+    """The description of a job, with ``waiting_before`` and ``result_deleted``."""
     gone = bool(without_results([row], state.catalogue))
     return JobView.of(row, state.catalogue.places.before(row), result_deleted=gone)
 

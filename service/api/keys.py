@@ -65,7 +65,8 @@ class NewKey(BaseModel):
         return self
 
     def end(self, now: float) -> float | None:
-        """The end of the key, seconds since 1970; None if no end is asked for."""
+        """The time at which the key expires, seconds since 1970; None if the request does not limit the life of the
+        key."""
         return self.expires_at if self.lasts_days is None else now + self.lasts_days * DAY_S
 
 
@@ -85,7 +86,7 @@ class KeyView(BaseModel):
 
     @classmethod
     def of(cls, row: KeyRow) -> KeyView:
-        """The view of a row."""
+        """The description of a key, from its row in the catalogue. It does not contain the secret key."""
         names = ("id", "owner", "label", "created_at", "expires_at", "revoked_at", "last_used_at", "made_by")
         shown = {name: getattr(row, name) for name in names}
         return cls(scopes=list(map(Scope, row.scopes)), state=_state(row), **shown)

@@ -62,8 +62,8 @@ class Watch(Generic[Followable]):
     """The rows of one table (jobs or bulk runs) as a stream last read them.
 
     kind: name of the events. named: ids that the request names; these rows are followed in any phase. place: the next
-    look reads rows that ended after this place. known: the last state that was sent of each row, by id; None: the
-    last event was ``gone``. after_end: number of ended rows that the stream still follows, to report when they are
+    look reads rows that ended after this place. known: for each id, the state of the row that was sent last; None if
+    the last event was ``gone``. after_end: number of ended rows that the stream still follows, to report when they are
     deleted. These are the rows that ended last.
     """
 
@@ -99,8 +99,11 @@ class Watch(Generic[Followable]):
         return news, replace(self, place=place, known=known | dict.fromkeys(self.named.intersection(gone)))
 
     def _expected(self) -> set[str]:
-        """Ids of rows whose state must be known after each look: the rows that had not ended, the ``after_end`` rows
-        that ended last, and the rows that the request names."""
+        """The ids of the rows that each look at the database must read again.
+
+        They are: the rows that had not ended at the last look; the ``after_end`` rows that ended last; the rows that
+        the request names.
+        """
         not_ended = {one for one, state in self.known.items() if state and state.ended_at is None}
         return not_ended.union(self._ended_last(self.known), self.named)
 
@@ -152,8 +155,10 @@ async def follow_all(
     ] = None,
     last_id: Moment = None,
 ) -> Response:
-    """First send all jobs and bulk runs that have not ended or that ended in the last seconds, and those that the
-    request names. Then send each job or bulk run again when it changes.
+    """Send the state of your jobs and bulk runs, and then each job or bulk run again when it changes.
+
+    The first events are for all jobs and bulk runs that have not ended or that ended in the last seconds, and for those
+    that the request names.
 
     A client that reconnects with `Last-Event-ID` also gets the jobs and bulk runs that ended in the meantime; it may
     get some of these jobs and bulk runs twice. If an owner has very many waiting jobs, only the newest are sent at

@@ -46,7 +46,10 @@ class ProductView(BaseModel):
 
     @classmethod
     def of(cls, row: ProductRow, details: dict[str, Any] | None = None) -> ProductView:
-        """The view of a row. details: the product's details as they are now; default: those of the row."""
+        """The description of a product, from its row in the catalogue.
+
+        details: the current details of the product; default: the details in the row.
+        """
         here = f"/v1/products/{row.id}"
         return cls(
             id=row.id,

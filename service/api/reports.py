@@ -45,7 +45,7 @@ class ReportView(BaseModel):
 
     @classmethod
     def of(cls, row: ReportRow) -> ReportView:
-        """The view of a row."""
+        """The description of a report, from its row in the catalogue."""
         here = f"/v1/reports/{row.id}"
         return cls(
             id=row.id,
@@ -110,7 +110,10 @@ def get_report_preview(report_id: Identity, request: Request, caller: Reading, s
     row = find(state, caller, report_id)
     if row.preview_sha256 is None:
         raise Problem(
-            404, "no-preview", "expected a report with a picture; this report has none: read its file"
+            404,
+            "no-preview",
+            "expected a report with a picture; this report has no picture: download the report as JSON "
+            f"(/v1/reports/{report_id}/file)",
         )
     return files.send(request, state.store, row.preview_sha256, "image/png", None)
 
@@ -120,7 +123,12 @@ def get_report_page(report_id: Identity, request: Request, caller: Reading, stat
     """The report as HTML with its figures inside. The headers of the answer forbid scripts and content from other addresses."""
     digest = find(state, caller, report_id).details.get("page_sha256")
     if digest is None:
-        raise Problem(404, "no-page", "expected a report with a page; this report has none: read its file")
+        raise Problem(
+            404,
+            "no-page",
+            "expected a report with a page; this report has no page: download the report as JSON "
+            f"(/v1/reports/{report_id}/file)",
+        )
     answer = files.send(request, state.store, digest, "text/html; charset=utf-8", None)
     answer.headers["Content-Security-Policy"] = PAGE_POLICY
     return answer
@@ -132,7 +140,10 @@ def get_report_output(report_id: Identity, request: Request, caller: Reading, st
     digest = find(state, caller, report_id).details.get("output_sha256")
     if digest is None:
         raise Problem(
-            404, "no-output", "expected the report of a rerun; this is another report: read its file"
+            404,
+            "no-output",
+            "expected the report of a rerun; this report is not of a rerun: download the report as JSON "
+            f"(/v1/reports/{report_id}/file)",
         )
     return files.send(request, state.store, digest, files.FITS_TYPE, f"again-{report_id[:12]}.fits")
 

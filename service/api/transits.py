@@ -55,7 +55,7 @@ class TransitView(BaseModel):
 
     @classmethod
     def of(cls, row: TransitRow) -> TransitView:
-        """The view of a row."""
+        """The description of a transit, from its row in the catalogue."""
         return cls.model_validate(_content(row))
 
 
@@ -66,7 +66,7 @@ class TransitDetails(TransitView):
 
     @classmethod
     def of(cls, row: TransitRow) -> TransitDetails:
-        """The view of a row."""
+        """The description of a transit and its files, from the row of the transit in the catalogue."""
         return cls.model_validate(_content(row))
 
 

@@ -120,7 +120,7 @@ CONTEXT = click.option(
 
 
 def id_argument(name: str = "identity", *, several: bool = False) -> Callable[[Command], Command]:
-    """The argument that names a thing of the service by its id, or by the first digits of its id."""
+    """The argument for the id of a PSF, product, job, ... The first digits of the id are enough."""
     return click.argument(
         name, type=ID, metavar="ID..." if several else "ID", nargs=-1 if several else 1, required=True
     )
@@ -159,8 +159,10 @@ def is_psf_id(psf: str) -> bool:
 
 
 def whole_id(service: Operations, things: str, identity: str) -> str:
-    """The whole id of a thing from its first digits. things: the part of the address that names the type, such as
-    "psfs"."""
+    """Find the whole id of a PSF, product, job, ... from the first digits of the id.
+
+    things: the type as it is written in the address, for example "psfs".
+    """
     if len(identity) == DIGITS:
         return identity
     found: str = service.get(f"/v1/{things}/{identity}")["id"]
@@ -168,7 +170,7 @@ def whole_id(service: Operations, things: str, identity: str) -> str:
 
 
 def whole_ids(service: Operations, things: str, identities: Sequence[str]) -> list[str]:
-    """The whole ids of several things."""
+    """Find the whole id for each of these ids, as `whole_id` does."""
     return [whole_id(service, things, identity) for identity in identities]
 
 

@@ -273,7 +273,7 @@ def listed(words: Sequence[str]) -> str:
 
 
 def percent(value: float | None, digits: int = 1) -> str:
-    """A relative change as text; None: the reference has no light."""
+    """A relative change as text. value: in percent; None if the reference contains no light."""
     return "n/a (no light)" if value is None else f"{value:+.{digits}f} %"
 
 

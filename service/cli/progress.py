@@ -51,8 +51,10 @@ def duration(seconds: float) -> str:
 
 
 def told(stage: str, step: int, steps: int) -> str:
-    """A stage and its step as text; only the stage if its number of steps is unknown (an unknown number is reported
-    as 1)."""
+    """The stage and its step as text. If the number of steps is unknown, the text contains only the stage.
+
+    A task reports an unknown number of steps as 1.
+    """
     if (steps <= 1 and step < steps) or not steps:
         return stage
     return f"{stage}: {STEPS_OF.get(stage, 'step')} {step} of {steps}"
@@ -107,7 +109,10 @@ _tellers: list[_Teller] = []  # of the open blocks of ``progress_bar``, the inne
 
 @contextmanager
 def progress_bar() -> Iterator[Report]:
-    """Show the progress of the block and the time left in its stage: a bar on a terminal, else a line every 10 s."""
+    """Show the progress of a ``with`` block and the time left in its stage.
+
+    A terminal shows a bar; otherwise a line is written every 10 s.
+    """
     teller = _Teller(bar=sys.stderr.isatty())
     _tellers.append(teller)
     try:

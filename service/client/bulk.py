@@ -27,9 +27,9 @@ QUIET_S = (
 class BulkClient(ABC):
     """The requests about bulk runs and events.
 
-    Every method raises ``ServiceError``; its ``code`` is the reason ("path-not-allowed", "no-such-bulk", ...).
-    server: address of the service. say: a function that is called with a sentence when the service stops answering
-    during a wait, and when it answers again.
+    If a request fails, every method raises ``ServiceError``. The ``code`` of the error states the reason
+    ("path-not-allowed", "no-such-bulk", ...). server: address of the service. say: a function that receives a message
+    for the user when the service stops answering during a wait, and when it answers again.
     """
 
     server: str

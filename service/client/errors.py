@@ -62,7 +62,8 @@ def _same(one: Mapping[str, Any]) -> str:
 class WaitInterrupted(KeyboardInterrupt):
     """Control-C was pressed during a wait for a job or a bulk run. The job or bulk run continues without the client.
 
-    what: "job" or "bulk". identity: its id. server: address of the service. others: ids of further jobs that continue.
+    what: "job" or "bulk". identity: the id of the job or bulk run. server: address of the service. others: ids of
+    further jobs that continue.
     """
 
     def __init__(self, what: str, identity: str, server: str, others: tuple[str, ...] = ()) -> None:

@@ -146,8 +146,11 @@ class _Run:
             yield first
 
     def _begin(self, image: Path) -> _Begun | Outcome:
-        """Upload an image and submit its job. No job is submitted if the product is in the folder, or if an earlier
-        image makes the same product."""
+        """Upload an image and submit its job.
+
+        No job is submitted if the folder already contains the product, or if the job of an earlier image makes the
+        same product.
+        """
         with image.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         image_id = _patiently(lambda: self._service.image_id(image, sha256))
@@ -196,7 +199,7 @@ def _told(image: Path, step: Callable[[], _Step]) -> _Step | Outcome:
 
 
 def _products_in(folder: Path) -> _Found:
-    """The complete products in a folder: the file of each, by its identity and the SHA-256 of its image."""
+    """The files of the complete products in a folder. The key is (id of the product, SHA-256 of its image)."""
     found: _Found = {}
     limits = FitsLimits(max_pixels=LARGEST_PX)
     for path in sorted(folder.glob("*.fits")):
@@ -212,7 +215,8 @@ def _products_in(folder: Path) -> _Found:
 
 
 def _patiently(ask: Callable[[], _Answer]) -> _Answer:
-    """The answer to a request. While the service is busy or the caller's rate is used up, the request is sent again."""
+    """The answer to a request. The request is repeated while the service is busy or the caller's rate limit is used
+    up."""
     give_up_at = time.monotonic() + PATIENCE_S
     while True:
         try:

@@ -119,7 +119,7 @@ class VersionedPsfs(ABC):
         return self._json("PUT", "/v1/contexts/default", json={"context": id_or_name, "reason": reason})
 
     def lineage(self, of: Literal["psf", "product"], identity: str) -> dict[str, Any]:
-        """The things from which a PSF or a product was made, back to the uploads."""
+        """The images, transits and PSFs from which a PSF or a product was made, back to the uploads."""
         return self.get(f"/v1/{of}s/{identity}/lineage")
 
     def rerun(

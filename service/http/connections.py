@@ -41,9 +41,12 @@ _FULL_BODY = (
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """most: largest number of connections that are open at the same time. header_s: longest time until the header of
-    a request is complete, from the connection or from the last answer. stalled_s: longest time in which a client
-    receives no part of its answer."""
+    """The limits of the connections of one server process.
+
+    most: largest number of connections that are open at the same time. header_s: longest time from the connection, or
+    from the last answer, until the header of a request is complete. stalled_s: longest time for which a client may
+    receive no part of its answer.
+    """
 
     most: int
     header_s: float
@@ -132,8 +135,10 @@ class BoundedConnection(H11Protocol):
         return sum(not one.transport.is_closing() for one in self.connections)
 
     def _close_the_longest_waiting(self) -> bool:
-        """Of the other connections, close the one that has waited longest for a request. Returns False if all are
-        answering requests."""
+        """Close another connection: the one that has waited longest for a request.
+
+        Returns False if all other connections are answering requests.
+        """
         waiting = [
             one
             for one in self.connections

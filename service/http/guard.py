@@ -93,7 +93,7 @@ def _check_origin(method: str, headers: Headers) -> None:
             403,
             "cross-site",
             "expected a request from a program or from a page of this service; got a request from a page of another site: "
-            "open the page of this service, and send its own form",
+            "open the page of this service in the browser, and send the form there",
         )
 
 

@@ -265,7 +265,7 @@ def _inspected(path: Path, expected: _Format[Found]) -> Found:
 
 
 def has_own_limit(address: str, content_type: str) -> bool:
-    """Whether the route at an address limits the size of such bodies itself, because they may contain files."""
+    """Whether the route itself limits the size of a body of this type, because the body may contain files."""
     form = content_type.lower().startswith("multipart/form-data")
     return address in LARGE or (form and re.fullmatch(r"/uws/jobs(/[^/]+/parameters)?", address) is not None)
 

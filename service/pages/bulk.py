@@ -219,7 +219,7 @@ def _told(failed: BulkItemRow) -> str:
 
 
 def _pace(line: BulkLine, caller: Caller, state: State) -> BulkView | None:
-    """The view of a run with its speed; None for a run that is not running, which has no speed."""
+    """The description of a bulk run with its speed; None for a run that is not LISTING or RUNNING: it has no speed."""
     return get_bulk(line.id, caller, state) if line.phase in AT_WORK else None
 
 

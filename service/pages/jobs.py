@@ -62,7 +62,8 @@ def job(
 ) -> Response:
     """The state of a job; a script keeps it up to date, and opens the result at its end.
 
-    image: the job builds a PSF for this image; at its end the page of the image is opened, with the PSF chosen.
+    image: id of the image for which the job builds a PSF. When the job ends, the page of this image opens, with the new
+    PSF chosen.
     """
     view = get_job(job_id, caller, state)
     return page(

@@ -96,7 +96,7 @@ def short(identity: str) -> str:
 
 
 def date(seconds: float | None) -> Markup | str:
-    """A time, seconds since 1970, as a date of UTC; a script may show it in the reader's zone."""
+    """Date and time in UTC, as a `<time>` element; "-" for None. seconds: seconds since 1970."""
     if seconds is None:
         return "-"
     moment = datetime.fromtimestamp(seconds, UTC)
@@ -146,5 +146,5 @@ def percent(value: float | None) -> str:
 
 
 def page_of(address: str) -> str:
-    """The page of a thing at an address of the interface: ``/v1/products/ID`` has the page ``/products/ID``."""
+    """The address of the page for an address of the API: ``/products/ID`` for ``/v1/products/ID``."""
     return address.removeprefix("/v1")

@@ -20,8 +20,12 @@ AT_ONCE = 50
 
 
 def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
-    """Queue the jobs of lost workers again, apply the UWS terms, keep the turns of bulk runs, and submit queued jobs.
-    Returns the number of submitted jobs, at most ``AT_ONCE``. Several processes may do this at the same time."""
+    """Correct the job table and submit queued jobs to the broker.
+
+    In this order: queue the jobs of lost workers again; enforce the time limits and destruction times of UWS jobs;
+    queue the turns that bulk runs need, and delete ended turns; submit queued jobs.
+    Returns the number of submitted jobs, at most ``AT_ONCE``. Several processes may do this at the same time.
+    """
     for job_id in catalogue.jobs.give_up_silent(settings.lease_s, settings.max_attempts):
         log.warning("job %s: no heartbeat from its worker; queued again", job_id)
     for job_id in catalogue.uws.end_by_terms():

@@ -54,7 +54,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Source:
-    """An image's file, the summary of its header, and the name from which its product's file name is made."""
+    """An image of a bulk run: its file and the summary of its header.
+
+    name: the file name of the product is made from this name.
+    """
 
     copy: Path | None  # the copy of an archive file; None for an upload, which is in the store
     sha256: str

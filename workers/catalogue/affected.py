@@ -54,8 +54,8 @@ class AffectedProducts:
     def page(self, owner: str, *, superseded: bool, limit: int, after: Place | None = None) -> list[Affected]:
         """Products that were made with deprecated PSFs. superseded: only PSFs that have a successor.
 
-        A join would sort all products of a PSF before it returned the first one. Therefore this method makes several
-        queries, which read only the rows that they return.
+        The method makes several queries, each of which reads only the rows that it returns. A single query with a join
+        would be slower: it would sort all products of a PSF first.
         """
         found: list[Affected] = []
         with self._database.reading() as session:
@@ -106,13 +106,13 @@ def _first_products(session: Session, psfs: Sequence[PsfRow], limit: int) -> lis
 
 
 def _told(session: Session, psfs: Sequence[PsfRow], products: Sequence[ProductRow]) -> list[Affected]:
-    """Products with their PSFs and the certified PSFs to which the chains of successors lead."""
+    """For each product: its PSF, and the certified PSF at the end of the chain of successors of this PSF."""
     known = _with_successors(session, psfs)
     return [Affected(row, known[row.psf_id], _last_successor(known, known[row.psf_id])) for row in products]
 
 
 def _with_successors(session: Session, psfs: Sequence[PsfRow]) -> dict[str, PsfRow]:
-    """These PSFs of one owner, and the PSFs in their chains of successors, by id."""
+    """These PSFs and all PSFs in their chains of successors, by id. All PSFs must have the same owner."""
     known = {psf.id: psf for psf in psfs}
     for _ in range(MOST_SUCCESSORS):
         further = {psf.successor_id for psf in known.values() if psf.successor_id is not None} - known.keys()
@@ -127,7 +127,7 @@ def _with_successors(session: Session, psfs: Sequence[PsfRow]) -> dict[str, PsfR
 
 
 def _last_successor(known: dict[str, PsfRow], psf: PsfRow) -> PsfRow | None:
-    """The certified PSF at the end of the chain of successors, or None."""
+    """The certified PSF at the end of the PSF's chain of successors; None if there is none."""
     at: PsfRow | None = psf
     for _ in range(MOST_SUCCESSORS):
         if at is None or at.successor_id is None:

@@ -22,7 +22,7 @@ PACE_S, PACE_IMAGES = 3600.0, 500
 
 @dataclass(frozen=True)
 class Pace:
-    """taken: images that workers process now. images_an_hour: images that ended per hour; None if not known."""
+    """The speed of a bulk run. taken: number of images that workers process now. images_an_hour: None if not known."""
 
     taken: int
     images_an_hour: float | None
@@ -30,7 +30,8 @@ class Pace:
 
 @dataclass(frozen=True)
 class Reason:
-    """Failed images of a run whose errors have the same code. example: the first such image in the order of the run."""
+    """The failed images of a run with the same error code. images: their number. example: the first of them in the
+    run."""
 
     code: str
     images: int
@@ -56,7 +57,11 @@ class BulkProgress:
         return None
 
     def pace(self, bulk: BulkRow) -> Pace:
-        """Images that workers process now, and images that ended per hour since the run was last started or resumed."""
+        """The speed of a run: the images that workers process now, and the images that ended per hour.
+
+        The rate is computed from the last ``PACE_S`` seconds, or from the time since the run was last started or
+        resumed if that is shorter; and from at most the last ``PACE_IMAGES`` images.
+        """
         until = bulk.ended_at or time.time()
         since = max(bulk.running_since or bulk.created_at, until - PACE_S)
         ended = select(BulkItemRow.ended_at).where(
@@ -93,7 +98,8 @@ class BulkProgress:
             return session.scalars(query.order_by(BulkItemRow.position).limit(limit)).all()
 
     def reasons(self, bulk_id: str) -> list[Reason]:
-        """The first ``MOST_EXPLAINED`` failed images by the code of their error, the most frequent code first."""
+        """The errors of the first ``MOST_EXPLAINED`` failed images, grouped by error code; the most frequent code
+        first."""
         failed = (BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.FAILED)
         code = BulkItemRow.error["code"].as_string().label("code")
         # PostgreSQL groups by a column of a subquery, but not by an expression with a parameter.

@@ -290,8 +290,8 @@ class Bulks:
                 return Taken(bulk_id, item.position, item.source, item.uploaded, item.attempts, lease)
 
     def release(self, taken: Taken) -> bool:
-        """Give an image back, as if it had not been taken; the attempt does not count. Returns False if the worker
-        has lost the right to work on the image."""
+        """Give an image back, so that a worker can take it again. The attempt does not count. Returns False if the
+        worker has lost the right to work on the image."""
         values = {"state": ItemState.WAITING, "attempts": BulkItemRow.attempts - 1, "token": None}
         return bool(self._database.change(update(BulkItemRow).where(*_holding(taken)).values(**values)))
 

@@ -257,7 +257,8 @@ def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:
 
 
 def _user_of(session: Session, psf: PsfRow) -> tuple[str, str] | None:
-    """One thing that uses a PSF: its type (a key of _FIRST) and its id; None if nothing uses the PSF."""
+    """The type (a key of _FIRST) and the id of one product, context, ... that uses a PSF; None if nothing uses the
+    PSF."""
     found: str | None
     owner = psf.owner
     products = select(ProductRow.id).where(ProductRow.owner == owner, ProductRow.psf_id == psf.id)

@@ -31,7 +31,7 @@ _SHORT_ID = re.compile(SHORT_ID)
 
 @dataclass(frozen=True)
 class Pin:
-    """A PSF for a range of times. validity None: the range for which the PSF is certified."""
+    """A PSF for a range of observation times. validity: this range; None: the range for which the PSF is certified."""
 
     psf_id: str
     validity: Validity | None = None
@@ -141,8 +141,8 @@ class Contexts:
     ) -> None:
         """Set an owner's default context; None: use the PSFs that are certified now.
 
-        quota_mib: as for ``Catalogue.add``, because every change is stored. Raises ``OverQuota``, and ``DataError``
-        "no-such-context".
+        quota_mib: as for ``Catalogue.add``; every change adds a row, which counts in the quota. Raises ``OverQuota``,
+        and ``DataError`` "no-such-context".
         """
         context_id = None if id_or_name is None else self.named(id_or_name, owner).id
         row = DefaultContextRow(owner=owner, context_id=context_id, at=time.time(), by=by, reason=reason)

@@ -98,7 +98,8 @@ class Jobs:
         raise RuntimeError(f"job for request {request_key} neither inserted nor found")
 
     def _shared(self, owner: str, request_key: str) -> tuple[str, JobRow | None]:
-        """Find the queued, executing or completed job that an identical request can share; returns its key and the job.
+        """Find the queued, executing or completed job that this request can share; returns the key and the row of that
+        job.
 
         If there is no such job, returns the key for a new job, and None instead of a job. If an identical job cannot
         be shared, the key of the new job is computed from the id of that job. Later identical requests then find the
@@ -173,7 +174,10 @@ class Jobs:
         return None if found is None else lease
 
     def _count_turn(self, session: Session, owner: str, queue: str) -> None:
-        """Record that this owner was served last in a queue. Turns are numbered, because clocks may be set back."""
+        """Record that this owner is the one most recently served from a queue.
+
+        The turns are numbered; times are not used, because clocks may be set back.
+        """
         insert = sqlite.insert if self._database.sqlite else postgresql.insert
         latest = select(func.coalesce(func.max(OwnerTurnRow.number), 0)).where(OwnerTurnRow.queue == queue)
         turn = insert(OwnerTurnRow).values(owner=owner, queue=queue, number=latest.scalar_subquery() + 1)

@@ -44,7 +44,7 @@ class NamedFiles:
     def all(self, *, solutions_from: float = -math.inf) -> Iterator[str]:
         """Every hash in the database; a hash may occur more than once. Rows are read in batches.
 
-        solutions_from: kept solutions that were made before this time are left out.
+        solutions_from: solutions that were stored before this time are left out.
         """
         for table in Base.metadata.sorted_tables:
             if table.name not in _SKIPPED:

@@ -16,8 +16,10 @@ from workers.catalogue.tables import PartRow
 
 @dataclass(frozen=True)
 class Part:
-    """The right to work on a part. A worker that lost this right may still store the result of the part, if no other
-    worker has stored a result."""
+    """A worker's right to work on a part of a job.
+
+    A worker that has lost this right can still store its result, if no other worker has stored a result of the part.
+    """
 
     owner: str
     request_key: str

@@ -222,8 +222,8 @@ class ProductRow(Base):
 class JobRow(Base):
     """A job. ``work_key`` is the identity of its result.
 
-    ``request_key`` equals ``work_key``. If another job that is queued, executing or completed already has that key,
-    ``request_key`` is a different key.
+    ``request_key`` normally equals ``work_key``. It is a different key if another queued, executing or completed job
+    already has this key.
     """
 
     __tablename__ = "jobs"

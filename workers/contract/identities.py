@@ -109,7 +109,10 @@ def diffraction_identity(request: ResolvedOnTransit) -> str | None:
 def _transit_identity(
     kind: str, request: ResolvedOnTransit, excluded: tuple[str, ...] = (), **more: str
 ) -> str:
-    """excluded: fields of the request that do not change the result. more: further values that determine the result."""
+    """The identity of the result of a request on a transit.
+
+    excluded: fields of the request that do not change the result. more: further values that determine the result.
+    """
     return canonical_hash(
         {
             "kind": kind,
@@ -123,7 +126,7 @@ def _transit_identity(
 
 
 def request_identity(kind: str) -> Callable[[Any], str]:
-    """The identity function of a kind whose result depends only on its parameters and its ``algorithm_version``."""
+    """The identity function of a job kind whose result depends only on its parameters and its ``algorithm_version``."""
 
     def identity(request: Parameters) -> str:
         version = {"algorithm_version": request.algorithm_version}

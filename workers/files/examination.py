@@ -31,7 +31,7 @@ class Fault:
 
     @property
     def what(self) -> str:
-        """The kind of thing that lacks a file, for example "product"."""
+        """The kind of the row whose file is lost or damaged, for example "product"."""
         return NAMES[type(self.row)]
 
 

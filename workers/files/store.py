@@ -209,8 +209,8 @@ class Store:
     def remove(self, digest: str, kept_before: float) -> bool:
         """Remove a file. If the file was stored again since ``kept_before``, or no longer exists, do nothing.
 
-        Returns whether the file was removed. The file is first moved aside and checked there, so that a file that is
-        stored at the same moment is not lost.
+        Returns whether the file was removed. The file is first moved to another folder and checked there. Otherwise a
+        file that is stored at the same moment could be lost.
         """
         aside = self._tmp / uuid.uuid4().hex
         target = self.path(digest)

@@ -37,7 +37,7 @@ TABLES: dict[Result, type[Any]] = {
 
 
 def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
-    """Queue a completed job again if its result was deleted or a file of it is lost; returns whether this was done."""
+    """Queue a completed job again if its result was deleted or a file of the result is lost; True if it was queued."""
     table = TABLES.get(KINDS[job.kind].result)
     if job.phase != Phase.COMPLETED or table is None or job.result_id is None:
         return False
@@ -46,7 +46,7 @@ def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
 
 
 def without_results(jobs: Sequence[JobRow], catalogue: Catalogue) -> frozenset[str]:
-    """The ids of completed jobs among ``jobs`` whose result was deleted later. All jobs must have the same owner."""
+    """The ids of the completed jobs in ``jobs`` whose result was deleted. All jobs must have the same owner."""
     gone: set[str] = set()
     for result, table in TABLES.items():
         done = {

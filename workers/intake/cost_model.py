@@ -33,8 +33,10 @@ class Linear(_Frozen):
 
 
 class Deconvolution(_Frozen):
-    """Time and memory of a deconvolution. ``step_ns``, by method: time of one step per pixel of the plane (the image with its
-    margins)."""
+    """Time and memory of a deconvolution. The plane is the image with its margins.
+
+    step_ns: for each method, the time of one step for one pixel of the plane, ns.
+    """
 
     base_s: float
     image_ns: float
@@ -80,7 +82,10 @@ class Build(_Frozen):
 
 
 class Costs(_Frozen):
-    """The content of ``estimates.json``. ``threads_exponent`` p: n threads need the time of one thread times n ** -p."""
+    """The content of ``estimates.json``.
+
+    threads_exponent: p. With n threads, the time is the time of one thread multiplied by n ** -p.
+    """
 
     class Kinds(BaseModel):
         """The models by kind of job. Every kind except ``deconvolve`` and ``psf-build`` is Linear; a kind without an entry uses "other"."""

@@ -53,7 +53,7 @@ class Found:
         return _joined(self._given()) or "no filter"
 
     def _given(self) -> dict[str, str]:
-        """The filters as people write them, in the order in which they are applied."""
+        """The given filters as text for messages, in the order in which they are applied."""
         wanted = self.wanted
         at = wanted.valid_at
         said = {

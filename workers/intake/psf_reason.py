@@ -15,8 +15,10 @@ from workers.versions.series import TOTAL, series_of
 
 @dataclass(frozen=True)
 class ReasonedPsf:
-    """The PSF of a deconvolution. status None: the PSF is not built yet; name and version are then the name and
-    version of the instrument file."""
+    """The PSF of a deconvolution, and the reason for its choice.
+
+    status: None if the PSF is not built yet. In this case, name and version are those of the instrument file.
+    """
 
     id: str
     name: str

@@ -59,7 +59,7 @@ class Child:
         """End the process after this time. A further call of this method starts the time again; ``expect_no_news``
         stops it.
 
-        The clock runs in a thread that needs no Python code, so it also ends a process whose C code never returns.
+        The timer needs no Python code. Therefore it also ends a process that hangs in C code.
         """
         faulthandler.dump_traceback_later(seconds, exit=True, file=2)
 

@@ -62,8 +62,9 @@ class Runner:
         submit: Callable[[str, Queue], bool] = lambda job_id, queue: False,
         child: Child | None = None,
     ) -> None:
-        """submit: function that sends an unfinished job to the broker again. If it returns False, the reconciler sends the job.
-        child: this process, if the runner may limit its memory and end it; None: the runner must do neither.
+        """submit: a function that sends an unfinished job to the broker again; if it returns False, the reconciler
+        does so. child: this process, if the runner may limit the memory of the process and end it; None if it may do
+        neither.
         """
         self._settings, self._catalogue, self._store = settings, catalogue, store
         self._call_for_help, self._submit = call_for_help, submit

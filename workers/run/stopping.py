@@ -18,7 +18,10 @@ class Stopping:
         )  # the deadline, as a time of time.monotonic(), a clock that all processes share; 0: the worker need not stop
 
     def ask(self, within_s: float) -> None:
-        """Take no more jobs, and hand back the running one after ``within_s`` seconds. Repeated calls change nothing."""
+        """Tell the worker to take no more jobs, and to hand back the running job after ``within_s`` seconds.
+
+        If the worker was already told, the call changes nothing.
+        """
         if not self.asked:
             self._let_go_at.value = time.monotonic() + within_s
 

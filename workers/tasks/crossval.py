@@ -74,7 +74,10 @@ def assist_cross_validation(context: Context, parameters: Mapping[str, Any]) -> 
 
 
 def _solution(context: Context, request: ResolvedCrossValidate, transit: Transit) -> Solution:
-    """The fit of all images, from which every fold starts. A worker that helps reads the fit that the job's worker kept."""
+    """The fit of all images; every fold starts from this fit.
+
+    Helping workers read the solution that the worker of the job has stored.
+    """
     return solved(context, request, transit, shape_named(request.shape), progress=context.report)
 
 

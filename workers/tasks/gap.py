@@ -70,7 +70,8 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def _added(context: Context, request: ResolvedGapDiagnose) -> tuple[Added, ...]:
-    """The operator's own effects. A worker runs only code that its own settings name, never code that a job names.
+    """The effects that the operator added. A worker runs only the code that its own settings name, never code from a
+    job.
 
     Raises DataError "effects-changed" if the effects have changed since the job was submitted.
     """

@@ -34,7 +34,7 @@ Thing = ProductRow | PsfRow
 
 
 class _RerunCatalogue(Catalogue):
-    """The catalogue with some rows hidden, as if they had not been made yet.
+    """The catalogue without the rows in `hidden`, so that a task makes them again.
 
     Added rows go into the list ``made``, not into the database.
     """
@@ -93,7 +93,7 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
     if request.kind == "psf-build":
         parameters |= {"instrument": None, "instrument_file": _instrument_text(context, first)}
     kind.load_task()(dataclasses.replace(context, catalogue=rerun_catalogue, anew=True), parameters)
-    # The last row is the requested thing. Rows before it are things that it needed and that had been deleted.
+    # The last row is the requested product or PSF. The rows before it had been deleted and were needed again.
     made = [row for row in rerun_catalogue.made if isinstance(row, type(first))]
     if not made:
         raise DataError(

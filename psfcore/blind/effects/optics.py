@@ -49,7 +49,8 @@ class AnisotropicScatter(Effect):
 
 @dataclass(frozen=True)
 class OneSidedScatter(Effect):
-    """More scatter to one side than to the other, similar to coma, up to some tens of pixels. Not in the library."""
+    """Scatter that is stronger towards one side, similar to coma. It reaches a few tens of pixels. Not in the
+    library."""
 
     angle_deg: float = 0.0
     reach_px: float = 40.0

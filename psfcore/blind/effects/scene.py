@@ -131,7 +131,10 @@ class OutOfFieldLight(Effect):
 
 @cache
 def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
-    """The scattered light [y, x] of a band of 1 DN/s beyond one edge. It is smooth, so it is computed on a coarse grid."""
+    """The light [y, x] that is scattered into the field from a band of 1 DN/s beyond one edge.
+
+    This light is smooth, so it is computed on a coarse grid and interpolated.
+    """
     size = fine_size // FINE
     step = size / 32
     at = (np.arange(32) + 0.5) * step

@@ -39,10 +39,10 @@ _NUMBERS = "LBIJKED"  # the allowed types of a column that the decoders do not u
 class Compression:
     """How a compressed image is stored.
 
-    shape: pixels (ny, nx). tile: pixels (ny, nx) of a tile that is not cut off at the edge of the image. items: bytes of
-    an item of the heap, by column. first, heap_bytes: position of the heap, counted from the start of the table's data,
-    and its size, bytes. bytepix, blocksize: bytes of a pixel and pixels of a block for RICE_1. quantised: whether
-    pixels are stored as integers, with a scale and a zero point for each tile.
+    shape: pixels (ny, nx). tile: pixels (ny, nx) of a tile that is not cut off at the edge of the image. items: bytes
+    of an item of the heap, by column. first: offset of the heap from the start of the table's data, bytes. heap_bytes:
+    size of the heap. bytepix, blocksize: bytes of a pixel and pixels of a block for RICE_1. quantised: whether pixels
+    are stored as integers, with a scale and a zero point for each tile.
     """
 
     codec: str
@@ -178,7 +178,8 @@ def _check_dither(header: Header) -> None:
 
 
 def _heap(header: Header) -> tuple[int, int]:
-    """Start of the heap after the start of the table's data, and its size, bytes (section 7.3.5)."""
+    """Offset of the heap from the start of the table's data, and size of the heap, bytes (FITS standard, section
+    7.3.5)."""
     for key, value in (("BITPIX", 8), ("NAXIS", 2), ("GCOUNT", 1)):
         card_count(header, key, smallest=value, largest=value)
     table_bytes = card_count(header, "NAXIS1") * card_count(header, "NAXIS2")

@@ -25,11 +25,11 @@ _LONGEST_UNIT = 68  # characters of a card's value
 
 
 def decode_plane(path: str | Path, name: str, limits: FitsLimits, target: BinaryIO) -> Decoded:
-    """Write the pixels of a plane to ``target``: little-endian float32, row 0 first as in FITS. NaN stays NaN.
+    """Write the pixels of a plane to ``target`` as little-endian float32, in the order of the FITS file (row 0 first).
 
-    name: IMAGE, the first 2-D image of the file, or the name of a plane of a product, such as "quality". Returns the shape and the
-    unit of the plane. Raises HeaderError for an unusable header; DataError "unreadable-pixels", "bad-tile", "tile-too-large" or
-    "no-such-plane".
+    NaN stays NaN. name: IMAGE for the first 2-D image of the file, or the name of a plane of a product, for example
+    "quality". Returns the shape and the unit of the plane. Raises HeaderError for an unusable header; DataError
+    "unreadable-pixels", "bad-tile", "tile-too-large" or "no-such-plane".
     """
     if name == IMAGE:
         with opened_image(path, read_summary(path, limits)) as hdu:
@@ -53,7 +53,7 @@ def _written(hdu: Any, target: BinaryIO) -> Decoded:
 
 
 def _rows(hdu: Any) -> Iterator[Any]:
-    """The rows of an image [y, x], some at a time."""
+    """The pixels of an image [y, x], read a few rows at a time to save memory."""
     ny, nx = hdu.shape
     at_once = max(1, _BLOCK_BYTES // (nx * _DECODED_BYTES))
     if isinstance(hdu, fits.CompImageHDU):

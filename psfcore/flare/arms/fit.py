@@ -164,7 +164,8 @@ class _Bases:
     slope_y: NDArray[np.float64]
 
     def stamps(self, source: Plane, *, slope: str = "") -> NDArray[np.float64]:
-        """S, or its slope along x or y, on the box of each order [order, y, x]."""
+        """The values of S on the box of each order [order, y, x]. slope: "x" or "y" for the derivative along this
+        axis."""
         along_x = self.slope_x if slope == "x" else self.x
         along_y = self.slope_y if slope == "y" else self.y
         return np.asarray(along_y @ source @ along_x.transpose(0, 2, 1))
@@ -212,7 +213,7 @@ def _light(orders: Orders, bases: _Bases, state: FitState) -> NDArray[np.float64
 
 
 def _added_up(orders: Orders, bases: _Bases, stamps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sum over the orders of their stamps, at each fitted pixel."""
+    """The sum of the stamps of all orders, at each fitted pixel."""
     on = bases.index >= 0
     total = np.bincount(bases.index[on], weights=stamps[on], minlength=orders.value.size)
     return np.asarray(total, dtype=np.float64)

@@ -30,17 +30,17 @@ class Geometry:
 
     @property
     def reach(self) -> int:
-        """Knots of S on each side of its middle."""
+        """The number of knots of S on each side of the middle knot."""
         return int(np.ceil(self.half_px / KNOT_PX))
 
     @property
     def disc(self) -> Flags:
-        """True for the knots [y, x] of S that are fitted, which lie within the half size of S."""
+        """A mask [y, x] of the knots of S: True for the fitted knots. They lie within the half size of S."""
         knots = np.arange(-self.reach, self.reach + 1) * KNOT_PX
         return np.asarray(np.hypot(knots[:, None], knots) <= self.half_px + 0.25)
 
     def source(self, coefficients: NDArray[np.float64]) -> Plane:
-        """Coefficients of S [y, x] from the coefficients on the disc."""
+        """The coefficients of S on all knots [y, x]: these coefficients on the disc, and 0 outside."""
         plane = np.zeros(self.disc.shape)
         plane[self.disc] = coefficients
         return plane
@@ -64,7 +64,10 @@ class Orders:
     number: NDArray[np.intp]
 
     def planes(self) -> list[tuple[NDArray[np.intp], Plane]]:
-        """For each order: the indices of its pixels, and an orthonormal basis of weighted planes on these pixels [pixel, 3]."""
+        """For each order with at least 3 pixels: the indices of its pixels, and a basis [pixel, 3].
+
+        The basis is orthonormal. It spans the functions that are linear in x and y on these pixels, divided by sigma.
+        """
         found = []
         by_order = np.argsort(self.nearest, kind="stable")
         for pixels in np.split(by_order, np.cumsum(np.bincount(self.nearest))[:-1]):

@@ -107,7 +107,10 @@ def _best_angles(
     n_arms: int,
     near_deg: tuple[float, ...] | None,
 ) -> NDArray[np.float64]:
-    """The n_arms best angles at least _APART_DEG apart, or the best one within _NEAR_DEG of each given angle."""
+    """The angles with the best scores, at least _APART_DEG apart.
+
+    Their number is n_arms. If `near_deg` is given, there is one angle within _NEAR_DEG of each angle of `near_deg`.
+    """
     found: list[float] = []
     for arm in range(n_arms if near_deg is None else len(near_deg)):
         allowed = np.ones(degrees.size, dtype=bool)

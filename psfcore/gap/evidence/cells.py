@@ -96,7 +96,10 @@ def sensitivities(optics: Optics, dark: Pixels, weights: Matrix) -> Planes:
 
 
 def whitening(covariance: Matrix) -> Matrix:
-    """The whitening matrix of a covariance (n, n): it scales values with this covariance to unit noise. It is 0 if there is no noise."""
+    """The whitening matrix of a covariance (n, n). It is 0 if there is no noise.
+
+    Multiplied by this matrix, values with this covariance become uncorrelated, with variance 1.
+    """
     values, vectors = np.linalg.eigh(covariance)
     if values[-1] <= 0:
         return np.zeros_like(covariance)

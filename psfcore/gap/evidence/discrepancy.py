@@ -88,7 +88,7 @@ class Discrepancy:
     orders: dict[str, tuple[int, ...]]
 
     def columns(self, orders: Sequence[str], first: int) -> list[int]:
-        """The columns of some orders, if the first column of the discrepancy has the number `first`."""
+        """The numbers of the columns of these orders. first: the number of the first column of the discrepancy."""
         return [first + column for order in orders for column in self.orders.get(order, ())]
 
 
@@ -113,7 +113,11 @@ def discrepancy(evidence: Evidence) -> Discrepancy:
 
 
 def _of_discs(evidence: Evidence) -> dict[str, list[Matrix]]:
-    """For each order the changes of the cells (discs, cells), DN/s; cells that a disc lacks are 0."""
+    """The changes of the disc cells for each order (a property such as time or exposure; see above).
+
+    An order has one array (discs, cells), DN/s, for each coefficient. Discs have different numbers of cells; the rest
+    of a row is 0.
+    """
     infos = [evidence.image_info[disc.index] for disc in evidence.discs]
     cells = max(disc.residual.size for disc in evidence.discs)
     level = np.array([disc.mean_expected for disc in evidence.discs])
@@ -150,7 +154,11 @@ def _of_discs(evidence: Evidence) -> dict[str, list[Matrix]]:
 
 
 def _of_blocks(evidence: Evidence) -> dict[str, list[Matrix]]:
-    """For each order the changes of the unocculted blocks (images, blocks), DN/s."""
+    """The changes of the unocculted blocks for each order (a property such as time or exposure) and for each block
+    alone.
+
+    An order has one array (images, blocks), DN/s, for each coefficient.
+    """
     blocks = evidence.unocculted
     mean = np.maximum(blocks.means, 1e-9)
     usual = float(mean.mean())
@@ -177,7 +185,8 @@ def _of_blocks(evidence: Evidence) -> dict[str, list[Matrix]]:
 
 
 def _that_vary(found: dict[str, list[Matrix]]) -> dict[str, list[Matrix]]:
-    """The orders without those columns that are zero, because the data do not vary along them."""
+    """Remove the arrays that are zero everywhere, because the data do not vary along them, and orders without any
+    array."""
     kept = {name: [plane for plane in planes if plane.any()] for name, planes in found.items()}
     return {name: planes for name, planes in kept.items() if planes}
 

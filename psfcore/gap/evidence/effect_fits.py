@@ -99,7 +99,11 @@ def left_chi2(model: LinearModel, step: Step) -> Vector:
 
 
 def _p_value(model: LinearModel, columns: Sequence[int], gain: float, trials: float) -> float:
-    """The probability that noise alone gains at least `gain`: a chi2 distribution with the mean and variance of that gain."""
+    """The probability that noise alone gives at least this gain, times the number of trials (at most 1).
+
+    The distribution of the gain from noise alone is approximated by a scaled chi2 distribution with the same mean and
+    variance.
+    """
     learned = model.learned(columns)
     shares = learned / (1 + learned)
     free = len(columns) - learned.size + model.evidence.numbers_of(columns)
@@ -111,9 +115,10 @@ def _p_value(model: LinearModel, columns: Sequence[int], gain: float, trials: fl
 
 
 def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
-    """The column of a fit that gains least, among the columns that gain less than their measured numbers cost.
+    """Find the columns whose gain is smaller than the cost of their measured numbers. Return the one with the smallest
+    gain.
 
-    None if every column gains at least as much as its measured numbers cost.
+    None if there is no such column.
     """
     columns = step.columns[len(model.evidence.base) :]
     idle = {}

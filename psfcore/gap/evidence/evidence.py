@@ -83,7 +83,7 @@ class Evidence:
         return tuple(disc.index for disc in self.discs)
 
     def unocculted_equations(self, images: Sequence[int] | None = None) -> UnoccultedEquations:
-        """The normal equations of all columns, from the unocculted blocks of some images (None: all images)."""
+        """The normal equations of all columns from the unocculted blocks. images: the images to use; None: all."""
         return self.all_unocculted if images is None else self.unocculted.equations(range(self.size), images)
 
     @cached_property
@@ -93,7 +93,10 @@ class Evidence:
 
     @cached_property
     def steady_unocculted(self) -> UnoccultedEquations:
-        """As `all_unocculted`, but flickering blocks have a low weight, from their observed variance. Used to judge residuals."""
+        """As `all_unocculted`, but the weight of a flickering block follows from its observed variance, so it is low.
+
+        These equations are used to judge residuals.
+        """
         return self.unocculted.with_flickering_blocks().equations(range(self.size))
 
     @property
@@ -158,7 +161,8 @@ def gather(
 def _changes(
     view: View, library: Sequence[Effect]
 ) -> tuple[list[Change], dict[str, tuple[int, ...]], dict[str, str]]:
-    """Three results: the changes of all effects in one list; their indices by effect; why effects are untestable, by effect."""
+    """Three results: the changes by all testable effects, in one list; for each of these effects, the indices of its
+    changes in the list; for each other effect, the reason why it cannot be tested."""
     changes: list[Change] = []
     columns: dict[str, tuple[int, ...]] = {}
     untestable: dict[str, str] = {}
@@ -192,7 +196,8 @@ def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
 
 
 class _Distance:
-    """The mean distance r from which light scatters into a disc. The weight of a distance is the light that arrives from it."""
+    """The mean distance r from which light scatters into a disc, weighted with the light that comes from each
+    distance."""
 
     def __init__(self, view: View) -> None:
         kernel, solution = view.kernel, view.solution
@@ -224,7 +229,7 @@ def _image_info(frame: Frame, found: FoundPlace, distance_px: float) -> ImageInf
 
 
 def _testable(evidence: Evidence) -> Evidence:
-    """The evidence without those effects that change neither a disc nor a block; they become untestable."""
+    """Remove the effects that change neither a disc nor a block, and list them as untestable."""
     untestable, columns = dict(evidence.untestable), dict(evidence.columns)
     for name, here in evidence.columns.items():
         cells = max(float(np.abs(disc.jacobian[list(here)]).max()) for disc in evidence.discs)

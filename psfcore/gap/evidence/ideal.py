@@ -170,7 +170,7 @@ def _left(model: LinearModel, effects: tuple[Effect, ...]) -> Left:
 
 
 def _at_places_of(clean: Solution, solution: Solution) -> Solution:
-    """A solution whose occulters are where another solution found them."""
+    """A copy of `solution` in which every occulter is at the position that the solution `clean` found."""
     sky = solution.sky.copy()
     sky.found = list(clean.sky.found)
     frames = solution.transit.frames
@@ -179,7 +179,8 @@ def _at_places_of(clean: Solution, solution: Solution) -> Solution:
 
 
 def _sampling_residuals(evidence: Evidence, solution: Solution, clean: Solution) -> list[Vector]:
-    """The residuals without the effect in the cells of every disc (cells,), DN/s."""
+    """For every disc: the residuals of the image without the effect, in the same cells as with the effect (cells,),
+    DN/s."""
     sky = clean.sky.copy()
     sky.dark = solution.sky.dark
     same_pixels = replace(clean, sky=sky)

@@ -102,7 +102,7 @@ class _Part:
     more: float
 
     def chi2(self, theta: Vector) -> float:
-        """chi2 at some parameters."""
+        """chi2 for the parameters `theta`."""
         long = np.append(-theta, 1.0)
         return max(float(long @ self.bordered @ long), 0.0) + self.more
 
@@ -176,7 +176,10 @@ class Likelihood:
         return self._weighed(parts, theta, scales, columns, taken, trials)
 
     def normal(self, columns: Sequence[int]) -> Matrix:
-        """The normal matrix of some columns for noise alone, with PSF, scenes and brightness free: no template error, no prior."""
+        """The normal matrix of some columns if the only error is noise: without template error and without prior.
+
+        PSF, scenes and brightness are free parameters.
+        """
         first = len(self._base)
         parts = self._parts([list(columns)], np.zeros(first + len(columns)), np.zeros(len(columns)))
         whole = _together(parts, (1.0, 1.0))[0]
@@ -227,7 +230,8 @@ class Likelihood:
         return size, fixed
 
     def _prior(self, columns: Sequence[int], scale: float) -> Vector:
-        """1 / variance of the prior of the coordinates of the PSF (0: no prior) and of some columns."""
+        """1 / variance of the prior, for the coordinates of the PSF and then for these columns. 0: no prior, as for
+        the PSF."""
         size, fixed = (one[list(columns)] for one in self._widths)
         return np.append(np.zeros(len(self._base)), (size * np.where(fixed, 1.0, scale)) ** -2.0)
 
@@ -363,7 +367,11 @@ class _Pointing:
     errors: Planes
 
     def part(self, columns: Sequence[int], effects: Sequence[tuple[list[int], Vector]]) -> _Part:
-        """Normal equations of some columns. effects: the columns of each effect, and the values that set its template error."""
+        """The normal equations of these columns.
+
+        effects: for each effect, its columns and the values of its parameters. The template error is proportional to
+        these values.
+        """
         images, blocks = self.level.shape
         changes = [TEMPLATE_ERROR * (self.errors[..., group] @ values) for group, values in effects]
         changes = [change for change in changes if change.any()]
@@ -392,7 +400,8 @@ class _Pointing:
 
 
 def _pointings(model: LinearModel, errors: Planes) -> list[_Pointing]:
-    """The blocks of every pointing in which at least LEAST_IMAGES images show a block."""
+    """For every pointing: the blocks that at least LEAST_IMAGES images show; pointings without such blocks are left
+    out."""
     blocks = model.evidence.unocculted
     found = []
     for pointing in np.unique(blocks.pointing):

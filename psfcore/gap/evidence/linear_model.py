@@ -97,7 +97,10 @@ class LinearModel:
         return Whitened(disc.index, white @ disc.residual, disc.jacobian @ white, white)
 
     def equations(self, images: Sequence[int] | None = None) -> tuple[Matrix, Vector]:
-        """Normal matrix and right-hand side (`score`) of all columns, from some images (None: all images). Results are kept."""
+        """The normal matrix and the right-hand side (`score`) of all columns. images: the images to use; None: all.
+
+        Each result is computed once and kept.
+        """
         key = None if images is None else tuple(images)
         if key not in self._equations:
             self._equations[key] = self._equations_of(images)
@@ -156,14 +159,16 @@ class LinearModel:
         return frozenset(column for name in fields for column in self.evidence.columns[name])
 
     def pull_of_prior(self, step: Step, taken_out: Vector) -> Vector:
-        """The amount by which the prior reduces the fitted values if it also applies to amounts that were subtracted before.
+        """How much smaller the fitted values become if the prior also applies to the amounts that were subtracted
+        before the fit.
 
-        taken_out: the subtracted amounts, by column of the fit.
+        taken_out: the subtracted amounts, for each column of the fit.
         """
         return np.asarray(step.covariance @ (self._prior[list(step.columns)] * taken_out))
 
     def learned(self, columns: Sequence[int]) -> Vector:
-        """l of Eq. (3) for those columns that belong to a random field. The other columns and the PSF are refitted."""
+        """l of Eq. (3) for the columns of random fields in `columns`. The other columns of `columns` and the PSF are
+        refitted."""
         field = [column for column in columns if column in self.of_fields]
         if not field:
             return np.zeros(0)

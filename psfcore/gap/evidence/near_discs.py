@@ -76,7 +76,10 @@ class NearDiscs:
         return np.concatenate(self._residuals)
 
     def of_kernel(self, change: Plane) -> Vector:
-        """T of Eq. (1) for all cells (cells,), in units of their noise. change: of the PSF [y, x], with its centre at n // 2."""
+        """T of Eq. (1) for all cells (cells,), in units of their noise.
+
+        change: the change of the PSF [y, x]; the centre of the PSF is at [n // 2, n // 2].
+        """
         near = crop_or_pad(change, 2 * REACH_PX + 1).astype(np.float32)
         responses = [np.tensordot(disc, near, axes=2) for disc in self._to_displacements]
         return np.concatenate(responses, dtype=np.float64)

@@ -170,7 +170,7 @@ class PlaceSearch:
         return np.asarray(gain.reshape(responses.shape[1:]))
 
     def _gain(self, means: Plane, cells: Plane | None = None, *, least: float = 0.0) -> Vector:
-        """Eq. (2) of some templates (templates,).
+        """Eq. (2) for several templates (templates,).
 
         means: T of the means of the discs (discs, templates), in units of the noise. cells: T of the cells (cells, templates);
         None: use the means alone. least: a template gains 0 if its sum T^2 is below this fraction of the largest sum T^2.

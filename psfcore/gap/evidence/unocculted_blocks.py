@@ -86,7 +86,8 @@ class UnoccultedBlocks:
 
     @cached_property
     def gain_width(self) -> float:
-        """The width of the prior of g_n: the given one, or the rms spread of g_n among images of one kind."""
+        """The width of the prior of g_n: `given_gain_width`; if this is None, the rms spread of g_n in images of the
+        same kind."""
         if self.given_gain_width is not None:
             return self.given_gain_width
         free = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
@@ -98,7 +99,10 @@ class UnoccultedBlocks:
         return max(float(np.sqrt(np.mean(spread))), LEAST_GAIN) if spread else WIDEST_GAIN
 
     def equations(self, columns: Sequence[int], images: Sequence[int] | None = None) -> UnoccultedEquations:
-        """Normal equations of these columns from some images (None: all images). Scene and brightness are free parameters."""
+        """The normal equations of these columns. images: the images to use; None: all.
+
+        Scene and brightness are free parameters.
+        """
         chosen = (
             np.flatnonzero(self.part) if images is None else np.array([n for n in images if self.part[n]])
         )
@@ -223,7 +227,8 @@ def not_compared(solution: Solution, n: int) -> NDArray[np.bool_]:
 
 
 def unocculted_blocks(view: View, columns: int, progress: Progress) -> UnoccultedBlocks:
-    """The blocks of all images. columns: the number of columns; their `errors` are zero, and the caller sets them."""
+    """The blocks of all images. columns: the number of columns of `errors`. `errors` is zero; the caller fills it
+    in."""
     solution = view.solution
     transit = solution.transit
     levels, variance, free, means = [], [], [], []

@@ -35,7 +35,8 @@ class Added:
 
 
 def added_effects(sources: Sequence[str]) -> tuple[Added, ...]:
-    """The effects that some files (path ending in .py) or modules add to the library. Raises DataError "bad-effects"."""
+    """The effects that files (their paths end in .py) and modules add to the library. Raises DataError
+    "bad-effects"."""
     found = tuple(_added(source) for source in sources)
     taken = {effect.name for effect in LIBRARY}
     for one in found:

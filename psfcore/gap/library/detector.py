@@ -132,7 +132,8 @@ def _persistence(view: View) -> Sequence[Change]:
 
 
 def _filled(view: View) -> Sequence[Change]:
-    """Errors of filled or clipped pixels. Two changes: a relative error that is constant, and one that grows inwards.
+    """Errors of filled or clipped pixels. Two changes: a constant relative error, and a relative error that grows
+    inwards.
 
     The second error is zero at the rim of a filled area and grows towards its middle, as for a clipped brightening.
     """

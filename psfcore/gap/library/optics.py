@@ -57,7 +57,7 @@ def shape_slopes(view: View, shape: str, parameters: tuple[int, ...]) -> list[Bl
 
 
 def not_a_power_law(view: View) -> str | None:
-    """The reason why changes of the softened power law cannot be tested; None if they can."""
+    """The reason why changes of the softened power law cannot be tested for this fit; None if they can be tested."""
     name = view.solution.inversion.shape.name
     return (
         None
@@ -83,7 +83,8 @@ def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
 
 
 def _held(name: str, changes: Callable[[View], Sequence[Change]]) -> Effect:
-    """The effect of this name, with the result of its search fixed. changes: the changes for this result."""
+    """The effect of this name, without its search. changes: the changes for the result of the search, which stays
+    fixed."""
     sought = next(effect for effect in EFFECTS if effect.name == name)
     return replace(sought, changes=changes, held=None)
 
@@ -152,7 +153,7 @@ def _core_blur(view: View) -> Sequence[Change]:
 
 
 def blur_as(view: View, width_px: float, steps: Steps) -> Sequence[Change]:
-    """The change of the images by a blur of width `width_px`, divided by its variance, width_px^2."""
+    """The change of the images by a blur of width `width_px`, divided by the variance of the blur, width_px^2."""
     change = (_blurred(view.kernel, width_px, steps) - view.kernel) / width_px**2
     return [by_psf(view, _blur(view, change))]
 

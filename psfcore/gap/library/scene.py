@@ -109,7 +109,7 @@ def _motion(view: View) -> Sequence[Change]:
 def _evolution(view: View) -> Sequence[Change]:
     """The changes of the Sun within each pointing, measured in the unocculted field. Each is scaled to a relative rms of 1.
 
-    Two changes: one that is linear in time, and the rest of the change that is smooth in time. The discs do not show these
+    Two changes: the part that is linear in time, and the other part that is smooth in time. The discs do not show these
     changes, because the scene of each image is reconstructed from the image itself.
     """
     frames = view.solution.transit.frames
@@ -150,15 +150,18 @@ class _Evolving:
     free: NDArray[np.int64]
 
     def planes(self, terms: slice) -> dict[int, Planes]:
-        """The difference of each image from the mean over time, from some of the terms, by image number [y, x], DN/s."""
+        """For each image, by its number: the change of the scene that these terms describe [y, x], DN/s.
+
+        The mean of the change over time is 0.
+        """
         # The mean over time belongs to the scene, not to its change.
         basis = self.basis[:, terms] - self.basis[:, terms].mean(axis=0)
         return dict(zip(self.images, np.tensordot(basis, self.terms[terms], axes=1), strict=True))
 
     def numbers(self, terms: slice) -> int:
-        """The number of values that were measured in the blocks for some of the terms.
+        """How many values were measured in all blocks for these terms.
 
-        A block counts with at most the number of images that show it.
+        In each block, at most as many values count as images show this block.
         """
         last = np.minimum(self.basis.shape[1] if terms.stop is None else terms.stop, self.free)
         return int(np.maximum(last - terms.start, 0).sum())

@@ -77,7 +77,8 @@ def _curve_row(k: int, radius: float, columns: list[tuple[Inversion, Any]]) -> l
 
 
 def _compared(values: list[float], sigma: list[float]) -> list[str]:
-    """The values with their errors; for two values also their difference, in units of the error of the first value."""
+    """The values with their errors. For two values, also the second minus the first, in units of the error of the
+    first."""
     cells = [with_error(value, s) for value, s in zip(values, sigma, strict=True)]
     if len(values) == 2:
         cells.append(f"{(values[1] - values[0]) / sigma[0]:+.1f}" if sigma[0] > 0 else DASH)

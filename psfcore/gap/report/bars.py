@@ -70,7 +70,8 @@ def draw_effects(axes: Any, report: Report) -> None:
 
 
 def _chosen(row: Report, report: Report) -> bool:
-    """Whether a row of the report is the fit of the named effects or, for a tie, of one of the tied hypotheses."""
+    """Whether a row of the report is the fit of the named effects. For a tie: whether it is the fit of a tied
+    hypothesis."""
     names, answer = set(row["name"].split(" + ")), set(report["answer"])
     if report["verdict"] != "tie":
         return names == answer

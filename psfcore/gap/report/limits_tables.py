@@ -48,7 +48,7 @@ def alike_parts(found: Limits) -> list[Part]:
 
 
 def _matrix(found: Limits) -> Details:
-    """A table of the distances of all pairs. The number at the top of a column is the number of the effect in its row."""
+    """A table of the distances of all pairs. The rows number the effects; the columns have the same numbers."""
     names, distances = list(found.effects), found.distances
     rows = []
     for k, name in enumerate(names):

@@ -198,12 +198,15 @@ def _scale(values: Vector, noise: Vector) -> float:
 
 
 def _places() -> list[tuple[float, float, int, int]]:
-    """For every cell: its inner and outer radius (in radii of the dark disc), its sector, and the number of sectors in its ring."""
+    """The cells of a disc: inner and outer radius of the ring, number of the sector, number of sectors in the ring.
+
+    Radii are in units of the radius of the dark disc.
+    """
     return [(low, high, k, sectors) for low, high, sectors in RINGS for k in range(sectors)]
 
 
 def _numbers(disc: DiscCells) -> list[int]:
-    """For each cell of a disc, its index in `_places`. A disc has no cells with too few pixels."""
+    """For each cell of a disc, its index in `_places`. Cells with too few pixels are missing from the disc."""
     out = []
     for radius, azimuth in zip(disc.radius, disc.azimuth, strict=True):
         ring = next(k for k, (_, high, _) in enumerate(RINGS) if radius < high or k == len(RINGS) - 1)

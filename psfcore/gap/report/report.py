@@ -106,7 +106,7 @@ def looks_like(judged: Judgement) -> list[tuple[str, float]]:
 
 
 def order_words(orders: Names) -> str:
-    """A change along some orders of the data, as text."""
+    """A text that describes a change along these orders of the data (see `discrepancy`)."""
     if len(orders) > MOST_ORDERS:
         return "a change along many orders of the data"
     return "a change that varies with " + " and ".join(WORDS[order] for order in orders)

@@ -80,7 +80,7 @@ class HeldOut:
     deviance: Mapping[tuple[int, ...], float] = field(default_factory=dict)
 
     def of(self, images: Sequence[int]) -> HeldOut:
-        """The same results for some of the images, without the deviance of the folds."""
+        """The results for these images only. The deviance is left out, because it belongs to folds."""
         at = {image: k for k, image in enumerate(self.images)}
         here = [at[image] for image in images]
         return HeldOut(
@@ -172,7 +172,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
 
 
 def _deviance(left: Vector, jacobian: Vector, covariance: Vector) -> float:
-    """Eq. (4). left: residuals (n,) in units of the noise. jacobian: (parameters, n). covariance: their covariance."""
+    """Eq. (4). left: residuals (n,) in units of the noise. jacobian: (parameters, n). covariance: of the parameters."""
     values, vectors = np.linalg.eigh(covariance)
     along = (np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T) @ jacobian
     inner = np.eye(values.size) + along @ along.T
@@ -236,7 +236,10 @@ def fall(before: HeldOut, after: HeldOut) -> float:
 
 
 def gap(held_out: HeldOut, rng: np.random.Generator) -> Interval:
-    """Eq. (3) with its 90 % interval. The upper end is at least as large as a gap that the noise could hide."""
+    """Eq. (3) with its 90 % interval.
+
+    Its upper end is never below the largest gap that the noise could hide.
+    """
     squares = held_out.residual_pct**2 - held_out.noise_pct**2
     chosen = rng.integers(0, squares.size, (RESAMPLES, squares.size))
     resampled = np.sqrt(np.maximum(squares[chosen].mean(axis=1), 0.0))

@@ -158,7 +158,7 @@ def add_to_model(
 
 
 def _by_effect(effects: Sequence[Effect], values: Vector) -> dict[str, tuple[float, ...]]:
-    """Values of the parameters of some effects, by the name of the effect."""
+    """Split the list of values: for the name of each effect, the values of its parameters."""
     found, first = {}, 0
     for effect in effects:
         last = first + len(effect.parameters)
@@ -171,8 +171,9 @@ def _by_effect(effects: Sequence[Effect], values: Vector) -> dict[str, tuple[flo
 class _Remaining:
     """A fit to images from which a part of the effects was subtracted.
 
-    model: the linear model at this fit. left: the linear fit of what remains of the effects. theta: the parameters,
-    subtracted and remaining parts added. start: the coordinates of the PSF for the next round, as in `_stepped`.
+    model: the linear model at this fit. left: the linear fit of the remaining part of the effects. theta: the
+    parameters: the subtracted part plus the remaining part. start: the coordinates of the PSF for the next round, as
+    in `_stepped`.
     """
 
     model: LinearModel
@@ -194,7 +195,10 @@ def _fit_remaining(
     model: LinearModel,
     progress: Progress,
 ) -> _Remaining:
-    """Fit what remains of the effects. out: the current parameters. in_images: whether the parameter was subtracted."""
+    """Fit the effects to images from which these effects were already subtracted.
+
+    out: the current parameters. in_images: for each parameter, whether its change was subtracted from the images.
+    """
     evidence = _with_noise_of(model.evidence, gather(view.solution, held, view=view, progress=progress))
     again = replace(model, evidence=evidence)
     left = fit_effects(again, evidence.effects, any_sign=True)
@@ -270,7 +274,7 @@ def with_library(
 
 
 def hold(effect: Effect, view: View) -> Effect:
-    """The effect with the result of its search, for example a position, fixed for these images."""
+    """The effect without its search: the result of the search, for example a position, is fixed for these images."""
     return effect if effect.held is None else effect.held(view)
 
 
@@ -296,7 +300,7 @@ def _with_noise_of(before: Evidence, after: Evidence) -> Evidence:
 
 
 def _acting(effect: Effect, found: EffectFit, effects: int) -> Effect:
-    """The effect with only those parameters that the fit `found` contains. effects: the number of effects in the fit."""
+    """The effect with only the parameters that the fit `found` contains. effects: the number of effects in the fit."""
     labels = [p.name if effects == 1 else f"{effect.name}.{p.name}" for p in effect.parameters]
     return _with_part(effect, [k for k, label in enumerate(labels) if label in found.values])
 

@@ -110,7 +110,7 @@ class EffectLimits:
 
 @dataclass(frozen=True)
 class Alike:
-    """Two effects that these data cannot tell apart. would_separate: an observation that would tell them apart."""
+    """Two effects that these data cannot tell apart. would_separate: an observation that could tell them apart."""
 
     pair: tuple[str, str]
     distance: float
@@ -251,7 +251,8 @@ class _Limits:
         ]
 
     def _hypothesis(self, effect: Effect, kept: Sequence[int] | None = None) -> _Hypothesis:
-        """An effect as a hypothesis. kept: the numbers of the parameters that act; None: all."""
+        """The hypothesis that an effect acts alone. kept: indices of the parameters that the hypothesis contains;
+        None: all."""
         columns = self._columns[effect.name]
         part = np.arange(len(columns)) if kept is None else np.array(kept)
         likely = np.array([effect.parameters[k].likely for k in part])
@@ -266,7 +267,7 @@ class _Limits:
     # --- strengths that would be found ------------------------------------------------------------------
 
     def parameters(self, effect: Effect, need: _Need, observed: bool) -> tuple[ParameterLimits, ...]:
-        """The limits of every parameter of an effect; of its rms, if it is a random field."""
+        """The limits of every parameter of an effect. If the effect is a random field: the limits of its rms."""
         if effect.field:
             return (self._of_field(effect, need, observed),)
         excluded = self._excluded(effect) if observed else [None] * self._of[effect.name].size
@@ -339,8 +340,8 @@ class _Limits:
     def _excluded_rms(self, effect: Effect, likely: Vector) -> float | None:
         """The 95 % quantile of the standard deviation t of the coefficients of a random field, for a constant prior of t.
 
-        With the eigenvalues l of S N S for t = 1, and the scores z in units of their noise without the field, ln L(t) is
-        sum of (z^2 t^2 l / (1 + t^2 l) - ln(1 + t^2 l)) / 2.
+        ln L(t) is the sum of (z^2 t^2 l / (1 + t^2 l) - ln(1 + t^2 l)) / 2. l are the eigenvalues of S N S for t = 1.
+        z are the scores in units of their noise without the field.
         """
         columns = self._columns[effect.name]
         found, covariance = self._likelihood.fitted(columns, np.zeros(len(columns)).tolist())
@@ -420,7 +421,7 @@ def _odds_of(
 ) -> Callable[[Vector], Vector]:
     """A function of the strength: Eq. (2) with the 1 - FOUND quantile of q_h.
 
-    change: the columns of N of the parameters that act: one column for a fixed change, several for a random field.
+    change: the columns of N that belong to the true effect: one column for a fixed change, several for a random field.
     gained: the gain of ln L by a decrease of chi2.
     """
     inner = normal[np.ix_(hypothesis.columns, hypothesis.columns)]
@@ -480,7 +481,10 @@ def _quantile_of_sum(cumulants: Matrix, probability: float) -> Vector:
 
 
 def _first_found(margin: Callable[[Vector], Vector], unit: float, most: float) -> float | None:
-    """The smallest strength, up to `most`, whose margin is at least 0; None if there is none. unit: the error of the strength."""
+    """The smallest strength, up to `most`, for which `margin` is at least 0; None if `margin` stays below 0.
+
+    unit: the error of the strength.
+    """
     if most <= WEAKEST_TRIED * unit:
         return None
     tried = np.geomspace(WEAKEST_TRIED * unit, min(STRONGEST_TRIED * unit, most), TRIED)

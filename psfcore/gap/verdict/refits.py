@@ -31,7 +31,8 @@ class Refits:
         self.failures: list[str] = []
 
     def weighed(self, names: Names) -> Mapping[Names, Weighed] | None:
-        """The evidence at the refit of a hypothesis (`posterior.at_refit`); None if the refit failed."""
+        """The evidence of hypotheses, computed at the refit of `names` (`posterior.at_refit`); None if the refit
+        failed."""
         made = self._fit(names)
         if made is None:
             return None
@@ -47,7 +48,7 @@ class Refits:
         return tuple(fit for fit in self._made.values() if fit is not None)
 
     def of(self, hypotheses: Sequence[Names]) -> tuple[Corrected, ...]:
-        """The refits of some hypotheses, in this order, without those that failed."""
+        """The refits of these hypotheses, in this order. Failed refits are left out."""
         fits = (self._fit(names) for names in hypotheses)
         return tuple(fit for fit in fits if fit is not None)
 
@@ -93,7 +94,11 @@ class Refits:
         return self._made[names]
 
     def _start(self, effects: Sequence[Effect]) -> EffectFit:
-        """The linear fit from which a refit starts. If an effect would lose all its parameters, the fit keeps all parameters."""
+        """The linear fit from which a refit starts.
+
+        The fit leaves out parameters with the wrong sign or with too little gain. If it leaves out all parameters of an
+        effect, it is repeated with all parameters.
+        """
         start = fit_effects(self._model, effects)
         kept = set(start.step.columns)
         if all(kept.intersection(self._model.evidence.columns[effect.name]) for effect in effects):

@@ -27,9 +27,10 @@ Refit = Callable[[Names], "Mapping[Names, Weighed] | None"]
 
 
 def settled_posterior(model: LinearModel, refit: Refit | None) -> tuple[Posterior, tuple[Names, ...]]:
-    """Two results: the posterior after the full refits; the hypotheses whose refit failed, which are left out.
+    """Two results: the posterior after the full refits, and the hypotheses whose refit failed. The posterior excludes
+    these.
 
-    refit: None: the posterior of the linear model.
+    refit: makes the full refit of a hypothesis. If it is None, the posterior is that of the linear model.
     """
     effects = len(model.evidence.effects)
     found = posterior(model)

@@ -61,10 +61,11 @@ def where(
 ) -> tuple[Axis, ...]:
     """All axes, the strongest first. Significant axes come before the others; then the share decides.
 
-    favoured: the axes of the best effect. They come first if they explain at least the fraction AS_GOOD of what the best axis
-    explains, because more data than the position on the track identified this effect. explained: the fit of an effect that explains the gap.
-    If `explained` is given, the shares are computed from the part of the residuals that this effect explains. This part
-    contains no noise.
+    favoured: the axes of the best effect. They come first if they explain at least the fraction AS_GOOD of what the
+    best axis explains, because more data than the position on the track identified this effect. explained: the fit of
+    an effect that explains the gap. If `explained` is given, the shares are computed from the part of the residuals
+    that this effect explains. This part is computed from the fitted model, so it does not contain the pixel noise of
+    the residuals.
     """
     designs = _designs(model.evidence)
     cells, unocculted = _of_cells(model, designs), _of_unocculted(model, designs)
@@ -146,7 +147,10 @@ def _curve(values: Vector) -> Matrix | None:
 
 
 def _kinds(values: Vector) -> Matrix | None:
-    """Indicators of each kind of image but the first, minus their mean: (kinds - 1, images). None if there is only one kind."""
+    """For each value that occurs, except the smallest: 1 for the images with this value, otherwise 0; minus the mean.
+
+    Returns an array (values - 1, images); None if all images have the same value.
+    """
     kinds = np.unique(values)
     if kinds.size < 2:
         return None
@@ -200,7 +204,7 @@ def _of_cells(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Cells:
 
 
 def _explained(model: LinearModel, step: Step) -> list[Vector]:
-    """The part of the cells of each disc that the effects of a fit explain."""
+    """For each disc: the residuals of its cells that the fitted effects predict."""
     base = len(model.evidence.base)
     here, values = list(step.columns[base:]), step.values[base:]
     return [disc.jacobian[here].T @ values for disc in model.discs]

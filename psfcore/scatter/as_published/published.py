@@ -63,13 +63,12 @@ LEAST_OF_MEAN = 0.5
 class Choices:
     """The four biases of the published fit. True: as published. False: corrected.
 
-    weighed_by_observed: each equation is divided by its own noisy intensity, which biases the light in faint discs low.
-    Corrected: each equation is divided by the noise expected at the disc's mean.
-    added: the scatter kernel is added to the diffraction PSF, Eq. (1) of `equations`. Corrected: kernel and diffraction
-    PSF are convolved, so the ring sums are computed from the diffracted scene. counted_on_array: the unscattered light
-    is 1 minus the scatter summed over the array of the diffraction PSF. Corrected: the sum covers the full reach.
-    whole_disc_blanked: all pixels whose centres lie within the radius are set to zero. Corrected: only the fully dark
-    pixels are set to zero.
+    weighed_by_observed: each equation is divided by its own noisy intensity; the fitted light in faint discs is then
+    too low. Corrected: each equation is divided by the noise expected at the disc's mean. added: the scatter kernel is
+    added to the diffraction PSF, Eq. (1) of `equations`. Corrected: kernel and diffraction PSF are convolved, so the
+    ring sums are computed from the diffracted scene. counted_on_array: the unscattered light is 1 minus the scatter
+    summed over the array of the diffraction PSF. Corrected: the sum covers the full reach. whole_disc_blanked: all
+    pixels whose centres lie within the radius are set to zero. Corrected: only the fully dark pixels are set to zero.
     """
 
     weighed_by_observed: bool = True
@@ -90,7 +89,10 @@ ALL_CORRECTED = Choices(False, False, False, False)
 
 @dataclass(frozen=True)
 class PublishedRound:
-    """One round. fit: free shells or power law. curve_pct: 1 - encircled energy of its total PSF, percent."""
+    """One round of the published fit. fit: free shells or power law.
+
+    curve_pct: 1 - encircled energy of the total PSF of this round, percent.
+    """
 
     fit: str
     curve_pct: tuple[float, ...]

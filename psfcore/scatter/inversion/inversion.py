@@ -141,11 +141,11 @@ def refit(
     *,
     progress: Progress = lambda stage, step, steps: None,
 ) -> SolutionWithoutErrors:
-    """Repeat the fit of a solution with other counts (see `invert`).
+    """Repeat the fit of a solution with other counts.
 
-    start: coordinates near the expected result, for example one Gauss-Newton step from the solution. The iteration starts
-    from the scenes of the solution. Every occulter is located again with the PSF at the coordinates `start`. Raises the
-    errors of `invert`.
+    counts: how many times each image counts (see `invert`). start: coordinates near the expected result, for example
+    one Gauss-Newton step from the solution. The iteration starts from the scenes of the solution. Every occulter is
+    located again with the PSF at the coordinates `start`. Raises the errors of `invert`.
     """
     total, threads = solution.total, solution.threads
     sky = solution.sky.copy()

@@ -43,7 +43,7 @@ _HEADER_BYTES = 4096  # no .npy header is longer
 
 @dataclass(frozen=True)
 class _FrameLight:
-    """The single numbers of a FrameFit. Its arrays and its frame are stored elsewhere."""
+    """The scalar values of a FrameFit. Other files contain its arrays and its frame."""
 
     observed: float
     expected: float
@@ -177,7 +177,8 @@ class _Members:
     def _array(
         self, name: str, dtype: np.dtype[Any], shape: tuple[int | None, ...], most: int | None = None
     ) -> NDArray[Any]:
-        """An array of this type and shape. None in the shape stands for any length; the data may then have up to `most` bytes."""
+        """Read an array, and check its type and shape. None in `shape` allows any length, but at most `most` bytes in
+        all."""
         sizes = [n for n in shape if n is not None]
         limit = int(np.prod(sizes)) * dtype.itemsize if most is None else most
         with self._open(f"{name}.npy", limit + _HEADER_BYTES) as member:

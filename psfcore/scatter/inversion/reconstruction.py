@@ -192,7 +192,8 @@ class Reconstruction:
 
 
 def pixel_weight(transit: Transit, n: int, expected: Vector) -> Vector:
-    """The inverse of the variance of Eq. (3) for the dark pixels of image n. expected: their intensities, DN/s."""
+    """1 / variance (Eq. (3)) of each dark pixel of image n. expected: the expected intensities of these pixels,
+    DN/s."""
     level = np.maximum(expected, LEAST_LEVEL * expected.mean())
     return np.asarray(1 / transit.noise.variance(level, transit.frames[n].exposure_s))
 

@@ -105,7 +105,8 @@ class Solution(Reconstruction):
 
 @dataclass(frozen=True, eq=False)
 class SolutionWithoutErrors(Reconstruction):
-    """A fit to some images of a transit, without errors. left_out: files that the fit could not use, with the reasons.
+    """A fit to all or some of the images of a transit. Its errors are not computed. left_out: files that the fit could
+    not use, with the reasons.
 
     The scenes of images outside the fit are taken from the solution from which the fit started.
     """

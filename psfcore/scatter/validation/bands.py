@@ -70,7 +70,7 @@ class ShellBands:
 
     @property
     def largest(self) -> Excess:
-        """The excess that is largest relative to its error."""
+        """The excess with the largest ratio of its absolute value to its error."""
         return self.excess(int(np.argmax(np.abs(self.excess_pct[2] / self.excess_sigma))))
 
     def to_json(self) -> dict[str, Any]:
@@ -96,8 +96,8 @@ class ShellBands:
 class Excess:
     """The light of the free fit within a distance minus the light of the formula within the same distance.
 
-    points: this difference in percentage points of all light. sigma: error of `points`. of_formula_pct: the same
-    difference in percent of the formula's light within the distance.
+    points: the difference in percent of all light. sigma: error of `points`. of_formula_pct: the same difference in
+    percent of the light that the formula puts within the distance.
     """
 
     within_px: float

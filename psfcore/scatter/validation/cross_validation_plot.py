@@ -52,7 +52,7 @@ def cross_validation_png(
 
 
 def draw_weights(axes: Axes, shells: ShellBands) -> None:
-    """Weight per pixel by distance."""
+    """Draw the weight per pixel of the diffuse scatter against distance, for the free fits and the formula."""
     radius = np.sqrt(shells.edges_px[1:] * shells.edges_px[:-1])
     lowest = 0.1 * float(shells.law_weight.min())
     _band(axes, radius, shells.law_weight, FORMULA, "formula")
@@ -120,7 +120,7 @@ def draw_curve(axes: Axes, bands: Bands) -> None:
 
 
 def draw_totals(axes: Axes, bands: Bands) -> None:
-    """Histogram of the total scattered light of all fits."""
+    """Draw a histogram of the scatter totals (percent of all light) of all fits."""
     axes.hist(100 * bands.totals, bins=min(25, max(5, bands.totals.size // 4)), color=FORMULA)
     axes.set(
         xlabel="Diffusely scattered light (%)", ylabel="Number of fits", title="Scattered light, all fits"
@@ -128,7 +128,7 @@ def draw_totals(axes: Axes, bands: Bands) -> None:
 
 
 def draw_held_out(axes: Axes, bands: Bands, fov_of: list[int]) -> None:
-    """Residuals of the held-out images."""
+    """Draw the residual of each held-out image, coloured by pointing. fov_of: the pointing of each image."""
     images = np.array(list(bands.held_out_pct))
     residual = np.array(list(bands.held_out_pct.values()))
     fov = np.array([fov_of[n] for n in images])
@@ -144,7 +144,7 @@ def draw_held_out(axes: Axes, bands: Bands, fov_of: list[int]) -> None:
 def _band(
     axes: Axes, x: Vector, limits: Vector, colour: str, name: str, *, marker: str = "", line: str = "-"
 ) -> None:
-    """The median and the bands of 1 and 2 sigma."""
+    """Draw a median and its bands of 1 and 2 sigma. limits: the rows -2 sigma, -1 sigma, median, +1 sigma, +2 sigma."""
     low_2, low_1, median, high_1, high_2 = limits
     axes.fill_between(x, low_2, high_2, color=colour, alpha=0.18, linewidth=0)
     axes.fill_between(x, low_1, high_1, color=colour, alpha=0.32, linewidth=0)

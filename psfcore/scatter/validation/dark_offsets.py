@@ -89,7 +89,8 @@ def dark_offset_study(
 ) -> DarkOffsetStudy:
     """Repeat the fit of a transit with each offset, starting from the fit without an offset.
 
-    nominal: the fit without an offset; the shape of this fit is used, not `shape`. Default: a new fit of `shape`. Raises
+    nominal: the fit without an offset; its shape is used for all fits, and `shape` is ignored. Default: a new fit of
+    `shape`. Raises
     the errors of `invert`.
     """
     if nominal is None:

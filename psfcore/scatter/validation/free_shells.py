@@ -25,9 +25,11 @@ the innermost shells cannot be separated from the centre, and the light beyond t
 | symbol | name | unit |
 |---|---|---|
 | d | step: light of a shell in the free fit minus its light in the formula | fraction of all light |
-| d_f | towards: change of the formula's light between the fitted PSF and the fit of the sample | fraction of all light |
+| d_f | towards: light of a shell in the formula fitted to the sample, minus its light in the formula of the fitted PSF (l) | fraction of all light |
 | l | law_light: light of the formula in the fitted PSF | fraction of all light |
-| A_S, B, n_S | ring sums, unscattered, counts | DN/s px^2, DN/s, px^2 |
+| A_S | ring sum: sum of the diffracted scene over the pixels of shell S around a pixel | DN/s px^2 |
+| B | the diffracted scene: the scene convolved with the diffraction PSF, not with the scatter | DN/s |
+| n_S | counts: number of pixels of shell S | px^2 |
 | s | looseness: width of the prior | fraction of all light |
 """
 

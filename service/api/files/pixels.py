@@ -38,7 +38,10 @@ router = APIRouter(tags=["pixels"], responses=RESPONSES)
 
 @dataclass(frozen=True)
 class Part:
-    """The window that a request asks for, px, and its step. width, height: None: up to the last column or row."""
+    """The window of an image that a request asks for, in pixels. step: every step-th row and column is sent.
+
+    width, height: None means up to the last column or row.
+    """
 
     x: int
     y: int

@@ -36,7 +36,7 @@ class AffectedView(BaseModel):
 
     @classmethod
     def of(cls, one: Affected) -> AffectedView:
-        """The view of a product and its PSF."""
+        """The description of an affected product and its PSF, from their rows in the catalogue."""
         return cls(
             product_id=one.product.id,
             image_id=one.product.image_id,

@@ -65,7 +65,7 @@ class PinView(BaseModel):
 
     @classmethod
     def of(cls, row: PsfPinRow) -> PinView:
-        """The view of a row."""
+        """The description of a pin, from its row in the catalogue."""
         return cls(
             series=row.series,
             valid_from=iso(row.valid_from),
@@ -87,7 +87,7 @@ class ContextView(BaseModel):
 
     @classmethod
     def of(cls, row: PsfContextRow) -> ContextView:
-        """The view of a row."""
+        """The description of a context, from its row in the catalogue."""
         return cls(
             id=row.id,
             name=row.name,
@@ -125,7 +125,7 @@ class Move(BaseModel):
 
     @classmethod
     def of(cls, row: DefaultContextRow) -> Move:
-        """The view of a row."""
+        """The description of a change of the default context, from its row in the catalogue."""
         return cls(context=row.context_id, at=row.at, by=row.by, reason=row.reason)
 
 

@@ -76,7 +76,7 @@ class Change(BaseModel):
 
     @classmethod
     def of(cls, row: PsfChangeRow) -> Change:
-        """The view of a row."""
+        """The description of a change of status, from its row in the catalogue."""
         return cls(
             at=row.at,
             by=row.by,

@@ -62,7 +62,7 @@ class PsfView(BaseModel):
 
     @classmethod
     def of(cls, row: PsfRow) -> PsfView:
-        """The view of a row."""
+        """The description of a PSF, from its row in the catalogue."""
         here = f"/v1/psfs/{row.id}"
         return cls(
             id=row.id,
@@ -153,7 +153,7 @@ async def upload_psf(
 
 
 def _made_here(state: Shared, caller: Caller, digest: str) -> PsfRow | None:
-    """The caller's PSF that a job made and whose file has this SHA-256; None if there is none."""
+    """The caller's PSF whose file has this SHA-256, if a job made this PSF; otherwise None."""
     # At most two PSFs have the same file: the PSF that a job made, and an upload of it.
     rows = state.catalogue.page(PsfRow, owner=caller.owner, limit=2, file_sha256=digest)
     return next((row for row in rows if row.id != digest), None)

@@ -43,7 +43,8 @@ LITTLE_ROOM_BYTES = 5 * 2**30
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check: its subject, its state, what was found, and the advice (empty: nothing to do)."""
+    """The result of one check. what: the subject of the check. found: the observation. advice: what to do; may be
+    empty."""
 
     what: str
     state: State

@@ -26,7 +26,7 @@ class Duration(click.ParamType):
     name = "duration"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Seconds of a text such as 30d."""
+        """Convert a text such as 30d to seconds."""
         parts = re.fullmatch(r"([0-9]{1,5})([hdw])", str(value))
         if parts is None or not int(parts[1]):
             self.fail(f"expected a duration such as 12h, 30d or 8w; got {value!r}", param, ctx)
@@ -83,7 +83,10 @@ def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: st
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 @DATA
 def list_keys(as_json: bool, data: Path | None) -> None:
-    """List all keys by their ids, including expired and revoked keys."""
+    """List all keys, oldest first, including expired and revoked keys.
+
+    The list shows the ids, not the secret keys.
+    """
     with opened_catalogue(data) as catalogue:
         rows = catalogue.keys.all()
     if as_json:

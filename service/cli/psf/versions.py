@@ -189,7 +189,7 @@ def best(
 def lineage(
     identity: str, product: bool, json_file: Path | None, server: str | None, overwrite: bool
 ) -> None:
-    """Show the things from which a PSF or a product was made, back to the uploads."""
+    """Show from which images, transits and PSFs a PSF or a product was made, back to the uploads."""
     with user_errors(), remote(server) as service:
         told = service.lineage("product" if product else "psf", identity)
     for line in _tree(told, 0):
@@ -238,7 +238,7 @@ def _validity(row: dict[str, Any]) -> str:
 
 
 def _tree(told: dict[str, Any], depth: int) -> Iterator[str]:
-    """A lineage as lines. Below each thing, the things from which it was made are indented."""
+    """A lineage as lines. The inputs of an entry follow it on indented lines."""
     made = told["made"] or {}
     named = " ".join(str(made[key]) for key in ("name", "version", "status") if made.get(key))
     by = [f"heliopsf {made['software_version']}"] if made.get("software_version") else []

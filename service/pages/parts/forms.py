@@ -29,7 +29,7 @@ def text(form: Sent, name: str) -> str:
 
 
 def filled(form: Sent, *names: str) -> dict[str, str]:
-    """The fields with a text; the others keep their defaults."""
+    """The fields that are not empty. Empty fields are left out, so that they get their defaults."""
     return {name: text(form, name) for name in names if text(form, name)}
 
 
@@ -85,8 +85,11 @@ async def fields(request: Request) -> Sent:
 
 
 def wrong_fields(error: ValidationError, model: Any, *, above: int = 0) -> Problem:
-    """The problem that names each wrong field. model: the validated model. above: the number of its levels above the
-    fields."""
+    """The problem that names each wrong field.
+
+    model: the model that refused the fields. above: how many names to remove from the start of each field's path
+    (``loc``), because they are levels of the model and not fields of the form.
+    """
     said = [
         f"{'.'.join(map(str, found['loc'][above:])) or 'the form'}: {told}"
         for found, told in explained(error.errors(), model)

@@ -75,12 +75,12 @@ class Plot:
 
 
 def written(value: float | None) -> str:
-    """A number as the table shows it; empty if there is none."""
+    """A number as the table shows it; empty if the number is None or not finite."""
     return "" if value is None or not isfinite(value) else f"{value:.{DIGITS}g}"
 
 
 def around(values: Sequence[float], sigma: Sequence[float] | None) -> tuple[Numbers | None, Numbers | None]:
-    """The ends of a band of one standard error around values; None without errors."""
+    """Lower and upper ends of a band of one standard error around values; None and None if there are no errors."""
     if sigma is None:
         return None, None
     pairs = list(zip(values, sigma, strict=True))
@@ -108,7 +108,8 @@ def shown_radii(radii: Sequence[float], least: float = 0.0) -> list[int]:
 def light_beyond_plot(curves: Mapping[str, Mapping[str, Any]], title: str = "Light beyond a radius") -> Plot:
     """1 - encircled energy of components or PSFs, in percent.
 
-    curves: by label, each with ``radii_px``, ``pct`` and ``sigma`` (a list or None); all with the same radii.
+    curves: the curves by label. Each curve has ``radii_px``, ``pct`` and ``sigma`` (a list, or None). All curves have
+    the same radii.
     """
     radii = next(iter(curves.values()))["radii_px"]
     places = shown_radii(radii)

@@ -66,7 +66,7 @@ async def build(request: Request, caller: PageSubmitting, state: Shared) -> Resp
 
 
 def _asked(request: Request) -> dict[str, str]:
-    """The filters that have a text. A browser also sends the empty fields of a form."""
+    """The filters of the request that are not empty. A browser also sends the empty fields of a form."""
     names = (*FILTERS, "context")
     return {name: text for name in names if (text := request.query_params.get(name, "").strip())}
 

@@ -147,14 +147,14 @@ def validity(psf: PsfView) -> str:
 
 
 def profile_series(label: str, profile: Mapping[str, Any], name: str, places: list[int]) -> Series:
-    """The mean weight by radius of one component, with its errors if the PSF was fitted."""
+    """The mean weight of one component at each radius. If the PSF was fitted, the errors are included."""
     values = [profile["mean_weight"][name][at] for at in places]
     errors = profile["sigma"].get(name)
     return Series(label, values, *around(values, None if errors is None else [errors[at] for at in places]))
 
 
 def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Mapping[str, Any] | None, str | None]:
-    """The tables, or the reason why there are none."""
+    """Two results: the tables, and None; or None, and the reason why the PSF has no tables."""
     try:
         return tables_of(state, caller, psf_id), None
     except Problem as problem:

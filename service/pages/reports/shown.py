@@ -105,7 +105,7 @@ def _tables(kind: str, said: Mapping[str, Any]) -> list[tuple[str, tuple[str, ..
 
 
 def _about(said: Mapping[str, Any], row: ReportRow) -> list[tuple[str, str]]:
-    """Addresses of the things that the report is about or that its job made: name and address."""
+    """Links to the transit, product or PSF on which the report is, and to the PSFs of its job: (text, address)."""
     found = [("Transit", f"/transits/{row.transit_id}")] if row.transit_id else []
     if row.kind == "rerun" and row.about_id:
         of = said["of"]

@@ -74,7 +74,9 @@ class _Part:
 
 @lru_cache(maxsize=MOST_KEPT)
 def read_stored(path: Path, figures_at: str) -> StoredPage:
-    """The stored page of a report. figures_at: the address of its figures, without their number. Raises OSError.
+    """The stored page of a report. Raises OSError.
+
+    figures_at: the beginning of the addresses of the figures; "/" and the number of the figure follow.
 
     A file of the store never changes, so its content can be kept in memory.
     """
@@ -169,7 +171,8 @@ class _Reader(HTMLParser):
         )
 
     def _picture(self, given: dict[str, str]) -> Markup:
-        """An image whose file is served from an address; nothing for an image that is not inside the page."""
+        """An `<img>` element with the address of a figure of the page. Empty if the stored page does not contain the
+        image data."""
         source = given.get("src", "")
         if not source.startswith(PICTURE):
             return Markup("")

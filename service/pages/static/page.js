@@ -112,7 +112,7 @@ export function duration(seconds) {
   return `${(seconds / 3600).toFixed(1)} h`;
 }
 
-/** A time, s since 1970, as a date of UTC. */
+/** Date and time in UTC, as text; "-" for null. seconds: seconds since 1970. */
 export function moment(seconds) {
   return seconds === null ? "-" : `${new Date(1000 * seconds).toISOString().slice(0, 19).replace("T", " ")} UTC`;
 }

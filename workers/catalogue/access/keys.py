@@ -141,7 +141,10 @@ class Keys:
     def page(
         self, owner: str | None, *, limit: int, after: tuple[float, str] | None = None
     ) -> Sequence[KeyRow]:
-        """A page of the keys of an owner, or of all owners (None), newest first. after: (created_at, id) of the last row before."""
+        """One page of a list of keys, newest first. owner: None for the keys of all owners.
+
+        after: (created_at, id) of the last key of the page before; None for the first page.
+        """
         query = select(KeyRow)
         if owner is not None:
             query = query.where(KeyRow.owner == owner)

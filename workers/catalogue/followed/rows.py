@@ -93,7 +93,7 @@ class Followed(Generic[Followable]):
             return _states(session.execute(query.order_by(table.ended_at, table.id).limit(MOST)))
 
     def among(self, owner: str, ids: Collection[str]) -> list[State]:
-        """The states of the rows with these few ids, in any phase. Ids that the owner does not have are left out."""
+        """The states of the rows with these ids, in any phase; unknown ids are left out. Pass only a few ids."""
         if not ids:
             return []
         query = select(*self._columns).where(self._these(owner, ids))
@@ -101,7 +101,7 @@ class Followed(Generic[Followable]):
             return _states(session.execute(query))
 
     def rows(self, owner: str, ids: Collection[str]) -> dict[str, tuple[State, Followable]]:
-        """The whole rows with these few ids, and their states, by id."""
+        """For each id that the owner has: the state of the row and the complete row. Pass only a few ids."""
         if not ids:
             return {}
         with self._database.reading() as session:
@@ -119,7 +119,7 @@ class Followed(Generic[Followable]):
 
 
 def followed_jobs(database: Database) -> Followed[JobRow]:
-    """The jobs that clients submit, which are all except the turns of bulk runs."""
+    """The jobs of the job kinds that clients can submit. The turns of bulk runs do not belong to them."""
     submitted = sorted(name for name, kind in KINDS.items() if kind.parameters is not None)
     return Followed(
         database,

@@ -24,7 +24,8 @@ class Again:
             return session.scalars(query.order_by(JobRow.created_at.desc())).first()
 
     def reopen(self, job_id: str) -> bool:
-        """COMPLETED -> QUEUED, as if the job had not run. Returns False if the job is not COMPLETED."""
+        """COMPLETED -> QUEUED. The job then has the state of a job that has not run. Returns False if the job is not
+        COMPLETED."""
         again = {
             "phase": Phase.QUEUED,
             "result_id": None,

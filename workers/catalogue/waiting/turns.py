@@ -68,7 +68,7 @@ class Turns:
     def leave_next(self, told_id: str, queue: Queue) -> str | None:
         """Record that a worker took a message from the broker but starts no job. The job will be submitted again.
 
-        Returns the id of this job, which is the job that ``claim_next`` would have claimed; None if no job could start.
+        The job is the one that ``claim_next`` would claim. Returns its id; None if no job of the queue can start.
         """
         job_id = self._next(told_id, queue)
         if job_id is not None:
@@ -76,7 +76,7 @@ class Turns:
         return job_id
 
     def _next(self, told_id: str, queue: Queue) -> str | None:
-        """The id of the job of a queue that comes next; None if no job of the queue could start now."""
+        """The id of the next job of a queue; None if no job of the queue can start now."""
         with self._database.reading() as session:
             for owner in session.scalars(_owners(queue)).all():
                 found = session.scalars(_oldest(owner, told_id, queue)).first()

@@ -1,6 +1,7 @@
-"""A cache of PSFs that were already read, resampled to the pixels of an image and Fourier-transformed, for later images.
+"""A cache of PSFs for later images. They are already read, resampled to the pixels of an image and Fourier-transformed.
 
-The cache must not be shared between threads: a worker process and an engine both work on one image at a time.
+Only one thread at a time may use the cache, because all calls of an engine share its buffers. A worker process runs its
+jobs one after the other, so one cache for each process is enough.
 """
 
 from __future__ import annotations

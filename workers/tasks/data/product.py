@@ -234,7 +234,7 @@ def details_of(
 
 
 def _saturation(image: Image) -> dict[str, Any] | None:
-    """The saturation level in the unit of the image, and where it was found; null where it is not known."""
+    """The saturation level in the unit of the image, and the source of this level; None if the level is not known."""
     found = image.saturation
     return None if found is None else {"level": found.level, "unit": image.unit, "found": found.found}
 

@@ -57,10 +57,11 @@ def solved(
     start: Vector | None = None,
     progress: Progress,
 ) -> Solution:
-    """The solution of a transit: the kept solution of the owner, or else a new solution, which is then kept.
+    """The solution of a transit: the owner's stored solution if it exists; otherwise a new solution.
 
-    transit: as ``load_transit`` returns it for the request; only its noise may be replaced. A rerun computes a new
-    solution and does not keep it. Raises DataError as ``psfcore.scatter.inversion.invert`` does.
+    A new solution is stored if the owner's quota allows it. A rerun always computes a new solution and does not store
+    it. transit: as ``load_transit`` returns it for the request; only its noise may be replaced. Raises DataError as
+    ``psfcore.scatter.inversion.invert`` does.
     """
     identity = solution_identity(request, transit, shape, start)
     kept = None if context.anew else _kept(context, identity, transit)
@@ -94,7 +95,7 @@ def solution_identity(
 
 
 def _kept(context: Context, identity: str, transit: Transit) -> Solution | None:
-    """The owner's kept solution with this identity; None if it does not exist or cannot be read."""
+    """The owner's stored solution with this identity; None if it does not exist or cannot be read."""
     row = context.catalogue.get(SolutionRow, identity, context.owner)
     if row is None:
         return None
@@ -111,7 +112,7 @@ def _kept(context: Context, identity: str, transit: Transit) -> Solution | None:
 
 
 def _keep(context: Context, identity: str, solution: Solution) -> None:
-    """Keep a solution if the owner has room for it."""
+    """Store a solution if the owner's quota allows it."""
     try:
         with context.store.temporary() as file:
             write_solution(file, solution)

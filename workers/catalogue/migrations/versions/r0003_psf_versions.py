@@ -49,7 +49,7 @@ _PSFS = sa.table(
 
 
 def upgrade() -> None:
-    """Add the new columns, tables and indexes, and fill them from the existing rows."""
+    """Add the new columns, tables and indexes. Fill in channel, kind, line and status of the existing PSFs."""
     for table, replaced in REPLACED.items():
         for column in replaced:
             op.drop_index(f"ix_{table}_{column}", table)
@@ -143,7 +143,7 @@ def _new_tables() -> None:
 
 
 def _fill(connection: sa.Connection) -> None:
-    """Fill in channel, kind and line of the existing PSFs. Rows are read in batches, because their details are long."""
+    """Fill in channel, kind, line and status of the existing PSFs. Rows are read in batches, because their details are long."""
     key = sa.tuple_(_PSFS.c.owner, _PSFS.c.id)
     columns = (_PSFS.c.owner, _PSFS.c.id, _PSFS.c.instrument, _PSFS.c.origin, _PSFS.c.details)
     after = ("", "")
@@ -164,7 +164,7 @@ def _fill(connection: sa.Connection) -> None:
 def _said(
     owner: str, identity: str, instrument: str | None, origin: str, details: dict[str, Any]
 ) -> dict[str, Any]:
-    """Channel, kind and line of a row."""
+    """The new columns of one PSF: its channel, kind, line and status. `of` and `key` are its owner and id."""
     wavelength = details.get("wavelength_angstrom")
     channel = CHANNELS.get(instrument or "") if wavelength is None else str(round(wavelength))
     parameters = (details.get("provenance") or {}).get("parameters") or {}
