@@ -16,9 +16,9 @@ class Comparison:
     """The differences between two arrays.
 
     same: whether the arrays are equal bit for bit. largest_relative: the largest difference divided by the largest
-    absolute value of the first array; None if the shapes differ, or if one array is finite where the other is not.
-    values_that_differ: number of differing values; None if the shapes differ. sha256: hashes of the two arrays, see
-    ``array_sha256``.
+    absolute value of the first array; None if the shapes differ, if one array is finite where the other is
+    not, or if the finite values differ and those of the first array are all 0. values_that_differ: number of
+    differing values; None if the shapes differ. sha256: hashes of the two arrays, see ``array_sha256``.
     """
 
     same: bool

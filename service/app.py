@@ -1,4 +1,4 @@
-"""The web application: its routers, its middlewares, and the objects that exist as long as it runs."""
+"""The web application: its routers, its middlewares, and the objects that it makes at its start and keeps until it ends."""
 
 from __future__ import annotations
 

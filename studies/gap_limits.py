@@ -116,7 +116,8 @@ def with_effect(transit: Transit, view: View, effect: Effect, at: ParameterLimit
 
 
 def _limits(model: LinearModel, asked: Settings, name: str) -> list[ParameterLimits]:
-    """The limits of an effect: the leading parameter, then all of them."""
+    """The limits of an effect: first those of its leading parameter, then those of every parameter, including the leading
+    one."""
     found = limits(model, threshold=asked.threshold, temperature=asked.temperature).effects[name]
     return [found.leading, *found.parameters]
 

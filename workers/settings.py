@@ -50,7 +50,7 @@ class Settings(BaseSettings):
     min_free_mib: int = Field(
         256,
         ge=0,
-        description="smallest free space of the disk of data_dir, MiB; if less is free, uploads and jobs are refused, and /readyz answers 503",
+        description="minimum free space on the disk that contains data_dir, MiB; if less is free, uploads and jobs are refused, and /readyz answers 503",
     )
     database_url: str | None = Field(
         None, description="SQLAlchemy URL of the database; default: SQLite in data_dir"

@@ -109,7 +109,7 @@ def make(case: Case, images: Sequence[Plane] = ()) -> Made:
 def _at_target(
     effect: Effect, target_pct: float | None, case: Case, effect_free: EffectFree, estimator: LinearEstimator
 ) -> tuple[Effect, Left]:
-    """Two results: the effect with its strength set, and the residual that it leaves.
+    """Return the effect with the chosen strength, and the residual that it leaves.
 
     The strength is chosen to leave a residual of about target_pct, but is at most the largest plausible strength. None: the
     strength is not changed.

@@ -120,7 +120,7 @@ class Iteration:
         raise NotImplementedError
 
     def update(self, *, last: bool) -> None:
-        """Make the next estimate. last: True if no call of `measure` follows."""
+        """Compute the next estimate. last: True if `measure` is not called again."""
         raise NotImplementedError
 
 

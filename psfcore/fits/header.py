@@ -255,7 +255,7 @@ def seen_by(header: Cards) -> dict[str, Any]:
 
 
 def _lenient(header: Cards, key: str) -> object:
-    """Value of a card that only describes the image; None if it is missing or damaged."""
+    """Value of an optional, descriptive card; None if the card is missing or damaged."""
     try:
         return header[key]
     except KeyError:

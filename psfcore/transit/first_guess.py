@@ -96,7 +96,8 @@ class FirstGuess:
     radius_px: float
 
     def to_json(self) -> dict[str, Any]:
-        """The first guess as JSON values; NaN and infinity become null. The key "fov" is the pointing."""
+        """The first guess as JSON values; NaN and infinity become null. The keys "best_fov" and "fov" contain
+        the number of a pointing."""
         return {
             "best_fov": self.best_pointing,
             "share": _number(self.share),

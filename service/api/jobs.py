@@ -221,7 +221,7 @@ def _view(row: JobRow, state: Shared) -> JobView:
 
 
 def time_left_s(row: JobRow, now: float | None = None) -> float | None:
-    """Estimated time left of a running job, s; None if unknown.
+    """Estimated remaining time of a running job, s; None if unknown.
 
     The estimate uses the speed since the job began to count its present steps. Earlier work, such as reading the
     images, does not count. now: seconds since 1970; default: this machine's clock.

@@ -199,7 +199,8 @@ def _told(image: Path, step: Callable[[], _Step]) -> _Step | Outcome:
 
 
 def _products_in(folder: Path) -> _Found:
-    """The files of the complete products in a folder. The key is (id of the product, SHA-256 of its image)."""
+    """Find the files of the complete products in a folder. Return a dictionary from (product id, SHA-256 of the input
+    image) to the file."""
     found: _Found = {}
     limits = FitsLimits(max_pixels=LARGEST_PX)
     for path in sorted(folder.glob("*.fits")):

@@ -87,8 +87,8 @@ def _caller(
 
 
 def admit(request: Request, state: State, scopes: Iterable[str], form_token: str | None = None) -> Caller:
-    """The caller of a request, counted against its limits. This function waits for the database, so call it in a
-    thread.
+    """Return the caller of a request, and count the request against the caller's limits. This function waits for the
+    database, so call it in a thread.
 
     form_token: the token that the request contains; default: the token in the header. Raises ``Problem`` 401 without
     a valid key or session, 403 if a scope or the form token is missing, and 429 if the caller has reached a limit.
@@ -161,7 +161,10 @@ def _let_in(request: Request, state: State, form_token: str) -> Caller:
 
 
 def _session_and_key(request: Request, state: State) -> tuple[SessionRow | None, KeyRow]:
-    """The session of a request (None if the request sent a key and no cookie), and its key. Raises ``KeyRefused``."""
+    """The session of a request, and the key of the request or session. Raises ``KeyRefused``.
+
+    The session is None if the request has an Authorization header or no session cookie.
+    """
     token = request.cookies.get(cookie_name(request))
     if token is None or "authorization" in request.headers:
         return None, state.catalogue.keys.check(_sent_key(request))

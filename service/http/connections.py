@@ -44,8 +44,8 @@ class ConnectionLimits:
     """The limits of the connections of one server process.
 
     most: largest number of connections that are open at the same time. header_s: longest time from the connection, or
-    from the last answer, until the header of a request is complete. stalled_s: longest time for which a client may
-    receive no part of its answer.
+    from the last answer, until the header of a request is complete. stalled_s: a connection is closed if
+    its client reads nothing of a waiting answer for this time.
     """
 
     most: int

@@ -62,9 +62,10 @@ class _Guard:
         return problems.document(problem.status, problem.code, problem.detail)
 
     def _check_host(self, headers: Headers) -> None:
-        """Refuse unknown host names. Otherwise a web page of another site could reach an open service by DNS rebinding.
+        """Refuse a request whose Host header does not contain a host name of this service. This prevents DNS rebinding.
 
-        Such a page makes its own host name resolve to a loopback address. The browser then treats page and service as one site.
+        In DNS rebinding, a web page of another site makes its own host name resolve to a loopback address. The browser
+        then treats the page and the service as one site, so the page could use a service that needs no key.
         """
         hosts = self._access.hosts
         if hosts is None:

@@ -74,7 +74,8 @@ def _no_cursor() -> Problem:
     return Problem(
         422,
         "bad-cursor",
-        "expected a cursor from `next` of an earlier page; got another text: start again without a cursor",
+        "expected the cursor in the `next` address of an earlier page; got a text that is not a cursor: repeat the request "
+        "without a cursor to start at the first page",
     )
 
 

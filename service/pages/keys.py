@@ -1,4 +1,4 @@
-"""The page of keys: list, make and revoke. A new key is shown once."""
+"""The web page on which users list, make and revoke keys. The page shows a new key only once."""
 
 from __future__ import annotations
 

@@ -207,8 +207,8 @@ def _diffraction_of(asked: Asked, summary: dict[str, Any]) -> PsfBuild | None:
         psf_identity(recipe),
         asked.owner,
         f"the diffraction PSF that heliopsf builds for {recipe.instrument}",
-        "name a file with another diffraction PSF as known_psf in transit.json, or use it anyway: `heliopsf psf download "
-        "{psf} -o FILE` writes it",
+        "name the file of another diffraction PSF as known_psf in transit.json; to use the deprecated PSF anyway, write it "
+        "to a file with `heliopsf psf download {psf} -o FILE` and name that file as known_psf",
     )
     return recipe
 

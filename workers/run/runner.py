@@ -130,8 +130,8 @@ class Runner:
         """A function that runs one short interactive job in this process; None if this job must not pause.
 
         While an interactive job pauses, only other owners' jobs run: its owner's jobs wait for their turn. A short job
-        does not pause itself. A job whose worker was lost does not pause either, because the short job may have
-        been the reason.
+        does not pause itself. A job in its second or a later attempt does not pause either: a short job that ran during
+        its pause may have caused the earlier attempt to fail.
         """
         if (
             self._child is None
@@ -311,7 +311,7 @@ class Runner:
         limit = f"expected a job of at most {allowed_mib(estimate_mib)} MiB, {MARGIN:g} times its estimate of {estimate_mib} MiB"
         if self._child is None:
             limit = f"expected enough memory for a job of about {estimate_mib} MiB"
-        message = f"{limit}; it asked for more: {KINDS[job.kind].memory_advice}"
+        message = f"{limit}; the job needed more: {KINDS[job.kind].memory_advice}"
         return JobError(fault=Fault.USER, code="out-of-memory", message=message)
 
     def _let_others_go_first(self, job: JobRow, lease: Lease) -> None:

@@ -49,7 +49,7 @@ class _RerunCatalogue(Catalogue):
         return None if identity in self._hidden else super().get(table, identity, owner)
 
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
-        """Add the row to the list ``made``. Nothing is written to the database, and the quota is not used."""
+        """Append the row to the list ``made``. This method writes nothing to the database and does not check the quota."""
         self.made.append(row)
         return row, True
 

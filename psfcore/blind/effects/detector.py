@@ -72,7 +72,7 @@ class Glow(Effect):
 
 @dataclass(frozen=True)
 class DustShadow(Effect):
-    """Specks with a soft rim block light on the track of the occulter. Not in the library."""
+    """Dust specks with soft edges, near positions of the occulter, block light. Not in the gap library."""
 
     specks: tuple[tuple[float, float, float], ...] = ((0.5, 0.5, 6.0),)
 

@@ -66,7 +66,10 @@ class Glass:
         return np.asarray(kernel / kernel.sum())
 
     def _drawn(self, size: int, turn_deg: float, pitch_factor: float) -> Kernel:
-        """A synthetic pattern: a core with wings, and orders along two axes. The light of an order decreases with its number."""
+        """A synthetic pattern: a core with wings, and orders along two axes.
+
+        The intensity of order n decreases with |n|.
+        """
         d = (np.arange(size) - size // 2) / FINE
         x, y = d[None, :], d[:, None]
         core, wing = (np.exp(-np.hypot(x, y) / scale) for scale in (self.core_px, self.wing_px))

@@ -74,7 +74,7 @@ def _median_and_scatter(values: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def smooth(plane: Plane, usable: Flags, width_px: float) -> Plane:
-    """Gaussian mean over the usable pixels; 0 where no usable pixel is near."""
+    """Gaussian-weighted mean of the usable pixels; 0 where no usable pixel is near."""
     weight = ndimage.gaussian_filter(usable.astype(np.float64), width_px)
     total = ndimage.gaussian_filter(np.where(usable, plane, 0.0), width_px)
     return np.divide(total, weight, out=np.zeros_like(total), where=weight > 1e-6)

@@ -1,17 +1,17 @@
 """The discrepancy: a change of the data that stands for a cause outside the library.
 
 A discrepancy changes the means of the discs, their cells or the unocculted blocks smoothly along one or several
-properties. These properties are called orders: position on the detector, time, intensity, exposure time, pointing,
-radius and azimuth. The discrepancy is a sum of Legendre polynomials along each order, times the expected light, with
-random coefficients. It does not depend on the library or on the images. A cause that varies along one of the orders
-resembles it.
+properties. These properties are called axes (in the names of the code: `orders`): position on the detector, time,
+intensity, exposure time, pointing, radius and azimuth. The discrepancy is a sum of Legendre polynomials along each axis,
+times the expected light, with random coefficients. It does not depend on the library or on the images. A cause that
+varies along one of the axes resembles it.
 
-A cause may also follow no order. The alternatives for this case are: every disc has its own change; every cell of every
+A cause may also follow no axis. The alternatives for this case are: every disc has its own change; every cell of every
 disc has its own change; every block of the detector has its own change, which is the same in all readouts. These
 alternatives have many coefficients, so they are probable only if the residuals after every other hypothesis are much
 larger than the noise.
 
-Each set of orders in ALTERNATIVES is one alternative: the data vary along all orders of the set. The hypothesis "unknown"
+Each set of axes in ALTERNATIVES is one alternative: the data vary along all axes of the set. The hypothesis "unknown"
 contains all alternatives with equal probability.
 """
 
@@ -38,7 +38,7 @@ DEGREE = 3
 DETECTOR = ("x", "y")
 OF_DISCS = (*DETECTOR, "time", "intensity", "exposure", "pointing", "radius", "azimuth")
 OF_BLOCKS = ("unocculted_time", "unocculted_exposure", "unocculted_intensity")
-# Changes without any order: one for each disc, one for each cell of each disc, one for each block of the detector.
+# Changes without any axis: one for each disc, one for each cell of each disc, one for each block of the detector.
 EACH_DISC, EACH_CELL, EACH_READOUT = "disc", "cell", "readout"
 ALTERNATIVES: tuple[tuple[str, ...], ...] = (
     ("x",),
@@ -61,7 +61,7 @@ ALTERNATIVES: tuple[tuple[str, ...], ...] = (
     (EACH_READOUT,),
     (EACH_DISC, EACH_READOUT),
 )
-# The words for each order in a report.
+# The words for each axis in a report.
 WORDS = {
     "x": "the position along detector x",
     "y": "the position along detector y",
@@ -82,13 +82,13 @@ WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class Discrepancy:
-    """The columns of the discrepancy. orders: for each order the numbers of its columns, counted from 0."""
+    """The columns of the discrepancy. orders: for each axis the numbers of its columns, counted from 0."""
 
     directions: Directions
     orders: dict[str, tuple[int, ...]]
 
     def columns(self, orders: Sequence[str], first: int) -> list[int]:
-        """The numbers of the columns of these orders. first: the number of the first column of the discrepancy."""
+        """The numbers of the columns of these axes. first: the number of the first column of the discrepancy."""
         return [first + column for order in orders for column in self.orders.get(order, ())]
 
 
@@ -113,9 +113,9 @@ def discrepancy(evidence: Evidence) -> Discrepancy:
 
 
 def _of_discs(evidence: Evidence) -> dict[str, list[Matrix]]:
-    """The changes of the disc cells for each order (a property such as time or exposure; see above).
+    """The changes of the disc cells for each axis (a property such as time or exposure; see above).
 
-    An order has one array (discs, cells), DN/s, for each coefficient. Discs have different numbers of cells; the rest
+    An axis has one array (discs, cells), DN/s, for each coefficient. Discs have different numbers of cells; the rest
     of a row is 0.
     """
     infos = [evidence.image_info[disc.index] for disc in evidence.discs]
@@ -154,10 +154,10 @@ def _of_discs(evidence: Evidence) -> dict[str, list[Matrix]]:
 
 
 def _of_blocks(evidence: Evidence) -> dict[str, list[Matrix]]:
-    """The changes of the unocculted blocks for each order (a property such as time or exposure) and for each block
+    """The changes of the unocculted blocks for each axis (a property such as time or exposure) and for each block
     alone.
 
-    An order has one array (images, blocks), DN/s, for each coefficient.
+    An axis has one array (images, blocks), DN/s, for each coefficient.
     """
     blocks = evidence.unocculted
     mean = np.maximum(blocks.means, 1e-9)
@@ -185,7 +185,7 @@ def _of_blocks(evidence: Evidence) -> dict[str, list[Matrix]]:
 
 
 def _that_vary(found: dict[str, list[Matrix]]) -> dict[str, list[Matrix]]:
-    """Remove the arrays that are zero everywhere, because the data do not vary along them, and orders without any
+    """Remove the arrays that are zero everywhere, because the data do not vary along them, and axes without any
     array."""
     kept = {name: [plane for plane in planes if plane.any()] for name, planes in found.items()}
     return {name: planes for name, planes in kept.items() if planes}

@@ -15,8 +15,9 @@ the mean of disc n by
 
     T_n = sum over displacements of K(d) C_n(d),   C_n(d) = sum over pixels of q_n(x) scene_n(x - d)     Eq. (3)
 
-One correlation for each disc therefore serves any number of kernels K. Copies of the image and changes of the core also
-change the distribution of light within the discs. For them, r and T also contain the cells (`near_discs`).
+One correlation for each disc therefore serves any number of kernels K. Ghosts (displaced copies of the image) and changes
+of the PSF core also change the distribution of light within the discs. For them, r and T also contain the cells
+(`near_discs`).
 """
 
 from __future__ import annotations
@@ -206,7 +207,8 @@ def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach
 
 
 def coarse_kernel(kernel: Plane, step: int) -> Plane:
-    """A kernel [y, x], summed over squares of `step` px. Its centre is in the middle of a coarse pixel."""
+    """A kernel [y, x], binned: each coarse pixel is the sum of `step` x `step` pixels. Its centre is in the
+    middle of a coarse pixel."""
     middle = kernel.shape[0] // 2
     reach = (middle + step // 2) // step
     at = (np.arange(kernel.shape[0]) - middle + step // 2) // step + reach

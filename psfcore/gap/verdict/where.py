@@ -1,4 +1,4 @@
-"""Where the gap lies: the share of the gap that varies along each axis.
+"""What the gap depends on: the share of the gap that each axis explains.
 
 An axis is a property of an image (for example its time) or of a cell in the disc (for example its radius). The axes are
 confounded: a transit has few pointings and one track, so position, time and brightness vary together. All axes together

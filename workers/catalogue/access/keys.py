@@ -22,7 +22,7 @@ from workers.catalogue.owners import add_bytes
 from workers.catalogue.tables import KeyRow
 
 OWNER = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
-OWNER_RULE = "1 to 64 lower-case letters, digits, '.', '_' and '-', the first a letter or digit"
+OWNER_RULE = "1 to 64 characters: lower-case letters, digits, '.', '_' and '-'; the first character is a letter or a digit"
 LABEL_LENGTH = 80
 _KEY = re.compile(r"hpsf_([0-9a-f]{16})_([A-Za-z0-9_-]{43})", re.ASCII)
 _USE_NOTED_EVERY_S = 60.0  # the time of use is written at most once a minute, not for every request
