@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from service.http.callers import Bulk, Caller, KeyFirst, Reading
-from service.http.paging import Cursor, Limit, Page, following, page, place, position
+from service.http.paging import Cursor, Limit, Page, following, page, no_cursor, place, position
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_room, rows_held
 from service.http.state import Shared
@@ -303,9 +303,5 @@ def _after(cursor: str | None) -> int:
     if parts is None:
         return -1
     if not parts[0].isdecimal() or len(parts[0]) > 9:
-        raise Problem(
-            422,
-            "bad-cursor",
-            "expected the cursor in `next` of an earlier page; got another text: start again without a cursor",
-        )
+        raise no_cursor()
     return int(parts[0])

@@ -46,9 +46,9 @@ def place(cursor: str | None, count: int) -> list[str] | None:
     try:
         parts = base64.urlsafe_b64decode(cursor.encode()).decode("ascii").split(" ")
     except (binascii.Error, ValueError) as error:
-        raise _no_cursor() from error
+        raise no_cursor() from error
     if len(parts) != count or not parts[-1].isalnum() or not all(map(str.isprintable, parts)):
-        raise _no_cursor()
+        raise no_cursor()
     return parts
 
 
@@ -57,9 +57,9 @@ def number(part: str) -> float:
     try:
         at = float(part)
     except ValueError as error:
-        raise _no_cursor() from error
+        raise no_cursor() from error
     if not math.isfinite(at):
-        raise _no_cursor()
+        raise no_cursor()
     return at
 
 
@@ -70,7 +70,8 @@ def following(request: Request, *parts: str) -> str:
     return f"{query.path}?{query.query}"
 
 
-def _no_cursor() -> Problem:
+def no_cursor() -> Problem:
+    """The problem for a cursor that this service did not issue."""
     return Problem(
         422,
         "bad-cursor",

@@ -15,7 +15,7 @@ from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.rendering import page
 from service.pages.visitors import PageReading, PageSubmitting
-from workers.catalogue.access.keys import LABEL_LENGTH, MEANINGS, Scope
+from workers.catalogue.access.keys import LABEL_LENGTH, MEANINGS, OWNER_RULE, Scope
 
 PER_PAGE = 50
 LIFETIMES_DAYS = (7, 30, 90, 365)
@@ -107,7 +107,7 @@ def _wrong_form(error: ValidationError) -> Problem:
     advice = {
         "scopes": "expected at least one scope of the list: go back and choose what the key allows",
         "lasts_days": "expected a lifetime of the list: go back and choose one",
-        "owner": "expected an owner of lower-case letters, digits, '.', '_' and '-', at most 64: go back and correct the name",
+        "owner": f"expected an owner of {OWNER_RULE}: go back and correct the name",
     }
     said = [text for name, text in advice.items() if name in wrong] or [str(error)]
     return Problem(422, "invalid-request", "; ".join(said))
