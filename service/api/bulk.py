@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from service.http.callers import Bulk, Caller, KeyFirst, Reading
-from service.http.paging import Cursor, Limit, Page, following, page, no_cursor, place, position
+from service.http.paging import Cursor, Limit, Page, following, no_cursor, page, place, position
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_room, rows_held
 from service.http.state import Shared
