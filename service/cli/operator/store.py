@@ -96,9 +96,7 @@ def check_command(sizes: bool, repairs: bool, data: Path | None) -> None:
         click.echo("all files are good")
         return
     advice = "" if repairs else "; to let jobs make them again where this is possible, add --repair"
-    click.echo(
-        f"lost or damaged files of {count} products, PSFs, reports, solutions or uploads{advice}", err=True
-    )
+    click.echo(f"the catalogue has {count} entries with lost or damaged files{advice}", err=True)
     raise click.exceptions.Exit(1)
 
 
