@@ -159,7 +159,7 @@ class View:
 
     @cached_property
     def scenes(self) -> Sequence[Field]:
-        """The scene of every image without its occulter [y, x], DN/s: the mean scene of the other images of the pointing.
+        """The scene [y, x] of every image, DN/s, without the occulter: the mean scene of the other images of the same pointing.
 
         This mean is scaled to the brightness of the image. A template that is made from the scene of the same image would
         contain the noise of its residual, and would fit this noise.

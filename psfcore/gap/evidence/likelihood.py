@@ -189,7 +189,10 @@ class Likelihood:
         )
 
     def gained(self, decrease: Vector) -> Vector:
-        """The gain of ln L from Eq. (2) if chi2 of the discs decreases by these amounts, down to the value for noise alone."""
+        """The increase of ln L, Eq. (2), if chi2 of the discs falls from n + `decrease` to n.
+
+        n is the number of cells, which is the chi2 that noise alone gives.
+        """
         whole = self._stiffness + self._cells
         return np.asarray(whole * (1 - (1 + decrease / whole) ** -CORRELATED) / (2 * CORRELATED))
 

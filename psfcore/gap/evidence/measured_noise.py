@@ -99,7 +99,7 @@ def _blocks(one: Frame, other: Frame) -> tuple[Vector, Vector]:
 
 
 def _line(level: Vector, variance: Vector) -> tuple[float, float]:
-    """Slope and intercept of the line of variance against level. The weight of a block is 1 / (expected variance)^2."""
+    """Fit a straight line to the variance as a function of the level; return its slope and intercept. The weight of a block is 1 / (expected variance)^2."""
     expected = np.full(level.shape, float(np.median(variance)))
     slope = intercept = 0.0
     for _ in range(ROUNDS):

@@ -100,7 +100,7 @@ class PlaceSearch:
         return self._best(self._to_displacements, kernels, cells)
 
     def wide_kernel(self, kernels: Sequence[Plane]) -> int:
-        """As `kernel`, for smooth changes of the PSF that may reach across the field. It uses the means, on coarse pixels."""
+        """As `kernel`, for smooth changes of the PSF that may reach across the field. It uses only the means of the discs, not their cells, and coarse pixels."""
         return self._best(self._to_far, [coarse_kernel(kernel, STEP_PX) for kernel in kernels])
 
     def _best(

@@ -23,7 +23,7 @@ _NO_CLOSURE, _MOST_CLOSURE = -0.35, 1.3
 
 
 def draw_where(axes: Any, report: Report) -> None:
-    """Draw one horizontal bar for each axis, with its p-value. The strongest axis is at the top."""
+    """Draw one horizontal bar for each axis, with its p-value. The axes are in the order of the report; the first is at the top."""
     rows = report["where"]
     at = np.arange(len(rows))[::-1]
     shares = np.array([100 * row["share"] for row in rows])
