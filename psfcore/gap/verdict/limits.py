@@ -36,6 +36,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -214,12 +215,30 @@ class _Need:
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """The columns of a hypothesis. widths: the widths of the prior (scales, columns). offset: o_h of Eq. (2)."""
+    """A hypothesis, and the eigenvalues of Eq. (1).
+
+    columns: its columns in `normal`, the normal matrix of all columns. widths: the widths of the prior (scales,
+    columns). offset: o_h of Eq. (2). one_sided: whether it has a single parameter, which cannot be negative.
+    """
 
     columns: NDArray[np.intp]
     widths: Matrix
     offset: float
+    normal: Matrix
     one_sided: bool = False
+
+    @cached_property
+    def modes(self) -> list[tuple[Vector, Matrix]]:
+        """For each scale of the prior: the eigenvalues l of W N_HH W, and V^T W.
+
+        Every effect is compared with the same rivals, so the eigenvalues are computed once for each hypothesis.
+        """
+        inner = self.normal[np.ix_(self.columns, self.columns)]
+        found = []
+        for widths in self.widths:
+            values, vectors = np.linalg.eigh(inner * np.outer(widths, widths))
+            found.append((np.maximum(values, 0.0), vectors.T * widths))
+        return found
 
 
 class _Limits:
@@ -246,6 +265,7 @@ class _Limits:
                 np.array([number[c] for c in columns]),
                 scales * np.full(len(columns), LIKELY),
                 math.log(prior["unknown"] / len(orders) / prior["none"]),
+                self._normal,
             )
             for columns in orders
         ]
@@ -262,7 +282,9 @@ class _Limits:
         offset = math.log(prior / effect.trials)
         offset -= MEASURED * self._evidence.numbers_of([columns[k] for k in part]) / 2
         one_sided = part.size == 1 and effect.parameters[part[0]].positive
-        return _Hypothesis(self._of[effect.name][part], scales[:, None] * likely, offset, one_sided)
+        return _Hypothesis(
+            self._of[effect.name][part], scales[:, None] * likely, offset, self._normal, one_sided
+        )
 
     # --- strengths that would be found ------------------------------------------------------------------
 
@@ -292,7 +314,7 @@ class _Limits:
         sided = math.log(2) if positive[k] else 0.0
         # A rival that would have to be negative cannot act.
         rivals = [h for h in self._rivals(effect) if not (h.one_sided and change[h.columns[0]] <= 0)]
-        ways = [_odds_of(h, self._normal, change, self._likelihood.gained) for h in (*own, *rivals)]
+        ways = [_odds_of(h, change, self._likelihood.gained) for h in (*own, *rivals)]
 
         def margin(strengths: Vector) -> Vector:
             odds = np.array([way(strengths) for way in ways]).T
@@ -311,7 +333,7 @@ class _Limits:
         likely = np.array([effect.parameters[k].likely for k in range(columns.size)])
         change = self._normal[:, columns] * (likely / likely[0])
         hypotheses = (self._single[effect.name], *self._rivals(effect))
-        ways = [_odds_of(h, self._normal, change, self._likelihood.gained) for h in hypotheses]
+        ways = [_odds_of(h, change, self._likelihood.gained) for h in hypotheses]
         typical = math.sqrt(1 / max(float(np.diag(self._normal)[columns].mean()), 1e-300))
 
         def margin(strengths: Vector) -> Vector:
@@ -417,19 +439,16 @@ def _explained(inner: Matrix, score: Vector, positive: NDArray[np.bool_]) -> flo
 
 
 def _odds_of(
-    hypothesis: _Hypothesis, normal: Matrix, change: Matrix | Vector, gained: Callable[[Vector], Vector]
+    hypothesis: _Hypothesis, change: Matrix | Vector, gained: Callable[[Vector], Vector]
 ) -> Callable[[Vector], Vector]:
     """A function of the strength: Eq. (2) with the 1 - FOUND quantile of q_h.
 
     change: the columns of N that belong to the true effect: one column for a fixed change, several for a random field.
     gained: the gain of ln L by a decrease of chi2.
     """
-    inner = normal[np.ix_(hypothesis.columns, hypothesis.columns)]
     spread, cumulants = [], []
-    for widths in hypothesis.widths:
-        values, vectors = np.linalg.eigh(inner * np.outer(widths, widths))
-        values = np.maximum(values, 0.0)
-        to_score = vectors.T * widths @ change[hypothesis.columns]
+    for values, along in hypothesis.modes:
+        to_score = along @ change[hypothesis.columns]
         spread.append(float(np.log1p(values).sum()))
         cumulants.append(
             _cumulants(values, to_score) if change.ndim == 1 else _cumulants_of_field(values, to_score)

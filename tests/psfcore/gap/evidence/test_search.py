@@ -14,7 +14,14 @@ from psfcore.gap.evidence.cells import sensitivities
 from psfcore.gap.evidence.effect_fits import fit_effects
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
-from psfcore.gap.evidence.search import STEP_PX, PlaceSearch, coarse_kernel, displaced, place_search
+from psfcore.gap.evidence.search import (
+    STEP_PX,
+    PlaceSearch,
+    _along_copy,
+    coarse_kernel,
+    displaced,
+    place_search,
+)
 from psfcore.gap.library.optics import (
     ANGLES_DEG,
     BETWEEN_THEM,
@@ -53,6 +60,12 @@ def test_the_sum_over_displacements_predicts_the_effect_of_a_psf_change_on_the_d
         moved = float(np.vdot(plane, view.blurred(n, blur)))
         assert float(np.vdot(window[k], kernel)) == pytest.approx(moved, rel=2e-3, abs=1e-4)
     assert place_search(view) is search
+
+
+@pytest.mark.parametrize("by", [(0, 0), (3, -4), (-31, 2), (29, 19), (-29, -19), (5, 25), (40, 1), (-7, 6)])
+def test_the_response_to_a_copy_equals_the_sum_over_the_displaced_plane(by: tuple[int, int]) -> None:
+    q, plane = np.random.default_rng(1).normal(size=(2, 20, 30))
+    assert _along_copy(q, plane, *by) == pytest.approx(float(np.vdot(q, displaced(plane, *by))), abs=1e-12)
 
 
 def test_a_blur_is_not_negative_and_has_its_nominal_width() -> None:
