@@ -30,7 +30,7 @@ from psfcore.blind.case_set import BlindSet, SetPlan, make_set
 from psfcore.blind.score_table import wilson
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import linear_model_of
-from psfcore.gap.evidence.likelihood import TEMPLATE_ERROR
+from psfcore.gap.evidence.likelihood import TEMPLATE_ERRORS
 from psfcore.gap.evidence.measured_noise import measured_noise
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict import calibration
@@ -213,7 +213,7 @@ def main() -> None:
     if departures:
         print(
             f"{len(departures)} full refits depart from first order by {np.median(departures):.3f} of the change (median); "
-            f"the likelihood assumes {TEMPLATE_ERROR:g}"
+            f"the likelihood assumes {', '.join(f'{error:g}' for error in TEMPLATE_ERRORS)}"
         )
     if asked.write:
         file = Path(calibration.__file__).with_name(calibration.FILE)

@@ -2,7 +2,7 @@
 
 A discrepancy changes the means of the discs, their cells or the unocculted blocks smoothly along one or several
 properties. These properties are called axes (in the names of the code: `orders`): position on the detector, time,
-intensity, exposure time, pointing, radius and azimuth. The discrepancy is a sum of Legendre polynomials along each axis,
+intensity, exposure time, counts (intensity times exposure time, DN), pointing, radius and azimuth. The discrepancy is a sum of Legendre polynomials along each axis,
 times the expected light, with random coefficients. It does not depend on the library or on the images. A cause that
 varies along one of the axes resembles it.
 
@@ -37,6 +37,7 @@ LIKELY = (
 DEGREE = 3
 DETECTOR = ("x", "y")
 OF_DISCS = (*DETECTOR, "time", "intensity", "exposure", "pointing", "radius", "azimuth")
+COUNTS = ("counts", "unocculted_counts")
 OF_BLOCKS = ("unocculted_time", "unocculted_exposure", "unocculted_intensity")
 # Changes without any axis: one for each disc, one for each cell of each disc, one for each block of the detector.
 EACH_DISC, EACH_CELL, EACH_READOUT = "disc", "cell", "readout"
@@ -51,6 +52,7 @@ ALTERNATIVES: tuple[tuple[str, ...], ...] = (
     ("intensity",),
     ("intensity", "unocculted_intensity"),
     ("exposure", "unocculted_exposure"),
+    COUNTS,
     ("pointing",),
     ("radius",),
     ("azimuth",),
@@ -68,12 +70,14 @@ WORDS = {
     "time": "the time",
     "intensity": "the intensity",
     "exposure": "the exposure time",
+    "counts": "the counts in the disc",
     "pointing": "the pointing",
     "radius": "the radius in the disc",
     "azimuth": "the azimuth in the disc",
     "unocculted_time": "the time, in the unocculted field",
     "unocculted_exposure": "the exposure time, in the unocculted field",
     "unocculted_intensity": "the intensity, in the unocculted field",
+    "unocculted_counts": "the counts, in the unocculted field",
     EACH_DISC: "the disc, without any order",
     EACH_CELL: "the place in each disc",
     EACH_READOUT: "the place on the detector, the same in every readout",
@@ -124,6 +128,7 @@ def _of_discs(evidence: Evidence) -> dict[str, list[Matrix]]:
     present = np.array([np.arange(cells) < disc.residual.size for disc in evidence.discs])
     readouts = np.array([1 / info.exposure_s for info in infos])
     faint = float(level.mean()) / level
+    counts = np.maximum(level * [info.exposure_s for info in infos], 1e-9)
 
     def whole(share: Vector) -> Matrix:
         return np.asarray((share * level)[:, None] * present)
@@ -141,6 +146,7 @@ def _of_discs(evidence: Evidence) -> dict[str, list[Matrix]]:
         "time": smooth([info.time_s for info in infos]),
         "intensity": [*smooth(np.log(np.maximum(level, 1e-9))), whole(faint)],
         "exposure": [whole(_unit(readouts)), whole(_unit(readouts) * faint)],
+        "counts": [whole(term) for term in _by_counts(counts)],
         "pointing": [
             whole(np.array([info.pointing == one for info in infos], dtype=np.float64))
             for one in sorted({info.pointing for info in infos})
@@ -168,6 +174,7 @@ def _of_blocks(evidence: Evidence) -> dict[str, list[Matrix]]:
     infos = evidence.image_info
     times = legvander(_unit(np.array([info.time_s for info in infos])), DEGREE).T[1:]
     readouts = _unit(np.array([1 / info.exposure_s for info in infos]))[:, None]
+    counts = mean * np.array([info.exposure_s for info in infos])[:, None]
     forms: tuple[Callable[[Matrix], Matrix], ...] = (
         lambda of_image: of_image * mean,
         lambda of_image: of_image * mean * x,
@@ -179,9 +186,21 @@ def _of_blocks(evidence: Evidence) -> dict[str, list[Matrix]]:
         "unocculted_time": [form(term[:, None]) for term in times for form in forms],
         "unocculted_exposure": [form(readouts) for form in forms[1:]],
         "unocculted_intensity": [mean * term for term in np.moveaxis(legvander(bright, DEGREE), -1, 0)[1:]],
+        "unocculted_counts": [mean * term for term in _by_counts(counts)],
         EACH_READOUT: [readouts * usual * block for block in np.eye(mean.shape[1])],
     }
     return _that_vary(found)
+
+
+def _by_counts(counts: Vector | Matrix) -> list[Vector | Matrix]:
+    """Relative changes that are smooth functions of the counts (DN), and one that is proportional to 1 / counts.
+
+    A detector or its electronics changes a signal according to its counts. The last change is the same number of DN
+    in every pixel and image.
+    """
+    bright = np.log(counts)
+    smooth = np.moveaxis(legvander(_unit(bright), DEGREE), -1, 0)[1:]
+    return [*smooth, float(np.exp(bright.mean())) / counts]
 
 
 def _that_vary(found: dict[str, list[Matrix]]) -> dict[str, list[Matrix]]:

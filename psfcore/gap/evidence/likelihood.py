@@ -1,11 +1,14 @@
 """The likelihood of a hypothesis: how probable the data are if some effects act, whatever their strengths.
 
-    y = J theta + delta * (J theta) + noise                                             Eq. (1)
+    y = J theta + delta * change + noise                                                Eq. (1)
 
 y are the residuals in the cells of the discs and the levels of the unocculted blocks. theta are the coordinates of the PSF
-and the parameters of the effects. No template is exact: delta is its relative error, a Gaussian of width TEMPLATE_ERROR.
+and the parameters of the effects. change is the change by an effect; in the discs, only the part that a change of the PSF
+cannot absorb. No template is exact: delta is its relative error, a Gaussian.
 One delta is common to all cells of a disc (or all blocks of an image) and one belongs to each cell (or block); their
-variance is added to the variance of the noise. The scene and the brightness of each image are parameters of the
+variance is added to the variance of the noise. Some templates are nearly exact, and others are not. The width of the Gaussian is
+therefore unknown: the evidence is the mean over the widths TEMPLATE_ERRORS. A discrepancy (`evidence.discrepancy`) is
+random and has no template, so it has no template error. The scene and the brightness of each image are parameters of the
 unocculted blocks, as in `unocculted_blocks`.
 
 ln det of the covariance, which the template error raises, counts as a part of chi2.
@@ -20,7 +23,8 @@ For s near 1 this is -chi2 / 2 plus a constant. Residuals far above the noise ar
 Eq. (2) therefore gives them less weight, so that a misfit of all hypotheses does not decide between the hypotheses.
 
 The strengths are integrated out. Near the best fit ln L is a quadratic form with the normal matrix N, and a parameter has a
-Gaussian prior of width w, its likely size times one of SCALES with equal probability:
+Gaussian prior of width w, its likely size times one of SCALES with equal probability. The coefficients of a random field
+have the same factor, because the field can be stronger than is likely:
 
     ln E = ln L + ln det(1 + w N w)^-1/2 + terms of the prior                             Eq. (3)
 
@@ -34,8 +38,8 @@ the likely size of the number is unknown.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -50,7 +54,9 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Planes = NDArray[np.float64]
 
-TEMPLATE_ERROR = 0.03
+TEMPLATE_ERRORS = (0.0, 0.03, 0.1)
+USUAL_ERROR = TEMPLATE_ERRORS[1]
+UNSEEN = 0.5  # if the largest template error adds less than this to chi2, its width does not matter
 CORRELATED = 0.5
 MEASURED = 2.0
 SCALES = (0.1, 1.0, 10.0)
@@ -78,7 +84,7 @@ class Weighed:
 
     log_evidence: ln E of Eq. (3), up to a constant that all hypotheses of one model share; minus infinity if no parameter can
     act. columns: the columns of the parameters that act, without the coordinates of the PSF. values: their best values.
-    visible_error: the chi2 that a relative error TEMPLATE_ERROR of the template would add in all data. It counts only
+    visible_error: the chi2 that a relative error USUAL_ERROR of the template would add in all data. It counts only
     the part of the template that was not subtracted. If it is above `settled.VISIBLE`, the first order is not accurate
     enough.
     """
@@ -133,27 +139,53 @@ class Likelihood:
             self._jacobian = np.concatenate([self._jacobian, further.discs], axis=2)
             errors = np.concatenate([errors, further.unocculted])
         self._further = 0.0 if further is None else further.width
+        self._white = np.linalg.inv(np.linalg.cholesky(self._covariance))
+        base = (self._white @ self._jacobian[:, :, self._base]).reshape(-1, len(self._base))
+        self._to_base = np.linalg.pinv(base)
         self._blocks = list(_pointings(model, errors))
         self._log_det = (0.0, 0.0)  # of discs and blocks without any effect
-        self._parts((), np.zeros(len(self._base)), np.zeros(0))
+        self._parts((), np.zeros(len(self._base)), np.zeros(0), 0.0)
         self._stiffness = 2 / max(model.scale_error, 1e-3) ** 2
 
     def weigh(
-        self, effects: Sequence[Sequence[int]], *, trials: float = 1.0, subtracted: Sequence[float] = ()
+        self,
+        effects: Sequence[Sequence[int]],
+        *,
+        trials: float = 1.0,
+        subtracted: Sequence[float] = (),
+        exact: bool = False,
     ) -> Weighed:
         """Weigh the hypothesis that some effects act. effects: the columns of each effect.
 
         trials: the number of templates among which the templates of the effects were chosen. subtracted: the amounts
         that a full refit subtracted from the images, by column; the fitted values are then the remaining amounts.
+        exact: whether the columns have no template error.
+        """
+        out = dict(zip((c for g in effects for c in g), subtracted, strict=True)) if len(subtracted) else {}
+        found = [self._weigh(effects, trials, out, 0.0)]
+        first = found[0]
+        whole = first.values + np.array([out.get(c, 0.0) for c in first.columns])
+        if not exact and self._visible_error(first.columns, whole, TEMPLATE_ERRORS[-1]) > UNSEEN:
+            found += [self._weigh(effects, trials, out, error) for error in TEMPLATE_ERRORS[1:]]
+        evidence = float(logsumexp([one.log_evidence for one in found])) - math.log(len(found))
+        best = max(found, key=lambda one: one.log_evidence)
+        visible = self._visible_error(best.columns, best.values, USUAL_ERROR)
+        return replace(best, log_evidence=evidence, visible_error=visible)
+
+    def _weigh(
+        self, effects: Sequence[Sequence[int]], trials: float, out: Mapping[int, float], error: float
+    ) -> Weighed:
+        """As `weigh`, for one width of the template error. The result has no visible_error.
+
+        out: the subtracted amounts, by column.
         """
         groups = [list(group) for group in effects]
-        out = dict(zip((c for g in groups for c in g), subtracted, strict=True)) if len(subtracted) else {}
         theta = np.zeros(len(self._base) + sum(len(group) for group in groups))
         parts: tuple[_Part, _Part] | None = None
         for _ in range(ROUNDS + sum(len(group) for group in groups)):
             columns = [c for group in groups for c in group]
             taken = np.array([out.get(c, 0.0) for c in columns])
-            parts = self._parts(groups, theta, taken)
+            parts = self._parts(groups, theta, taken, error)
             after, scales = self._fit(parts, columns, taken)
             acting = after[len(self._base) :] + taken
             below = [
@@ -181,7 +213,8 @@ class Likelihood:
         PSF, scenes and brightness are free parameters.
         """
         first = len(self._base)
-        parts = self._parts([list(columns)], np.zeros(first + len(columns)), np.zeros(len(columns)))
+        nothing = np.zeros(len(columns))
+        parts = self._parts([list(columns)], np.zeros(first + len(columns)), nothing, 0.0)
         whole = _together(parts, (1.0, 1.0))[0]
         across = whole[:first, first:]
         return np.asarray(
@@ -199,12 +232,12 @@ class Likelihood:
     def fitted(self, columns: Sequence[int], values: Sequence[float]) -> tuple[Vector, Matrix]:
         """Two results of a fit of the columns of one effect: their values (of any sign), and the covariance.
 
-        values: approximately the values that the fit finds; they set the template error.
+        values: approximately the values that the fit finds; they set the template error, whose width is USUAL_ERROR.
         """
         first = len(self._base)
         theta = np.concatenate([np.zeros(first), np.asarray(values, dtype=np.float64)])
         nothing = np.zeros(len(columns))
-        parts = self._parts([list(columns)], theta, nothing)
+        parts = self._parts([list(columns)], theta, nothing, USUAL_ERROR)
         found, scales = self._fit(parts, columns, nothing)
         prior = np.diag(self._prior(columns, SCALES[-1]))
         covariance = scaled_inverse(_together(parts, scales)[0] + prior, weakest=WEAKEST)
@@ -221,22 +254,20 @@ class Likelihood:
         return out
 
     @cached_property
-    def _widths(self) -> tuple[Vector, NDArray[np.bool_]]:
-        """Two results by column: the likely size; whether this size is fixed, because the column belongs to a random field."""
+    def _likely(self) -> Vector:
+        """The likely size of the parameter of each column."""
         size = np.full(self._jacobian.shape[2], self._further)
-        fixed = np.zeros(size.shape, dtype=np.bool_)
         for effect in self._evidence.effects:
             for column, parameter in zip(
                 self._evidence.columns[effect.name], effect.parameters, strict=False
             ):
-                size[column], fixed[column] = parameter.likely, effect.field
-        return size, fixed
+                size[column] = parameter.likely
+        return size
 
     def _prior(self, columns: Sequence[int], scale: float) -> Vector:
         """1 / variance of the prior, for the coordinates of the PSF and then for these columns. 0: no prior, as for
         the PSF."""
-        size, fixed = (one[list(columns)] for one in self._widths)
-        return np.append(np.zeros(len(self._base)), (size * np.where(fixed, 1.0, scale)) ** -2.0)
+        return np.append(np.zeros(len(self._base)), (self._likely[list(columns)] * scale) ** -2.0)
 
     def _fit(
         self, parts: tuple[_Part, _Part], columns: Sequence[int], taken: Vector
@@ -296,26 +327,28 @@ class Likelihood:
             float(logsumexp(found)) - math.log(len(found)) - math.log(trials),
             tuple(columns),
             theta[base:],
-            self._visible_error(columns, theta),
+            0.0,
         )
 
-    def _visible_error(self, columns: Sequence[int], theta: Vector) -> float:
+    def _visible_error(self, columns: Sequence[int], values: Vector, error: float) -> float:
+        """The chi2 that a relative error of the change by these columns would add."""
         if not columns:
             return 0.0
-        values = theta[len(self._base) :]
-        change = TEMPLATE_ERROR * (self._jacobian[:, :, columns] @ values)
-        seen = float(np.sum(change * np.linalg.solve(self._covariance, change[..., None])[..., 0]))
+        here = list(columns)
+        seen = float(np.sum((self._white @ self._net(self._jacobian[:, :, here] @ values)[..., None]) ** 2))
         for pointing in self._blocks:
-            seen += float(
-                np.sum(
-                    pointing.free
-                    * (TEMPLATE_ERROR * pointing.errors[..., columns] @ values) ** 2
-                    / pointing.variance
-                )
-            )
-        return seen
+            change = pointing.errors[..., here] @ values
+            seen += float(np.sum(pointing.free * change**2 / pointing.variance))
+        return error**2 * seen
 
-    def _parts(self, groups: Sequence[Sequence[int]], theta: Vector, taken: Vector) -> tuple[_Part, _Part]:
+    def _net(self, change: Matrix) -> Matrix:
+        """The part of a change of the discs (discs, cells) that a change of the PSF cannot absorb."""
+        absorbed = self._to_base @ (self._white @ change[..., None]).ravel()
+        return np.asarray(change - self._jacobian[:, :, self._base] @ absorbed)
+
+    def _parts(
+        self, groups: Sequence[Sequence[int]], theta: Vector, taken: Vector, error: float
+    ) -> tuple[_Part, _Part]:
         columns = [*self._base, *(c for group in groups for c in group)]
         whole = theta + np.append(np.zeros(len(self._base)), taken)
         spans, first = [], len(self._base)
@@ -323,18 +356,18 @@ class Likelihood:
             spans.append((list(group), whole[first : first + len(group)]))
             first += len(group)
         covariance = self._covariance
-        changes = [self._jacobian[:, :, group] @ values for group, values in spans]
-        if any(change.any() for change in changes):
+        if error > 0 and any(values.any() for _, values in spans):
             covariance = covariance.copy()
             diagonal = np.arange(covariance.shape[1])
-            for change in changes:
-                covariance += TEMPLATE_ERROR**2 * change[:, :, None] * change[:, None, :]
-                covariance[:, diagonal, diagonal] += (TEMPLATE_ERROR * change) ** 2
+            for group, values in spans:
+                change = error * self._net(self._jacobian[:, :, group] @ values)
+                covariance += change[:, :, None] * change[:, None, :]
+                covariance[:, diagonal, diagonal] += change**2
         lower = np.linalg.cholesky(covariance)
         design = np.concatenate([self._jacobian[:, :, columns], self._residual], axis=2)
         white = np.linalg.solve(lower, design).reshape(-1, design.shape[2])
         log_det = 2 * float(np.log(np.einsum("dcc->dc", lower)).sum())
-        blocks = [pointing.part(columns, spans) for pointing in self._blocks]
+        blocks = [pointing.part(columns, spans, error) for pointing in self._blocks]
         size = len(columns) + 1
         measured = self._evidence.numbers_of(columns)
         in_blocks = sum(part.more for part in blocks)
@@ -369,14 +402,16 @@ class _Pointing:
     brightness: Matrix
     errors: Planes
 
-    def part(self, columns: Sequence[int], effects: Sequence[tuple[list[int], Vector]]) -> _Part:
+    def part(
+        self, columns: Sequence[int], effects: Sequence[tuple[list[int], Vector]], error: float
+    ) -> _Part:
         """The normal equations of these columns.
 
         effects: for each effect, its columns and the values of its parameters. The template error is proportional to
-        these values.
+        these values. error: the width of the template error.
         """
         images, blocks = self.level.shape
-        changes = [TEMPLATE_ERROR * (self.errors[..., group] @ values) for group, values in effects]
+        changes = [error * (self.errors[..., group] @ values) for group, values in effects]
         changes = [change for change in changes if change.any()]
         variance = self.variance + sum((change**2 for change in changes), np.zeros_like(self.variance))
         weight = np.where(self.free, 1 / variance, 0.0)

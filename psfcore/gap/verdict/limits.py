@@ -276,8 +276,7 @@ class _Limits:
         columns = self._columns[effect.name]
         part = np.arange(len(columns)) if kept is None else np.array(kept)
         likely = np.array([effect.parameters[k].likely for k in part])
-        # The sizes of the coefficients of a random field are known.
-        scales = np.ones(1) if effect.field else np.array(SCALES)
+        scales = np.array(SCALES)
         prior = self._prior["single"] / len(self._evidence.effects) / self._prior["none"]
         offset = math.log(prior / effect.trials)
         offset -= MEASURED * self._evidence.numbers_of([columns[k] for k in part]) / 2

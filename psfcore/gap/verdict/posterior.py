@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from psfcore.gap.effect import Effect
@@ -28,6 +29,7 @@ from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Likelihood, Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 
+Vector = NDArray[np.float64]
 Names = tuple[str, ...]
 Kind = Literal["none", "single", "pair", "triple", "unknown"]
 
@@ -104,7 +106,7 @@ def posterior(model: LinearModel) -> Posterior:
     weighed = {names: weigh(likelihood, evidence, names) for names in _hypotheses(evidence.effects)}
     weighed |= _triples(likelihood, evidence, weighed, evidence.effects)
     orders = {
-        orders: likelihood.weigh([columns]).log_evidence
+        orders: likelihood.weigh([columns], exact=True).log_evidence
         for orders in ALTERNATIVES
         if (columns := further.columns(orders, evidence.size))
     }
@@ -141,14 +143,17 @@ def at_refit(
     before: LinearModel,
     names: Names,
     taken: Mapping[str, Sequence[float]],
+    moved: Vector,
     effects: Sequence[Effect],
 ) -> dict[Names, Weighed]:
     """The evidence from a full refit, for the refitted hypothesis and, after a refit of a single effect, for its pairs.
 
     refit: the linear model at the refit, with the effects that may act. before: the linear model without any effect.
-    taken: the amounts of the parameters that the refit subtracted from the images, by effect.
+    taken: the amounts of the parameters that the refit subtracted from the images, by effect. moved: the coordinates of
+    the PSF of the refit minus those of the fit without any effect.
     """
-    after = _with_blocks_of(before.evidence, refit.evidence, taken)
+    after = _with_same_discs(before.evidence, refit.evidence, taken, moved)
+    after = _with_blocks_of(before.evidence, after, taken)
     refit = replace(refit, evidence=after)
     likelihood = Likelihood(refit)
     others = [e.name for e in effects if e.name not in names] if len(names) == 1 else []
@@ -177,6 +182,37 @@ def _with_blocks_of(before: Evidence, after: Evidence, taken: Mapping[str, Seque
             errors[column] = blocks.errors[columns[name]]
             levels -= value * errors[column]
     return replace(after, unocculted=replace(blocks, errors=errors, levels=levels))
+
+
+def _with_same_discs(
+    before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]], moved: Vector
+) -> Evidence:
+    """The evidence of a refit, with the discs of the fit before it.
+
+    All hypotheses must explain the same data. A refit can lose discs, for example if an effect that is too strong was
+    subtracted from a faint image. The lost discs are taken from before the refit, and respond to PSF and effects
+    linearly. Discs that only the refit can use are left out.
+    """
+    kept = [disc for disc in after.discs if disc.index in before.images]
+    lost = [disc for disc in before.discs if disc.index not in after.images]
+    first = {effect.name: effect for effect in before.effects}
+    source, amounts = np.zeros(after.size, dtype=np.intp), np.zeros(after.size)
+    source[list(after.base)], amounts[list(after.base)] = before.base, moved
+    for effect in after.effects:
+        own = [p.name for p in effect.parameters]
+        column_of = dict(
+            zip((p.name for p in first[effect.name].parameters), before.columns[effect.name], strict=False)
+        )
+        values = taken.get(effect.name, (0.0,) * len(own))
+        for name, column, value in zip(own, after.columns[effect.name], values, strict=False):
+            source[column], amounts[column] = column_of[name], value
+    linear = [
+        replace(
+            disc, jacobian=disc.jacobian[source], residual=disc.residual - amounts @ disc.jacobian[source]
+        )
+        for disc in lost
+    ]
+    return replace(after, discs=tuple(sorted((*kept, *linear), key=lambda disc: disc.index)))
 
 
 def weigh(

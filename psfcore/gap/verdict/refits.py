@@ -40,7 +40,8 @@ class Refits:
         model = made.model
         if len(names) == 1:  # the pairs with this effect are weighed at the same refit
             model = with_library(made, effects, self._model, progress=self._say(f"effects beside {names[0]}"))
-        return at_refit(model, self._model, names, made.subtracted, effects)
+        moved = made.solution.inversion.coordinates - self._view.solution.inversion.coordinates
+        return at_refit(model, self._model, names, made.subtracted, moved, effects)
 
     @property
     def made(self) -> tuple[Corrected, ...]:

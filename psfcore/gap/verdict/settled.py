@@ -1,6 +1,6 @@
 """The settled posterior: the linear model is replaced by full refits where it is not exact enough.
 
-A plausible hypothesis is refitted if an error of its template (`likelihood.TEMPLATE_ERROR`) would be visible in the
+A plausible hypothesis is refitted if an error of its template (`likelihood.USUAL_ERROR`) would be visible in the
 data. The most probable hypothesis comes first. Before several effects are refitted together, the most probable of them is
 refitted alone, for two reasons: this refit also gives the evidence of all pairs with this effect; and a strong effect
 that is not linear can make a pair look more probable than the effect alone. The refits end when no plausible hypothesis needs a
@@ -49,8 +49,24 @@ def settled_posterior(model: LinearModel, refit: Refit | None) -> tuple[Posterio
             weights = {names: weight for names, weight in found.log_weights.items() if names != chosen}
             found = replace(found, log_weights=weights)
         else:
-            found = found.with_evidence(real, effects)
+            # The refit of a hypothesis itself is more exact than its evidence at the refit of another one.
+            new = {names: weighed for names, weighed in real.items() if names == chosen or names not in done}
+            found = _without_stale(found, chosen, done, new).with_evidence(new, effects)
     return found, tuple(failed)
+
+
+def _without_stale(
+    found: Posterior, refitted: Names, done: set[Names], real: Mapping[Names, Weighed]
+) -> Posterior:
+    """The posterior without the linear evidence that a refit of one effect contradicts.
+
+    The refit weighs this effect alone, its pairs, and the triples of the best pair. The linear model overestimates the
+    other triples with this effect, if the effect is strong. A triple that was refitted itself stays.
+    """
+    if len(refitted) > 1:
+        return found
+    stale = {n for n in found.log_weights if set(refitted) < set(n) and n not in real and n not in done}
+    return replace(found, log_weights={n: w for n, w in found.log_weights.items() if n not in stale})
 
 
 def _to_refit(found: Posterior, done: set[Names]) -> Names | None:

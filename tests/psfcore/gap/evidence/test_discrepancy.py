@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from psfcore.gap.evidence.discrepancy import ALTERNATIVES, EACH_READOUT, OF_BLOCKS, discrepancy
+from psfcore.gap.evidence.discrepancy import ALTERNATIVES, COUNTS, EACH_READOUT, OF_BLOCKS, discrepancy
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Likelihood
 from psfcore.gap.evidence.linear_model import LinearModel
@@ -18,7 +18,7 @@ def likeliest(model: LinearModel) -> tuple[str, ...]:
     further = discrepancy(model.evidence)
     likelihood = Likelihood(model, further.directions)
     found = {
-        orders: likelihood.weigh([columns]).log_evidence
+        orders: likelihood.weigh([columns], exact=True).log_evidence
         for orders in ALTERNATIVES
         if (columns := further.columns(orders, model.evidence.size))
     }
@@ -43,7 +43,7 @@ def test_every_order_has_columns_that_change_the_data(evidence: Evidence) -> Non
     for order, some in found.orders.items():
         planes = (
             found.directions.unocculted
-            if order in (*OF_BLOCKS, EACH_READOUT)
+            if order in (*OF_BLOCKS, COUNTS[1], EACH_READOUT)
             else np.moveaxis(found.directions.discs, 2, 0)
         )
         assert all(planes[column].any() for column in some)
@@ -54,6 +54,13 @@ def test_a_gap_that_differs_between_pointings_is_found_there(evidence: Evidence)
     infos = evidence.image_info
     share = {n: by_pointing.get(info.pointing, 0.0) for n, info in enumerate(infos)}
     assert "pointing" in likeliest(with_share(evidence, share))
+
+
+def test_a_gap_that_depends_on_the_counts_is_found_there(evidence: Evidence) -> None:
+    """Neither the intensity nor the exposure alone describes a loss of a detector that depends on the counts."""
+    counts = {d.index: d.mean_expected * evidence.image_info[d.index].exposure_s for d in evidence.discs}
+    usual = float(np.median(list(counts.values())))
+    assert likeliest(with_share(evidence, {n: -0.5 / (1 + c / usual) for n, c in counts.items()})) == COUNTS
 
 
 def test_a_gap_across_the_disc_is_found_along_the_azimuth(evidence: Evidence) -> None:

@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from psfcore.gap.evidence import likelihood as likelihoods
 from psfcore.gap.evidence.evidence import Evidence
-from psfcore.gap.evidence.likelihood import Likelihood
+from psfcore.gap.evidence.likelihood import TEMPLATE_ERRORS, Likelihood
 from psfcore.gap.evidence.linear_model import LinearModel
 from tests.psfcore.gap.linear_models import with_residuals
 
@@ -33,7 +33,7 @@ def gain(model: LinearModel, *names: str) -> float:
 
 
 def test_the_evidence_is_the_gaussian_integral(evidence: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(likelihoods, "TEMPLATE_ERROR", 0.0)
+    monkeypatch.setattr(likelihoods, "TEMPLATE_ERRORS", (0.0,))
     monkeypatch.setattr(likelihoods, "SCALES", (1.0,))
     noisy = replace(with_residuals(evidence, {"dark_offset": 0.3}, noise=1.0), scale_error=EXACT)
     (column,) = evidence.columns["dark_offset"]
@@ -65,20 +65,37 @@ def test_a_parameter_that_cannot_be_negative_excludes_a_loss_of_light(evidence: 
     assert added.values[0] == pytest.approx(8 * sigma, rel=0.2)
 
 
-def test_what_an_error_of_the_first_template_explains_is_not_credited_to_a_second_effect(
-    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+def test_what_an_error_of_the_first_template_explains_is_credited_less_to_a_second_effect(
+    evidence: Evidence,
 ) -> None:
+    """A weak smear beside a strong offset counts less if the template of the offset is not exact."""
     sigma = sigma_of(evidence, "column_smear")
-    weak = with_residuals(evidence, {"dark_offset": 3.0, "column_smear": 8 * sigma})
-    strong = with_residuals(evidence, {"dark_offset": 3000.0, "column_smear": 8 * sigma})
-    both = ("dark_offset", "column_smear")
-    assert gain(weak, *both) > gain(weak, "dark_offset") + 5
-    assert gain(strong, *both) < gain(strong, "dark_offset") + 1
-    seen = [Likelihood(one).weigh([list(evidence.columns["dark_offset"])]) for one in (weak, strong)]
-    assert seen[0].visible_error < seen[1].visible_error
-    assert seen[1].visible_error > 9
-    monkeypatch.setattr(likelihoods, "TEMPLATE_ERROR", 0.0)
-    assert gain(strong, *both) > gain(strong, "dark_offset") + 5
+    weak, strong = (
+        with_residuals(evidence, {"dark_offset": size, "column_smear": 8 * sigma}) for size in (3.0, 300.0)
+    )
+    offset, smear = (list(evidence.columns[name]) for name in ("dark_offset", "column_smear"))
+    seen = [Likelihood(one).weigh([offset]) for one in (weak, strong)]
+    assert seen[0].visible_error < 9 < seen[1].visible_error
+
+    def credit(model: LinearModel, error: float) -> float:
+        likelihood = Likelihood(model)
+        alone, both = (likelihood._weigh(some, 1.0, {}, error) for some in ([offset], [offset, smear]))
+        return both.log_evidence - alone.log_evidence
+
+    largest = TEMPLATE_ERRORS[-1]
+    assert credit(weak, largest) == pytest.approx(credit(weak, 0.0), abs=1)
+    assert 5 < credit(strong, largest) < credit(strong, 0.0) - 5
+
+
+def test_the_template_error_leaves_out_what_a_change_of_the_psf_absorbs(evidence: Evidence) -> None:
+    likelihood = Likelihood(with_residuals(evidence, {}))
+    by_psf = likelihood._jacobian[:, :, evidence.base[0]]
+    (offset,) = evidence.columns["dark_offset"]
+    change = likelihood._jacobian[:, :, offset]
+    np.testing.assert_allclose(likelihood._net(by_psf), 0.0, atol=1e-6 * np.abs(by_psf).max())
+    net = likelihood._net(change + 5.0 * by_psf)
+    np.testing.assert_allclose(net, likelihood._net(change), atol=1e-6 * np.abs(by_psf).max())
+    assert 0 < np.abs(net).max()
 
 
 def test_a_misfit_that_every_hypothesis_has_decides_less(evidence: Evidence) -> None:
