@@ -95,7 +95,7 @@ def test_the_template_error_leaves_out_what_a_change_of_the_psf_absorbs(evidence
     np.testing.assert_allclose(likelihood._net(by_psf), 0.0, atol=1e-6 * np.abs(by_psf).max())
     net = likelihood._net(change + 5.0 * by_psf)
     np.testing.assert_allclose(net, likelihood._net(change), atol=1e-6 * np.abs(by_psf).max())
-    assert 0 < np.abs(net).max()
+    assert np.abs(net).max() > 0
 
 
 def test_a_misfit_that_every_hypothesis_has_decides_less(evidence: Evidence) -> None:
