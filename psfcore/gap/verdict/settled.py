@@ -15,7 +15,7 @@ from dataclasses import replace
 
 from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.verdict.posterior import Names, Posterior, posterior
+from psfcore.gap.verdict.posterior import Names, Posterior, kind_of, posterior
 
 MOST_REFITS = 4  # a pair, its two effects, and a rival
 VISIBLE = 9.0  # a template error is visible if it adds this much to chi2
@@ -65,8 +65,16 @@ def _without_stale(
     """
     if len(refitted) > 1:
         return found
-    stale = {n for n in found.log_weights if set(refitted) < set(n) and n not in real and n not in done}
-    return replace(found, log_weights={n: w for n, w in found.log_weights.items() if n not in stale})
+    return replace(
+        found,
+        log_weights={
+            names: weight
+            for names, weight in found.log_weights.items()
+            if not (kind_of(names) == "triple" and set(refitted) < set(names))
+            or names in real
+            or names in done
+        },
+    )
 
 
 def _to_refit(found: Posterior, done: set[Names]) -> Names | None:

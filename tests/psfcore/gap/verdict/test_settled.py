@@ -19,7 +19,7 @@ from psfcore.gap.verdict.settled import MOST_REFITS, VISIBLE, settled_posterior
 from tests.psfcore.gap.linear_models import with_residuals
 
 OFFSET: Names = ("dark_offset",)
-A, B, C, AB, AC = ("a",), ("b",), ("c",), ("a", "b"), ("a", "c")
+A, B, AB, AC, ABC = ("a",), ("b",), ("a", "b"), ("a", "c"), ("a", "b", "c")
 EFFECTS = 3
 MODEL = cast(LinearModel, SimpleNamespace(evidence=SimpleNamespace(effects=(None,) * EFFECTS)))
 
@@ -117,6 +117,24 @@ def test_a_pair_is_refitted_although_the_refit_of_its_effect_alone_failed(start:
     found, failed = settled_posterior(MODEL, refit)
     assert refit.asked == [A, AB] and failed == (A,)
     assert A not in found.log_weights and next(iter(found.probabilities())) == AB
+
+
+def test_a_refit_of_one_effect_replaces_all_its_triples(start: Start) -> None:
+    """The linear model overestimates the triples with a strong effect; its refit weighs only those of the best pair."""
+    start({NONE: 0.0, A: 30.0, B: 20.0, AB: 35.0, ABC: 38.0})
+    refit = Refitted({A: {A: 20.0, AB: 19.0, AC: 18.0}, B: {B: 20.0}})
+    found, _ = settled_posterior(MODEL, refit)
+    assert ABC not in found.log_weights and next(iter(without_idle(found.probabilities()))) in (A, B)
+    assert {NONE, B, AB} <= set(found.log_weights)
+
+
+def test_a_pair_keeps_the_evidence_of_its_own_refit(start: Start) -> None:
+    """After the refit of the pair, the refit of one of its effects states a less exact evidence of the pair."""
+    start({NONE: 0.0, A: 39.0, B: 38.0, AB: 45.0})
+    refit = Refitted({AB: {AB: 38.5}, B: {B: 38.0, AB: 90.0}})
+    found, failed = settled_posterior(MODEL, refit)
+    assert refit.asked == [A, AB, B] and failed == (A,)
+    assert found.log_weights[AB] < 40.0
 
 
 def test_the_number_of_refits_is_bounded(start: Start) -> None:
