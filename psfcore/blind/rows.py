@@ -78,7 +78,12 @@ def share(
 
 
 def share_of_expected(
-    figure: str, cases: Sequence[Judged], holds: Callable[[Judged], bool], expected: Callable[[Judged], float]
+    figure: str,
+    cases: Sequence[Judged],
+    holds: Callable[[Judged], bool],
+    expected: Callable[[Judged], float],
+    goal: str = "",
+    met: Callable[[float], bool] | None = None,
 ) -> Row:
     """The row of a ratio: the number of cases for which ``holds`` is true, divided by the sum of ``expected``.
 
@@ -87,11 +92,14 @@ def share_of_expected(
     """
     most = math.fsum(expected(case) for case in cases)
     if most <= 0:
-        return Row(figure, len(cases), None, None, "", None)
+        return Row(figure, len(cases), None, None, goal, None)
     hits = sum(holds(case) for case in cases)
     low, high = wilson(hits, len(cases))
     scale = len(cases) / most
-    return Row(figure, len(cases), hits / most, (low * scale, high * scale), "", None)
+    found = hits / most
+    return Row(
+        figure, len(cases), found, (low * scale, high * scale), goal, None if met is None else met(found)
+    )
 
 
 def of_values(

@@ -182,6 +182,19 @@ def is_right_and_alone(case: Judged) -> bool:
     return case.kind == FOREIGN or set(case.members[0]) <= set(case.true_names)
 
 
+def verdict_is_right(case: Judged) -> bool:
+    """Whether the verdict states the truth and nothing else.
+
+    It is `none` for clean data and `unknown` for an effect that is not in the library. For other cases it is
+    `attributed`, and the answer contains every required effect and no wrong effect.
+    """
+    if case.kind == CLEAN:
+        return case.verdict == NONE
+    if case.kind == FOREIGN:
+        return case.verdict == UNKNOWN_VERDICT
+    return case.verdict == ATTRIBUTED and contains_truth(case) and set(case.answer) <= set(case.true_names)
+
+
 def has_only_wrong_effects(case: Judged) -> bool:
     """Whether the set has only one member, and this member names one or more effects, none of which is true."""
     if case.members is None or len(case.members) != 1:

@@ -10,6 +10,7 @@ they were computed.
 | set covers the truth: all, clean, single, pair, not in the library | all, or of one kind | a member covers the truth |
 | mean number of members | all; cases with a noncentrality of SEEN or more | number of members of the set |
 | right and alone / ideal observer | cases with an ideal observer, and clean cases | the number of sets that are right and alone, divided by the number expected of the ideal observer (the sum of `bounds.Known.alone`) |
+| right verdict / ideal observer | the same | the number of verdicts that are right, divided by the same number |
 | clean data: set without [] | clean | no member is [] |
 | one wrong effect alone in the set | all | the only member names effects, none of which is true |
 | not in the library: unknown in the set | effects that are not in the library; one row counts cases with a noncentrality of SEEN or more, the next row cases with a rival of SEEN or more | a member is ["unknown"] |
@@ -18,7 +19,7 @@ they were computed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from statistics import mean
 
 from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE
@@ -29,6 +30,7 @@ from psfcore.blind.scoring import (
     has_only_wrong_effects,
     is_right_and_alone,
     set_covers_truth,
+    verdict_is_right,
 )
 
 SEEN = (
@@ -46,16 +48,26 @@ def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
     seen = [case for case in stated if case.noncentrality >= SEEN]
     foreign = [case for case in stated if case.kind == FOREIGN]
     return (
-        share("set covers the truth", stated, set_covers_truth, ">= 0.90", lambda p: p >= 0.9),
+        share(
+            "set covers the truth", stated, set_covers_truth, "0.86 - 0.94", lambda p: 0.86 <= p <= 0.94
+        ),
         *(
             share(
                 f"the same, {words}",
                 [case for case in stated if case.kind == kind],
                 set_covers_truth,
+                ">= 0.80",
+                lambda p: p >= 0.8,
             )
             for kind, words in KIND_WORDS.items()
         ),
-        of_values("mean number of members of the set", [_size(case) for case in stated], mean),
+        of_values(
+            "mean number of members of the set",
+            [_size(case) for case in stated],
+            mean,
+            "<= 3",
+            lambda value: value <= 3,
+        ),
         of_values(
             "the same, noncentrality >= 30",
             [_size(case) for case in seen],
@@ -63,12 +75,19 @@ def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
             "<= 1.5",
             lambda value: value <= 1.5,
         ),
-        _against_ideal("right and alone / ideal observer", stated),
-        _against_ideal("the same, without clean data", [case for case in stated if case.kind != CLEAN]),
+        _against_ideal("right and alone / ideal observer", stated, is_right_and_alone),
+        _against_ideal(
+            "the same, without clean data",
+            [case for case in stated if case.kind != CLEAN],
+            is_right_and_alone,
+        ),
+        _against_ideal("right verdict / ideal observer", stated, verdict_is_right),
         share(
             "clean data: set without []",
             [case for case in stated if case.kind == CLEAN],
             lambda case: NOTHING not in (case.members or ()),
+            "<= 0.01",
+            lambda p: p <= 0.01,
         ),
         share(
             "one wrong effect alone in the set",
@@ -81,8 +100,8 @@ def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
             "not in the library, noncentrality >= 30: unknown in set",
             [case for case in foreign if case.noncentrality >= SEEN],
             set_covers_truth,
-            ">= 0.80",
-            lambda p: p >= 0.8,
+            ">= 0.85",
+            lambda p: p >= 0.85,
         ),
         share(
             "the same, nearest rival >= 30",
@@ -103,10 +122,12 @@ def _size(case: Judged) -> float:
     return float(len(case.members or ()))
 
 
-def _against_ideal(figure: str, cases: Sequence[Judged]) -> Row:
+def _against_ideal(figure: str, cases: Sequence[Judged], holds: Callable[[Judged], bool]) -> Row:
     return share_of_expected(
         figure,
         [case for case in cases if case.known is not None],
-        is_right_and_alone,
+        holds,
         lambda case: 0.0 if case.known is None else case.known.alone,
+        ">= 0.85",
+        lambda ratio: ratio >= 0.85,
     )

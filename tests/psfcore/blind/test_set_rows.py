@@ -10,7 +10,7 @@ import pytest
 from psfcore.blind.bounds import LEVEL
 from psfcore.blind.rows import share_of_expected, wilson
 from psfcore.blind.score_table import score, table
-from psfcore.blind.scoring import Judged, covers, is_right_and_alone
+from psfcore.blind.scoring import Judged, covers, is_right_and_alone, verdict_is_right
 from psfcore.blind.set_rows import set_rows
 
 Members = list[list[str]]
@@ -82,6 +82,7 @@ def test_every_figure_equals_the_one_computed_by_hand() -> None:
     assert set(rows) - set(EXPECTED) == {
         "right and alone / ideal observer",
         "the same, without clean data",
+        "right verdict / ideal observer",
     }
 
 
@@ -95,6 +96,9 @@ def test_what_is_right_is_compared_with_what_could_be_known() -> None:
     assert (with_clean.cases, with_clean.value) == (10, pytest.approx(4 / math.fsum(alone)))
     without = rows["the same, without clean data"]
     assert (without.cases, without.value) == (7, pytest.approx(3 / math.fsum(alone[3:])))
+    # The verdict of every case is `unknown`, which is right for both stripes.
+    verdicts = rows["right verdict / ideal observer"]
+    assert (verdicts.cases, verdicts.value) == (10, pytest.approx(2 / math.fsum(alone)))
     low, high = wilson(3, 7)
     mean = math.fsum(alone[3:]) / 7
     assert without.interval95 == pytest.approx((low / mean, high / mean))
@@ -147,3 +151,25 @@ def test_a_truth_without_a_residual_takes_that_of_the_ideal_observer() -> None:
     del unmeasured.truth["left_after_refit_pct"]
     assert math.isnan(unmeasured.left_pct)
     assert score([unmeasured]).to_json()["cases"][0]["left_after_refit_pct"] is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "names", "verdict", "answer", "right"),
+    [
+        ("clean", [], "none", [], True),
+        ("clean", [], "inconclusive", [], False),
+        ("unknown", ["stripes"], "unknown", [], True),
+        ("unknown", ["stripes"], "attributed", ["ghost"], False),
+        ("single", ["ghost"], "attributed", ["ghost"], True),
+        ("single", ["ghost"], "attributed", ["ghost", "core_blur"], False),
+        ("single", ["ghost"], "tie", ["ghost"], False),
+        ("pair", ["ghost", "core_blur"], "attributed", ["ghost"], False),
+        ("pair", ["ghost", "core_blur"], "attributed", ["core_blur", "ghost"], True),
+    ],
+)
+def test_a_verdict_is_right_if_it_states_the_truth_and_nothing_else(
+    kind: str, names: list[str], verdict: str, answer: list[str], right: bool
+) -> None:
+    judged = case(kind, names, [[]])
+    judged.report.update(verdict=verdict, answer=answer)
+    assert verdict_is_right(judged) is right
