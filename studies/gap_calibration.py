@@ -193,7 +193,7 @@ def main() -> None:
     """Make the sets, compute the posteriors that are missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--cases", type=int, default=72)
+    parser.add_argument("--cases", type=int, default=144)
     parser.add_argument("--seed", type=int, default=101)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--write", action="store_true")
