@@ -27,7 +27,7 @@ from psfcore.transit.transit import Transit
 Vector = NDArray[np.float64]
 
 ROUNDS = 3
-SETTLED = 0.3  # the rounds end when every parameter changes by less than this fraction of its error
+SETTLED = 0.3  # the rounds end when the parameters change by less than this fraction of their errors, rms
 # A round may leave more chi2 than the best round by WORSE or, if larger, by WORSE_SHARE times the gain of the effect.
 WORSE = 9.0
 WORSE_SHARE = 0.05
@@ -151,7 +151,7 @@ def add_to_model(
             subtracted=_by_effect(held, gone),
             rounds=rounds,
         )
-        if float(np.abs(steps / np.maximum(seen.sigma, 1e-300)).max()) < SETTLED:
+        if float(np.sqrt(np.mean((steps / np.maximum(seen.sigma, 1e-300)) ** 2))) < SETTLED:
             break
     assert taken is not None
     return taken

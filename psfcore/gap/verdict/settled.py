@@ -1,7 +1,8 @@
 """The settled posterior: the linear model is replaced by full refits where it is not exact enough.
 
 A plausible hypothesis is refitted if an error of its template (`likelihood.USUAL_ERROR`) would be visible in the
-data. The most probable hypothesis comes first. Before several effects are refitted together, the most probable of them is
+data. A hypothesis that is more probable than all others together is always refitted, because the report names its
+effects. The most probable hypothesis comes first. Before several effects are refitted together, the most probable of them is
 refitted alone, for two reasons: this refit also gives the evidence of all pairs with this effect; and a strong effect
 that is not linear can make a pair look more probable than the effect alone. The refits end when no plausible hypothesis needs a
 refit, or after MOST_REFITS refits.
@@ -15,11 +16,12 @@ from dataclasses import replace
 
 from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.verdict.posterior import Names, Posterior, kind_of, posterior
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior, kind_of, posterior
 
 MOST_REFITS = 4  # a pair, its two effects, and a rival
 VISIBLE = 9.0  # a template error is visible if it adds this much to chi2
 PLAUSIBLE = 0.02
+LEADING = 0.5
 
 # A function that makes a full refit of a hypothesis. It returns the evidence of this hypothesis, and of the other
 # hypotheses that the refit also tests; None if the refit failed.
@@ -81,7 +83,8 @@ def _to_refit(found: Posterior, done: set[Names]) -> Names | None:
     for names, share in found.probabilities().items():
         if share < PLAUSIBLE:
             return None
-        if names in done or found.visible_error.get(names, 0.0) <= VISIBLE:
+        leads = share > LEADING and names not in (NONE, UNKNOWN)
+        if names in done or not (leads or found.visible_error.get(names, 0.0) > VISIBLE):
             continue
         alone = [(name,) for name in names]
         if len(alone) > 1 and not done.intersection(alone):

@@ -146,7 +146,7 @@ def test_the_number_of_refits_is_bounded(start: Start) -> None:
     assert len(refit.asked) == len(set(refit.asked)) == MOST_REFITS
 
 
-@pytest.mark.parametrize(("log", "visible"), [(-6.0, 2 * VISIBLE), (30.0, VISIBLE / 2)])
+@pytest.mark.parametrize(("log", "visible"), [(-6.0, 2 * VISIBLE), (0.5, VISIBLE / 2)])
 def test_an_improbable_effect_and_an_invisible_error_need_no_refit(
     start: Start, log: float, visible: float
 ) -> None:
@@ -154,3 +154,12 @@ def test_an_improbable_effect_and_an_invisible_error_need_no_refit(
     refit = Refitted({})
     settled_posterior(MODEL, refit)
     assert refit.asked == []
+
+
+def test_a_leading_effect_is_refitted_although_its_error_is_invisible(start: Start) -> None:
+    """The report would name it. Its refit fails, so that it is left out."""
+    start({NONE: 0.0, A: 30.0}, VISIBLE / 2)
+    refit = Refitted({})
+    found, failed = settled_posterior(MODEL, refit)
+    assert refit.asked == [A] and failed == (A,)
+    assert next(iter(found.probabilities())) == NONE
