@@ -18,7 +18,7 @@ from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior, kind_of, posterior
 
-MOST_REFITS = 4  # a pair, its two effects, and a rival
+MOST_REFITS = 3  # for example, an effect alone, a pair that contains it, and a rival
 VISIBLE = 9.0  # a template error is visible if it adds this much to chi2
 PLAUSIBLE = 0.02
 LEADING = 0.5
