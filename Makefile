@@ -69,7 +69,7 @@ lint: $(DEV)
 
 # The documentation site, docs/_build/html/index.html. Its tutorials run; neither the build nor the pages need a network.
 docs: $(DOCS)
-	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+	$(BIN)/python -m sphinx -W --keep-going -E -b html docs docs/_build/html
 
 # The table of settings, made from the settings class.
 settings: $(DEV)

@@ -57,6 +57,7 @@ sphinx_gallery_conf = {
     "examples_dirs": "tutorials",
     "gallery_dirs": "_gallery",
     "filename_pattern": r"\.py$",  # all tutorials run
+    "run_stale_examples": True,  # also those whose text did not change: heliopsf may have changed
     "within_subsection_order": "FileNameSortKey",
     "doc_module": ("heliopsf", "psfcore"),
     "backreferences_dir": None,
@@ -68,7 +69,6 @@ sphinx_gallery_conf = {
     "image_srcset": ["2x"],
     "reset_modules": ("matplotlib",),
 }
-
 
 NAMED = re.compile(r"(?:^|(?<=[.)] ))(\w+(?:, \w+)*)(?:\(view\))?: ")
 
