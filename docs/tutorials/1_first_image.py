@@ -72,7 +72,7 @@ result.plot_change(axes).set_title("Change")
 # QUALITY is 0 for a good pixel; :doc:`Products </products>` explains the other values. Here the pixels near the edges are marked,
 # because a part of their light may come from beyond the image.
 
-print(f"good pixels: {(result.quality == 0).mean():.0%}")
+print(f"good pixels: {100 * (result.quality == 0).mean():.0f} %")
 change = result.changes["change_pct"]
 print(f"1 % of the pixels lose at least {-change['p1']:.0f} %")
 print(f"1 % of the pixels gain at least {change['p99']:.0f} %")

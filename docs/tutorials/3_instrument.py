@@ -84,7 +84,7 @@ print("light beyond 1, 10 and 100 px:", np.round(psf.light_beyond([1, 10, 100]),
 # Thicker wires diffract more light. The hash of the file is a part of the identity of its PSF, so the changed
 # file gives another PSF with another id.
 
-figure, axes = plt.subplots(figsize=(6.4, 4))
+figure, axes = plt.subplots(figsize=(6.4, 4.4))
 radii_px = np.geomspace(0.5, 250, 300)
 for wire_um in (20, 40, 80):
     file.write_text(text.replace("wire_um = 40.0", f"wire_um = {wire_um}.0"))

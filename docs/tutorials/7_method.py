@@ -102,7 +102,7 @@ added = scattered + (1 - scattered.sum()) * psf.components["DIFFRACTION"]
 radii_px = np.geomspace(0.5, 1000, 200)
 difference = cumulative_curve(psf.kernel, radii_px) - cumulative_curve(added, radii_px)
 
-figure, axes = plt.subplots(figsize=(6.4, 4))
+figure, axes = plt.subplots(figsize=(6.4, 4.4))
 axes.semilogx(radii_px, difference)
 axes.axhline(0, color="black", linewidth=0.8)
 axes.set(xlabel="Radius (px)", ylabel="Convolution minus sum (points)")
