@@ -45,8 +45,8 @@ for one, name in zip(axes.flat, names, strict=True):
 figure.colorbar(drawn, ax=axes, label="Weight")
 
 # %%
-# The drawing of the mount is not public. Its bars are assumed, such that all diffraction puts as much light outside the
-# central pixel as the paper states (26.4 %). Therefore the PSF is a draft.
+# The drawing of the mount is not public. Its bars are assumed, such that all diffraction puts about as much light outside
+# the central pixel as the paper states (26.4 %). Therefore the PSF is a draft.
 #
 # What is fitted: diffuse scatter
 # -------------------------------
