@@ -4,8 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
+DOCS := $(VENV)/.installed-docs
 
-.PHONY: demo test test-full bench bench-peers blind chaos lint openapi settings pins clean
+.PHONY: demo test test-full bench bench-peers blind chaos lint docs openapi settings pins clean
 .DELETE_ON_ERROR:
 
 $(RUN): pyproject.toml constraints.txt
@@ -16,6 +17,10 @@ $(RUN): pyproject.toml constraints.txt
 
 $(DEV): $(RUN)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+$(DOCS): $(RUN)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	touch $@
 
 demo: $(RUN)
@@ -62,6 +67,10 @@ lint: $(DEV)
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/house
 
+# The documentation site, docs/_build/html/index.html. Its tutorials run; neither the build nor the pages need a network.
+docs: $(DOCS)
+	$(BIN)/python -m sphinx -W --keep-going -E -b html docs docs/_build/html
+
 # The table of settings, made from the settings class.
 settings: $(DEV)
 	$(BIN)/python -m workers.settings_table docs/settings.md
@@ -75,4 +84,4 @@ pins: constraints.txt pyproject.toml pins/build.in
 	.venv-pins/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c constraints.txt --extra s3 -o pins/service.txt pyproject.toml pins/build.in
 
 clean:
-	rm -rf $(VENV) .venv-peers .venv-pins .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-peers .venv-pins .mypy_cache .ruff_cache .hypothesis docs/_build docs/_gallery

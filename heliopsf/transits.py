@@ -101,8 +101,10 @@ def diagnose_gap(
 ) -> GapDiagnosis:
     """Fit a transit and find out which effect explains the residuals of the fit.
 
-    coverage: the probability with which the answer set contains the true cause. The other parameters are the same as
-    in ``fit_scatter``. ``report()`` of the result is the report (JSON). Raises the same errors as ``fit_scatter``.
+    coverage: the probability with which the answer set contains the true cause.
+
+    The other parameters are the same as in ``fit_scatter``. ``report()`` of the result is the report (JSON). Raises the same
+    errors as ``fit_scatter``.
     """
     threads = threads or cores()
     found = diagnose.diagnose(

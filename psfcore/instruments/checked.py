@@ -54,7 +54,7 @@ class Fault(NamedTuple):
 
 
 class BadValues(ValueError):
-    """Values that are not accepted, in the order of the keys of the class."""
+    """Values that are not accepted: in each table unknown keys first, then the others in the order of the keys of the class."""
 
     def __init__(self, faults: list[Fault]) -> None:
         super().__init__("; ".join(f"{'.'.join(map(str, fault.key))}: {fault.expected}" for fault in faults))
@@ -96,7 +96,12 @@ class Checked:
     def read(cls, table: Mapping[str, Any]) -> Self:
         """An object from the keys and values of a table. Raises BadValues, also for unknown and missing keys."""
         annotations = annotations_of(cls)
-        faults: list[Fault] = []
+        # Unknown keys come first: a misspelt key is often the reason why another key is missing.
+        faults = [
+            Fault((name,), f"expected one of the keys {', '.join(annotations)}", table[name])
+            for name in table
+            if name not in annotations
+        ]
         values: dict[str, Any] = {}
         required = {field.name for field in fields(cls) if _is_required(field)}  # type: ignore[arg-type]
         for name, annotation in annotations.items():
@@ -107,11 +112,6 @@ class Checked:
                     faults += error.faults
             elif name in required:
                 faults.append(Fault((name,), "expected this key", None))
-        unknown = [name for name in table if name not in annotations]
-        faults += [
-            Fault((name,), f"expected one of the keys {', '.join(annotations)}", table[name])
-            for name in unknown
-        ]
         if faults:
             raise BadValues(faults)
         return cls(**values)

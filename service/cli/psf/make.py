@@ -127,7 +127,9 @@ def fit(
             overwrite=overwrite,
         )
     found = fitted["details"]["fit"]
-    click.echo(f"{output}: {fitted['name']} {fitted['version']} ({fitted['status']})")
+    click.echo(
+        f"{output}: {fitted['name']} {fitted['version']} ({fitted['status']}), id {short(fitted['id'])}"
+    )
     click.echo(found["sentence"])
     for name, parameter in found["parameters"].items():
         click.echo(f"  {name:<12} {parameter['value']:10.4f} ± {parameter['sigma']:.4f} {parameter['unit']}")

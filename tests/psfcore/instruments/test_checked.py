@@ -102,8 +102,12 @@ def test_the_fault_names_the_key_and_what_was_expected(
     assert found == key and said.startswith(expected)
 
 
-def test_all_faults_are_told_in_the_order_of_the_keys() -> None:
-    assert [key for key, _ in faults(other=1, kind="flat", count=0)] == ["count", "kind", "other"]
+def test_all_faults_are_told_unknown_keys_first_then_in_the_order_of_the_keys() -> None:
+    assert [key for key, _ in faults(other=1, kind="flat", count=0)] == ["other", "count", "kind"]
+
+
+def test_a_misspelt_key_is_told_before_the_key_that_is_missing() -> None:
+    assert [key for key, _ in faults(parts=[{"lenght": 1.0}])] == ["parts.0.lenght", "parts.0.length"]
 
 
 def test_objects_do_not_change_and_a_changed_copy_is_checked() -> None:

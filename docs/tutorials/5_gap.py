@@ -1,0 +1,99 @@
+"""
+Is the gap real?
+================
+
+A fitted PSF never reproduces a transit exactly. The *gap* is the part of the residuals that noise does not explain. The gap diagnosis
+states which physical effect could cause it, with a probability. This tutorial adds a known error to a simulated transit
+and reads the diagnosis.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import matplotlib.pyplot as plt
+
+import heliopsf
+from psfcore.psf import crop_centred
+from psfcore.simulate.plan import default_plan
+from psfcore.simulate.scatter_truth import ScatterTruth
+from psfcore.simulate.transit import simulate
+from psfcore.simulate.transit_files import write
+
+# %%
+# A transit with an error
+# -----------------------
+#
+# The detector adds 6 DN to every pixel of every exposure. The images are not corrected for this dark offset.
+
+diffraction = crop_centred(heliopsf.build_psf("hri_euv").components["DIFFRACTION"], (256, 256))
+diffraction /= diffraction.sum()
+plan = default_plan(images=12, size_px=128, oversampling=1, brightness=8.0, dark_offset_dn=6.0)
+
+temporary = TemporaryDirectory()
+folder = Path(temporary.name)
+write(simulate(plan, ScatterTruth(b_px=6.15, c=2.53, total=0.411), diffraction, seed=3), folder)
+
+# %%
+# The diagnosis
+# -------------
+#
+# Begin with the sentence and the cautions of the report.
+
+gap = heliopsf.diagnose_gap(folder)
+report = gap.report()
+print(report["sentence"])
+print(report["cautions"] or "No cautions.")
+
+# %%
+# The verdict and the answer set
+# ------------------------------
+#
+# The answer set contains the hypotheses that the data do not exclude. Each hypothesis is a list of effects; an empty list
+# means that there is no gap. On transits like those of the calibration, the set contains the true cause with a probability
+# of 90 % (``coverage``).
+
+print("verdict: ", report["verdict"])
+print("answer:  ", report["answer"])
+print("set:     ", report["set"])
+
+# %%
+# The figure shows the effects with the highest probabilities. The bars show the closure: the share of the gap in held-out
+# images that disappears when the effect is added to the model. A high closure does not identify the cause, because another
+# effect can look alike; the probabilities at the right decide. They need not sum to 1, because several effects can act together.
+
+figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+gap.plot(axes)
+
+# %%
+# The report states the size of each effect with its error.
+
+best = report["effects"][0]
+offset = best["parameters"]["offset"]
+print(f"{best['name']}: {offset['value']:.2f} ± {offset['sigma']:.2f} {offset['unit']}")
+print(f"closure on held-out images: {best['closure']['value']:.2f}")
+
+# %%
+# What these data could have shown
+# --------------------------------
+#
+# An effect that is not in the answer may act, but too weakly to be seen. ``found_90`` is the strength that would be found
+# in 90 % of observations; ``excluded_95`` is the strength above which these data exclude the effect.
+
+print(f"{'effect':20} {'found_90':>10} {'excluded_95':>12}")
+for name in ("dark_offset", "intensity_gradient", "column_smear", "ghost"):
+    limit = report["limits"][name]
+    found, excluded = limit["found_90"], limit["excluded_95"]
+    print(f"{name:20} {found:10.3g} {excluded:12.3g} {limit['unit']}")
+
+# %%
+# What next?
+# ----------
+#
+# ``gap.quicklook()`` draws the whole diagnosis, and ``heliopsf gap transit -o gap.html`` writes it as a page. What to do next
+# depends on the verdict:
+#
+# - ``attributed``: correct the cause, here the dark level, and fit again. ``heliopsf gap transit --corrected psf.fits``
+#   writes a PSF that was fitted with the effect in the model.
+# - ``tie``: ``report["would_separate"]`` names the observation that would separate the effects.
+# - ``none``: no gap was found. The limits state how strong an effect can still be.
+# - ``unknown`` or ``inconclusive``: see :doc:`the gap diagnosis </gap>`, which also states how often the diagnosis is right.
