@@ -206,9 +206,7 @@ class _Model:
     def __init__(self, shape: Shape, diffraction: Kernel, size: int, threads: int) -> None:
         self._shape, self._size = shape, size
         self._grid = max(size, REACH_GRID_PX)
-        self._convolver = Convolver(
-            diffraction, (self._grid, self._grid), dtype=np.float64, threads=threads
-        )
+        self._convolver = Convolver(diffraction, (self._grid, self._grid), dtype=np.float64, threads=threads)
 
     def total(self, fitted: FittedShape) -> Kernel:
         """The total PSF [y, x] at the coordinates of a fit."""
@@ -265,8 +263,9 @@ def _check_same_diffraction(before: Psf, after: Psf) -> None:
     if moved > SAME_LIGHT:
         raise DataError(
             "diffraction-differs",
-            f"expected two PSFs with the same diffraction PSF; those of {before.name} {before.version} and {after.name} "
-            f"{after.version} differ by {100 * moved:.3g} % of the light: fit both transits with the same diffraction PSF",
+            f"expected two PSFs with the same diffraction PSF; got {before.name} {before.version} and {after.name} "
+            f"{after.version}, whose diffraction differs by {100 * moved:.3g} % of the light: fit both transits with the same "
+            "diffraction PSF",
         )
 
 
@@ -275,8 +274,8 @@ def _check_of_its_shape(psf: Psf, model: Kernel) -> None:
     if moved > SAME_LIGHT:
         raise DataError(
             "psf-not-of-its-shape",
-            f"expected a PSF that is its fitted shape convolved with its diffraction PSF; {psf.name} {psf.version} differs "
-            f"from that by {100 * moved:.3g} % of the light, for example because it contains a corrected effect: "
+            f"expected a PSF that is its fitted shape convolved with its diffraction PSF; got {psf.name} {psf.version}, which "
+            f"differs from that by {100 * moved:.3g} % of the light, for example because it contains a corrected effect: "
             "name a PSF for the image instead (--psf)",
         )
 
