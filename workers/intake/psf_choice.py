@@ -1,5 +1,9 @@
 """Finds the one PSF that meets filters or fits the header of an image. If no PSF or several PSFs fit, the error says
-why."""
+why.
+
+If the PSFs of a series may be interpolated, and the time of an image is between the ranges of two PSFs, the search also
+finds these two PSFs.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +15,11 @@ from typing import Any
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import NOW
+from workers.catalogue.interpolated.series import Ends
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfContextRow, PsfRow
+from workers.contract.requests import PsfInterpolate
+from workers.versions.interpolation import rounded
 from workers.versions.series import TOTAL, channel_of, instrument_of, series_of
 from workers.versions.status import PsfStatus
 from workers.versions.validity import iso, seconds
@@ -28,6 +35,22 @@ class Found:
     context: PsfContextRow | None  # None: all PSFs were searched
     psfs: Sequence[PsfRow]  # at most MOST_NAMED + 1 PSFs
     emptied_by: str | None  # the first filter after which no PSF was left; None if PSFs were found
+    ends: Ends | None = None  # the PSFs between which the PSF of an image may be interpolated
+
+    @property
+    def interpolation(self) -> PsfInterpolate | None:
+        """How the PSF of the image is interpolated, at its rounded time; None if it is not interpolated."""
+        ends, at = self.ends, self.wanted.valid_at
+        if ends is None or at is None:
+            return None
+        time = rounded(ends.before_time, ends.after_time, at)
+        return PsfInterpolate(
+            before_psf_id=ends.before_psf_id,
+            before_time=iso(ends.before_time) or "",
+            after_psf_id=ends.after_psf_id,
+            after_time=iso(ends.after_time) or "",
+            time=iso(time) or "",
+        )
 
     def one(self) -> PsfRow:
         """The PSF. Raises ``DataError`` "no-psf-fits" or "several-psfs-fit"."""
@@ -47,7 +70,13 @@ class Found:
         before = dict(list(given.items())[: list(given).index(self.emptied_by)]) if self.emptied_by else given
         asked = f"{self.emptied_by} {given[self.emptied_by]}" if self.emptied_by else "any property"
         among = f"no PSF with {_joined(before)}" if before else "no PSF"
-        return f"expected one PSF with {self._said()}; {among} has {asked}"
+        between = ""
+        if self.ends is not None:
+            between = (
+                f"; a deconvolution of the image interpolates between PSF {self.ends.before_psf_id} and PSF "
+                f"{self.ends.after_psf_id}"
+            )
+        return f"expected one PSF with {self._said()}; {among} has {asked}{between}"
 
     def _said(self) -> str:
         return _joined(self._given()) or "no filter"
@@ -106,7 +135,12 @@ def look_for_image(
             f"expected DATE-BEG or DATE-OBS in the image's header, in the form 2024-03-01T12:00:00, because PSFs of "
             f"{series_of(instrument, channel, kind)} are valid only for some times; got {header['date_obs']!r}",
         )
-    return found
+    if at is None or found.psfs or kind != TOTAL:
+        return found
+    series = series_of(instrument, channel, kind)
+    assert series is not None
+    context_id = None if found.context is None else found.context.id
+    return replace(found, ends=catalogue.series.ends(series, at, owner, context_id))
 
 
 def picked_for_image(

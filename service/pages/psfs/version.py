@@ -31,6 +31,7 @@ from workers.catalogue.access.keys import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
 from workers.contract.requests import Identity
+from workers.versions.series import INTERPOLATED
 from workers.versions.status import PsfStatus
 
 MOST_OTHERS = 50
@@ -139,7 +140,8 @@ def psf_facts(psf: PsfView) -> list[tuple[str, str]]:
 
 def validity(psf: PsfView) -> str:
     """The range of observation times for which the PSF is certified."""
-    if psf.status == PsfStatus.DRAFT:
+    # An interpolated PSF may be deprecated together with one of its ends, without having been certified.
+    if psf.status == PsfStatus.DRAFT or (psf.origin == INTERPOLATED and psf.valid_from is None):
         return "not certified"
     if psf.valid_from is None and psf.valid_to is None:
         return "at all times"
