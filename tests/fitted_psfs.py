@@ -19,20 +19,25 @@ LATE = {"b_px": 5.2, "c": 2.62, "total": 0.455}
 
 
 def fitted_psf(
-    values: dict[str, float], *, shape: str = "softened-power-law", sigma: float = 0.01, **changes: Any
+    values: dict[str, float],
+    *,
+    shape: str = "softened-power-law",
+    sigma: float = 0.01,
+    size: int = SIZE,
+    **changes: Any,
 ) -> Psf:
     """The PSF of these parameters, with the same error for each coordinate."""
     form = SHAPES[shape]
     at = form.coordinates(values)
     whole = TotalPsf(DIFFRACTION, form, (REACH_GRID_PX, REACH_GRID_PX)).kernel(at)
     known: dict[str, Any] = {
-        "kernel": np.maximum(crop_centred(whole, (SIZE, SIZE)), 0.0),
+        "kernel": np.maximum(crop_centred(whole, (size, size)), 0.0),
         "name": "fitted",
         "version": f"0.1.0+{values['total']:g}",
         "instrument": "hri_euv",
         "status": "draft",
         "plate_scale_arcsec": 0.492,
-        "components": {"DIFFRACTION": crop_or_pad(DIFFRACTION, SIZE)},
+        "components": {"DIFFRACTION": crop_or_pad(DIFFRACTION, size)},
         "fitted": FittedShape(
             shape, form.names, tuple(at.tolist()), tuple(map(tuple, (sigma**2 * np.eye(at.size)).tolist()))
         ),

@@ -95,9 +95,9 @@ class VersionedPsfs(ABC):
             return self._all(f"/v1/psfs/{psf_id}/affected", {})
         return self._all("/v1/affected", {"superseded": "true" if superseded else "false"})
 
-    def series(self) -> list[dict[str, Any]]:
+    def series(self) -> Iterator[dict[str, Any]]:
         """The series of which a PSF was certified: name, and whether its PSFs may be interpolated."""
-        return list(self.get("/v1/series")["items"])
+        return self._all("/v1/series", {})
 
     def interpolate_series(
         self, series: str, interpolated: bool = True, *, reason: str = ""

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from psfcore.errors import DataError
 from service.api.psfs.filters import TEXT
 from service.http.callers import Caller, Certifying, KeyFirst, Reading
+from service.http.paging import Page
 from service.http.problems import RESPONSES, problem
 from service.http.quotas import rows_held
 from service.http.state import Shared, State
@@ -68,22 +69,15 @@ class SeriesView(SeriesSummary):
     history: list[SeriesMove] = Field(description="the last 200 changes, latest first; all are stored")
 
 
-class AllSeries(BaseModel):
-    """All series of which a PSF was certified."""
-
-    items: list[SeriesSummary] = Field(description="sorted by name")
-
-
 @router.get("", summary="List series")
-def list_series(caller: Reading, state: Shared) -> AllSeries:
-    """The series of which a PSF was certified."""
+def list_series(caller: Reading, state: Shared) -> Page[SeriesSummary]:
+    """The series of which a PSF was certified, sorted by name, on one page."""
     series = state.catalogue.series
-    return AllSeries(
-        items=[
-            SeriesSummary(series=name, interpolated=series.interpolated(name, caller.owner))
-            for name in series.all(caller.owner)
-        ]
-    )
+    items = [
+        SeriesSummary(series=name, interpolated=series.interpolated(name, caller.owner))
+        for name in series.all(caller.owner)
+    ]
+    return Page(items=items, next=None)
 
 
 @router.get("/{instrument}/{channel}/{kind}", summary="One series")

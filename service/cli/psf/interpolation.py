@@ -38,7 +38,7 @@ def series(series: str | None, interpolated: bool | None, reason: str, server: s
         if series is not None and interpolated is not None:
             rows = [service.interpolate_series(series, interpolated, reason=reason)]
         else:
-            rows = service.series()
+            rows = list(service.series())
     if not rows:
         click.echo("no series yet; `heliopsf psf certify` begins a series")
     for row in rows:
