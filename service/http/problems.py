@@ -62,6 +62,7 @@ STATUS_OF = {
     "series-not-total": 409,
     "several-ids-fit": 409,
     "several-psfs-fit": 409,
+    "several-variants-fit": 409,
     "successor-named": 409,
     "version-taken": 409,
     "wrong-transition": 409,

@@ -23,6 +23,7 @@ from workers.catalogue.tables import PsfChangeRow, PsfPinRow, PsfRow, PsfSeriesR
 from workers.versions.series import INTERPOLATED, UPLOADED, series_of
 from workers.versions.status import PsfStatus, check_transition, check_version
 from workers.versions.validity import Validity
+from workers.versions.variants import is_variant_of
 
 MOST_REASON = 400  # characters of a reason that the database stores
 
@@ -267,6 +268,8 @@ def _said_of_series(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | 
     }
     for name, value in known.items():
         said = getattr(asked, name)
+        if name == "channel" and open_to and said and value and is_variant_of(said, value):
+            continue  # the file names the channel, the request a variant of it
         if said is not None and value is not None and said != value:
             raise DataError(
                 "line-known",
@@ -274,7 +277,7 @@ def _said_of_series(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | 
             )
     return (
         row.instrument or asked.instrument,
-        row.channel or asked.channel,
+        asked.channel or row.channel,
         known["kind"] or asked.kind or row.kind,
     )
 

@@ -23,6 +23,7 @@ from workers.versions.interpolation import rounded
 from workers.versions.series import TOTAL, channel_of, instrument_of, series_of
 from workers.versions.status import PsfStatus
 from workers.versions.validity import iso, seconds
+from workers.versions.variants import variant_for
 
 MOST_NAMED = 20
 
@@ -119,9 +120,10 @@ def look_for_image(
 ) -> Found:
     """The PSFs for the instrument, channel and time of an image. header: the header summary that is stored with the upload.
 
-    Raises ``DataError`` "no-instrument", "no-date" or "no-such-context".
+    If the channel has variants, the filter and the plate scale in the header choose the variant.
+    Raises ``DataError`` "no-instrument", "no-date", "no-such-context" or "several-variants-fit".
     """
-    instrument, channel = seen_through(header)
+    instrument, channel = _seen_as(catalogue, header, owner, context, kind)
     if instrument is None:
         raise DataError(
             "no-instrument",
@@ -150,7 +152,7 @@ def picked_for_image(
 
     Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context contains none of them.
     """
-    instrument, channel = seen_through(header)
+    instrument, channel = _seen_as(catalogue, header, owner, context, TOTAL)
     series = series_of(instrument, channel, TOTAL)
     pinned = catalogue.contexts.asked_for(context, owner)
     if series is not None and pinned is not None and catalogue.contexts.any_pinned(pinned.id, series, owner):
@@ -169,6 +171,22 @@ def seen_through(header: Mapping[str, Any]) -> tuple[str | None, str | None]:
     """The instrument and the channel of an image. header: the header summary that is stored with the upload."""
     instrument = instrument_of(header)
     return instrument, channel_of(instrument, header["wavelnth"])
+
+
+def _seen_as(
+    catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None, kind: str
+) -> tuple[str | None, str | None]:
+    """The instrument and the channel of an image, with the variant of the channel to which the image belongs, if any.
+
+    Raises ``DataError`` "no-such-context" or "several-variants-fit".
+    """
+    instrument, channel = seen_through(header)
+    if instrument is None or channel is None:
+        return instrument, channel
+    pinned = catalogue.contexts.asked_for(context, owner)
+    known = catalogue.series.variants(instrument, channel, kind, owner, None if pinned is None else pinned.id)
+    # The summaries of images that were uploaded by earlier versions contain no cards.
+    return instrument, variant_for(header.get("cards") or {}, known) or channel
 
 
 def _observed_at(header: Mapping[str, Any]) -> float | None:

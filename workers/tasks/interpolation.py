@@ -22,7 +22,7 @@ from workers.tasks.context import Context
 from workers.tasks.data.psfs import named_psf, psf_row
 from workers.tasks.data.reports import provenance_of
 from workers.versions.interpolation import name_of
-from workers.versions.series import INTERPOLATED
+from workers.versions.series import INTERPOLATED, series_of
 
 STAGE = "interpolating the PSF"
 
@@ -57,7 +57,11 @@ def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
         threads=context.settings.threads,
     )
     context.report(STAGE, 1, 2)
-    return context.add(_saved(context, identity, psf))
+    row = _saved(context, identity, psf)
+    # The files of the ends do not name the variant of the channel; their rows do.
+    row.channel = named_psf(context, request.before_psf_id).channel or row.channel
+    row.series = series_of(row.instrument, row.channel, row.kind)
+    return context.add(row)
 
 
 def _epoch(context: Context, psf_id: str, time: str) -> Epoch:

@@ -29,7 +29,7 @@ PRODUCT = click.option("--product", is_flag=True, help="The ID is of a product, 
 def _line_options(command: Command) -> Command:
     for name, what in (
         ("kind", "Kind: total, uploaded, or a component such as diffraction"),
-        ("channel", "Channel: wavelength in whole angstrom, such as 174"),
+        ("channel", "Channel: wavelength in whole angstrom, such as 174; or a variant, such as 174-open_2"),
         ("instrument", "Instrument, such as hri_euv"),
     ):
         command = click.option(f"--{name}", help=what)(command)

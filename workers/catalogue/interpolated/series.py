@@ -20,6 +20,7 @@ from workers.catalogue.owners import add_held, counted_bytes
 from workers.catalogue.tables import PsfPinRow, PsfRow, PsfSeriesRow, SeriesChangeRow
 from workers.versions.series import TOTAL
 from workers.versions.status import PsfStatus
+from workers.versions.variants import SEPARATOR
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,23 @@ class Series:
         query = select(PsfSeriesRow.series).where(PsfSeriesRow.owner == owner)
         with self._database.reading() as session:
             return session.scalars(query.order_by(PsfSeriesRow.series)).all()
+
+    def variants(
+        self, instrument: str, channel: str, kind: str, owner: str, context_id: str | None
+    ) -> list[str]:
+        """The variants of a channel of which a PSF is certified, or pinned by a context: their channels, such as 174-open_2."""
+        table: Any = PsfRow if context_id is None else PsfPinRow
+        start, end = f"{instrument}/{channel}{SEPARATOR}", f"/{kind}"
+        query = select(table.series).where(
+            table.owner == owner,
+            table.series.startswith(start, autoescape=True),
+            table.series.endswith(end, autoescape=True),
+            PsfRow.status == PsfStatus.CERTIFIED
+            if context_id is None
+            else PsfPinRow.context_id == context_id,
+        )
+        with self._database.reading() as session:
+            return sorted(series.split("/")[1] for series in session.scalars(query.distinct()))
 
     def interpolated(self, series: str, owner: str) -> bool:
         """Whether the PSFs of a series may be interpolated."""
