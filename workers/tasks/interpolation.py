@@ -47,13 +47,16 @@ def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
         "after": _epoch(context, request.after_psf_id, request.after_time),
     }
     name, version = name_of(ends["before"].psf.instrument, identity)
+    # The id of the job is in the details of the row, not in the file, so that the file can be made again bit for bit.
+    provenance = {"psf_id": identity, **provenance_of(context, request)}
+    del provenance["job_id"]
     psf = interpolated_psf(
         ends["before"],
         ends["after"],
         datetime.fromisoformat(request.time),
         name=name,
         version=version,
-        provenance={"psf_id": identity, **provenance_of(context, request)},
+        provenance=provenance,
         threads=context.settings.threads,
     )
     context.report(STAGE, 1, 2)

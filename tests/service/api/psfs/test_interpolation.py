@@ -153,7 +153,8 @@ def test_lineage_names_both_ends_and_a_rerun_gives_the_same_psf(
         run_jobs()
         done = api.get(asked.headers["Location"]).json()
         assert done["phase"] == "COMPLETED", done
-        assert api.get(done["result"]).json()["details"]["same"] is True
+        details = api.get(done["result"]).json()["details"]
+        assert details["same"] is True and details["same_file"] is True
     assert api.get(f"/psfs/{between['id']}", headers={"Accept": "text/html"}).status_code == 200
 
 
