@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Select, select
+from sqlalchemy import Select, exists, select
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
@@ -53,15 +53,18 @@ class Series:
         self, instrument: str, channel: str, kind: str, owner: str, context_id: str | None
     ) -> list[str]:
         """The variants of a channel of which a PSF is certified, or pinned by a context: their channels, such as 174-open_2."""
-        table: Any = PsfRow if context_id is None else PsfPinRow
+        table: Any = PsfSeriesRow if context_id is None else PsfPinRow
         start, end = f"{instrument}/{channel}{SEPARATOR}", f"/{kind}"
+        certified = exists().where(
+            PsfRow.owner == PsfSeriesRow.owner,
+            PsfRow.series == PsfSeriesRow.series,
+            PsfRow.status == PsfStatus.CERTIFIED,
+        )
         query = select(table.series).where(
             table.owner == owner,
+            certified if context_id is None else PsfPinRow.context_id == context_id,
             table.series.startswith(start, autoescape=True),
             table.series.endswith(end, autoescape=True),
-            PsfRow.status == PsfStatus.CERTIFIED
-            if context_id is None
-            else PsfPinRow.context_id == context_id,
         )
         with self._database.reading() as session:
             return sorted(series.split("/")[1] for series in session.scalars(query.distinct()))
