@@ -42,6 +42,7 @@ QUICK: list[dict[str, Any]] = [
     {"kind": "psf-build", "instrument": "aia_171", "size": 2048},
     {"kind": "psf-build", "instrument": "hri_euv", "size": 4096},
     {"kind": "psf-tables", "psf": 2048},
+    *({"kind": "psf-interpolate", "px": px} for px in (128, 2048)),
     *({"kind": kind, "px": 128, "images": 12} for kind in ("psf-fit", "report", "gap-diagnose")),
     {"kind": "cross-validate", "px": 256, "images": 18, "runs": 10},
     {"kind": "psf-fit", "px": 256, "images": 18},
@@ -140,6 +141,8 @@ def asked(case: dict[str, Any], folder: Path, service: Any) -> dict[str, Any]:
     if case["kind"] in STUDIES:
         given = {key: case[key] for key in ("runs", "scheme", "as_published") if key in case}
         return {"transit_id": service.upload_transit(transit(case, folder))["id"], **given}
+    if case["kind"] == "psf-interpolate":
+        return two_fitted(case["px"], folder, service)
     psf_id = service.upload_psf(psf_file(case["psf"], folder))["id"]
     if case["kind"] == "psf-tables":
         return {"psf_id": psf_id}
@@ -150,6 +153,23 @@ def asked(case: dict[str, Any], folder: Path, service: Any) -> dict[str, Any]:
     if case.get("noise"):
         wanted["noise"] = {"photon_gain_dn": 6.0, "read_noise_dn": 2.0}
     return {"image_id": service.upload_image(image)["id"], "psf_id": psf_id, **wanted}
+
+
+def two_fitted(px: int, folder: Path, service: Any) -> dict[str, Any]:
+    """Upload two fitted PSFs; returns the parameters of a job that interpolates between them."""
+    from tests.fitted_psfs import EARLY, LATE, write_fitted
+
+    early, late = (
+        service.upload_psf(write_fitted(folder / f"fitted-{px}-{n}.fits", values, size=px))["id"]
+        for n, values in enumerate((EARLY, LATE))
+    )
+    return {
+        "before_psf_id": early,
+        "before_time": "2022-01-01",
+        "after_psf_id": late,
+        "after_time": "2023-01-01",
+        "time": "2022-06-01",
+    }
 
 
 def psf_file(which: int | str, folder: Path) -> Path:

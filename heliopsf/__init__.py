@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from heliopsf.images import deconvolve, psf_for
     from heliopsf.outputs import Deconvolution
-    from heliopsf.psfs import Psf, build_psf, read_psf
+    from heliopsf.psfs import Psf, build_psf, interpolate_psf, read_psf
     from heliopsf.transits import GapDiagnosis, ScatterFit, diagnose_gap, fit_scatter
     from psfcore.errors import DataError, MissingExtra
     from service.client.errors import ServiceError
@@ -38,6 +38,7 @@ __all__ = [
     "deconvolve",
     "diagnose_gap",
     "fit_scatter",
+    "interpolate_psf",
     "psf_for",
     "read_psf",
 ]
@@ -56,6 +57,7 @@ _MODULES = {
     "deconvolve": ("heliopsf.images", ""),
     "diagnose_gap": ("heliopsf.transits", "fit"),
     "fit_scatter": ("heliopsf.transits", "fit"),
+    "interpolate_psf": ("heliopsf.psfs", ""),
     "psf_for": ("heliopsf.images", ""),
     "read_psf": ("heliopsf.psfs", ""),
 }

@@ -1,8 +1,9 @@
-"""Build, read and find PSFs in this process."""
+"""Build, read, find and interpolate PSFs in this process."""
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from heliopsf.machine import cores
 from heliopsf.progress import Told, told
 from psfcore.built.cache import sha256_of_file
 from psfcore.built.recipe import Recipe
-from psfcore.errors import module_of_extra
+from psfcore.errors import DataError, module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.mask_file import read_mask_image
@@ -20,6 +21,7 @@ from psfcore.instruments.model import load_instrument, read_instrument_text
 from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
 from psfcore.psf_sampling import rebinned
+from psfcore.scatter.interpolation import Epoch, interpolated_psf
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -127,3 +129,53 @@ def read_psf(path: str | Path) -> Psf:
     # The id that a service would give to this file after an upload: a built PSF keeps the id that its file states.
     identity = psfs.stated_id(path, LIMITS) or sha256_of_file(Path(path))
     return replace(psf, provenance={**psf.provenance, "psf_id": identity})
+
+
+def interpolate_psf(
+    before: CorePsf | str | Path,
+    after: CorePsf | str | Path,
+    *,
+    before_time: datetime | str,
+    after_time: datetime | str,
+    time: datetime | str,
+    threads: int | None = None,
+) -> Psf:
+    """Interpolate between two fitted PSFs in time: the PSF at ``time``, with its errors.
+
+    The coordinates of the fitted shape are interpolated linearly; ``fitted`` of the result holds them with their
+    covariance (``psfcore.scatter.interpolation`` gives the equations). Nothing is extrapolated.
+
+    before, after: PSFs of ``ScatterFit`` or of files, fitted with the same shape and the same diffraction PSF.
+    before_time, after_time: when they hold. Times are datetimes or texts such as "2024-03-01T12:00:00"; a time without a
+    zone is UTC.
+    threads: default: all cores.
+
+    Raises ``DataError``: "bad-time", "psf-not-fitted", "shapes-differ", "psfs-differ", "diffraction-differs",
+    "psf-not-of-its-shape", "epochs-not-in-order", "time-outside-epochs", and the errors of ``read_psf``.
+    """
+    first, second = (
+        Epoch(one if isinstance(one, CorePsf) else read_psf(one), _time(at, name))
+        for one, at, name in ((before, before_time, "before_time"), (after, after_time, "after_time"))
+    )
+    return Psf.of(
+        interpolated_psf(
+            first,
+            second,
+            _time(time, "time"),
+            name=f"{first.psf.instrument or 'psf'}-interpolated",
+            version="0.1.0",
+            provenance={},
+            threads=threads or cores(),
+        )
+    )
+
+
+def _time(given: datetime | str, name: str) -> datetime:
+    """A time with a zone. Raises DataError "bad-time"."""
+    try:
+        at = given if isinstance(given, datetime) else datetime.fromisoformat(given)
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            "bad-time", f"{name}: expected a time such as 2024-03-01T12:00:00, got {ascii(given)[:60]}"
+        ) from error
+    return at if at.tzinfo else at.replace(tzinfo=UTC)

@@ -24,7 +24,7 @@ from service.api import (
     transits,
 )
 from service.api.files import headers, pixels
-from service.api.psfs import affected, contexts
+from service.api.psfs import affected, contexts, series
 from service.api.psfs import choice as psf_choice
 from service.api.psfs import curves as psf_queries
 from service.api.psfs import status as psf_status
@@ -111,7 +111,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
     guard.install(app, access, BodyLimits.of(settings), problem_page)
     app.state.requests = observation.install(app)
     # psf_choice comes before psfs, so that "best" is not taken for an id.
-    versions = (psf_choice, psf_status, contexts, affected, lineage)
+    versions = (psf_choice, psf_status, series, contexts, affected, lineage)
     for part in (
         *versions,
         images,

@@ -16,6 +16,7 @@ from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, Repor
 from workers.contract.kinds import kind_of_origin
 from workers.contract.resolved import ResolvedRerun
 from workers.contract.suggestions import FORMER_NAMES
+from workers.versions.series import INTERPOLATED
 
 MOST_DEEP = 16
 MOST_THINGS = 200
@@ -49,6 +50,10 @@ class Ancestor(BaseModel):
         description="whether the catalogue still contains the thing; false for an instrument file, because its text is in the PSF file"
     )
     made: Made | None = Field(None, description="null for an upload and for a deleted thing")
+    weight: float | None = Field(
+        None,
+        description="the weight of this PSF in the PSF that was interpolated between it and another PSF; null for other parents",
+    )
     parents: list[Ancestor] = []
     cut: bool = Field(
         False,
@@ -112,8 +117,8 @@ def _origin(row: ProductRow | PsfRow) -> str:
     """The origin of a product or PSF, as ``workers.contract.kinds`` names it."""
     if isinstance(row, ProductRow):
         return "deconvolved"
-    if row.origin == "built":
-        return "built"
+    if row.origin in ("built", INTERPOLATED):
+        return row.origin
     return "corrected" if "parents" in row.details else "fitted"
 
 
@@ -149,9 +154,17 @@ class _Walk:
             id=row.id,
             there=True,
             made=_made_of(row),
-            parents=[] if enough else [self._parent(*parent, depth + 1) for parent in parents],
+            parents=[]
+            if enough
+            else [self._weighted(row, self._parent(*parent, depth + 1)) for parent in parents],
             cut=enough and bool(parents),
         )
+
+    @staticmethod
+    def _weighted(row: ProductRow | PsfRow, parent: Ancestor) -> Ancestor:
+        """The parent with its weight, if the PSF was interpolated from it."""
+        weights: dict[str, float] = row.details.get("weights") or {}
+        return parent.model_copy(update={"weight": weights.get(parent.id)})
 
     def _parent(self, kind: Type, identity: str, depth: int) -> Ancestor:
         match kind:
@@ -183,8 +196,7 @@ def _parents(row: ProductRow | PsfRow) -> list[tuple[Type, str]]:
         found.append(("transit", row.details["transit_id"]))
     if "report" in named:
         found.append(("report", named["report"]))
-    if "psf" in named:
-        found.append(("psf", named["psf"]))
+    found += [("psf", named[name]) for name in ("psf", "before", "after") if name in named]
     if row.details.get("diffraction_psf_id") is not None:
         found.append(("psf", row.details["diffraction_psf_id"]))
     if provenance.get("instrument_file_sha256") is not None:

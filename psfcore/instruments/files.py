@@ -11,10 +11,13 @@ from functools import cache
 from pathlib import Path
 
 from psfcore.errors import DataError
+from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
 
 WAVELENGTH_TOLERANCE = (
     0.01  # two wavelengths count as the same channel if their ratio differs from 1 by at most this
 )
+# The numbers in the table [match] may differ from those of an image by this ratio.
+_TOLERANCES = {"WAVELNTH": WAVELENGTH_TOLERANCE, "CDELT1": PLATE_SCALE_TOLERANCE}
 _FOLDER = Path(__file__).parent
 
 
@@ -32,16 +35,20 @@ def instrument_path(name: str) -> Path:
 
 
 def match_instrument(cards: Mapping[str, object]) -> str | None:
-    """Name of the first instrument whose cards in the table [match] all equal the given header cards, or None.
+    """Name of the instrument whose cards in the table [match] all equal the given header cards, or None.
 
-    cards: TELESCOP, INSTRUME and DETECTOR as texts, and WAVELNTH in angstrom. `psfcore.fits.header.known_instrument`
-    reads them from a header.
+    Several instruments may match: the file of a variant of an instrument, for one filter or plate scale, has the cards of
+    the instrument and further ones. The instrument with the most cards is chosen; of several, the first by name.
+    cards: TELESCOP, INSTRUME, DETECTOR and FILTER as texts, WAVELNTH in angstrom, CDELT1 in arcsec/px.
+    `psfcore.fits.header.known_instrument` reads them from a header.
     """
+    best, most = None, 0
     for name in instrument_names():
         wanted = match_table(name)
-        if wanted and all(_same(cards.get(key), value) for key, value in wanted.items()):
-            return name
-    return None
+        matches = (_same(cards.get(key), value, _TOLERANCES.get(key, 0.0)) for key, value in wanted.items())
+        if len(wanted) > most and all(matches):
+            best, most = name, len(wanted)
+    return best
 
 
 @cache
@@ -50,9 +57,9 @@ def match_table(name: str) -> dict[str, str | float]:
     return dict(tomllib.loads(instrument_path(name).read_text("utf-8")).get("match", {}))
 
 
-def _same(found: object, wanted: str | float) -> bool:
+def _same(found: object, wanted: str | float, tolerance: float) -> bool:
     if isinstance(wanted, str):
         return isinstance(found, str) and found.strip().upper() == wanted.upper()
     if not isinstance(found, (int, float)) or isinstance(found, bool):
         return False
-    return abs(found / wanted - 1) <= WAVELENGTH_TOLERANCE
+    return abs(found / wanted - 1) <= tolerance

@@ -35,7 +35,8 @@ MOST_KEYS = 64
 Windows = Annotated[int, Limit(ge=1, le=MOST_WINDOWS)]
 Name = Annotated[str, Limit(max_length=80)]
 Share = Annotated[float, Limit(gt=0, lt=1)]
-MatchKey = Literal["TELESCOP", "INSTRUME", "DETECTOR", "WAVELNTH"]
+MatchKey = Literal["TELESCOP", "INSTRUME", "DETECTOR", "FILTER", "WAVELNTH", "CDELT1"]
+_NUMBERS = ("WAVELNTH", "CDELT1")
 
 
 class GainMode(Checked):
@@ -212,14 +213,14 @@ class Instrument(Checked):
     scatter: Scatter | None = None
 
     def check(self) -> None:
-        """Check that WAVELNTH of the table [match] is a number and its other keys are texts.
+        """Check that WAVELNTH and CDELT1 of the table [match] are numbers and its other keys are texts.
 
         Check also that no spectral line is so weak that its weight cannot be normalised.
         """
         wrong = [
-            Fault(("match", key), f"expected {'a number' if key == 'WAVELNTH' else 'a text'}", value)
+            Fault(("match", key), f"expected {'a number' if key in _NUMBERS else 'a text'}", value)
             for key, value in self.match.items()
-            if isinstance(value, str) == (key == "WAVELNTH")
+            if isinstance(value, str) == (key in _NUMBERS)
         ]
         total = sum(line.weight for line in self.bandpass)
         wrong += [

@@ -59,7 +59,8 @@ def show(name: str, server: str | None) -> None:
     click.echo(f"{short(found['id'])}  {found['name']}")
     for pin in found["pins"]:
         times = f"[{pin['valid_from'] or 'always'}, {pin['valid_to'] or 'open'})"
-        click.echo(f"  {pin['series']}  {times}  {pin['version']}  {short(pin['psf_id'])}")
+        may = "  may be interpolated" if pin["interpolated"] else ""
+        click.echo(f"  {pin['series']}  {times}  {pin['version']}  {short(pin['psf_id'])}{may}")
 
 
 @context.command("use", short_help="Set the default context.")

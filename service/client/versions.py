@@ -1,4 +1,4 @@
-"""The client's requests about PSF versions: status, best PSF, contexts, lineage, reruns."""
+"""The client's requests about PSF versions: status, best PSF, series, contexts, lineage, reruns."""
 
 from __future__ import annotations
 
@@ -94,6 +94,41 @@ class VersionedPsfs(ABC):
         if psf_id is not None:
             return self._all(f"/v1/psfs/{psf_id}/affected", {})
         return self._all("/v1/affected", {"superseded": "true" if superseded else "false"})
+
+    def series(self) -> Iterator[dict[str, Any]]:
+        """The series of which a PSF was certified: name, and whether its PSFs may be interpolated."""
+        return self._all("/v1/series", {})
+
+    def interpolate_series(
+        self, series: str, interpolated: bool = True, *, reason: str = ""
+    ) -> dict[str, Any]:
+        """Say whether the PSFs of a series (instrument/channel/kind) may be interpolated in time. Returns the series."""
+        body = {"interpolated": interpolated, "reason": reason}
+        return self._json("PUT", f"/v1/series/{series}", json=body)
+
+    def interpolate_psf(
+        self,
+        before: str,
+        after: str,
+        time: str,
+        *,
+        before_time: str | None = None,
+        after_time: str | None = None,
+        progress: Progress | None = None,
+    ) -> dict[str, Any]:
+        """Interpolate between two fitted PSFs in time; returns the new PSF.
+
+        before, after: their ids. before_time, after_time: the last time at which the earlier PSF holds, and the first
+        time at which the later PSF holds; default: the end and the start of the ranges for which they are certified.
+        """
+        times = {
+            "before_time": before_time or self.get(f"/v1/psfs/{before}")["valid_to"],
+            "after_time": after_time or self.get(f"/v1/psfs/{after}")["valid_from"],
+        }
+        job = self.submit(
+            "psf-interpolate", before_psf_id=before, after_psf_id=after, time=time, **_given(times)
+        )
+        return self.get(self.wait(job, progress=progress)["result"])
 
     def contexts(self) -> Iterator[dict[str, Any]]:
         """All contexts, newest first, without their pins."""

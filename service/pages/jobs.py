@@ -29,6 +29,7 @@ TITLES = {
     "cross-validate": "Cross-validation",
     "report": "Report on a transit",
     "gap-diagnose": "Gap diagnosis",
+    "psf-interpolate": "Interpolation in time",
     "psf-tables": "Tables of a PSF",
     "rerun": "Rerun",
 }

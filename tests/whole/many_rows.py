@@ -110,6 +110,9 @@ def fill(catalogue: Catalogue, size: Size) -> Archive:
     with catalogue._engine.begin() as connection:
         for statement in statements:
             connection.execute(text(statement))
+    for name in catalogue.series.all(OWNER):
+        if name.endswith("/total"):
+            catalogue.series.set_interpolated(name, OWNER, True, "x")
     catalogue.contexts.create("all", OWNER, "x")
     if not sqlite:  # as its autovacuum does by itself, in time
         with catalogue._engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
@@ -180,6 +183,20 @@ def _best(archive: Archive, rng: random.Random) -> Any:
 
 def _best_in_context(archive: Archive, rng: random.Random) -> Any:
     return psf_choice.look(archive.catalogue, PsfFilter(**_line(rng), valid_at=_at(rng)), OWNER, "all")
+
+
+def _interpolated(context: str | None) -> Question:
+    """The variants of a channel, and the PSFs between which a time lies."""
+
+    def ask(archive: Archive, rng: random.Random) -> Any:
+        n = 2 * rng.randrange(LINES // 2)  # a series of total PSFs
+        instrument, channel = f"instrument_{n // 10}", str(100 + n // 2 % 5)
+        contexts, series = archive.catalogue.contexts, archive.catalogue.series
+        context_id = None if context is None else contexts.named(context, OWNER).id
+        variants = series.variants(instrument, channel, "total", OWNER, context_id)
+        return variants, series.ends(f"{instrument}/{channel}/total", _at(rng), OWNER, context_id)
+
+    return ask
 
 
 def _none_fits(archive: Archive, rng: random.Random) -> Any:
@@ -255,6 +272,9 @@ QUESTIONS: dict[str, Question] = {
     "PSFs of a series in a context": _in_context,
     "the best PSF": _best,
     "the best PSF in a context": _best_in_context,
+    "the ends of an interpolation": _interpolated(None),
+    "the ends of an interpolation in a context": _interpolated("all"),
+    "all series": lambda archive, rng: archive.catalogue.series.all(OWNER),
     "why none fits": _none_fits,
     "a PSF's status": _status,
     "contexts": _rows(PsfContextRow),

@@ -23,6 +23,7 @@ from workers.catalogue.census import Census
 from workers.catalogue.contexts import Contexts
 from workers.catalogue.database import Database, begins_with
 from workers.catalogue.followed.rows import followed_bulks, followed_jobs
+from workers.catalogue.interpolated.series import Series
 from workers.catalogue.jobs import Jobs
 from workers.catalogue.named_files import NamedFiles
 from workers.catalogue.owners import Owners, add_bytes, add_held, counted_bytes
@@ -77,6 +78,7 @@ class Catalogue:
         self.followed_bulks = followed_bulks(self._database)
         self.psfs = Psfs(self._database)
         self.contexts = Contexts(self._database)
+        self.series = Series(self._database)
         self.affected = AffectedProducts(self._database)
         self.census = Census(self._database)
         self.stage_times = KeptStageTimes(self._database)

@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.database import Database, begins_with, several_ids_fit
+from workers.catalogue.interpolated.series import may_interpolate
 from workers.catalogue.owners import add_held, counted_bytes
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow, PsfRow
 from workers.contract.identities import canonical_hash
@@ -55,6 +56,7 @@ class Contexts:
     ) -> tuple[PsfContextRow, bool]:
         """Create a context of these pins; if ``pins`` is None, of all certified PSFs.
 
+        The context also keeps, for each series, whether its PSFs may be interpolated now.
         Returns the context, and whether it is new. If the name exists with the same pins, that context is returned.
         quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
 
@@ -69,6 +71,8 @@ class Contexts:
         try:
             with self._database.writing.begin() as session:
                 rows = _certified(session, owner) if pins is None else _given(session, owner, pins)
+                for row in rows:
+                    row.interpolated = may_interpolate(session, row.series, owner)
                 made = _context(name, owner, by, reason, rows)
                 session.add_all((made, *rows))
                 session.flush()
@@ -81,8 +85,8 @@ class Contexts:
             if existing.id != made.id:
                 raise DataError(
                     "name-taken",
-                    f"expected a name that no other context has; {name} is the context {existing.id} with other PSFs, and contexts "
-                    "never change: choose another name",
+                    f"expected a name that no other context has; {name} is the context {existing.id} with other PSFs or other series "
+                    "that may be interpolated, and contexts never change: choose another name",
                 ) from None
             return existing, False
 
@@ -234,7 +238,17 @@ def _context(name: str, owner: str, by: str, reason: str, rows: Iterable[PsfPinR
     identity = canonical_hash(
         {
             "name": name,
-            "pins": [[pin.series, iso(pin.valid_from), iso(pin.valid_to), pin.psf_id] for pin in pins],
+            # The ids of contexts without interpolation are those from before PSFs were interpolated.
+            "pins": [
+                [
+                    pin.series,
+                    iso(pin.valid_from),
+                    iso(pin.valid_to),
+                    pin.psf_id,
+                    *(["interpolated"] if pin.interpolated else []),
+                ]
+                for pin in pins
+            ],
         }
     )
     for pin in pins:

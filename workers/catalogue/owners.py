@@ -2,7 +2,7 @@
 
 The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The database
 rows count too, because a small file takes less room than its row. Rows without files also count: jobs, bulk runs and
-their images, contexts, and changes of a PSF's status. The count changes in the transaction that adds, changes or
+their images, contexts, and changes of a PSF's status or of a series. The count changes in the transaction that adds, changes or
 removes the row. Rows of which an owner has only a few (keys, turns) do not count.
 
 A transaction that changes jobs or PSFs first locks the owner's row, and then the rows of the jobs or PSFs. To lock the
@@ -36,6 +36,7 @@ from workers.catalogue.tables import (
     PsfContextRow,
     PsfRow,
     ReportRow,
+    SeriesChangeRow,
     SolutionRow,
     TransitRow,
 )
@@ -58,6 +59,7 @@ CountedRow = (
     | BulkRow
     | PsfContextRow
     | PsfChangeRow
+    | SeriesChangeRow
     | DefaultContextRow
     | PartRow
 )
@@ -201,7 +203,7 @@ COUNTED: dict[type[Any], ColumnElement[int]] = {
     JobRow: ROW_BYTES + _length(JobRow.parameters),
     BulkRow: cast(BulkRow.total + 1, BigInteger) * ROW_BYTES + _length(BulkRow.request),
     PsfContextRow: (PsfContextRow.pins + 1) * ROW_BYTES,
-    **{row: literal(ROW_BYTES) for row in (PsfChangeRow, DefaultContextRow, PartRow)},
+    **{row: literal(ROW_BYTES) for row in (PsfChangeRow, SeriesChangeRow, DefaultContextRow, PartRow)},
 }
 
 

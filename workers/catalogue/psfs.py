@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from sqlalchemy import Select, and_, exists, select, tuple_
+from sqlalchemy import Select, String, and_, cast, exists, select, tuple_
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
@@ -20,9 +20,12 @@ from psfcore.errors import DataError
 from workers.catalogue.database import Database
 from workers.catalogue.owners import ROW_BYTES, add_bytes, add_held, counted_bytes
 from workers.catalogue.tables import PsfChangeRow, PsfPinRow, PsfRow, PsfSeriesRow
-from workers.versions.series import UPLOADED, series_of
+from workers.versions.series import INTERPOLATED, UPLOADED, series_of
 from workers.versions.status import PsfStatus, check_transition, check_version
 from workers.versions.validity import Validity
+from workers.versions.variants import is_variant_of
+
+MOST_REASON = 400  # characters of a reason that the database stores
 
 
 @dataclass(frozen=True)
@@ -265,6 +268,8 @@ def _said_of_series(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | 
     }
     for name, value in known.items():
         said = getattr(asked, name)
+        if name == "channel" and open_to and said and value and is_variant_of(said, value):
+            continue  # the file names the channel, the request a variant of it
         if said is not None and value is not None and said != value:
             raise DataError(
                 "line-known",
@@ -272,7 +277,7 @@ def _said_of_series(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | 
             )
     return (
         row.instrument or asked.instrument,
-        row.channel or asked.channel,
+        asked.channel or row.channel,
         known["kind"] or asked.kind or row.kind,
     )
 
@@ -301,6 +306,7 @@ def _certify(session: Session, row: PsfRow, series: str, asked: StatusAsked, by:
                 "not-to-supersede", f"supersedes: expected certified PSFs of {series}; got {superseded_id}"
             )
         _write(session, superseded, asked.reason, by, status=PsfStatus.DEPRECATED, successor_id=row.id)
+        _deprecate_interpolated(session, superseded, asked.reason, by)
     session.flush()
     other = _overlapping(session, row, series, validity)
     if other is not None:
@@ -376,7 +382,30 @@ def _deprecate(session: Session, row: PsfRow, asked: StatusAsked, by: str) -> No
             )
         if successor is row:
             raise DataError("no-such-successor", f"successor: expected a PSF other than {row.id} itself")
+    before = row.status
     _write(session, row, asked.reason, by, status=PsfStatus.DEPRECATED, successor_id=asked.successor_id)
+    if before != PsfStatus.DEPRECATED:
+        _deprecate_interpolated(session, row, asked.reason, by)
+
+
+def _deprecate_interpolated(session: Session, end: PsfRow, reason: str, by: str) -> None:
+    """Deprecate the drafts that were interpolated between a PSF, which is deprecated now, and another PSF.
+
+    So their products are listed as affected. A PSF that somebody certified keeps its status.
+    """
+    query = select(PsfRow).where(
+        PsfRow.owner == end.owner,
+        PsfRow.origin == INTERPOLATED,
+        PsfRow.status == PsfStatus.DRAFT,
+        cast(PsfRow.details, String).contains(end.id),  # the details name the ends
+    )
+    said = f"it was interpolated from PSF {end.id[:12]}, which is deprecated" + (
+        f": {reason}" if reason else ""
+    )
+    rows = session.scalars(query.order_by(PsfRow.id).with_for_update()).all()
+    for row in rows:
+        _write(session, row, said[:MOST_REASON], by, status=PsfStatus.DEPRECATED)
+    add_bytes(session, end.owner, ROW_BYTES * len(rows))
 
 
 def _refuse(asked: StatusAsked, other: str, **given: object) -> None:

@@ -128,6 +128,24 @@ class PsfSeriesRow(Base):
     series: Mapped[str] = mapped_column(String(128), primary_key=True)
 
 
+class SeriesChangeRow(Base):
+    """A change of a series: whether its PSFs may be interpolated. The latest row of a series is valid.
+
+    The PSFs of a series without a row may not be interpolated. Rows are never changed or deleted.
+    """
+
+    __tablename__ = "series_changes"
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    owner: Mapped[str] = mapped_column(String(64))
+    series: Mapped[str] = mapped_column(String(128))
+    interpolated: Mapped[bool]
+    at: Mapped[float]
+    by: Mapped[str] = mapped_column(String(128))
+    reason: Mapped[str] = mapped_column(String(400))
+
+    __table_args__ = (Index("series_changes_of_a_series", "owner", "series", "number"),)
+
+
 class PsfChangeRow(Base):
     """A change of a PSF's status, with the person, time and reason. Rows are never changed or deleted."""
 
@@ -181,6 +199,8 @@ class PsfPinRow(Base):
     valid_to: Mapped[float]
     psf_id: Mapped[str] = mapped_column(String(64))
     version: Mapped[str]
+    # Whether the PSFs of the series may be interpolated in this context; all pins of a series have the same value.
+    interpolated: Mapped[bool] = mapped_column(default=False, server_default=false())
 
 
 class DefaultContextRow(Base):

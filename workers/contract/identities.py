@@ -60,10 +60,11 @@ PRODUCT_FORMAT = 2
 
 def product_identity(request: ResolvedDeconvolve) -> str:
     """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, versions of algorithm and file."""
-    # The id of the PSF determines the PSF. The recipe only says how to build the PSF, and the context where it was found.
+    # The id of the PSF determines the PSF. The recipe and the interpolation only say how to make the PSF, and the context
+    # where it was found.
     # `again` only permits a second deconvolution; the image itself determines whether this deconvolution is a second
     # one.
-    excluded = {"psf_recipe", "context_id", "again"} | (
+    excluded = {"psf_recipe", "psf_interpolation", "context_id", "again"} | (
         {"picked_for"} if request.picked_for is None else set()
     )
     if not request.other_channel:
@@ -133,6 +134,9 @@ def request_identity(kind: str) -> Callable[[Any], str]:
         return canonical_hash({"kind": kind, **request.model_dump(mode="json"), **version})
 
     return identity
+
+
+interpolated_psf_identity = request_identity("psf-interpolate")
 
 
 def rerun_identity(request: ResolvedRerun, job_id: str) -> str:

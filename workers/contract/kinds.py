@@ -16,6 +16,7 @@ from pydantic import Field, create_model
 
 from workers.contract.identities import (
     gap_identity,
+    interpolated_psf_identity,
     product_identity,
     psf_fit_identity,
     psf_identity,
@@ -30,6 +31,7 @@ from workers.contract.requests import (
     GapDiagnose,
     PsfBuild,
     PsfFit,
+    PsfInterpolate,
     PsfTables,
     Report,
     Rerun,
@@ -42,6 +44,7 @@ from workers.contract.resolved import (
     ResolvedReport,
     ResolvedRerun,
 )
+from workers.versions.series import INTERPOLATED
 
 Task = Callable[[Any, Mapping[str, Any]], str]
 Assistant = Callable[[Any, Mapping[str, Any]], None]
@@ -149,6 +152,17 @@ _ROWS = (
         identity=psf_fit_identity,
         origin="fitted",
         counted_whole=True,
+    ),
+    Kind(
+        "psf-interpolate",
+        task="workers.tasks.interpolation:psf_interpolate",
+        result=Result.PSF,
+        parameters=PsfInterpolate,
+        resolved=PsfInterpolate,
+        identity=interpolated_psf_identity,
+        origin=INTERPOLATED,
+        time_advice="crop the two PSFs",
+        memory_advice="crop the two PSFs",
     ),
     Kind(
         "psf-tables",

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from psfcore.built.recipe import BUILD_VERSION
+from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise_figures import NoiseFigures
 from workers.contract.methods import Method, Parameters, RichardsonLucy
+from workers.versions.validity import TIME, iso, seconds
 
 ContextName = Annotated[
     str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="id or name of a context")
@@ -231,6 +233,49 @@ class GapDiagnose(Parameters):
         True,
         description="if the diagnosis finds an effect, also add a corrected PSF to the catalogue: a fit with this effect in the model",
     )
+
+
+def _in_utc(text: str) -> str:
+    """The time in the one form that the identity of a request contains. Raises ValueError."""
+    try:
+        return iso(seconds(text)) or text
+    except DataError as error:
+        raise ValueError(error.message) from error
+
+
+Time = Annotated[
+    str,
+    Field(pattern=TIME),
+    AfterValidator(_in_utc),
+]
+
+
+class PsfInterpolate(Parameters):
+    """Interpolate between two fitted PSFs in time. The result is a PSF version with its errors. Nothing is extrapolated."""
+
+    algorithm_version: ClassVar[int] = 1
+    before_psf_id: Identity = Field(description="id of the earlier PSF")
+    before_time: Time = Field(
+        description="the last time at which the earlier PSF holds, such as 2024-03-01T12:00:00Z; a time without a zone is UTC"
+    )
+    after_psf_id: Identity = Field(description="id of the later PSF, which was fitted with the same shape")
+    after_time: Time = Field(description="the first time at which the later PSF holds")
+    time: Time = Field(description="the time of the new PSF, between the two other times")
+
+    @model_validator(mode="after")
+    def _between(self) -> PsfInterpolate:
+        before, after, at = (seconds(text) for text in (self.before_time, self.after_time, self.time))
+        if not before < after:
+            raise ValueError(
+                f"expected before_time earlier than after_time; got {self.before_time} and {self.after_time}: "
+                "exchange the two PSFs, or correct the times"
+            )
+        if not before <= at <= after:
+            raise ValueError(
+                f"time: expected a time from {self.before_time} to {self.after_time}, because PSFs are not extrapolated; got "
+                f"{self.time}: name PSFs whose times enclose it"
+            )
+        return self
 
 
 class PsfTables(Parameters):

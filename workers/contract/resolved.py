@@ -9,16 +9,26 @@ from typing import Any
 
 from psfcore.noise_figures import NoiseFigures
 from workers.contract.methods import Method, Parameters
-from workers.contract.requests import CrossValidate, GapDiagnose, Identity, PsfBuild, PsfFit, Report, Rerun
+from workers.contract.requests import (
+    CrossValidate,
+    GapDiagnose,
+    Identity,
+    PsfBuild,
+    PsfFit,
+    PsfInterpolate,
+    Report,
+    Rerun,
+)
 
 
 class ResolvedDeconvolve(Parameters):
-    """A deconvolution with the id of its PSF. If the PSF may still have to be built, the parameters also contain its
-    recipe."""
+    """A deconvolution with the id of its PSF. If the PSF may still have to be built or interpolated, the parameters
+    also say how."""
 
     image_id: Identity
     psf_id: Identity
     psf_recipe: PsfBuild | None = None
+    psf_interpolation: PsfInterpolate | None = None
     picked_for: str | None = None  # the instrument of the image, if the service chose the PSF
     context_id: str | None = None  # the context from which the service chose the PSF
     method: Method

@@ -20,6 +20,7 @@ from psfcore.instruments.model import load_instrument
 from psfcore.noise_figures import NoiseFigures
 from workers.catalogue.tables import PsfRow
 from workers.contract.resolved import ResolvedDeconvolve
+from workers.versions.variants import without_variant
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,9 @@ def noise_of(request: ResolvedDeconvolve, header: Cards) -> NoiseFigures | None:
 def of_upload(row: PsfRow, instrument: str | None, angstrom: float | None) -> tuple[str | None, float | None]:
     """The instrument and the wavelength of a PSF: the values in its file, or else the values in the request of its
     upload."""
-    if angstrom is None and row.channel is not None and row.channel.isdecimal():
-        angstrom = float(row.channel)
+    channel = without_variant(row.channel or "")
+    if angstrom is None and channel.isdecimal():
+        angstrom = float(channel)
     return instrument or row.instrument, angstrom
 
 

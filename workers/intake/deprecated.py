@@ -11,6 +11,7 @@ from typing import Any
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow, PsfRow
+from workers.versions.series import INTERPOLATED
 from workers.versions.status import PsfStatus
 
 CODE = "psf-deprecated"  # the code of the error and of the warning
@@ -46,14 +47,27 @@ def check_not_deprecated(catalogue: Catalogue, psf_id: str, owner: str, what: st
 
 
 def deprecated_warning(catalogue: Catalogue, psf: PsfRow) -> str | None:
-    """The warning for users of a deprecated PSF; None for every other PSF."""
+    """The warning for users of a deprecated PSF, or of a PSF that was interpolated from a deprecated PSF; None for every
+    other PSF."""
     if psf.status != PsfStatus.DEPRECATED:
-        return None
+        return _end_warning(catalogue, psf) if psf.origin == INTERPOLATED else None
     better = "another PSF" if psf.successor_id is None else f"its successor {psf.successor_id[:SHOWN_DIGITS]}"
     return (
         f"PSF {psf.id[:SHOWN_DIGITS]} ({psf.name} {psf.version}) was deprecated ({_reason(catalogue, psf)}); "
         f"use {better} for new products"
     )
+
+
+def _end_warning(catalogue: Catalogue, psf: PsfRow) -> str | None:
+    """The warning for users of an interpolated PSF one of whose ends is deprecated."""
+    for end_id in (psf.details.get("parents") or {}).values():
+        end = catalogue.get(PsfRow, end_id, psf.owner)
+        if end is not None and end.status == PsfStatus.DEPRECATED:
+            return (
+                f"PSF {psf.id[:SHOWN_DIGITS]} ({psf.name} {psf.version}) was interpolated from PSF {end_id[:SHOWN_DIGITS]} "
+                f"({end.name} {end.version}), which was deprecated ({_reason(catalogue, end)}); use another PSF for new products"
+            )
+    return None
 
 
 def deprecation(catalogue: Catalogue, psf: PsfRow) -> Deprecation | None:

@@ -129,6 +129,11 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     built_s, built_mib, psf_shape = 0.0, 0.0, (ny, nx)
     if psf is not None:
         psf_shape = tuple(psf.details["shape"])
+    elif parameters.get("psf_interpolation") is not None:  # the PSF may still have to be interpolated
+        interpolation = parameters["psf_interpolation"]
+        built_s, built_mib = _linear("psf-interpolate", interpolation, catalogue, owner)
+        psf = catalogue.get(PsfRow, interpolation["before_psf_id"], owner)
+        psf_shape = psf_shape if psf is None else tuple(psf.details["shape"])
     elif parameters.get("psf_recipe") is not None:  # the PSF may still have to be built
         recipe = parameters["psf_recipe"]
         built_s, built_mib = _build(recipe, _mask_px(recipe, catalogue, owner))
@@ -137,7 +142,8 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     margin = 2 * _margin_px(method, (ny, nx), max(psf_shape))
     plane = (ny + margin) * (nx + margin)
     draws = parameters["error_draws"]
-    fitted = psf is not None and "fit" in psf.details
+    interpolated = parameters.get("psf_interpolation") is not None
+    fitted = interpolated or (psf is not None and "fit" in psf.details)
     runs = 1 + draws + (cost.psf_draws if draws and fitted else 0)
     cpu_s = built_s + cost.base_s + cost.image_ns * 1e-9 * ny * nx
     cpu_s += runs * method["steps"] * _of_method(cost.step_ns, method) * 1e-9 * plane
@@ -226,5 +232,6 @@ def _pixels(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> 
     if parameters.get("image_id"):
         image = catalogue.get(ImageRow, parameters["image_id"], owner)
         return 0.0 if image is None else math.prod(image.summary["shape"])
-    psf = catalogue.get(PsfRow, parameters.get("psf_id") or "", owner)
+    psf_id = parameters.get("psf_id") or parameters.get("before_psf_id") or ""
+    psf = catalogue.get(PsfRow, psf_id, owner)
     return 0.0 if psf is None else math.prod(psf.details["shape"])

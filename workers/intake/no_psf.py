@@ -13,6 +13,7 @@ from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfRow
 from workers.versions.series import TOTAL, UPLOADED
 from workers.versions.status import PsfStatus
+from workers.versions.variants import without_variant
 
 MOST_NAMED = 20
 MOST_SEARCHED = 500
@@ -38,8 +39,9 @@ def _candidates(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> 
     found = 0
     for row in catalogue.psfs.page(PsfFilter(), owner, limit=MOST_SEARCHED):
         scale = row.details.get("plate_scale_arcsec")
-        same = same_as_image(row.instrument, row.channel, scale, header)
-        other_channel = wanted is not None and row.channel is not None and row.channel != wanted
+        channel = None if row.channel is None else without_variant(row.channel)
+        same = same_as_image(row.instrument, channel, scale, header)
+        other_channel = wanted is not None and channel is not None and channel != wanted
         if not _usable(row) or other_channel or not {"telescope", "plate_scale"} & set(same):
             continue
         yield {
@@ -50,7 +52,7 @@ def _candidates(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> 
             "instrument": row.instrument,
             "channel": row.channel,
             "same": same,
-            "told": agreement_with_image(same, row.channel, scale, header),
+            "told": agreement_with_image(same, channel, scale, header),
         }
         found += 1
         if found == MOST_NAMED:

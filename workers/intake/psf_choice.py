@@ -1,5 +1,9 @@
 """Finds the one PSF that meets filters or fits the header of an image. If no PSF or several PSFs fit, the error says
-why."""
+why.
+
+If the PSFs of a series may be interpolated, and the time of an image is between the ranges of two PSFs, the search also
+finds these two PSFs.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,15 @@ from typing import Any
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import NOW
+from workers.catalogue.interpolated.series import Ends
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfContextRow, PsfRow
+from workers.contract.requests import PsfInterpolate
+from workers.versions.interpolation import rounded
 from workers.versions.series import TOTAL, channel_of, instrument_of, series_of
 from workers.versions.status import PsfStatus
 from workers.versions.validity import iso, seconds
+from workers.versions.variants import variant_for
 
 MOST_NAMED = 20
 
@@ -28,6 +36,22 @@ class Found:
     context: PsfContextRow | None  # None: all PSFs were searched
     psfs: Sequence[PsfRow]  # at most MOST_NAMED + 1 PSFs
     emptied_by: str | None  # the first filter after which no PSF was left; None if PSFs were found
+    ends: Ends | None = None  # the PSFs between which the PSF of an image may be interpolated
+
+    @property
+    def interpolation(self) -> PsfInterpolate | None:
+        """How the PSF of the image is interpolated, at its rounded time; None if it is not interpolated."""
+        ends, at = self.ends, self.wanted.valid_at
+        if ends is None or at is None:
+            return None
+        time = rounded(ends.before_time, ends.after_time, at)
+        return PsfInterpolate(
+            before_psf_id=ends.before_psf_id,
+            before_time=iso(ends.before_time) or "",
+            after_psf_id=ends.after_psf_id,
+            after_time=iso(ends.after_time) or "",
+            time=iso(time) or "",
+        )
 
     def one(self) -> PsfRow:
         """The PSF. Raises ``DataError`` "no-psf-fits" or "several-psfs-fit"."""
@@ -47,7 +71,13 @@ class Found:
         before = dict(list(given.items())[: list(given).index(self.emptied_by)]) if self.emptied_by else given
         asked = f"{self.emptied_by} {given[self.emptied_by]}" if self.emptied_by else "any property"
         among = f"no PSF with {_joined(before)}" if before else "no PSF"
-        return f"expected one PSF with {self._said()}; {among} has {asked}"
+        between = ""
+        if self.ends is not None:
+            between = (
+                f"; a deconvolution of the image interpolates between PSF {self.ends.before_psf_id} and PSF "
+                f"{self.ends.after_psf_id}"
+            )
+        return f"expected one PSF with {self._said()}; {among} has {asked}{between}"
 
     def _said(self) -> str:
         return _joined(self._given()) or "no filter"
@@ -90,9 +120,10 @@ def look_for_image(
 ) -> Found:
     """The PSFs for the instrument, channel and time of an image. header: the header summary that is stored with the upload.
 
-    Raises ``DataError`` "no-instrument", "no-date" or "no-such-context".
+    If the channel has variants, the filter and the plate scale in the header choose the variant.
+    Raises ``DataError`` "no-instrument", "no-date", "no-such-context" or "several-variants-fit".
     """
-    instrument, channel = seen_through(header)
+    instrument, channel = _seen_as(catalogue, header, owner, context, kind)
     if instrument is None:
         raise DataError(
             "no-instrument",
@@ -106,7 +137,12 @@ def look_for_image(
             f"expected DATE-BEG or DATE-OBS in the image's header, in the form 2024-03-01T12:00:00, because PSFs of "
             f"{series_of(instrument, channel, kind)} are valid only for some times; got {header['date_obs']!r}",
         )
-    return found
+    if at is None or found.psfs or kind != TOTAL:
+        return found
+    series = series_of(instrument, channel, kind)
+    assert series is not None
+    context_id = None if found.context is None else found.context.id
+    return replace(found, ends=catalogue.series.ends(series, at, owner, context_id))
 
 
 def picked_for_image(
@@ -116,7 +152,7 @@ def picked_for_image(
 
     Raises the same ``DataError`` as ``look_for_image``, and "no-psf-fits" if the series has PSFs, but the context contains none of them.
     """
-    instrument, channel = seen_through(header)
+    instrument, channel = _seen_as(catalogue, header, owner, context, TOTAL)
     series = series_of(instrument, channel, TOTAL)
     pinned = catalogue.contexts.asked_for(context, owner)
     if series is not None and pinned is not None and catalogue.contexts.any_pinned(pinned.id, series, owner):
@@ -135,6 +171,22 @@ def seen_through(header: Mapping[str, Any]) -> tuple[str | None, str | None]:
     """The instrument and the channel of an image. header: the header summary that is stored with the upload."""
     instrument = instrument_of(header)
     return instrument, channel_of(instrument, header["wavelnth"])
+
+
+def _seen_as(
+    catalogue: Catalogue, header: Mapping[str, Any], owner: str, context: str | None, kind: str
+) -> tuple[str | None, str | None]:
+    """The instrument and the channel of an image, with the variant of the channel to which the image belongs, if any.
+
+    Raises ``DataError`` "no-such-context" or "several-variants-fit".
+    """
+    instrument, channel = seen_through(header)
+    if instrument is None or channel is None:
+        return instrument, channel
+    pinned = catalogue.contexts.asked_for(context, owner)
+    known = catalogue.series.variants(instrument, channel, kind, owner, None if pinned is None else pinned.id)
+    # The summaries of images that were uploaded by earlier versions contain no cards.
+    return instrument, variant_for(header.get("cards") or {}, known) or channel
 
 
 def _observed_at(header: Mapping[str, Any]) -> float | None:

@@ -15,7 +15,12 @@ from psfcore.instruments.workload import check_workload
 from psfcore.noise_figures import NoiseFigures
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
-from workers.contract.identities import canonical_hash, instrument_text, psf_identity
+from workers.contract.identities import (
+    canonical_hash,
+    instrument_text,
+    interpolated_psf_identity,
+    psf_identity,
+)
 from workers.contract.kinds import KINDS, JobRequest, Kind, load
 from workers.contract.methods import Parameters
 from workers.contract.requests import Deconvolve, PsfBuild
@@ -23,7 +28,7 @@ from workers.contract.resolved import ResolvedDeconvolve
 from workers.intake import compatibility
 from workers.intake.deprecated import check_not_deprecated
 from workers.intake.no_psf import no_psf
-from workers.intake.psf_choice import picked_for_image
+from workers.intake.psf_choice import Found, picked_for_image
 from workers.lineage import made_by
 
 
@@ -143,7 +148,12 @@ def resolved_deconvolution(
     resolved = ResolvedDeconvolve(
         **_psf_for(catalogue, header, wanted, owner), **wanted.model_dump(exclude={"psf_id", "context"})
     )
-    compatibility.check(resolved, catalogue.get(PsfRow, resolved.psf_id, owner), header)
+    psf_id = resolved.psf_id
+    if (
+        resolved.psf_interpolation is not None
+    ):  # both ends have the instrument, channel and pixels of the new PSF
+        psf_id = resolved.psf_interpolation.before_psf_id
+    compatibility.check(resolved, catalogue.get(PsfRow, psf_id, owner), header)
     return resolved
 
 
@@ -214,14 +224,15 @@ def _diffraction_of(asked: Asked, summary: dict[str, Any]) -> PsfBuild | None:
 
 
 def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, owner: str) -> dict[str, Any]:
-    """The PSF that the request names; else the certified PSF that fits the image; else the PSF that is built for the instrument."""
+    """The PSF that the request names; else the certified PSF that fits the image, or the PSF that is interpolated between
+    two certified PSFs; else the PSF that is built for the instrument."""
     if wanted.psf_id is not None:
         _psf(catalogue, wanted.psf_id, owner)
         return {"psf_id": wanted.psf_id}
     found = picked_for_image(catalogue, header, owner, wanted.context)
     if found is not None:
         return {
-            "psf_id": found.one().id,
+            **_certified(catalogue, owner, found),
             "picked_for": header["instrument"],
             "context_id": None if found.context is None else found.context.id,
         }
@@ -238,3 +249,22 @@ def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, o
         "name another PSF, or use it anyway with --psf {psf} (psf_id in a request)",
     )
     return {"psf_id": identity, "psf_recipe": recipe}
+
+
+def _certified(catalogue: Catalogue, owner: str, found: Found) -> dict[str, Any]:
+    """The certified PSF that was found, or how it is interpolated between two certified PSFs."""
+    interpolation = found.interpolation
+    if interpolation is None:
+        return {"psf_id": found.one().id}
+    identity = interpolated_psf_identity(interpolation)
+    if (
+        found.context is None
+    ):  # a context still uses the PSFs that it pins, even if they were deprecated later
+        check_not_deprecated(
+            catalogue,
+            identity,
+            owner,
+            f"the PSF that is interpolated to {interpolation.time}",
+            "name another PSF, or use it anyway with --psf {psf} (psf_id in a request)",
+        )
+    return {"psf_id": identity, "psf_interpolation": interpolation.model_dump(mode="json")}

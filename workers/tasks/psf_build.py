@@ -15,12 +15,13 @@ from psfcore.fits.images import read_image
 from psfcore.fits.psfs import write_psf
 from psfcore.instruments.model import Instrument, parse_instrument
 from workers.catalogue.tables import PsfRow
-from workers.contract.identities import recipe_of
-from workers.contract.requests import PsfBuild
+from workers.contract.identities import interpolated_psf_identity, recipe_of
+from workers.contract.requests import PsfBuild, PsfInterpolate
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.settings import library_versions
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import named_psf, psf_row
+from workers.tasks.interpolation import interpolated_row
 from workers.versions.series import TOTAL
 
 
@@ -30,16 +31,20 @@ def psf_build(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
-    """The row of the PSF that a deconvolution names. If the catalogue does not contain this PSF, it is built first from
-    its recipe, if the recipe is known.
+    """The row of the PSF that a deconvolution names. If the catalogue does not contain this PSF, it is made first: built
+    from its recipe, or interpolated between two PSFs, if the request says how.
 
-    Raises DataError "no-such-psf", and "instrument-changed" if the recipe now gives another PSF.
+    Raises DataError "no-such-psf", "instrument-changed" if the recipe now gives another PSF, "interpolation-changed" if
+    this version interpolates in another way, and the errors of ``workers.tasks.interpolation``.
     """
-    if request.psf_recipe is None:
+    if request.psf_recipe is None and request.psf_interpolation is None:
         return named_psf(context, request.psf_id)
     made = context.made(PsfRow, request.psf_id)
     if made is not None:
         return made
+    if request.psf_interpolation is not None:
+        return _interpolated(context, request.psf_id, request.psf_interpolation)
+    assert request.psf_recipe is not None
     row = built_psf(context, request.psf_recipe)
     if row.id != request.psf_id:
         raise DataError(
@@ -48,6 +53,16 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
             "file changed after the job was submitted; submit the job again",
         )
     return row
+
+
+def _interpolated(context: Context, psf_id: str, asked: PsfInterpolate) -> PsfRow:
+    if interpolated_psf_identity(asked) != psf_id:
+        raise DataError(
+            "interpolation-changed",
+            f"expected the interpolation that gave PSF {psf_id} when the job was submitted; this version interpolates in another "
+            "way: submit the job again",
+        )
+    return interpolated_row(context, asked)
 
 
 def built_psf(context: Context, build: PsfBuild) -> PsfRow:

@@ -10,6 +10,7 @@ from psfcore.instruments.unknown import channel_of as channel_of
 
 TOTAL = "total"  # a total PSF, with which images are deconvolved
 UPLOADED = "uploaded"  # an uploaded PSF whose kind is not known
+INTERPOLATED = "interpolated"  # the origin of a PSF that was interpolated between two PSFs
 WORD = r"^[a-z0-9][a-z0-9_.-]{0,39}$"
 _NOT_OF_A_WORD = re.compile(r"[^a-z0-9_.]+")
 

@@ -52,7 +52,9 @@ def next_version(released: Iterable[str]) -> str:
 
     FIRST_VERSION if no version was released.
     """
-    highest = max((_numbers(version) for version in released), default=None)
+    # An interpolated PSF is deprecated together with its ends; its version is not one of three numbers.
+    certified = (version for version in released if _VERSION.fullmatch(version))
+    highest = max((_numbers(version) for version in certified), default=None)
     return FIRST_VERSION if highest is None else f"{highest[0]}.{highest[1] + 1}.0"
 
 

@@ -62,6 +62,9 @@ class PinView(BaseModel):
     valid_to: str | None = Field(description="null: no upper limit")
     psf_id: str
     version: str = Field(description="version of the PSF when it was pinned")
+    interpolated: bool = Field(
+        description="whether the PSFs of this series may be interpolated in this context, as for the series when the context was created"
+    )
 
     @classmethod
     def of(cls, row: PsfPinRow) -> PinView:
@@ -72,6 +75,7 @@ class PinView(BaseModel):
             valid_to=iso(row.valid_to),
             psf_id=row.psf_id,
             version=row.version,
+            interpolated=row.interpolated,
         )
 
 

@@ -56,7 +56,11 @@ class StatusChange(BaseModel):
         None, description="for a deprecated PSF: id of the certified PSF to use instead"
     )
     instrument: Word | None = Field(None, description="for a draft whose file names no instrument")
-    channel: Word | None = Field(None, description="for a draft whose file names no wavelength")
+    channel: Word | None = Field(
+        None,
+        description="for a draft whose file names no wavelength; or a variant of its channel for one filter (card FILTER) or plate "
+        "scale, such as `174-open_2` or `174-0.984arcsec`",
+    )
     kind: Word | None = Field(None, description="for an uploaded draft, such as `total`")
 
 

@@ -51,7 +51,9 @@ class PsfView(BaseModel):
     )
     valid_to: str | None = Field(description="null: no upper limit, or never certified")
     successor: str | None = Field(description="for a deprecated PSF: id of the PSF to use instead")
-    origin: str = Field(description="`built`, `fitted` (to a transit) or `uploaded`")
+    origin: str = Field(
+        description="`built`, `fitted` (to a transit), `interpolated` (in time) or `uploaded`"
+    )
     bytes: int
     details: dict[str, Any] = Field(description="shape, curve, parameters and provenance")
     file: str = Field(description="address of the FITS file")

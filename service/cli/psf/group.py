@@ -24,6 +24,12 @@ SECTIONS = {
         "download": Lazy("service.cli.psf.files", "download", "Download a PSF."),
         "upload": Lazy("service.cli.psf.versions", "upload_psf", "Upload a PSF."),
         "certify": Lazy("service.cli.psf.versions", "certify", "Certify a PSF for a range of times."),
+        "series": Lazy(
+            "service.cli.psf.interpolation", "series", "List series, and allow interpolation in time."
+        ),
+        "interpolate": Lazy(
+            "service.cli.psf.interpolation", "interpolate", "Interpolate between two PSFs in time."
+        ),
         "deprecate": Lazy("service.cli.psf.versions", "deprecate", "Deprecate a certified PSF."),
         "delete": Lazy("service.cli.psf.versions", "delete_psf", "Delete a draft that nothing uses."),
         "best": Lazy("service.cli.psf.versions", "best", "Find the PSF for an image."),

@@ -11,7 +11,7 @@ import click
 
 from service.cli.connection import CONTEXT, ID, SERVER, id_argument, remote, short, whole_id, whole_ids
 from service.cli.options import FILE, JSON, progress_bar, user_errors, write_json, writes_files
-from workers.versions.series import TOTAL
+from workers.versions.series import INTERPOLATED, TOTAL
 from workers.versions.status import PsfStatus
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ PRODUCT = click.option("--product", is_flag=True, help="The ID is of a product, 
 def _line_options(command: Command) -> Command:
     for name, what in (
         ("kind", "Kind: total, uploaded, or a component such as diffraction"),
-        ("channel", "Channel: wavelength in whole angstrom, such as 174"),
+        ("channel", "Channel: wavelength in whole angstrom, such as 174; or a variant, such as 174-open_2"),
         ("instrument", "Instrument, such as hri_euv"),
     ):
         command = click.option(f"--{name}", help=what)(command)
@@ -232,7 +232,8 @@ def _given(filters: dict[str, str | None]) -> dict[str, str]:
 
 def _validity(row: dict[str, Any]) -> str:
     """The time range of a PSF; empty for a draft, which has no range."""
-    if row["status"] == PsfStatus.DRAFT:
+    never_certified = row.get("origin") == INTERPOLATED and row["valid_from"] is None
+    if row["status"] == PsfStatus.DRAFT or never_certified:
         return ""
     return f"  [{row['valid_from'] or 'always'}, {row['valid_to'] or 'open'})"
 
@@ -243,9 +244,10 @@ def _tree(told: dict[str, Any], depth: int) -> Iterator[str]:
     named = " ".join(str(made[key]) for key in ("name", "version", "status") if made.get(key))
     by = [f"heliopsf {made['software_version']}"] if made.get("software_version") else []
     by += [f"job {short(made['job_id'])}"] if made.get("job_id") else []
+    share = f"weight {told['weight']:.3f}" if told.get("weight") is not None else ""
     gone = "" if told["there"] or told["type"] == "instrument-file" else "deleted since"
     cut = "shown above" if told["cut"] else ""
-    said = "; ".join(part for part in (named, ", ".join(by), gone, cut) if part)
+    said = "; ".join(part for part in (named, share, ", ".join(by), gone, cut) if part)
     yield "  " * depth + f"{told['type']} {short(told['id'])}" + (f"  ({said})" if said else "")
     for parent in told["parents"]:
         yield from _tree(parent, depth + 1)

@@ -31,7 +31,9 @@ from workers.catalogue.access.keys import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
 from workers.contract.requests import Identity
+from workers.versions.series import INTERPOLATED
 from workers.versions.status import PsfStatus
+from workers.versions.variants import without_variant
 
 MOST_OTHERS = 50
 MOST_REPORTS = 10
@@ -124,7 +126,7 @@ def psf_facts(psf: PsfView) -> list[tuple[str, str]]:
     scale, total = details.get("plate_scale_arcsec"), details.get("sum")
     facts = {
         "Instrument": psf.instrument or "unknown",
-        "Channel": f"{psf.channel} angstrom" if psf.channel else "unknown",
+        "Channel": _channel(psf.channel),
         "Kind": psf.kind,
         "Origin": psf.origin,
         "Size": "{1} x {0} px".format(*details["shape"]),
@@ -137,9 +139,19 @@ def psf_facts(psf: PsfView) -> list[tuple[str, str]]:
     return [(name, said) for name, said in facts.items() if said != "-"]
 
 
+def _channel(channel: str | None) -> str:
+    """A channel with its unit, and its variant, if it names one."""
+    if channel is None:
+        return "unknown"
+    plain = without_variant(channel)
+    variant = channel[len(plain) + 1 :]
+    return f"{plain} angstrom" + (f", variant {variant}" if variant else "")
+
+
 def validity(psf: PsfView) -> str:
     """The range of observation times for which the PSF is certified."""
-    if psf.status == PsfStatus.DRAFT:
+    # An interpolated PSF may be deprecated together with one of its ends, without having been certified.
+    if psf.status == PsfStatus.DRAFT or (psf.origin == INTERPOLATED and psf.valid_from is None):
         return "not certified"
     if psf.valid_from is None and psf.valid_to is None:
         return "at all times"

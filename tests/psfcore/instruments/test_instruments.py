@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 
 import pytest
 
 from psfcore.errors import DataError
+from psfcore.fits.header import known_instrument
+from psfcore.instruments import files
 from psfcore.instruments.files import instrument_names, instrument_path, match_instrument
 from psfcore.instruments.model import SpectralLine, load_instrument, parse_instrument
 from tests.conftest import SMALL_INSTRUMENT
@@ -38,6 +41,41 @@ def test_every_shipped_instrument_loads_under_its_own_name() -> None:
 )
 def test_headers_are_matched(cards: dict[str, object], name: str | None) -> None:
     assert match_instrument(cards) == name
+
+
+@pytest.fixture
+def variants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A telescope with a file of its own for one filter, for binned images, and for both together."""
+    text, cards = instrument_path("hri_euv").read_text("utf-8"), 'DETECTOR = "HRI_EUV"'
+    further = {"": "", "_binned": "CDELT1 = 0.984", "_open": 'FILTER = "Open 2"'}
+    further["_both"] = f"{further['_binned']}\n{further['_open']}"
+    for name, more in further.items():
+        file = text.replace('name = "hri_euv"', f'name = "hri_euv{name}"').replace(cards, f"{cards}\n{more}")
+        (tmp_path / f"hri_euv{name}.toml").write_text(file, "utf-8")
+    monkeypatch.setattr(files, "_FOLDER", tmp_path)
+    files.match_table.cache_clear()
+    yield tmp_path
+    files.match_table.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("cards", "name"),
+    [
+        ({}, "hri_euv"),
+        ({"FILTER": "Open 1", "CDELT1": 0.492}, "hri_euv"),
+        ({"FILTER": "open 2"}, "hri_euv_open"),
+        ({"CDELT1": 0.99}, "hri_euv_binned"),
+        ({"CDELT1": -0.984 / 3600, "CUNIT1": "deg"}, "hri_euv_binned"),
+        ({"CDELT1": 1.0}, "hri_euv"),
+        ({"FILTER": "Open 2", "CDELT1": 0.984}, "hri_euv_both"),
+        ({"FILTER": "Open 2", "DETECTOR": "FSI"}, None),
+    ],
+)
+def test_filter_and_plate_scale_choose_among_variants_of_an_instrument(
+    variants: Path, cards: dict[str, object], name: str | None
+) -> None:
+    assert known_instrument({"DETECTOR": "HRI_EUV", **cards}) == name
+    assert load_instrument("hri_euv_both").match["FILTER"] == "Open 2"
 
 
 def test_the_error_of_an_unknown_instrument_names_the_known_ones() -> None:
@@ -77,7 +115,7 @@ def test_the_error_of_an_unknown_instrument_names_the_known_ones() -> None:
         ),
         ('DETECTOR = "HRI_EUV"', "DETECTOR = 174", "match.DETECTOR: expected a text; got 174"),
         ('DETECTOR = "HRI_EUV"', 'WAVELNTH = "174"', "match.WAVELNTH: expected a number; got '174'"),
-        ('DETECTOR = "HRI_EUV"', 'FILTER = "Al"', "match.FILTER"),
+        ('DETECTOR = "HRI_EUV"', 'OBJECT = "Sun"', "match.OBJECT"),
         ('name = "hri_euv"', "name = ", "TOML"),
     ],
 )

@@ -19,9 +19,11 @@ from tests.service.keyed import Keyed, keyed
 from tests.transit_files import write_transit
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.contexts import Pin
+from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
 from workers.files.store import Store
 from workers.settings import Settings
+from workers.versions.status import PsfStatus
 
 UNKNOWN = {64: "f" * 64, 32: "f" * 32, 16: "f" * 16}
 
@@ -80,6 +82,8 @@ def anns(
     ]
     for row in rows:
         service.catalogue.add(row)
+    certified = StatusAsked(PsfStatus.CERTIFIED, "good", "1.0.0", channel="174")
+    service.catalogue.psfs.change("4" * 64, "ann", certified, "ann")
     context, _ = service.catalogue.contexts.create("s3cret", "ann", "ann", pins=[Pin("4" * 64)])
     transit = write_transit(tmp_path / "transit", images=3)
     pack(transit, tmp_path / "transit.tar")
@@ -97,6 +101,9 @@ def anns(
         "job_id": ann.post("/v1/jobs", json=job).json()["id"],
         "uws": pending.headers["location"].rpartition("/")[2],
         "name": "result",
+        "instrument": "hri_euv",
+        "channel": "174",
+        "kind": "total",
         "key_id": next(row.id for row in service.catalogue.keys.all() if row.owner == "ann"),
     }
 
@@ -137,7 +144,7 @@ def knock_everywhere(bob: TestClient, anns: dict[str, str]) -> int:
             body = {"data": data} if address.startswith("/uws") and method == "POST" else {}
             others = bob.request(method, address, headers=headers, follow_redirects=False, **body)
             nobodys = bob.request(method, unknown, headers=headers, follow_redirects=False, **body)
-            ids = [*anns.values(), *UNKNOWN.values()]
+            ids = [*anns.values(), *UNKNOWN.values(), "nothing"]
             assert plain(others, *ids) == plain(nobodys, *ids), (method, address)
             assert others.status_code in (404, 422), (method, address, others.text)
             assert others.status_code == 404 or method != "GET"
@@ -185,7 +192,17 @@ def test_lists_show_one_s_own_alone(service: Keyed, anns: dict[str, str]) -> Non
 
 
 @pytest.mark.parametrize(
-    "kind", ["deconvolve", "deconvolve psf", "psf-tables", "psf-build", "report", "psf-fit", "gap-diagnose"]
+    "kind",
+    [
+        "deconvolve",
+        "deconvolve psf",
+        "psf-tables",
+        "psf-build",
+        "psf-interpolate",
+        "report",
+        "psf-fit",
+        "gap-diagnose",
+    ],
 )
 def test_a_job_uses_one_s_own_things_alone(
     service: Keyed, anns: dict[str, str], kind: str, tmp_path: Path
@@ -198,6 +215,13 @@ def test_a_job_uses_one_s_own_things_alone(
         "deconvolve psf": {"image_id": own, "psf_id": anns["psf_id"]},
         "psf-tables": {"psf_id": anns["psf_id"]},
         "psf-build": {"instrument_file": SMALL_INSTRUMENT, "mask_id": anns["image_id"]},
+        "psf-interpolate": {
+            "before_psf_id": anns["psf_id"],
+            "before_time": "2021-01-01",
+            "after_psf_id": anns["psf_id"],
+            "after_time": "2022-01-01",
+            "time": "2021-06-01",
+        },
         "report": {"transit_id": anns["transit_id"]},
         "psf-fit": {"transit_id": anns["transit_id"]},
         "gap-diagnose": {"transit_id": anns["transit_id"]},

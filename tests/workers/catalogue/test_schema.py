@@ -59,6 +59,9 @@ OLD_ROWS = {
     },
 }  # fmt: skip
 
+# Without these, the tables are those of revision 0017.
+UNDO_0018 = ("DROP TABLE series_changes", "ALTER TABLE psf_pins DROP COLUMN interpolated")
+
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
@@ -215,7 +218,7 @@ def test_a_revision_between_is_upgraded(catalogue: Catalogue) -> None:
 
 
 def test_rows_without_files_count_after_the_upgrade(catalogue: Catalogue) -> None:
-    """Also those of an owner who had no count. Revision 0017 changes no table, so that 0016 has the present ones."""
+    """Also those of an owner who had no count. Revision 0017 changes no table, so that 0016 has those of 0017."""
     catalogue.upgrade()
     rows: list[Base] = []
     for owner in ("counted", "new"):
@@ -233,7 +236,9 @@ def test_rows_without_files_count_after_the_upgrade(catalogue: Catalogue) -> Non
     with catalogue._database.writing.begin() as session:
         session.add_all(rows)
         session.add(OwnerRow(owner="counted", bytes=0))
-        session.execute(text("UPDATE alembic_version SET version_num = '0016'"))
+        session.flush()
+        for statement in (*UNDO_0018, "UPDATE alembic_version SET version_num = '0016'"):
+            session.execute(text(statement))
     catalogue.upgrade()
     assert catalogue.schema.status().state == "current"
     # A job, a bulk run of three images, a context of two pins, a change of a PSF and of the default, and a part.
@@ -242,6 +247,24 @@ def test_rows_without_files_count_after_the_upgrade(catalogue: Catalogue) -> Non
         json_bytes = len(f'{{"a": "{owner}"}}{{"b": "{owner}"}}')
         assert catalogue.owners.usage(owner, 0).used_bytes == expected + json_bytes
     assert catalogue.owners.recount() == []
+
+
+def test_in_existing_contexts_no_series_is_interpolated(catalogue: Catalogue) -> None:
+    catalogue.upgrade()
+    pin = {
+        "owner": "o", "context_id": "c" * 64, "series": "hri_euv/174/total", "valid_from": 0.0, "valid_to": 1.0,
+        "psf_id": "d" * 64, "version": "1.0.0",
+    }  # fmt: skip
+    with catalogue._database.writing.begin() as session:
+        for statement in (*UNDO_0018, "UPDATE alembic_version SET version_num = '0017'"):
+            session.execute(text(statement))
+        named = ", ".join(pin), ", ".join(f":{name}" for name in pin)
+        session.execute(text(f"INSERT INTO psf_pins ({named[0]}) VALUES ({named[1]})"), pin)
+    catalogue.upgrade()
+    assert differences(catalogue) == []
+    (row,) = catalogue.contexts.pins("c" * 64, "o")
+    assert row.interpolated is False and row.version == "1.0.0"
+    assert not catalogue.series.interpolated("hri_euv/174/total", "o")
 
 
 def test_a_later_revision_is_refused_and_left_alone(catalogue: Catalogue) -> None:

@@ -13,6 +13,7 @@ from workers.contract.identities import (
     canonical_hash,
     corrected_psf_identity,
     gap_identity,
+    interpolated_psf_identity,
     product_identity,
     psf_fit_identity,
     psf_identity,
@@ -20,7 +21,7 @@ from workers.contract.identities import (
     request_identity,
 )
 from workers.contract.methods import Linear, Parameters, RichardsonLucy
-from workers.contract.requests import CrossValidate, GapDiagnose, PsfBuild, PsfFit, PsfTables
+from workers.contract.requests import CrossValidate, GapDiagnose, PsfBuild, PsfFit, PsfInterpolate, PsfTables
 from workers.contract.resolved import (
     ResolvedCrossValidate,
     ResolvedDeconvolve,
@@ -46,6 +47,10 @@ def test_everything_that_changes_the_result_changes_the_identity(monkeypatch: py
     assert base == identity(method={"name": "richardson-lucy", "steps": 20})
     recipe = {"instrument": "hri_euv"}
     assert base == identity(psf_recipe=recipe), "how a PSF would be made is in its id"
+    between = {
+        "before_psf_id": A, "before_time": "2021-01-01", "after_psf_id": T, "after_time": "2022-01-01", "time": "2021-06-01",
+    }  # fmt: skip
+    assert base == identity(psf_interpolation=between), "how a PSF would be interpolated is in its id"
     assert base == identity(again=True), "this only allows the deconvolution"
     others = {
         identity(image_id=B),
@@ -61,6 +66,24 @@ def test_everything_that_changes_the_result_changes_the_identity(monkeypatch: py
     monkeypatch.setattr(RichardsonLucy, "algorithm_version", RichardsonLucy.algorithm_version + 1)
     others.add(identity())
     assert len(others) == 10 and base not in others
+
+
+def test_an_interpolated_psf_is_identified_by_its_ends_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = {
+        "before_psf_id": A, "before_time": "2021-01-01", "after_psf_id": B, "after_time": "2022-01-01", "time": "2021-06-01",
+    }  # fmt: skip
+    changes = (
+        {},
+        {"before_psf_id": T},
+        {"after_psf_id": T},
+        {"before_time": "2021-01-02"},
+        {"after_time": "2022-01-02"},
+        {"time": "2021-06-02"},
+    )
+    found = {interpolated_psf_identity(PsfInterpolate.model_validate(known | change)) for change in changes}
+    monkeypatch.setattr(PsfInterpolate, "algorithm_version", PsfInterpolate.algorithm_version + 1)
+    found.add(interpolated_psf_identity(PsfInterpolate.model_validate(known)))
+    assert len(found) == len(changes) + 1
 
 
 def test_a_built_psf_is_identified_by_its_parameters() -> None:

@@ -48,5 +48,6 @@ def test_a_rerun_finds_the_kind_that_made_a_thing() -> None:
         "built": "psf-build",
         "fitted": "psf-fit",
         "corrected": "gap-diagnose",
+        "interpolated": "psf-interpolate",
     }
     assert all(kind_of_origin(origin).name == name for origin, name in origins.items())

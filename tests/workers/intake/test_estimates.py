@@ -118,6 +118,19 @@ def test_a_psf_that_may_have_to_be_built_first_counts(catalogue: Catalogue) -> N
     assert needs(catalogue, "rerun", rerun) == built
 
 
+def test_a_psf_that_may_have_to_be_interpolated_first_counts(catalogue: Catalogue) -> None:
+    end = psf(catalogue, 2048, fit={})
+    interpolation = {"before_psf_id": end, "after_psf_id": end}
+    there = deconvolution(catalogue, 256, psf_id=end)
+    missing = {**there, "psf_id": "f" * 64, "psf_interpolation": interpolation}
+    alone = needs(catalogue, "psf-interpolate", interpolation)
+    assert alone[0] > needs(catalogue, "psf-interpolate", {"before_psf_id": psf(catalogue, 128)})[0]
+    for draws in (0, 4):
+        there, missing = ({**one, "error_draws": draws} for one in (there, missing))
+        both = needs(catalogue, "deconvolve", there)[0] + alone[0]
+        assert needs(catalogue, "deconvolve", missing)[0] == pytest.approx(both, abs=0.15)
+
+
 @pytest.mark.parametrize(
     ("change", "least"),
     [

@@ -138,3 +138,9 @@ def test_series_and_their_names() -> None:
         None,
         None,
     )
+
+
+def test_the_version_of_an_interpolated_psf_is_not_counted() -> None:
+    """It is deprecated together with its ends, without having been certified."""
+    assert next_version(["1.2.0", "0.1.0+0123abcd"]) == "1.3.0"
+    assert next_version(["0.1.0+0123abcd"]) == "1.0.0"

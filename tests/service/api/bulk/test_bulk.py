@@ -18,6 +18,7 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from tests.conftest import write_image, write_psf
+from tests.fitted_psfs import EARLY, LATE, write_fitted
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
 from workers.bulk import image as bulk_image
@@ -441,6 +442,30 @@ def test_a_context_pins_the_psf_of_each_image(
     work()
     expected = [of_channel[0]] * 3 + [of_channel[1]] * 2
     assert [line["psf_id"] for line in results(api, bulk)] == expected
+
+
+def test_in_a_context_the_psf_of_an_image_between_two_psfs_is_interpolated(
+    api: TestClient, archive: Path, work: Callable[[], None], tmp_path: Path
+) -> None:
+    ends = []
+    for version, values, times in (
+        ("1.0.0", EARLY, {"valid_to": "2020-02-01"}),
+        ("1.1.0", LATE, {"valid_from": "2022-01-01"}),
+    ):
+        file = write_fitted(tmp_path / f"{version}.fits", values, instrument="eui")
+        ends.append(upload(api, file, "/v1/psfs?channel=174&kind=total"))
+        body = {"status": "certified", "version": version, **times}
+        assert api.post(f"/v1/psfs/{ends[-1]}/status", json=body).status_code == 200
+    assert api.put("/v1/series/eui/174/total", json={"interpolated": True}).status_code == 200
+    assert api.post("/v1/contexts", json={"name": "aging"}).status_code == 201
+    bulk = asked(api, files=[{"glob": f"{archive}/*/image [012].fits"}], context="aging")
+    work()
+    used = [line["psf_id"] for line in results(api, bulk)]
+    assert len(set(used)) == 3 and used[2] == ends[1]
+    for psf_id, weight in zip(used[:2], (0.04, 0.56), strict=True):
+        told = api.get(f"/v1/psfs/{psf_id}/lineage").json()
+        assert [parent["id"] for parent in told["parents"]] == ends
+        assert told["parents"][1]["weight"] == pytest.approx(weight, abs=0.01)
 
 
 @pytest.mark.parametrize(

@@ -191,6 +191,7 @@ def test_contexts_and_the_default(api: TestClient, psfs: list[str]) -> None:
         "valid_from": "2020-01-01T00:00:00Z",
         "valid_to": None,
         "psf_id": psfs[0],
+        "interpolated": False,
         "version": "1.0.0",
     }
     again = api.post("/v1/contexts", json={"name": "early"})

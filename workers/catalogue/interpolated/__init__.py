@@ -1,0 +1,1 @@
+"""Series whose PSFs may be interpolated in time."""

@@ -1,0 +1,122 @@
+"""The task ``psf-interpolate``: interpolates between two fitted PSFs in time; the result is a PSF with its errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from psfcore.drawing.plots import psf_png
+from psfcore.fits.psfs import read_psf, write_psf
+from psfcore.psf import Psf, cumulative_curve
+from psfcore.scatter.interpolation import Epoch, curve_sigma, interpolated_psf, parameters_of
+from psfcore.scatter.total_psf import CURVE_RADII_PX
+from workers.catalogue.tables import PsfRow
+from workers.contract.identities import interpolated_psf_identity
+from workers.contract.requests import PsfInterpolate
+from workers.intake.compatibility import of_upload
+from workers.tasks.context import Context
+from workers.tasks.data.psfs import named_psf, psf_row
+from workers.tasks.data.reports import provenance_of
+from workers.versions.interpolation import name_of
+from workers.versions.series import INTERPOLATED, series_of
+
+STAGE = "interpolating the PSF"
+
+
+def psf_interpolate(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Interpolate between two PSFs of the catalogue, and add the new PSF to it; returns the PSF's id."""
+    return interpolated_row(context, PsfInterpolate.model_validate(parameters)).id
+
+
+def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
+    """The row of the interpolated PSF. If the catalogue does not contain this PSF, it is made and added.
+
+    Raises DataError "no-such-psf", and the errors of ``psfcore.scatter.interpolation.interpolated_psf``.
+    """
+    identity = interpolated_psf_identity(request)
+    made = context.made(PsfRow, identity)
+    if made is not None:
+        return made
+    context.report(STAGE, 0, 2)
+    ends = {
+        "before": _epoch(context, request.before_psf_id, request.before_time),
+        "after": _epoch(context, request.after_psf_id, request.after_time),
+    }
+    name, version = name_of(ends["before"].psf.instrument, identity)
+    # The id of the job is in the details of the row, not in the file, so that the file can be made again bit for bit.
+    provenance = {"psf_id": identity, **provenance_of(context, request)}
+    del provenance["job_id"]
+    psf = interpolated_psf(
+        ends["before"],
+        ends["after"],
+        datetime.fromisoformat(request.time),
+        name=name,
+        version=version,
+        provenance=provenance,
+        threads=context.settings.threads,
+    )
+    context.report(STAGE, 1, 2)
+    row = _saved(context, identity, psf)
+    # The files of the ends do not name the variant of the channel; their rows do.
+    row.channel = named_psf(context, request.before_psf_id).channel or row.channel
+    row.series = series_of(row.instrument, row.channel, row.kind)
+    return context.add(row)
+
+
+def _epoch(context: Context, psf_id: str, time: str) -> Epoch:
+    """A PSF of the catalogue, and the time at which it holds."""
+    row = named_psf(context, psf_id)
+    psf = read_psf(context.store.verified(row.file_sha256), context.limits)
+    # The request of an upload or of a certification may give an instrument and a channel that the file does not contain.
+    instrument, angstrom = of_upload(row, psf.instrument, psf.wavelength_angstrom)
+    psf = replace(
+        psf, name=row.name, version=row.version, instrument=instrument, wavelength_angstrom=angstrom
+    )
+    return Epoch(psf, datetime.fromisoformat(time), {"psf_id": row.id, "file_sha256": row.file_sha256})
+
+
+def _saved(context: Context, identity: str, psf: Psf) -> PsfRow:
+    """The row of the PSF; its file, picture and tables are in the store."""
+    ends = psf.provenance["interpolated_between"]
+    with context.store.temporary() as file, context.store.temporary() as picture:
+        write_psf(file, psf)
+        psf_png(psf, picture)
+        return psf_row(
+            psf,
+            identity,
+            context.owner,
+            origin=INTERPOLATED,
+            file_sha256=context.store.keep(file),
+            store=context.store,
+            preview_sha256=context.store.keep(picture),
+            details={
+                "parents": {name: end["psf_id"] for name, end in zip(("before", "after"), ends, strict=True)},
+                "weights": {end["psf_id"]: end["weight"] for end in ends},
+                "job_id": context.job_id,
+                "fit": _fit_of(psf, context.settings.threads),
+            },
+            threads=context.settings.threads,
+        )
+
+
+def _fit_of(psf: Psf, threads: int) -> dict[str, Any]:
+    """The parameters and the curve with their errors, in the form of the details of a fitted PSF."""
+    assert psf.fitted is not None
+    radii = np.array([radius for radius in CURVE_RADII_PX if radius < psf.kernel.shape[0] // 2])
+    curve, sigma = cumulative_curve(psf.kernel, radii), curve_sigma(psf, radii, threads=threads)
+    before, after = psf.provenance["interpolated_between"]
+    return {
+        "sentence": f"Interpolated to {psf.provenance['interpolated_at']} between {before['name']} {before['version']} (weight "
+        f"{before['weight']:.3f}) and {after['name']} {after['version']} (weight {after['weight']:.3f}).",
+        "shape": psf.fitted.shape,
+        "parameters": parameters_of(psf.fitted),
+        "curve": {
+            "radii_px": radii.tolist(),
+            "light_beyond_pct": curve.tolist(),
+            "sigma": sigma.tolist(),
+        },
+    }
