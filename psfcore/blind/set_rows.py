@@ -48,9 +48,7 @@ def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
     seen = [case for case in stated if case.noncentrality >= SEEN]
     foreign = [case for case in stated if case.kind == FOREIGN]
     return (
-        share(
-            "set covers the truth", stated, set_covers_truth, "0.86 - 0.94", lambda p: 0.86 <= p <= 0.94
-        ),
+        share("set covers the truth", stated, set_covers_truth, "0.86 - 0.94", lambda p: 0.86 <= p <= 0.94),
         *(
             share(
                 f"the same, {words}",
