@@ -54,7 +54,7 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Planes = NDArray[np.float64]
 
-TEMPLATE_ERRORS = (0.0, 0.03, 0.1)
+TEMPLATE_ERRORS = (0.0, 0.03)
 USUAL_ERROR = TEMPLATE_ERRORS[1]
 UNSEEN = 0.5  # if the largest template error adds less than this to chi2, its width does not matter
 CORRELATED = 0.5
