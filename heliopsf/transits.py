@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from heliopsf.machine import cores
 from heliopsf.progress import Stages, told_stages
-from heliopsf.psfs import LIMITS, build_psf
+from heliopsf.psfs import LIMITS, Psf, build_psf
 from psfcore.errors import module_of_extra
 from psfcore.gap import diagnose
 from psfcore.gap.report.report import gap_report
@@ -16,7 +16,7 @@ from psfcore.gap.verdict.calibration import COVERAGE
 from psfcore.known_diffraction import check_known
 from psfcore.noise import Noise
 from psfcore.psf import Kernel
-from psfcore.scatter.fit import TransitFit, fit_transit
+from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
 from psfcore.transit.folder import read_transit
 from psfcore.transit.transit import Transit
 
@@ -27,6 +27,21 @@ if TYPE_CHECKING:
 
 class ScatterFit(TransitFit):
     """The fit of a transit: total PSF (``kernel``), ``scatter`` kernel, curves with errors, and limits of the fit."""
+
+    def psf(self, *, name: str | None = None, version: str = "0.1.0") -> Psf:
+        """The fitted PSF, a draft: to plot it, to write it, or to deconvolve images with it.
+
+        name: default: the name of the instrument and "-fitted". Its provenance contains the SHA-256 of the files of
+        the transit.
+        """
+        return Psf.of(
+            fitted_psf(
+                self,
+                name=name or f"{self.transit.instrument or 'transit'}-fitted",
+                version=version,
+                provenance={"inputs_sha256": dict(self.transit.sha256)},
+            )
+        )
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the light beyond each radius with its error. Needs the extra "plot". axes None: new axes."""

@@ -84,7 +84,7 @@ print(f"largest difference: {np.abs(difference).max():.2f} percentage points")
 # Certify the PSF
 # ---------------
 #
-# A fitted PSF is a draft. These commands fit the transit on a service, test the fit on held-out images, and certify the PSF for
+# A fitted PSF is a draft. ``fit.psf()`` is this PSF, and ``fit.psf().write("fitted.fits")`` keeps it. These commands fit the transit on a service, test the fit on held-out images, and certify the PSF for
 # a range of observation times:
 #
 # .. code-block:: console

@@ -132,6 +132,12 @@ def test_a_transit_is_fitted(tmp_path: Path) -> None:
     write(observed(sky()), tmp_path / "transit")
     fit = heliopsf.fit_scatter(tmp_path / "transit", threads=2)
     assert abs(fit.inversion.values["total"] - SCATTER.total) < 0.03
+    psf = fit.psf(version="0.3.0")
+    psf.write(tmp_path / "fitted.fits")
+    again = heliopsf.read_psf(tmp_path / "fitted.fits")
+    assert (again.version, again.name) == ("0.3.0", psf.name) and again.fitted is not None
+    assert again.fitted.coordinates == pytest.approx(fit.inversion.coordinates)
+    assert set(psf.provenance["inputs_sha256"]) == set(fit.transit.sha256) and fit.transit.sha256
     with pytest.raises(heliopsf.DataError, match="transit"):
         heliopsf.diagnose_gap(tmp_path)
 
