@@ -304,10 +304,12 @@ def _explained(found: Diagnosis) -> str:
         for name, (value, sigma, unit) in values.items()
     ]
     in_short = in_short_if_many([value for value, _, _ in values.values()])
+    # If the discs do not show the gap, the gap in the discs can only change within the noise.
+    shrinks = "falls" if found.after.value < found.rms.value else "changes"
     return (
         f"The gap is explained by {words(best.label)} ({in_short or ', '.join(numbers)}), with a probability of "
-        f"{percent_words(judged.hypotheses[best.names])}: on held-out images it falls from {found.rms.value:.1f} % to "
-        f"{found.after.value:.1f} %, and the noise is {found.noise_pct:.1f} %"
+        f"{percent_words(judged.hypotheses[best.names])}: on held-out images the gap in the discs {shrinks} from "
+        f"{found.rms.value:.1f} % to {found.after.value:.1f} %, and the noise is {found.noise_pct:.1f} %"
     )
 
 

@@ -165,7 +165,7 @@ SAID = {
     "attributed": (
         "There is a gap of ",
         "The gap is explained by dark offset (offset ",
-        "with a probability of 93 %: on held-out images it falls from ",
+        "with a probability of 93 %: on held-out images the gap in the discs falls from ",
     ),
     "tie": (
         "There is a gap of ",
