@@ -154,8 +154,10 @@ def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], 
         if len(chosen) >= LEAST_NEIGHBOURS and photons >= ENOUGH_PHOTONS:
             break
         level = float(frames[k].pixels[window].mean(dtype=np.float64))
-        # The square of signal / noise: the number of photons, reduced because of the read noise.
-        photons += level**2 / float(noise.variance(np.array(max(level, 0.0)), frames[k].exposure_s))
+        # The square of signal / noise: the number of photons, reduced because of the read noise. An image without light has
+        # no photons; its mean can be negative if an effect that is too strong was subtracted.
+        if level > 0:
+            photons += level**2 / float(noise.variance(np.array(level), frames[k].exposure_s))
         chosen.append(k)
     return chosen
 

@@ -277,6 +277,16 @@ def test_the_given_places_decide_which_frames_are_neighbours() -> None:
     assert neighbours_of(5, transit.frames, places, transit.noise) == before[1:]
 
 
+def test_images_without_light_or_noise_have_no_photons() -> None:
+    """A correction can leave images whose mean is negative; without read noise their variance would be 0."""
+    transit = observed(sky()).transit
+    dark = [dataclasses.replace(frame, pixels=np.full_like(frame.pixels, -1.0)) for frame in transit.frames]
+    places, noiseless = places_of(transit), Noise(photon_gain_dn=6.0, read_noise_dn=0.0)
+    counts = [len(neighbours_of(n, dark, places, noiseless)) for n in range(len(dark))]
+    assert counts == [len(neighbours_of(n, dark, places, transit.noise)) for n in range(len(dark))]
+    assert max(counts) > 0
+
+
 def even_sky(shots: tuple[Shot, ...]) -> TrueSky:
     """A Sun of uniform brightness with a texture of 5 %."""
     plan = dataclasses.replace(default_plan(3, SIZE_PX, oversampling=1), shots=shots)

@@ -156,6 +156,14 @@ def test_an_improbable_effect_and_an_invisible_error_need_no_refit(
     assert refit.asked == []
 
 
+def test_a_leading_effect_keeps_its_evidence_if_its_refit_succeeds(start: Start) -> None:
+    start({NONE: 0.0, A: 30.0}, VISIBLE / 2)
+    refit = Refitted({A: {A: -30.0, AB: 90.0}})
+    found, failed = settled_posterior(MODEL, refit)
+    assert refit.asked == [A] and failed == ()
+    assert next(iter(found.probabilities())) == A and AB not in found.log_weights
+
+
 def test_a_leading_effect_is_refitted_although_its_error_is_invisible(start: Start) -> None:
     """The report would name it. Its refit fails, so that it is left out."""
     start({NONE: 0.0, A: 30.0}, VISIBLE / 2)
