@@ -85,7 +85,7 @@ def test_the_core_depends_on_five_packages_and_extras_name_all_that_is_imported(
     names = {Requirement(one).name for one in project["dependencies"]}
     assert names == {"astropy", "numba", "numpy", "platformdirs", "scipy"}
     extras = project["optional-dependencies"]
-    assert {"map", "plot", "fit", "service", "s3", "all", "dev"} == set(extras)
+    assert {"map", "plot", "fit", "service", "s3", "all", "docs", "dev"} == set(extras)
     named = set(re.findall(r'module_of_extra\(\s*"(\w+)"', _sources())) | {"fit", "service"}
     assert named <= set(extras)
 
@@ -149,7 +149,8 @@ def test_the_wheel_holds_the_packages_and_their_files_and_stays_small(wheel: Pat
         assert name in names
     kept = {f"{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "service" / "pages").rglob("*.html")}
     assert kept and kept <= names
-    assert wheel.stat().st_size < 1.4e6
+    # The wheel is code and texts; with the interpolation of PSFs in time it exceeded the 1.4 MB of before.
+    assert wheel.stat().st_size < 1.45e6
 
 
 @pytest.mark.slow

@@ -100,6 +100,9 @@ def test_an_upgrade_of_the_database_is_one_line(
     wanted = catalogue.schema.status().wanted
     assert caplog.messages == [f"database: created, revision {wanted}"]
     with catalogue._engine.begin() as connection:
+        # The tables of revision 0016; revision 0017 changes only counts.
+        connection.execute(text("DROP TABLE series_changes"))
+        connection.execute(text("ALTER TABLE psf_pins DROP COLUMN interpolated"))
         connection.execute(text("UPDATE alembic_version SET version_num = '0016'"))
     caplog.clear()
     catalogue.upgrade()
