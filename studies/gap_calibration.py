@@ -28,6 +28,7 @@ from scipy.optimize import minimize_scalar
 from heliopsf.psfs import LIMITS
 from psfcore.blind.case_set import BlindSet, SetPlan, make_set
 from psfcore.blind.score_table import wilson
+from psfcore.blind.scoring import required_names
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import linear_model_of
 from psfcore.gap.evidence.likelihood import TEMPLATE_ERRORS
@@ -45,9 +46,6 @@ from psfcore.transit.folder import read_transit
 from psfcore.whole_files import write_whole
 
 KINDS = ("clean", "single", "pair", "unknown")
-LEAST_LEFT_PCT = (
-    1.0  # the weaker effect of a pair need not be in the answer if it alone leaves less than this
-)
 TEMPERATURES = (0.5, 10.0)
 HOLDS_FOR = (
     "The coverage holds for transits like these: 18 images of 256 px in three pointings, with no effect, with one or two effects of the "
@@ -97,17 +95,8 @@ def weights_of(folder: Path) -> tuple[dict[Names, float], tuple[float, ...]]:
 
 
 def required(truth: Mapping[str, Any]) -> Names:
-    """The hypothesis that is the true cause of a case.
-
-    A pair counts as one effect if the other effect alone leaves less than LEAST_LEFT_PCT.
-    """
-    if truth["kind"] == "unknown":
-        return UNKNOWN
-    effects = truth["effects"]
-    shown = tuple(
-        effect["name"] for effect in effects if effect.get("left_alone_pct", LEAST_LEFT_PCT) >= LEAST_LEFT_PCT
-    )
-    return shown or tuple(effect["name"] for effect in effects)
+    """The hypothesis that is the true cause of a case, by the rule of the score (`scoring.required_names`)."""
+    return UNKNOWN if truth["kind"] == "unknown" else required_names(truth)
 
 
 def calibrated(cases: Sequence[Case], about: Mapping[str, Any]) -> Calibration:

@@ -20,6 +20,7 @@ this member covers the truth and names no wrong effect.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -85,12 +86,7 @@ class Judged:
 
         If no effect leaves that much, the answer must contain all withheld effects.
         """
-        required = [
-            effect["name"]
-            for effect in self.truth["effects"]
-            if effect.get("left_alone_pct", LOWER_LEVEL_PCT) >= LOWER_LEVEL_PCT
-        ]
-        return tuple(required) or self.true_names
+        return required_names(self.truth)
 
     @property
     def left_pct(self) -> float:
@@ -149,6 +145,13 @@ class Judged:
         """The closure (value and ci90) that the report states for an effect; None if it states no closure."""
         found: dict[str, Any] | None = self.entries.get(name or "", {}).get("closure")
         return found
+
+
+def required_names(truth: Mapping[str, Any]) -> tuple[str, ...]:
+    """`Judged.required_names` for a truth."""
+    effects = truth["effects"]
+    shown = (e["name"] for e in effects if e.get("left_alone_pct", LOWER_LEVEL_PCT) >= LOWER_LEVEL_PCT)
+    return tuple(shown) or tuple(effect["name"] for effect in effects)
 
 
 def raises_alarm(case: Judged) -> bool:

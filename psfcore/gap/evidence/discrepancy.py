@@ -2,9 +2,9 @@
 
 A discrepancy changes the means of the discs, their cells or the unocculted blocks smoothly along one or several
 properties. These properties are called axes (in the names of the code: `orders`): position on the detector, time,
-intensity, exposure time, counts (intensity times exposure time, DN), pointing, radius and azimuth. The discrepancy is a sum of Legendre polynomials along each axis,
-times the expected light, with random coefficients. It does not depend on the library or on the images. A cause that
-varies along one of the axes resembles it.
+intensity, exposure time, counts (intensity times exposure time, DN), pointing, radius and azimuth. The discrepancy is a
+sum of Legendre polynomials along each axis, times the expected light, with random coefficients. It does not depend on
+the library or on the images. A cause that varies along one of the axes resembles it.
 
 A cause may also follow no axis. The alternatives for this case are: every disc has its own change; every cell of every
 disc has its own change; every block of the detector has its own change, which is the same in all readouts. These

@@ -168,19 +168,12 @@ def _with_blocks_of(before: Evidence, after: Evidence, taken: Mapping[str, Seque
     The change by some effects, for example a halo, is computed from each image and contains a part of its noise. If it
     is subtracted from the images, their blocks have less noise, and this would wrongly count in favour of the effect.
     """
-    first = {effect.name: effect for effect in before.effects}
     blocks = before.unocculted
     errors = np.zeros((after.size, *blocks.levels.shape))
     levels = blocks.levels.copy()
-    for effect in after.effects:
-        columns = dict(
-            zip((p.name for p in first[effect.name].parameters), before.columns[effect.name], strict=False)
-        )
-        own = [p.name for p in effect.parameters]
-        values = taken.get(effect.name, (0.0,) * len(own))
-        for name, column, value in zip(own, after.columns[effect.name], values, strict=False):
-            errors[column] = blocks.errors[columns[name]]
-            levels -= value * errors[column]
+    for column, source, amount in _parameters_of(before, after, taken):
+        errors[column] = blocks.errors[source]
+        levels -= amount * errors[column]
     return replace(after, unocculted=replace(blocks, errors=errors, levels=levels))
 
 
@@ -195,24 +188,38 @@ def _with_same_discs(
     """
     kept = [disc for disc in after.discs if disc.index in before.images]
     lost = [disc for disc in before.discs if disc.index not in after.images]
+    columns = [
+        *zip(after.base, before.base, moved.tolist(), strict=True),
+        *_parameters_of(before, after, taken),
+    ]
+    linear = []
+    for disc in lost:
+        jacobian, residual = np.zeros((after.size, disc.residual.size)), disc.residual.copy()
+        for column, source, amount in columns:
+            jacobian[column] = disc.jacobian[source]
+            residual -= amount * jacobian[column]
+        linear.append(replace(disc, jacobian=jacobian, residual=residual))
+    return replace(after, discs=tuple(sorted((*kept, *linear), key=lambda disc: disc.index)))
+
+
+def _parameters_of(
+    before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]]
+) -> list[tuple[int, int, float]]:
+    """For each parameter of the effects of a refit: its column at the refit, its column before, and the amount that the
+    refit subtracted from the images."""
     first = {effect.name: effect for effect in before.effects}
-    source, amounts = np.zeros(after.size, dtype=np.intp), np.zeros(after.size)
-    source[list(after.base)], amounts[list(after.base)] = before.base, moved
+    found: list[tuple[int, int, float]] = []
     for effect in after.effects:
-        own = [p.name for p in effect.parameters]
-        column_of = dict(
+        columns = dict(
             zip((p.name for p in first[effect.name].parameters), before.columns[effect.name], strict=False)
         )
+        own = [p.name for p in effect.parameters]
         values = taken.get(effect.name, (0.0,) * len(own))
-        for name, column, value in zip(own, after.columns[effect.name], values, strict=False):
-            source[column], amounts[column] = column_of[name], value
-    linear = [
-        replace(
-            disc, jacobian=disc.jacobian[source], residual=disc.residual - amounts @ disc.jacobian[source]
+        found += (
+            (column, columns[name], value)
+            for name, column, value in zip(own, after.columns[effect.name], values, strict=False)
         )
-        for disc in lost
-    ]
-    return replace(after, discs=tuple(sorted((*kept, *linear), key=lambda disc: disc.index)))
+    return found
 
 
 def weigh(

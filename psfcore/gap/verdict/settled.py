@@ -44,17 +44,17 @@ def settled_posterior(model: LinearModel, refit: Refit | None) -> tuple[Posterio
     if refit is None:
         return found, ()
     for _ in range(MOST_REFITS):
-        chosen = _to_refit(found, done) or _leading(found, done)
+        inexact = _to_refit(found, done)
+        chosen = inexact or _leading(found, done)
         if chosen is None:
             break
-        inexact = chosen == _to_refit(found, done)
         done.add(chosen)
         real = refit(chosen)
         if real is None:  # the images do not contain the effects as the linear fit states them
             failed.append(chosen)
             weights = {names: weight for names, weight in found.log_weights.items() if names != chosen}
             found = replace(found, log_weights=weights)
-        elif inexact:
+        elif inexact is not None:
             # The refit of a hypothesis itself is more exact than its evidence at the refit of another one.
             new = {names: weighed for names, weighed in real.items() if names == chosen or names not in done}
             found = _without_stale(found, chosen, done, new).with_evidence(new, effects)
