@@ -145,7 +145,7 @@ def interpolate_psf(
     The coordinates of the fitted shape are interpolated linearly; ``fitted`` of the result holds them with their
     covariance (``psfcore.scatter.interpolation`` gives the equations). Nothing is extrapolated.
 
-    before, after: PSFs of ``ScatterFit`` or of files, fitted with the same shape and the same diffraction PSF.
+    before, after: PSFs (``ScatterFit.psf()``) or files, fitted with the same shape and the same diffraction PSF.
     before_time, after_time: when they hold. Times are datetimes or texts such as "2024-03-01T12:00:00"; a time without a
     zone is UTC.
     threads: default: all cores.

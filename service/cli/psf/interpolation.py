@@ -9,6 +9,7 @@ import click
 
 from service.cli.connection import ID, SERVER, remote, short, whole_id
 from service.cli.options import OUTPUT, progress_bar, user_errors, writes_files
+from service.cli.psf.make import say_fit
 
 if TYPE_CHECKING:
     from service.client.http import Client
@@ -87,15 +88,7 @@ def interpolate(
         if output is not None:
             service.download(made["file"], output, overwrite=overwrite)
     click.echo(f"{short(made['id'])}  {made['name']}  {made['version']}  {made['status']}")
-    fit = made["details"]["fit"]
-    click.echo(fit["sentence"])
-    for name, parameter in fit["parameters"].items():
-        click.echo(f"  {name:<12} {parameter['value']:10.4f} ± {parameter['sigma']:.4f} {parameter['unit']}")
-    curve = fit["curve"]
-    for radius, beyond, sigma in zip(
-        curve["radii_px"], curve["light_beyond_pct"], curve["sigma"], strict=True
-    ):
-        click.echo(f"  light beyond {radius:>6g} px  {beyond:6.2f} ± {sigma:.2f} %")
+    say_fit(made["details"]["fit"])
 
 
 def _end(service: Client, psf_id: str, name: str, option: str) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import get_args
+from typing import Any, get_args
 
 import click
 
@@ -130,16 +130,21 @@ def fit(
     click.echo(
         f"{output}: {fitted['name']} {fitted['version']} ({fitted['status']}), id {short(fitted['id'])}"
     )
-    click.echo(found["sentence"])
-    for name, parameter in found["parameters"].items():
+    say_fit(found)
+    for limit in found["limits"]:
+        click.echo(f"  note: {limit}")
+
+
+def say_fit(fit: dict[str, Any]) -> None:
+    """Print the sentence of a fitted shape, its parameters and its curve, with their errors."""
+    click.echo(fit["sentence"])
+    for name, parameter in fit["parameters"].items():
         click.echo(f"  {name:<12} {parameter['value']:10.4f} ± {parameter['sigma']:.4f} {parameter['unit']}")
-    curve = found["curve"]
+    curve = fit["curve"]
     for radius, beyond, sigma in zip(
         curve["radii_px"], curve["light_beyond_pct"], curve["sigma"], strict=True
     ):
         click.echo(f"  light beyond {radius:>6g} px  {beyond:6.2f} ± {sigma:.2f} %")
-    for limit in found["limits"]:
-        click.echo(f"  note: {limit}")
 
 
 @click.command("crossval")
