@@ -29,8 +29,13 @@ have the same factor, because the field can be stronger than is likely:
     ln E = ln L + ln det(1 + w N w)^-1/2 + terms of the prior                             Eq. (3)
 
 N is the normal matrix of the strengths with the PSF free (its Schur complement). The integral is computed in the
-Laplace approximation. The prior of a parameter that cannot be negative is half a Gaussian. If a template was chosen
-among many, the logarithm of their number is subtracted from ln E. For each number that was measured in the blocks to
+Laplace approximation. The prior of a parameter that cannot be negative is half a Gaussian. If the best value of such a
+parameter is 0, ln L falls with the slope g <= 0 from there, and the factor of E for this parameter is
+
+    2 / (w K^1/2) exp(b^2 / 2) Phi(b),    K = N + w^-2,    b = g K^-1/2                   Eq. (4)
+
+N is the normal matrix of this parameter with all others free, and Phi is the normal distribution function. If there are
+several such parameters, their correlations are neglected. If a template was chosen among many, the logarithm of their number is subtracted from ln E. For each number that was measured in the blocks to
 build a template, MEASURED is added to the chi2 of the blocks: noise alone lowers this chi2 by 1 for each number, and
 the likely size of the number is unknown.
 """
@@ -182,6 +187,7 @@ class Likelihood:
         groups = [list(group) for group in effects]
         theta = np.zeros(len(self._base) + sum(len(group) for group in groups))
         parts: tuple[_Part, _Part] | None = None
+        at_zero: list[int] = []
         for _ in range(ROUNDS + sum(len(group) for group in groups)):
             columns = [c for group in groups for c in group]
             taken = np.array([out.get(c, 0.0) for c in columns])
@@ -195,6 +201,7 @@ class Likelihood:
             ]
             if below:
                 gone = min(below)[1]
+                at_zero.append(gone)
                 theta = np.delete(after, len(self._base) + columns.index(gone))
                 groups = [[c for c in group if c != gone] for group in groups]
                 if not all(groups):
@@ -205,7 +212,11 @@ class Likelihood:
             if settled:
                 break
         assert parts is not None
-        return self._weighed(parts, theta, scales, columns, taken, trials)
+        if at_zero:
+            parts = self._parts(groups, theta, taken, error, at_zero)
+        amounts = np.array([out.get(c, 0.0) for c in at_zero])
+        weighed = self._weighed(parts, theta, scales, columns, taken, at_zero, amounts)
+        return replace(weighed, log_evidence=weighed.log_evidence - math.log(trials))
 
     def normal(self, columns: Sequence[int]) -> Matrix:
         """The normal matrix of some columns if the only error is noise: without template error and without prior.
@@ -297,10 +308,13 @@ class Likelihood:
         scales: tuple[float, float],
         columns: list[int],
         taken: Vector,
-        trials: float,
+        at_zero: list[int],
+        taken_at_zero: Vector,
     ) -> Weighed:
-        base = len(self._base)
-        normal, score = _together(parts, scales)
+        base, free = len(self._base), theta.size
+        every, score = _together(parts, scales)
+        normal, across = every[:free, :free], every[free:, :free]
+        slope, score = score[free:] - across @ theta, score[:free]
         gradient = score - normal @ theta
         best = sum(
             (self._stiffness + part.count) * (s**-CORRELATED - 1) / (2 * CORRELATED)
@@ -322,9 +336,15 @@ class Likelihood:
             quadratic = float(step @ normal @ step - 2 * gradient @ step + prior @ (whole + step) ** 2)
             above = (whole + step)[base:][positive] / np.sqrt(np.diag(inverse)[base:][positive])
             half = float(np.sum(math.log(2) + log_ndtr(above)))
-            found.append(best - (quadratic + log_det - np.log(prior[base:]).sum()) / 2 + half)
+            one_sided = _one_sided(
+                slope - across @ step,
+                np.diag(every)[free:] - np.einsum("ij,jk,ik->i", across, inverse, across),
+                self._likely[at_zero] * scale,
+                taken_at_zero,
+            )
+            found.append(best - (quadratic + log_det - np.log(prior[base:]).sum()) / 2 + half + one_sided)
         return Weighed(
-            float(logsumexp(found)) - math.log(len(found)) - math.log(trials),
+            float(logsumexp(found)) - math.log(len(found)),
             tuple(columns),
             theta[base:],
             0.0,
@@ -347,9 +367,16 @@ class Likelihood:
         return np.asarray(change - self._jacobian[:, :, self._base] @ absorbed)
 
     def _parts(
-        self, groups: Sequence[Sequence[int]], theta: Vector, taken: Vector, error: float
+        self,
+        groups: Sequence[Sequence[int]],
+        theta: Vector,
+        taken: Vector,
+        error: float,
+        at_zero: Sequence[int] = (),
     ) -> tuple[_Part, _Part]:
-        columns = [*self._base, *(c for group in groups for c in group)]
+        """The normal equations of the PSF, the columns of `groups`, and the columns `at_zero`, in this order."""
+        acting = [*self._base, *(c for group in groups for c in group)]
+        columns = [*acting, *at_zero]
         whole = theta + np.append(np.zeros(len(self._base)), taken)
         spans, first = [], len(self._base)
         for group in groups:
@@ -369,7 +396,7 @@ class Likelihood:
         log_det = 2 * float(np.log(np.einsum("dcc->dc", lower)).sum())
         blocks = [pointing.part(columns, spans, error) for pointing in self._blocks]
         size = len(columns) + 1
-        measured = self._evidence.numbers_of(columns)
+        measured = self._evidence.numbers_of(acting)
         in_blocks = sum(part.more for part in blocks)
         if not groups:
             self._log_det = log_det, in_blocks
@@ -378,6 +405,19 @@ class Likelihood:
             sum(part.count for part in blocks),
             in_blocks - self._log_det[1] + MEASURED * measured,
         )
+
+
+def _one_sided(slope: Vector, normal: Vector, width: Vector, taken: Vector) -> float:
+    """ln of the product of the factors of Eq. (4). All arguments have one entry for each parameter.
+
+    slope, normal: the slope of ln L and the curvature of -ln L at the fit. A slope above 0, which remains if a parameter was set
+    to 0 before the others, counts as 0. width: the width of the prior. taken: the amount that was subtracted before the fit.
+    """
+    slope, curvature = np.minimum(slope, 0.0), np.maximum(normal, 0.0)
+    total = curvature + width**-2.0
+    above = (slope + curvature * taken) / np.sqrt(total)
+    factors = math.log(2) - np.log(width * np.sqrt(total)) + above**2 / 2 + log_ndtr(above)
+    return float(np.sum(factors - slope * taken - curvature * taken**2 / 2))
 
 
 def _together(parts: tuple[_Part, _Part], scales: tuple[float, float]) -> tuple[Matrix, Vector]:

@@ -28,6 +28,7 @@ from psfcore.gap.evidence.discrepancy import ALTERNATIVES, discrepancy
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Likelihood, Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.verdict.same_data import with_same_data
 
 Vector = NDArray[np.float64]
 Names = tuple[str, ...]
@@ -152,74 +153,12 @@ def at_refit(
     taken: the amounts of the parameters that the refit subtracted from the images, by effect. moved: the coordinates of
     the PSF of the refit minus those of the fit without any effect.
     """
-    after = _with_same_discs(before.evidence, refit.evidence, taken, moved)
-    after = _with_blocks_of(before.evidence, after, taken)
-    refit = replace(refit, evidence=after)
+    refit = replace(refit, evidence=with_same_data(before.evidence, refit.evidence, taken, moved))
     likelihood = Likelihood(refit)
     others = [e.name for e in effects if e.name not in names] if len(names) == 1 else []
     pairs = [_in_order((*names, other), effects) for other in others]
     found = {one: weigh(likelihood, refit.evidence, one, taken) for one in (names, *pairs)}
     return found | _triples(likelihood, refit.evidence, {one: found[one] for one in pairs}, effects, taken)
-
-
-def _with_blocks_of(before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]]) -> Evidence:
-    """The evidence of a refit, with other blocks: the blocks from before the refit, minus the change by the effects.
-
-    The change by some effects, for example a halo, is computed from each image and contains a part of its noise. If it
-    is subtracted from the images, their blocks have less noise, and this would wrongly count in favour of the effect.
-    """
-    blocks = before.unocculted
-    errors = np.zeros((after.size, *blocks.levels.shape))
-    levels = blocks.levels.copy()
-    for column, source, amount in _parameters_of(before, after, taken):
-        errors[column] = blocks.errors[source]
-        levels -= amount * errors[column]
-    return replace(after, unocculted=replace(blocks, errors=errors, levels=levels))
-
-
-def _with_same_discs(
-    before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]], moved: Vector
-) -> Evidence:
-    """The evidence of a refit, with the discs of the fit before it.
-
-    All hypotheses must explain the same data. A refit can lose discs, for example if an effect that is too strong was
-    subtracted from a faint image. The lost discs are taken from before the refit, and respond to PSF and effects
-    linearly. Discs that only the refit can use are left out.
-    """
-    kept = [disc for disc in after.discs if disc.index in before.images]
-    lost = [disc for disc in before.discs if disc.index not in after.images]
-    columns = [
-        *zip(after.base, before.base, moved.tolist(), strict=True),
-        *_parameters_of(before, after, taken),
-    ]
-    linear = []
-    for disc in lost:
-        jacobian, residual = np.zeros((after.size, disc.residual.size)), disc.residual.copy()
-        for column, source, amount in columns:
-            jacobian[column] = disc.jacobian[source]
-            residual -= amount * jacobian[column]
-        linear.append(replace(disc, jacobian=jacobian, residual=residual))
-    return replace(after, discs=tuple(sorted((*kept, *linear), key=lambda disc: disc.index)))
-
-
-def _parameters_of(
-    before: Evidence, after: Evidence, taken: Mapping[str, Sequence[float]]
-) -> list[tuple[int, int, float]]:
-    """For each parameter of the effects of a refit: its column at the refit, its column before, and the amount that the
-    refit subtracted from the images."""
-    first = {effect.name: effect for effect in before.effects}
-    found: list[tuple[int, int, float]] = []
-    for effect in after.effects:
-        columns = dict(
-            zip((p.name for p in first[effect.name].parameters), before.columns[effect.name], strict=False)
-        )
-        own = [p.name for p in effect.parameters]
-        values = taken.get(effect.name, (0.0,) * len(own))
-        found += (
-            (column, columns[name], value)
-            for name, column, value in zip(own, after.columns[effect.name], values, strict=False)
-        )
-    return found
 
 
 def weigh(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import block_diag, null_space
+from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from psfcore.gap.evidence import likelihood as likelihoods
@@ -63,6 +64,53 @@ def test_a_parameter_that_cannot_be_negative_excludes_a_loss_of_light(evidence: 
     assert lost.log_evidence == -math.inf and lost.columns == ()
     added = Likelihood(with_residuals(evidence, {"column_smear": 8 * sigma})).weigh(columns)
     assert added.values[0] == pytest.approx(8 * sigma, rel=0.2)
+
+
+def test_a_one_sided_parameter_at_zero_costs_as_much_as_its_integral(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The integral over both one-sided shares of a smear, of which one has its best value at 0, on a grid of values."""
+    monkeypatch.setattr(likelihoods, "TEMPLATE_ERRORS", (0.0,))
+    monkeypatch.setattr(likelihoods, "SCALES", (1.0,))
+    sigma = sigma_of(evidence, "column_smear")
+    below, above = evidence.columns["column_smear"]
+    plain = replace(with_residuals(evidence, {"column_smear": 8 * sigma}), scale_error=EXACT)
+    lost = next(p for e in evidence.effects if e.name == "column_smear" for p in e.parameters).likely
+    # Light is missing above: the best value of the second share is below 0.
+    discs = tuple(
+        replace(disc, residual=disc.residual - 4 * sigma * disc.jacobian[above])
+        for disc in plain.evidence.discs
+    )
+    model = replace(plain, evidence=replace(plain.evidence, discs=discs))
+
+    white = np.linalg.inv(
+        np.linalg.cholesky(
+            block_diag(
+                *(disc.covariance + model.floor**2 * np.outer(disc.expected, disc.expected) for disc in discs)
+            )
+        )
+    )
+    jacobian = white @ np.concatenate([disc.jacobian.T for disc in discs])
+    unchanged = null_space(jacobian[:, list(evidence.base)].T).T
+    seen = unchanged @ white @ np.concatenate([disc.residual for disc in discs])
+    changes = unchanged @ jacobian[:, [below, above]]
+    values = np.linspace(0, 30 * sigma, 3001)
+    left = (values[1] - values[0]) * np.where(np.arange(values.size) == 0, 0.5, 1.0)
+    prior = np.sqrt(2 / np.pi) / lost * np.exp(-((values / lost) ** 2) / 2) * left
+    normal, score = changes.T @ changes, changes.T @ seen
+    first, second = values[:, None], values[None, :]
+    ln_l = (
+        score[0] * first
+        + score[1] * second
+        - (normal[0, 0] * first**2 + 2 * normal[0, 1] * first * second + normal[1, 1] * second**2) / 2
+    )
+    wanted = float(logsumexp(ln_l, b=prior[:, None] * prior[None, :]))
+    likelihood = Likelihood(model)
+    found = likelihood.weigh([[below, above]])
+    assert found.columns == (below,)
+    assert found.log_evidence - likelihood.weigh([]).log_evidence == pytest.approx(wanted, abs=0.3)
+    without = likelihood.weigh([[below]]).log_evidence
+    assert found.log_evidence < without - 0.5, "the second share costs nothing"
 
 
 def test_what_an_error_of_the_first_template_explains_is_credited_less_to_a_second_effect(

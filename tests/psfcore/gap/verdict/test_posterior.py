@@ -1,10 +1,9 @@
-"""The posterior: probabilities of hypotheses, and blocks at a refit."""
+"""The posterior: probabilities of hypotheses."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence, gather
@@ -14,8 +13,6 @@ from psfcore.gap.verdict.posterior import (
     NONE,
     UNKNOWN,
     Names,
-    _with_blocks_of,
-    _with_same_discs,
     kind_of,
     posterior,
     without_idle,
@@ -78,34 +75,3 @@ def test_after_a_failed_refit_a_pair_without_any_weight_counts_to_its_other_effe
     assert without_idle({NONE: 1.0, only: 0.0, pair: 0.0}) == {NONE: 1.0, only: 0.0}
     assert without_idle({NONE: 1.0, pair: 0.0}) == {NONE: 1.0, pair: 0.0}
     assert without_idle({NONE: 0.5, only: 0.1, pair: 0.4}) == {NONE: 0.5, pair: 0.4, only: 0.1}
-
-
-def test_the_blocks_of_a_refit_keep_their_noise_and_lose_the_effect(evidence: Evidence) -> None:
-    """The refit has other blocks and its own order of columns; only the errors of the first model count."""
-    (column,) = evidence.columns["dark_offset"]
-    other = evidence.columns["column_smear"]
-    moved = replace(
-        evidence,
-        effects=evidence.effects[::-1],
-        columns={"column_smear": evidence.columns["dark_offset"] + other[:1], "dark_offset": (other[1],)},
-        unocculted=replace(evidence.unocculted, levels=0.5 * evidence.unocculted.levels),
-    )
-    after = _with_blocks_of(evidence, moved, {"dark_offset": (2.0,)}).unocculted
-    change = evidence.unocculted.errors[column]
-    np.testing.assert_allclose(after.levels, evidence.unocculted.levels - 2.0 * change)
-    np.testing.assert_array_equal(after.errors[other[1]], change)
-    np.testing.assert_array_equal(after.variance, evidence.unocculted.variance)
-
-
-def test_every_refit_is_judged_by_the_same_discs(evidence: Evidence) -> None:
-    """The refit lost the first disc, and could use a disc that the fit before it could not use."""
-    first, *rest = evidence.discs
-    fit = replace(evidence, discs=(first, *rest[:-1]))
-    offset, *_ = evidence.columns["dark_offset"]
-    moved = np.arange(1.0, 1.0 + len(evidence.base))
-    after = _with_same_discs(fit, replace(evidence, discs=tuple(rest)), {"dark_offset": (2.0,)}, moved)
-    assert after.images == fit.images
-    change = moved @ first.jacobian[list(evidence.base)] + 2.0 * first.jacobian[offset]
-    np.testing.assert_allclose(after.discs[0].residual, first.residual - change)
-    np.testing.assert_array_equal(after.discs[0].jacobian, first.jacobian)
-    assert after.discs[1:] == fit.discs[1:]
