@@ -36,6 +36,7 @@ bench: $(DEV)
 	$(BIN)/python -m benchmarks.start_up
 	$(BIN)/python -m benchmarks.quick_calls
 	$(BIN)/python -m benchmarks.deconvolution
+	$(BIN)/python -m benchmarks.roofline
 	$(BIN)/python -m benchmarks.ring_sums --quick
 	$(BIN)/python -m benchmarks.fit
 	$(BIN)/python -m benchmarks.cross_validation
