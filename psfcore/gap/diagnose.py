@@ -9,7 +9,8 @@ The steps, in this order:
 5. Compute the posterior of all hypotheses about the cause, with full refits where the linear model is not exact enough.
 6. Read the verdict off the posterior. The effects that the verdict names are called "the named effects" here
    (`Judgement.answer`, "answer" in the report).
-7. Make full refits with the named effects in the model, at most MOST_REFITS. Each refit is made only once.
+7. Make a full refit with the named effects in the model. Each refit is made only once. If the verdict is a tie, the best of the
+   tied hypotheses is refitted.
 8. Locate the gap, and compute gap and closure on held-out images.
 """
 
@@ -54,7 +55,6 @@ from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_name
 from psfcore.transit.blocks import Fold
 from psfcore.transit.transit import Transit
 
-MOST_REFITS = 3
 SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0
 
 
@@ -79,7 +79,7 @@ class Diagnosis:
     effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear
     fits of all single effects, the most probable first; then of the pairs that are best or decide the verdict. p_value:
     the p-value of the gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by their
-    label. corrected: the full refits with the named effects; the refit with the best effects comes first. residual,
+    label. corrected: the full refits with the named effects that were made; the refit with the best effects comes first. residual,
     residual_after: the residuals of held-out images without and with the best effects. cautions: sentences on
     everything that weakens the result.
     """
@@ -193,9 +193,7 @@ def diagnose_solution(
     )
     fits = _fits(model, found)
     best = next((fit for fit in fits if fit.names == found.best), None)
-    corrected = (
-        refits.of(found.named[:MOST_REFITS]) if refit and found.verdict in ("attributed", "tie") else ()
-    )
+    corrected = refits.of(found.named) if refit and found.verdict in ("attributed", "tie") else ()
     rng = np.random.default_rng(seed)
     shrinking, before, after = _shrinking(model, found, fits, refits.made, rng)
     nothing = Interval(0.0, 0.0, 0.0)

@@ -49,9 +49,13 @@ class Refits:
         return tuple(fit for fit in self._made.values() if fit is not None)
 
     def of(self, hypotheses: Sequence[Names]) -> tuple[Corrected, ...]:
-        """The refits of these hypotheses, in this order. Failed refits are left out."""
-        fits = (self._fit(names) for names in hypotheses)
-        return tuple(fit for fit in fits if fit is not None)
+        """The refits of these hypotheses, in this order: of the first one whose refit succeeds, and of those after it that
+        were refitted before. Only the first refit is made for this purpose, because each takes as long as the fit."""
+        found: list[Corrected] = []
+        for names in hypotheses:
+            fit = self._made.get(names) if found else self._fit(names)
+            found += [] if fit is None else [fit]
+        return tuple(found)
 
     @property
     def departures(self) -> dict[Names, float]:

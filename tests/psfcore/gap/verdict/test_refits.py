@@ -46,14 +46,16 @@ def test_a_refit_weighs_its_effect_all_pairs_with_it_and_the_triples_of_the_best
     assert next(iter(without_idle(settled.probabilities()))) == OFFSET
 
 
-def test_a_refit_is_made_once(made: Refits, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refit_is_made_once_and_rivals_are_not_refitted_for_the_report(
+    made: Refits, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (fit,) = made.of([OFFSET])
 
     def again(*given: Any, **named: Any) -> None:
         raise AssertionError("a refit was repeated")
 
     monkeypatch.setattr(refitting, "add_to_model", again)
-    assert made.of([OFFSET]) == (fit,) and made.made == (fit,)
+    assert made.of([OFFSET, ("dark_offset", "core_blur")]) == (fit,) and made.made == (fit,)
     assert made.failures == []
 
 
