@@ -87,8 +87,9 @@ class Directions:
 class Weighed:
     """A hypothesis after its fit.
 
-    log_evidence: ln E of Eq. (3), up to a constant that all hypotheses of one model share; minus infinity if no parameter can
-    act. columns: the columns of the parameters that act, without the coordinates of the PSF. values: their best values.
+    log_evidence: ln E of Eq. (3), up to a constant that all hypotheses of one model share; minus infinity if one of several
+    effects has no parameter with a best value above 0. columns: the columns of the parameters that act, without the coordinates
+    of the PSF. values: their best values.
     visible_error: the chi2 that a relative error USUAL_ERROR of the template would add in all data. It counts only
     the part of the template that was not subtracted. If it is above `settled.VISIBLE`, the first order is not accurate
     enough.
@@ -204,7 +205,7 @@ class Likelihood:
                 at_zero.append(gone)
                 theta = np.delete(after, len(self._base) + columns.index(gone))
                 groups = [[c for c in group if c != gone] for group in groups]
-                if not all(groups):
+                if not all(groups) and len(groups) > 1:  # the other effects alone are another hypothesis
                     return Weighed(-math.inf, (), np.zeros(0), 0.0)
                 continue
             settled = np.allclose(after, theta, rtol=SETTLED)
@@ -323,7 +324,7 @@ class Likelihood:
         whole = theta + np.append(np.zeros(base), taken)
         positive = self._positive[columns]
         found = []
-        for scale in SCALES if columns else (1.0,):
+        for scale in SCALES if columns or at_zero else (1.0,):
             # Around theta, ln L is quadratic with the matrix N; with this prior its maximum is a step away.
             prior = self._prior(columns, scale)
             inverse = scaled_inverse(normal + np.diag(prior), weakest=WEAKEST)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 from scipy.linalg import block_diag, null_space
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
@@ -57,11 +58,27 @@ def test_the_evidence_is_the_gaussian_integral(evidence: Evidence, monkeypatch: 
     assert gain(noisy, "dark_offset") == pytest.approx(wanted, abs=1e-3)
 
 
-def test_a_parameter_that_cannot_be_negative_excludes_a_loss_of_light(evidence: Evidence) -> None:
+def test_an_effect_that_can_only_add_light_explains_no_loss_of_light(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its best strength is 0. Its evidence is the integral over all strengths, so that a weak effect is not excluded."""
+    monkeypatch.setattr(likelihoods, "SCALES", (1.0,))
     sigma = sigma_of(evidence, "column_smear")
     columns = [list(evidence.columns["column_smear"])[:1]]
-    lost = Likelihood(with_residuals(evidence, {"column_smear": -8 * sigma})).weigh(columns)
-    assert lost.log_evidence == -math.inf and lost.columns == ()
+    offset = list(evidence.columns["dark_offset"])
+    width = next(p for e in evidence.effects if e.name == "column_smear" for p in e.parameters).likely
+    strengths = np.linspace(0, 20 * width, 20001)
+    prior = np.sqrt(2 / np.pi) / width * np.exp(-((strengths / width) ** 2) / 2)
+    for lost in (-8 * sigma, -0.5 * sigma):
+        model = replace(with_residuals(evidence, {"column_smear": lost}), scale_error=EXACT)
+        likelihood = Likelihood(model)
+        found = likelihood.weigh(columns)
+        assert found.columns == ()
+        seen = np.exp(((lost / sigma) ** 2 - ((strengths - lost) / sigma) ** 2) / 2)
+        wanted = math.log(trapezoid(prior * seen, strengths))
+        assert found.log_evidence - likelihood.weigh([]).log_evidence == pytest.approx(wanted, abs=0.02)
+        assert wanted < -0.5
+        assert likelihood.weigh([offset, *columns]).log_evidence == -math.inf  # the same as the offset alone
     added = Likelihood(with_residuals(evidence, {"column_smear": 8 * sigma})).weigh(columns)
     assert added.values[0] == pytest.approx(8 * sigma, rel=0.2)
 
