@@ -13,6 +13,7 @@ from typing import Any
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import load_instrument
+from psfcore.instruments.without_file import Telescope, telescope_without_file
 from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
 
 WAYS = (
@@ -29,15 +30,9 @@ WAYS = (
     {
         "way": "fit",
         "text": "fit the scatter to a transit of this telescope (images in which the Moon or a planet covers a part of "
-        "the Sun): `heliopsf psf fit TRANSIT`",
+        "the Sun): `heliopsf psf fit TRANSIT`. If heliopsf has no instrument file for it, the key "
+        "known_psf of transit.json must name its diffraction PSF (docs/transits.md)",
     },
-)
-# Publications that help with telescopes without an instrument file (docs/instruments.md). Each entry: a word of the
-# cards TELESCOP, INSTRUME or DETECTOR, the step ("way") with which the publication helps, and a sentence.
-PUBLISHED = (
-    ("xrt", "upload", "SolarSoft has PSFs of XRT as FITS files (hinode/xrt/idl/util/XRT*.PSF560.fits)"),
-    ("trace", "fit", "DeForest et al. (2009) used the transit of Venus of 2004 for TRACE 171"),
-    ("euvi", "fit", "Shearer et al. (2012) used the transit of the Moon of 2007 for EUVI-B"),
 )
 _NAMES = {"telescope": "telescope", "channel": "channel", "plate_scale": "pixel scale"}
 
@@ -58,42 +53,62 @@ def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str
 def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, Any]] = ()) -> DataError:
     """The error "no-psf-for-instrument" for an image with this header summary (`psfcore.fits.header.HeaderSummary` as a table).
 
-    Its fields: `image` is the name of the telescope. `instruments` are the instruments whose PSF can be built, sorted
-    by how well they agree with the image. `psfs` are the given PSFs, which could fit. `ways` are the steps that the
+    Its fields: `image` is the name of the telescope. `reason` says why heliopsf has no instrument file for a telescope that
+    it recognises; it is None for other telescopes. `instruments` are the instruments whose PSF can be built, sorted by
+    how well they agree with the image. `psfs` are the given PSFs, which could fit. `ways` are the steps that the
     user can take next. For an instrument, `same` names the properties that agree with the image; `told` also says which
     properties differ.
     """
+    telescope = telescope_without_file(header)
     named = " ".join(str(header[key]) for key in ("telescop", "instrume", "detector") if header[key])
-    channel = channel_of(None, header["wavelnth"])
-    seen = f"'{named or 'an unnamed instrument'}'" + (f" at {channel} angstrom" if channel else "")
     instruments = [_instrument(name, header) for name in instrument_names()]
     instruments.sort(key=lambda one: (-len(one["same"]), one["wavelength_angstrom"]))
     could = [f"PSF {psf['id']} ({psf['name']})" for psf in psfs] + [
         f"instrument {one['name']}" for one in instruments if {"telescope", "channel"} <= set(one["same"])
     ]
+    candidates = (
+        f"These could suit the image: {', '.join(could)}" if could else "No known PSF suits the image"
+    )
     return DataError(
         "no-psf-for-instrument",
-        f"expected an image of an instrument whose PSF is known, or a PSF in the request; got an image of {seen} and no "
-        f"PSF. Could fit: {', '.join(could) or 'none that is known here'}. Name a PSF (psf in Python, psf_id in a request, --psf in a command), upload a PSF or an "
-        "instrument file, or fit a PSF to a transit",
+        "expected an image of an instrument whose PSF is known, or a PSF in the request; got an image of "
+        f"{_seen(named, telescope, header)} and no PSF. {_why(telescope)}"
+        f"{candidates}. Name a PSF (psf in Python, psf_id in a request, --psf in a command), upload a PSF or an instrument "
+        "file, or fit a PSF to a transit",
         {
-            "image": named or "this telescope",
+            "image": telescope.name if telescope else named or "this telescope",
+            "reason": telescope.reason if telescope else None,
             "instruments": instruments,
             "psfs": list(psfs),
-            "ways": _ways(header),
+            "ways": _ways(telescope),
         },
     )
 
 
-def _ways(header: Mapping[str, Any]) -> list[dict[str, str]]:
-    """The steps that the user can take next.
+def _seen(named: str, telescope: Telescope | None, header: Mapping[str, Any]) -> str:
+    """The telescope and the channel of an image, for a message. named: the words of its header cards."""
+    channel = channel_of(None, header["wavelnth"])
+    cards = f"'{named or 'an unnamed instrument'}'"
+    return (f"{telescope.name} ({cards})" if telescope else cards) + (
+        f" at {channel} angstrom" if channel else ""
+    )
 
-    If a publication helps with a step for this telescope, the text of the step names the publication.
-    """
-    seen = _words_of(header)
-    published = {way: sentence for word, way, sentence in PUBLISHED if word in seen}
+
+def _why(telescope: Telescope | None) -> str:
+    """The reason why a recognised telescope has no instrument file, and the recommended step; with a blank at the end."""
+    if telescope is None:
+        return ""
+    recommended = next(iter(telescope.ways.values()), None)
+    return f"heliopsf has no instrument file for it: {telescope.reason}. " + (
+        f"{recommended}. " if recommended else ""
+    )
+
+
+def _ways(telescope: Telescope | None) -> list[dict[str, str]]:
+    """The steps that the user can take next, each with what is known about this telescope."""
+    known = {} if telescope is None else {str(way): sentence for way, sentence in telescope.ways.items()}
     return [
-        one | {"text": f"{one['text']}. {published[one['way']]}"} if one["way"] in published else dict(one)
+        one | {"text": f"{one['text']}. {known[one['way']]}"} if one["way"] in known else dict(one)
         for one in WAYS
     ]
 

@@ -20,18 +20,60 @@ def real(shared: Path, name: str) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_an_image_of_hri_euv_needs_no_option(shared: Path) -> None:
-    image = sunpy.map.Map(real(shared, "eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"))
+@pytest.mark.parametrize(
+    ("name", "instrument", "kept"),
+    [
+        ("eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits", "hri_euv", 0.01),
+        ("aia/aia_171_cutout_20130310.fits", "aia_171", 0.03),
+    ],
+)
+def test_an_image_of_a_known_telescope_needs_no_option(
+    shared: Path, name: str, instrument: str, kept: float
+) -> None:
+    """kept: relative change of the sum of all pixels; a cut-out exchanges light with the Sun beyond its edges."""
+    image = sunpy.map.Map(real(shared, name))
     sharp = heliopsf.deconvolve(image)
-    assert type(sharp) is type(image) and sharp.meta["psfname"] == "hri_euv"
+    assert type(sharp) is type(image) and sharp.meta["psfname"] == instrument
     assert sharp.wcs.wcs.compare(image.wcs.wcs)
-    assert sharp.data.sum() == pytest.approx(image.data.sum(), rel=0.01)
+    assert sharp.data.sum() == pytest.approx(image.data.sum(), rel=kept)
     assert np.percentile(sharp.data, 99) > np.percentile(image.data, 99)
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
-    "name", ["occultation/L1_XRT20120605_215839.9.fits", "other/trace_19980519_222143_171.fits.gz"]
+    ("name", "telescope", "step"),
+    [
+        ("occultation/L1_XRT20120605_215839.9.fits", "Hinode/XRT", "PSF560.fits"),
+        ("other/trace_19980519_222143_171.fits.gz", "TRACE", "transit of Venus of 2004"),
+        ("other/swap_lv1_20110607_063329.fits.gz", "PROBA2/SWAP", "arXiv:1309.1345"),
+        ("eui/solo_L2_eui-fsi174-image_20240109T200055237_V01.fits", "EUI/FSI", "hri_euv.toml"),
+        ("occultation/AIA1600_venus_20120606_040731_UTC.0041.fits", "SDO/AIA", "Venus of 2012"),
+    ],
+)
+def test_an_image_of_a_telescope_without_a_file_is_refused_with_a_way_out(
+    shared: Path, name: str, telescope: str, step: str
+) -> None:
+    with pytest.raises(heliopsf.DataError) as caught:
+        heliopsf.deconvolve(sunpy.map.Map(real(shared, name)))
+    assert caught.value.code == "no-psf-for-instrument" and caught.value.fields["image"] == telescope
+    for said in (
+        f"got an image of {telescope} (",
+        "heliopsf has no instrument file for it",
+        step,
+        "psf in Python",
+    ):
+        assert said in caught.value.message
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "occultation/L1_XRT20120605_215839.9.fits",
+        "other/trace_19980519_222143_171.fits.gz",
+        pytest.param("other/swap_lv1_20110607_063329.fits.gz", marks=pytest.mark.slow),
+        pytest.param("eui/solo_L2_eui-fsi174-image_20240109T200055237_V01.fits", marks=pytest.mark.slow),
+    ],
 )
 def test_an_image_goes_in_and_out_with_a_given_psf(shared: Path, name: str) -> None:
     image = sunpy.map.Map(real(shared, name))

@@ -52,7 +52,8 @@ def checked(api: TestClient, image_id: str, **options: str) -> list[str]:
 def test_an_image_without_a_psf_is_told_so(api: TestClient, tmp_path: Path) -> None:
     xrt = image(api, tmp_path, **XRT)
     assert checked(api, xrt) == [
-        "No PSF for HINODE XRT is known here. Upload one below, or fit one to a transit."
+        "No PSF for Hinode/XRT is known here. heliopsf has no instrument file for it: an instrument file describes pupils "
+        "and meshes, but not mirrors that reflect X-rays at grazing incidence. Upload a PSF below, or fit one to a transit."
     ]
     page = api.get(f"/images/{xrt}").text
     assert "none: choose a PSF" in page and "chosen for this image" not in page

@@ -38,7 +38,7 @@ def test_an_image_without_a_psf_says_what_to_do_and_goes_on_with_one(
     page.get_by_role("button", name="Upload").click()
     expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
     expect(page.locator("#checked")).to_have_text(
-        "No PSF for TEST is known here. Upload one below, or fit one to a transit."
+        "No PSF for TEST is known here. Upload a PSF below, or fit one to a transit."
     )
     start = page.locator("#go")
     expect(start).to_have_text("Check and start")

@@ -1,0 +1,105 @@
+"""Telescopes without an instrument file are recognised by the headers of their archives, and the error says what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sunpy.data.test
+from astropy.io.fits import Header
+
+from psfcore.errors import DataError
+from psfcore.fits.header import seen_by
+from psfcore.instruments.unknown import WAYS, unknown_instrument
+from psfcore.instruments.without_file import TELESCOPES, telescope_without_file
+
+SAMPLES = Path(sunpy.data.test.__file__).parent
+SUVI = "GOES-R Series Solar Ultraviolet Imager"
+
+# The cards of real headers: those of sunpy's tests, and others whose cards differ.
+HEADERS: list[tuple[str, dict[str, Any]]] = [
+    ("TRACE", {"TELESCOP": "TRACE", "INSTRUME": "TRACE", "WAVE_LEN": "171", "CDELT1": 0.5}),
+    ("TRACE", {"TELESCOP": "TRACE   ", "WAVE_LEN": "WL"}),
+    ("STEREO/EUVI", {"OBSRVTRY": "STEREO_A", "INSTRUME": "SECCHI", "DETECTOR": "EUVI", "WAVELNTH": 171}),
+    ("STEREO/EUVI", {"OBSRVTRY": "STEREO_B", "INSTRUME": "SECCHI", "DETECTOR": "EUVI", "WAVELNTH": 284}),
+    ("PROBA2/SWAP", {"TELESCOP": "PROBA2", "INSTRUME": "SWAP", "DETECTOR": "SWAP", "WAVELNTH": 174}),
+    ("PROBA2/SWAP", {"TELESCOP": "PROBA2", "INSTRUME": "SWAP", "DETECTOR": "CMOS 1Kx1K", "WAVELNTH": 174}),
+    ("GOES/SUVI", {"TELESCOP": "GOES-R", "INSTRUME": SUVI, "DETECTOR": "SUVI", "WAVELNTH": 195}),
+    ("GOES/SUVI", {"TELESCOP": "G16", "INSTRUME": SUVI, "WAVELNTH": 93.9, "WAVEUNIT": "angstrom"}),
+    ("Hinode/XRT", {"TELESCOP": "HINODE", "INSTRUME": "XRT", "EC_FW1_": "Open", "EC_FW2_": "Ti_poly"}),
+    ("Hinode/XRT", {"TELESCOP": "HINODE", "INSTRUME": "XRT", "EC_FW1_": "Be_thin", "EC_FW2_": "Open"}),
+    ("EUI/FSI", {"TELESCOP": "SOLO/EUI/FSI", "INSTRUME": "EUI", "DETECTOR": "FSI", "WAVELNTH": 174}),
+    ("EUI/FSI", {"TELESCOP": "SOLO/EUI/FSI", "INSTRUME": "EUI", "DETECTOR": "FSI", "WAVELNTH": 304}),
+    ("EUI/HRI_LYA", {"TELESCOP": "SOLO/EUI/HRI_LYA", "INSTRUME": "EUI", "DETECTOR": "HRI_LYA"}),
+    ("SDO/AIA", {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 1600, "WAVEUNIT": "angstrom"}),
+    ("SDO/AIA", {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 170, "WAVEUNIT": "nm"}),
+]
+OTHERS: list[dict[str, Any]] = [
+    {},
+    {"TELESCOP": "SWIFT", "INSTRUME": "XRT"},
+    {"TELESCOP": "HINODE", "INSTRUME": "SOT/WB"},
+    {"INSTRUME": "SECCHI", "DETECTOR": "COR1"},
+    {"TELESCOP": "SDO/HMI", "INSTRUME": "HMI_SIDE1", "WAVELNTH": 6173.0},
+    {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171},
+    {"TELESCOP": "SOLO/EUI/HRI_EUV", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174},
+]
+SUNPY = {
+    "tsi20010130_025823_a2.header": "TRACE",
+    "euvi_20090615_000900_n4euA_s.header": "STEREO/EUVI",
+    "swap_lv1_20140606_000113.header": "PROBA2/SWAP",
+    "dr_suvi-l2-ci195_g16_s20190403T093200Z_e20190403T093600Z_v1-0-0_rebinned.header": "GOES/SUVI",
+    "HinodeXRT.header": "Hinode/XRT",
+    "solo_L1_eui-fsi304-image_20201021T145510206_V03.header": "EUI/FSI",
+}
+
+
+def refusal(header: Header) -> DataError:
+    seen = seen_by(header)
+    assert seen["instrument"] is None
+    return unknown_instrument(seen)
+
+
+@pytest.mark.parametrize(("name", "cards"), HEADERS)
+def test_the_error_names_the_telescope_the_reason_and_the_step(name: str, cards: dict[str, Any]) -> None:
+    error = refusal(Header(cards))
+    telescope = next(one for one in TELESCOPES if one.name == name)
+    assert (error.fields["image"], error.fields["reason"]) == (name, telescope.reason)
+    assert f"got an image of {name} (" in error.message and telescope.reason in error.message
+    texts = {one["way"]: one["text"] for one in error.fields["ways"]}
+    assert list(texts) == ["name", "upload", "fit"]
+    for way, sentence in telescope.ways.items():
+        assert texts[way].endswith(sentence)
+    for recommended in list(telescope.ways.values())[:1]:
+        assert recommended in error.message
+
+
+@pytest.mark.parametrize("cards", OTHERS)
+def test_other_telescopes_are_not_taken_for_these(cards: dict[str, Any]) -> None:
+    seen = seen_by(Header(cards))
+    assert telescope_without_file(seen) is None
+    error = unknown_instrument(seen)
+    assert error.fields["reason"] is None and error.fields["ways"] == list(WAYS)
+
+
+@pytest.mark.parametrize("file", SUNPY)
+def test_the_sample_headers_of_sunpy_are_recognised(file: str) -> None:
+    path = SAMPLES / file
+    if not path.is_file():
+        pytest.skip(f"this version of sunpy has no {file}")
+    assert refusal(Header.fromtextfile(path)).fields["image"] == SUNPY[file]
+
+
+def test_the_documentation_lists_every_telescope() -> None:
+    table = (Path(__file__).parents[3] / "docs" / "instruments.md").read_text("utf-8")
+    for telescope in TELESCOPES:
+        assert f"\n| {telescope.name}" in table, telescope.name
+
+
+def test_sentences_can_be_put_together() -> None:
+    """A sentence of a step follows a full stop; a reason follows a colon. The error adds the full stop of both."""
+    for telescope in TELESCOPES:
+        assert telescope.reason[0].islower() or telescope.reason.startswith("Hofmeister")
+        for text in (telescope.reason, *telescope.ways.values()):
+            assert not text.endswith(".")
+        assert all(sentence[0].isupper() for sentence in telescope.ways.values())
