@@ -16,7 +16,7 @@ from service.api.lineage import get_psf_lineage, rerun_psf
 from service.api.psfs.affected import list_affected_by_psf
 from service.api.psfs.curves import get_cutout, tables_of
 from service.api.psfs.status import StatusChange, change_psf_status, get_psf_status
-from service.api.psfs.versions import PsfView, delete_psf, get_psf
+from service.api.psfs.versions import delete_psf, get_psf
 from service.http import downloads
 from service.http.callers import Caller
 from service.http.paging import Cursor
@@ -27,6 +27,7 @@ from service.pages.parts.plots import Plot, Series, around, light_beyond_plot, s
 from service.pages.parts.readings import fit_parameters, fit_plots
 from service.pages.rendering import number, page
 from service.pages.visitors import PageCertifying, PageReading, PageSubmitting
+from service.views.psfs import PsfView
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
