@@ -24,6 +24,9 @@ class PsfView(BaseModel):
         description="`total`, a component's name such as `diffraction`, or `uploaded` if the kind is unknown"
     )
     status: PsfStatus
+    was_certified: bool = Field(
+        description="whether the PSF is or was certified; if not, it has no range of observation times"
+    )
     valid_from: str | None = Field(
         description="start of the range of observation times; null: no lower limit, or never certified"
     )
@@ -53,6 +56,8 @@ class PsfView(BaseModel):
             channel=row.channel,
             kind=row.kind,
             status=PsfStatus(row.status),
+            # An interpolated PSF may be deprecated together with one of its ends, without having been certified.
+            was_certified=row.status == PsfStatus.CERTIFIED or row.valid_from is not None,
             valid_from=None if row.valid_from is None else iso(row.valid_from),
             valid_to=None if row.valid_to is None else iso(row.valid_to),
             successor=row.successor_id,
