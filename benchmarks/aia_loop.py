@@ -46,7 +46,7 @@ HEADING = "## Time and memory of a whole image"
 SECTION = """{heading}
 
 `python -m benchmarks.aia_loop`: a simulated image of the whole Sun, {size} x {size} px, and a PSF of the same size, {steps} Richardson-Lucy
-steps on {cores} cores. The loops run in turn, {rounds} times each; a time is the minimum, and a ratio is the median of the rounds. 1 F
+steps on {cores} cores. The loops run in turn; rounds: {rounds}. A time is the minimum, and a ratio is the median of the rounds. 1 F
 is the time of one Fourier transform of this size and its inverse (`rfft2` and `irfft2` of SciPy, float32, two workers), measured before each run: here {f}.
 The times contain the transform of the PSF, but not the compilation of the loops. The deviation is the largest one of a pixel within the
 inner 1600 x 1600 px, from the result of heliopsf.
@@ -56,7 +56,7 @@ inner 1600 x 1600 px, from the result of heliopsf.
 {rows}
 
 aiapy continues the image periodically. heliopsf convolves linearly, so that light does not come back at the opposite edge, and needs a
-larger plane for this. The deviation is this difference.
+larger plane for this. On a padded image the loops of both agree better (the table above).
 """
 
 
