@@ -44,13 +44,15 @@ bench: $(DEV)
 	$(BIN)/python -m benchmarks.viewer
 
 # Other programs in their own environment, timed in turn with heliopsf on the same data. The second command writes
-# docs/aia.md, the PSFs of AIA beside those of aiapy, if there is an image (level 1 at 171 angstrom).
+# docs/aia.md, the PSFs of AIA beside those of aiapy, if there is an image (level 1 at 171 angstrom). The third one adds
+# the times of a 4096 px image to this page.
 AIA_IMAGE ?= $(or $(HELIOPSF_SHARED),../shared)/data/real/aia/aia_171_cutout_20130310.fits
 bench-peers: $(DEV)
 	test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
-	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt numpy scipy 'scikit-image>=0.24' 'aiapy>=0.9'
+	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt numpy scipy 'scikit-image>=0.24' 'aiapy>=0.9' 'jax>=0.4'
 	$(BIN)/python -m benchmarks.peers .venv-peers/bin/python
 	$(BIN)/python -m benchmarks.aia .venv-peers/bin/python "$(AIA_IMAGE)" docs/aia.md
+	$(BIN)/python -m benchmarks.aia_loop .venv-peers/bin/python --rounds 3 --page docs/aia.md
 
 # Runs jobs while workers, Redis, PostgreSQL and the service are killed at random. Needs Redis and PostgreSQL.
 chaos: $(DEV)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ from heliopsf.machine import cores
 from heliopsf.progress import Told, told
 from psfcore.built.cache import sha256_of_file
 from psfcore.built.recipe import Recipe
-from psfcore.errors import DataError, module_of_extra
+from psfcore.errors import module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.mask_file import read_mask_image
@@ -22,6 +22,7 @@ from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
 from psfcore.psf_sampling import rebinned
 from psfcore.scatter.interpolation import Epoch, interpolated_psf
+from psfcore.scatter.utc_time import utc_time
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -154,28 +155,17 @@ def interpolate_psf(
     "psf-not-of-its-shape", "epochs-not-in-order", "time-outside-epochs", and the errors of ``read_psf``.
     """
     first, second = (
-        Epoch(one if isinstance(one, CorePsf) else read_psf(one), _time(at, name))
+        Epoch(one if isinstance(one, CorePsf) else read_psf(one), utc_time(at, name))
         for one, at, name in ((before, before_time, "before_time"), (after, after_time, "after_time"))
     )
     return Psf.of(
         interpolated_psf(
             first,
             second,
-            _time(time, "time"),
+            utc_time(time, "time"),
             name=f"{first.psf.instrument or 'psf'}-interpolated",
             version="0.1.0",
             provenance={},
             threads=threads or cores(),
         )
     )
-
-
-def _time(given: datetime | str, name: str) -> datetime:
-    """A time with a zone. Raises DataError "bad-time"."""
-    try:
-        at = given if isinstance(given, datetime) else datetime.fromisoformat(given)
-    except (TypeError, ValueError) as error:
-        raise DataError(
-            "bad-time", f"{name}: expected a time such as 2024-03-01T12:00:00, got {ascii(given)[:60]}"
-        ) from error
-    return at if at.tzinfo else at.replace(tzinfo=UTC)

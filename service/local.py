@@ -25,15 +25,15 @@ from psfcore.fits.weights import check_is_psf
 from psfcore.tables import lookup
 from psfcore.transit.archive import ArchiveLimits, list_archive
 from psfcore.transit.in_place import FolderTransit, transit_in
-from service.api.jobs import JobView
-from service.api.products import ProductView
-from service.api.psfs.versions import PsfView
-from service.api.reports import ReportView
-from service.api.transits import TransitDetails
 from service.client.errors import ServiceError
 from service.client.operations import Operations
 from service.client.outputs import written
 from service.client.versions import Progress
+from service.views.jobs import JobView
+from service.views.products import ProductView
+from service.views.psfs import PsfView
+from service.views.reports import ReportView
+from service.views.transits import TransitDetails
 from workers.cache_folder import psf_cache
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
@@ -136,14 +136,15 @@ def _check(seen: _Seen) -> None:
 class LocalService(Operations):
     """The requests to a service, which are executed in this process."""
 
-    def __init__(self, settings: Settings, cache: PsfCache | None = None) -> None:
-        """cache: keeps built PSFs for later commands; None: built PSFs are not kept."""
+    def __init__(self, settings: Settings, cache: PsfCache | None = None, *, previews: bool = True) -> None:
+        """cache: keeps built PSFs for later commands; None: built PSFs are not kept. previews: False if the caller
+        downloads no preview of a product, so that none is drawn."""
         self._settings = settings
         self._recipes: dict[str, list[PsfBuild]] = {}  # recipes of the PSFs that a job may build, by its id
         self._store = LocalStore(settings.data_dir)
         self._catalogue = Catalogue(settings.catalogue_url)
-        self._catalogue.upgrade()
-        self._runner = Runner(settings, self._catalogue, self._store)
+        self._catalogue.schema.create()
+        self._runner = Runner(settings, self._catalogue, self._store, previews=previews)
         self._built = (
             None
             if cache is None
@@ -354,13 +355,15 @@ def _says_more(record: logging.LogRecord) -> bool:
 
 
 @contextmanager
-def local_service(*, gap_effects: str = "") -> Iterator[LocalService]:
+def local_service(*, gap_effects: str = "", previews: bool = True) -> Iterator[LocalService]:
     """A local service on a temporary folder, with the user's cache of built PSFs.
 
     gap_effects: files and modules that add effects to the library, as in the setting HELIOPSF_GAP_EFFECTS.
+    previews: see ``LocalService``.
     """
     with TemporaryDirectory(prefix="heliopsf-") as folder:
-        service = LocalService(Settings.apart(Path(folder), gap_effects=gap_effects), psf_cache())
+        settings = Settings.apart(Path(folder), gap_effects=gap_effects)
+        service = LocalService(settings, psf_cache(), previews=previews)
         jobs = logging.getLogger(runner.__name__)
         jobs.addFilter(_says_more)
         try:

@@ -54,8 +54,11 @@ _ANGSTROM_PER_UNIT = {
 IMAGE, PRODUCT, PSF = "image", "product", "psf"
 # The cards that are compared to find out whether a PSF and an image fit together.
 ORIGIN_CARDS = ("TELESCOP", "INSTRUME", "DETECTOR", "FILTER")
+# Names of filters. XRT has two filter wheels and one of the last two cards for each; the others have FILTER.
+FILTER_CARDS = ("FILTER", "EC_FW1_", "EC_FW2_")
 _FIT_CARDS = (
     *ORIGIN_CARDS,
+    *FILTER_CARDS[1:],
     *("WAVELNTH", "WAVEUNIT", "CDELT1", "CDELT2", "CUNIT1", "CUNIT2", "CD1_1", "CD1_2", "CD2_1", "CD2_2"),
     *("GAINCOMB", "PSFNAME"),
 )
@@ -222,7 +225,7 @@ def wavelength_angstrom(header: Cards) -> float | None:
 def known_instrument(header: Cards) -> str | None:
     """Name of the shipped instrument whose table [match] agrees with this header; None if there is none."""
     cards: dict[str, object] = {
-        key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR", "FILTER")
+        key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR", *FILTER_CARDS)
     }
     cards |= {"WAVELNTH": wavelength_angstrom(header), "CDELT1": plate_scale_arcsec(header)}
     return match_instrument(cards)

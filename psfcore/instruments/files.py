@@ -39,7 +39,7 @@ def match_instrument(cards: Mapping[str, object]) -> str | None:
 
     Several instruments may match: the file of a variant of an instrument, for one filter or plate scale, has the cards of
     the instrument and further ones. The instrument with the most cards is chosen; of several, the first by name.
-    cards: TELESCOP, INSTRUME, DETECTOR and FILTER as texts, WAVELNTH in angstrom, CDELT1 in arcsec/px.
+    cards: TELESCOP, INSTRUME, DETECTOR, FILTER, EC_FW1_ and EC_FW2_ as texts, WAVELNTH in angstrom, CDELT1 in arcsec/px.
     `psfcore.fits.header.known_instrument` reads them from a header.
     """
     best, most = None, 0

@@ -35,7 +35,7 @@ MOST_KEYS = 64
 Windows = Annotated[int, Limit(ge=1, le=MOST_WINDOWS)]
 Name = Annotated[str, Limit(max_length=80)]
 Share = Annotated[float, Limit(gt=0, lt=1)]
-MatchKey = Literal["TELESCOP", "INSTRUME", "DETECTOR", "FILTER", "WAVELNTH", "CDELT1"]
+MatchKey = Literal["TELESCOP", "INSTRUME", "DETECTOR", "FILTER", "EC_FW1_", "EC_FW2_", "WAVELNTH", "CDELT1"]
 _NUMBERS = ("WAVELNTH", "CDELT1")
 
 

@@ -25,11 +25,12 @@ from starlette.types import Receive, Scope, Send
 
 from service.api.bulk import BulkId, BulkView
 from service.api.bulk import find as find_bulk
-from service.api.jobs import JobId, JobView
+from service.api.jobs import JobId
 from service.api.jobs import find as find_job
 from service.http.callers import Caller, Reading, still_let_in
 from service.http.problems import RESPONSES
 from service.http.state import Shared
+from service.views.jobs import JobView
 from workers.contract.bulk import BULK_ENDED, BulkPhase
 from workers.contract.phases import Phase
 

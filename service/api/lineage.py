@@ -7,10 +7,11 @@ from typing import Literal
 from fastapi import APIRouter, Response
 
 from psfcore.errors import DataError
-from service.api.jobs import JobView, submit_job
+from service.api.jobs import submit_job
 from service.http.callers import Reading, Submitting
 from service.http.problems import RESPONSES, problem
 from service.http.state import Shared
+from service.views.jobs import JobView
 from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.kinds import KINDS
 from workers.contract.requests import Identity, Rerun

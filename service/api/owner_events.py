@@ -24,10 +24,10 @@ from pydantic import BaseModel, StringConstraints
 
 from service.api.bulk import BulkView
 from service.api.events import TYPE, Said, stream
-from service.api.jobs import JobView
 from service.http.callers import Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
+from service.views.jobs import JobView
 from workers.catalogue.followed.rows import MOST, Followable, Followed, Place, State
 
 # Rows that ended up to this number of seconds before the last look are read again: they may have been committed late,

@@ -140,8 +140,13 @@ def remote(server: str | None) -> Client:
 
 
 @contextmanager
-def connection(server: str | None, local: bool, *, gap_effects: str = "") -> Iterator[Operations]:
-    """A service over HTTP, or with ``local`` a service in this process. gap_effects: further effects of the local service."""
+def connection(
+    server: str | None, local: bool, *, gap_effects: str = "", previews: bool = True
+) -> Iterator[Operations]:
+    """A service over HTTP, or with ``local`` a service in this process.
+
+    gap_effects: further effects of the local service. previews: False if the command downloads no preview of a product.
+    """
     if not local:
         with remote(server) as service:
             service.health()
@@ -149,7 +154,7 @@ def connection(server: str | None, local: bool, *, gap_effects: str = "") -> Ite
         return
     from service.local import local_service
 
-    with local_service(gap_effects=gap_effects) as here:
+    with local_service(gap_effects=gap_effects, previews=previews) as here:
         yield here
 
 

@@ -125,7 +125,11 @@ def deconvolve(
             check_output_folder(output.path)
         else:
             check_outputs((output.path, plot, changes), inputs=[*files, *psf_files], overwrite=overwrite)
-    with user_errors(), connection(server, local) as service, progress_bar() as report:
+    with (
+        user_errors(),
+        connection(server, local, previews=plot is not None) as service,
+        progress_bar() as report,
+    ):
         parameters["psf_id"] = named_psf(service, psf)
         if not into_folder:
             lines = _one(service, files[0], output.path, plot, changes, report, parameters)

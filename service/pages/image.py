@@ -11,7 +11,6 @@ from fastapi.responses import JSONResponse, RedirectResponse
 
 from service.api.estimates import ChosenPsf, EstimateView, estimate_job
 from service.api.jobs import submit_job
-from service.api.products import ProductView
 from service.http.callers import Caller
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -21,6 +20,7 @@ from service.pages.parts.forms import Sent, fields, text, wanted_job
 from service.pages.parts.sentences import of_problem
 from service.pages.rendering import duration, page
 from service.pages.visitors import PageReading, PageSubmitting
+from service.views.products import ProductView
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.phases import Phase

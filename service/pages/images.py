@@ -14,14 +14,14 @@ from fastapi.responses import RedirectResponse
 
 from psfcore.fits.header import read_summary
 from service.api.images import ImageView, upload_image
-from service.api.jobs import JobView
-from service.api.products import ProductView
 from service.http.callers import Caller
 from service.http.quotas import Allowed
 from service.http.state import Shared, State
 from service.pages.jobs import job_lines
 from service.pages.rendering import page, short
 from service.pages.visitors import PageReading, PageSubmitting
+from service.views.jobs import JobView
+from service.views.products import ProductView
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow
 from workers.intake.no_psf import buildable
 from workers.intake.uploads import image_row

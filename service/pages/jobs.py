@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from pydantic import BaseModel
 
-from service.api.jobs import JobId, JobView, cancel_job, get_job, list_jobs
+from service.api.jobs import JobId, cancel_job, get_job, list_jobs
 from service.http.callers import Caller
 from service.http.paging import Cursor
 from service.http.state import Shared, State
@@ -18,6 +18,7 @@ from service.pages.parts import options
 from service.pages.parts.sentences import of_error
 from service.pages.rendering import page, page_of
 from service.pages.visitors import PageReading, PageSubmitting
+from service.views.jobs import JobView
 from workers.contract.phases import Phase
 from workers.contract.requests import Identity
 

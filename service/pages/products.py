@@ -11,7 +11,7 @@ from starlette.background import BackgroundTasks
 from service.api.bulk import LOOK_FROM
 from service.api.files.pixels import prepare_image
 from service.api.lineage import get_product_lineage, rerun_product
-from service.api.products import ProductView, delete_product, find
+from service.api.products import delete_product, find
 from service.http import downloads
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -19,6 +19,7 @@ from service.pages.parts import options
 from service.pages.parts.sentences import of_problem
 from service.pages.rendering import number, page, short
 from service.pages.visitors import PageReading, PageSubmitting
+from service.views.products import ProductView
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow
 from workers.contract.requests import Identity
 from workers.intake.deprecated import CODE, deprecation

@@ -16,7 +16,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, RedirectResponse
 
-from service.api.jobs import check_own, time_left_s
+from service.api.jobs import check_own
 from service.http.callers import Caller, Reading, Submitting
 from service.http.problems import Problem
 from service.http.quotas import rows_held
@@ -25,6 +25,7 @@ from service.uws import documents
 from service.uws import plain_errors as routing
 from service.uws.parameters import Form, bad, check, integer, kind_of, moment, phase, query_of, resolved
 from service.uws.uploads import SentForm, ids_of, keep
+from service.views.jobs import time_left_s
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.contract.phases import JobError, Phase
 

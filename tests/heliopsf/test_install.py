@@ -149,8 +149,10 @@ def test_the_wheel_holds_the_packages_and_their_files_and_stays_small(wheel: Pat
         assert name in names
     kept = {f"{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "service" / "pages").rglob("*.html")}
     assert kept and kept <= names
-    # The wheel is code and texts; with the interpolation of PSFs in time it exceeded the 1.4 MB of before.
-    assert wheel.stat().st_size < 1.45e6
+    # The wheel is code and texts. Compressed, in kB: Python code 1082 (psfcore 604, service 250, workers 210, heliopsf 18), sample image
+    # 109, web pages 92, data 16, metadata 33, and 83 for the names of its 619 files. Only a second wheel for the service
+    # would bring it below 1 MB.
+    assert wheel.stat().st_size < 1.43e6
 
 
 @pytest.mark.slow

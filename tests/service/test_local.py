@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -203,3 +206,36 @@ def test_a_cache_that_cannot_be_written_is_no_error(
     monkeypatch.setenv("HELIOPSF_CACHE_DIR", str(tmp_path / "file"))
     psf, _, _ = _built(tmp_path)
     assert psf["name"] == "small" and "not kept for later commands" in caplog.text
+
+
+def test_a_deconvolution_without_a_picture_draws_none(tmp_path: Path) -> None:
+    write_image(tmp_path / "image.fits")
+    write_psf(tmp_path / "psf.fits")
+    with local_service(previews=False) as service:
+        psf_id = service.upload_psf(tmp_path / "psf.fits")["id"]
+        product = service.deconvolve(tmp_path / "image.fits", psf_id=psf_id, steps=1)
+        service.download(product["preview"], tmp_path / "preview.png")
+        service.download(product["thumbnail"], tmp_path / "thumbnail.png")
+    assert (tmp_path / "preview.png").read_bytes() == (tmp_path / "thumbnail.png").read_bytes()
+
+
+def test_the_command_loads_neither_the_web_framework_nor_the_drawing_library(tmp_path: Path) -> None:
+    write_image(tmp_path / "image.fits")
+    write_psf(tmp_path / "psf.fits")
+    script = (
+        "import sys, json, atexit\n"
+        "atexit.register(lambda: print(json.dumps(sorted(sys.modules))))\n"
+        "from service.cli.main import main\n"
+        "main(['deconvolve', 'image.fits', '-o', 'sharp.fits', '--psf', 'psf.fits', '--steps', '1', '--local'])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(heliopsf.__file__).parents[1])},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    loaded = set(json.loads(done.stdout.splitlines()[-1]))
+    unwanted = {"fastapi", "matplotlib", "alembic", "celery", "httpx", "scipy.optimize", "scipy.integrate"}
+    assert "workers.tasks.deconvolve" in loaded and loaded & unwanted == set()

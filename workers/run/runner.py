@@ -61,15 +61,17 @@ class Runner:
         stopping: Stopping | None = None,
         submit: Callable[[str, Queue], bool] = lambda job_id, queue: False,
         child: Child | None = None,
+        previews: bool = True,
     ) -> None:
         """submit: a function that sends an unfinished job to the broker again; if it returns False, the reconciler
         does so. child: this process, if the runner may limit the memory of the process and end it; None if it may do
-        neither.
+        neither. previews: see ``Context``.
         """
         self._settings, self._catalogue, self._store = settings, catalogue, store
         self._call_for_help, self._submit = call_for_help, submit
         self._stopping = stopping or Stopping()
         self._child = child
+        self._previews = previews
         self._pausing = False  # a job pauses while this process runs a short one
 
     def run(self, job_id: str, on_progress: Progress | None = None) -> None:
@@ -207,6 +209,7 @@ class Runner:
             others_wait=lambda: self._stopping.asked or self._catalogue.jobs.others_wait(job.kind),
             lease=lease,
             times=attempt.times,
+            previews=self._previews,
         )
         try:
             self._check_room(job)

@@ -41,6 +41,7 @@ class Context:
     lease: the lease under which a job takes its pieces.
     times: measures the time of the reported stages. If the pieces of a job report their own stages, the time of these
     stages is measured instead.
+    previews: False if nobody looks at the previews of products; the thumbnail then takes the place of the preview.
     anew: True for a rerun: compute everything again, and use no solution that an earlier job kept.
     """
 
@@ -55,6 +56,7 @@ class Context:
     others_wait: Callable[[], bool] = lambda: False
     lease: Lease | None = None
     times: StageTimer = field(default_factory=StageTimer)
+    previews: bool = True
     anew: bool = False
 
     @property

@@ -47,7 +47,7 @@ def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
         return identity
     psf_row = requested_psf(context, request)
     image = _load_upload(context, request)
-    made = make(context, request, psf_row, image)
+    made = make(context, request, psf_row, image, preview=context.previews)
     with context.store.temporary() as path:
         write(made, path)
         context.report("saving", 1, 1)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from psfcore.drawing.plots import psf_png
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import Psf, cumulative_curve
 from psfcore.scatter.interpolation import Epoch, curve_sigma, interpolated_psf, parameters_of
@@ -81,6 +80,8 @@ def _epoch(context: Context, psf_id: str, time: str) -> Epoch:
 
 def _saved(context: Context, identity: str, psf: Psf) -> PsfRow:
     """The row of the PSF; its file, picture and tables are in the store."""
+    from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
+
     ends = psf.provenance["interpolated_between"]
     with context.store.temporary() as file, context.store.temporary() as picture:
         write_psf(file, psf)

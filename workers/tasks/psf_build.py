@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.build import build_recipe
-from psfcore.drawing import plots
 from psfcore.errors import DataError
 from psfcore.fits.images import read_image
 from psfcore.fits.psfs import write_psf
@@ -73,6 +71,10 @@ def built_psf(context: Context, build: PsfBuild) -> PsfRow:
     if row is not None:
         return row
     instrument = parse_instrument(recipe.text, recipe.name or "instrument_file")
+    # A deconvolution with a PSF that is already built loads neither matplotlib nor the libraries of the diffraction.
+    from psfcore.build import build_recipe
+    from psfcore.drawing import plots
+
     psf = build_recipe(
         recipe,
         mount_image=_mount_image(context, build, instrument),

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from psfcore.errors import DataError
+from psfcore.scatter.utc_time import bad_time, utc_time
 
 TIME = r"^\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d{1,9})?)?(Z|[+-]\d\d:\d\d)?)?$"
 _TIME = re.compile(TIME, re.ASCII)
@@ -22,17 +23,15 @@ def seconds(text: str, name: str = "time") -> float:
 
     A time without a zone is in UTC. name: name of the field, for the message. Raises ``DataError`` "bad-time".
     """
+    if not _TIME.fullmatch(text):
+        raise bad_time(text, name)
+    when = utc_time(text, name)
     try:
-        if not _TIME.fullmatch(text):
-            raise ValueError
-        when = datetime.fromisoformat(text)
-        at = (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+        at = when.timestamp()
         iso(at)  # raises an error for times near the year 9999 that cannot be converted back
         return at
     except (ValueError, OverflowError) as error:
-        raise DataError(
-            "bad-time", f"{name}: expected a time such as 2024-03-01T12:00:00Z, got {ascii(text)[:60]}"
-        ) from error
+        raise bad_time(text, name) from error
 
 
 def iso(at: float) -> str | None:

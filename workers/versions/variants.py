@@ -1,7 +1,7 @@
 """Variants of a channel: PSFs of one channel for several filter positions or plate scales.
 
-The channel of a PSF may name a variant after a hyphen: `174-open_2` is for images of 174 angstrom whose card FILTER is
-"Open 2", `174-0.984arcsec` for images of that plate scale, and `174-open_2-0.984arcsec` for images with both. So each variant
+The channel of a PSF may name a variant after a hyphen: `174-open_2` is for images of 174 angstrom whose card FILTER,
+EC_FW1_ or EC_FW2_ is "Open 2", `174-0.984arcsec` for images of that plate scale, and `174-open_2-0.984arcsec` for images with both. So each variant
 is a series of its own. An image belongs to the variant of which all properties agree with its header; if several
 variants agree, to the one with the most properties; if none agrees, to the channel without a variant.
 """
@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.header import optional_text, plate_scale_arcsec
+from psfcore.fits.header import FILTER_CARDS, optional_text, plate_scale_arcsec
 from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
 from workers.versions.series import word
 
@@ -60,7 +60,7 @@ def _has(cards: Mapping[str, Any], wanted: str) -> bool:
     """Whether an image has a property of a variant: a plate scale, or a filter."""
     scale = _SCALE.fullmatch(wanted)
     if scale is None:
-        return word(optional_text(cards, "FILTER")) == wanted
+        return wanted in {word(optional_text(cards, card)) for card in FILTER_CARDS}
     found = [plate_scale_arcsec(cards, axis) for axis in (1, 2)]
     known = [one for one in found if one is not None]
     return bool(known) and all(abs(one / float(scale[1]) - 1) <= PLATE_SCALE_TOLERANCE for one in known)

@@ -32,11 +32,11 @@ the image increases this estimate, so it is an upper limit.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve, maximum_filter, minimum_filter
+from scipy.ndimage import convolve
 
 HOLE_SHARE = 0.02
 DETECTION_SIGMA = 5.0
@@ -44,6 +44,7 @@ EXTREME_SIGMA = 8.0
 # Values from which a person should inspect the image: pixels per million, and percent of the peak of a source.
 ALARMS = {"holes_ppm": 100.0, "overshoots_ppm": 100.0, "new_extremes_ppm": 200.0, "ringing_pct": 2.0}
 RING_RADIUS_PX = 8
+_BLOCK_ROWS = 64
 _SOURCES = 100
 _FEWEST_SOURCES = 3
 _BRIGHTNESS_CLASSES = 16
@@ -51,6 +52,7 @@ _SECOND_DIFFERENCE = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 
 
 Plane = NDArray[np.floating[Any]]
 Flags = NDArray[np.bool_]
+Pixels = TypeVar("Pixels", NDArray[np.floating[Any]], NDArray[np.bool_])
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +155,8 @@ def _new_extremes(before: Plane, after: Plane, noise_before: Plane, noise_after:
     limit = EXTREME_SIGMA * noise_after
     # A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the
     # limit, it cannot fulfil Eq. (3). Medians are therefore needed only for the few remaining pixels.
-    peak = (after == maximum_filter(after, 3)) & (after - minimum_filter(after, 5) > limit)
-    pit = (after == minimum_filter(after, 3)) & (maximum_filter(after, 5) - after > limit)
+    peak = (after == _maxima(after, 1)) & (after - _minima(after, 2) > limit)
+    pit = (after == _minima(after, 1)) & (_maxima(after, 2) - after > limit)
     places = np.nonzero(peak | pit)
     away_after = after[places] - _medians(after, places)
     away_before = before[places] - _medians(before, places)
@@ -165,6 +167,38 @@ def _new_extremes(before: Plane, after: Plane, noise_before: Plane, noise_after:
     found = np.zeros(after.shape, dtype=np.bool_)
     found[places] = new_peak | new_pit
     return found
+
+
+def _maxima(plane: Pixels, radius_px: int) -> Pixels:
+    """Largest value of the square of 2 radius_px + 1 px around each pixel [y, x]; near an edge, of its part inside the plane."""
+    return _extremes(plane, radius_px, np.maximum)
+
+
+def _minima(plane: Pixels, radius_px: int) -> Pixels:
+    """Smallest value, as in ``_maxima``."""
+    return _extremes(plane, radius_px, np.minimum)
+
+
+def _extremes(plane: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:
+    """As the filters of scipy.ndimage, but several times as fast: blocks of rows stay in the cache."""
+    # Repeated edge pixels do not change the extremes.
+    padded = np.pad(plane, radius_px, mode="edge")
+    found = np.empty_like(plane)
+    for top in range(0, len(plane), _BLOCK_ROWS):
+        rows = found[top : top + _BLOCK_ROWS]
+        block = padded[top : top + len(rows) + 2 * radius_px]
+        rows[:] = _slid(_slid(block, radius_px, chosen).T, radius_px, chosen).T
+    return found
+
+
+def _slid(rows: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:
+    """Extremes of 2 radius_px + 1 successive rows. The windows double their height until they are high enough."""
+    wanted, height = 2 * radius_px + 1, 1
+    while height < wanted:
+        more = min(height, wanted - height)
+        rows = chosen(rows[:-more], rows[more:])
+        height += more
+    return rows
 
 
 def _medians(plane: Plane, places: tuple[NDArray[np.intp], ...]) -> Plane:
@@ -179,9 +213,10 @@ def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
 
     A peak is the largest value within RING_RADIUS_PX along both axes.
     """
-    size = 2 * RING_RADIUS_PX + 1
-    whole = minimum_filter(counted.astype(np.uint8), size, mode="constant", cval=0) > 0
-    found = np.argwhere(whole & (before == maximum_filter(before, size)))
+    inside = np.zeros_like(counted)
+    inner = np.s_[RING_RADIUS_PX:-RING_RADIUS_PX]
+    inside[inner, inner] = _minima(counted, RING_RADIUS_PX)[inner, inner]
+    found = np.argwhere(inside & (before == _maxima(before, RING_RADIUS_PX)))
     height = before[tuple(found.T)]
     found = found[height > 2 * np.maximum(_median_on_circle(before, found), 0)]
     order = np.argsort(-before[tuple(found.T)], kind="stable")

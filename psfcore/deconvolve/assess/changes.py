@@ -133,7 +133,8 @@ def measure_changes(
     # The filters of the artefact check run at the same time as the percentiles.
     with ThreadPoolExecutor(1) as beside:
         artefacts = beside.submit(find_artefacts, image.pixels, result, counted, peak_weight, sigma=sigma)
-        blocks = [_blocks(image.pixels, result, counted, block_px) for block_px in BLOCKS_PX]
+        old, new = (np.where(counted, plane, 0.0) for plane in (image.pixels, result))
+        blocks = [_blocks(old, new, counted, block_px) for block_px in BLOCKS_PX]
         structures = tuple(row for part in blocks for row in _structures(part))
         ranges = tuple(row for part in blocks for row in _ranges(part))
         change_pct, difference = _percentiles(change), _percentiles(after - before)
@@ -166,12 +167,18 @@ def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
     """
     if block_px == 1:
         return np.asarray(plane[counted])
+    whole = _in_blocks(counted, block_px).all(axis=(1, 3))
+    return _means(np.where(counted, plane, 0.0), whole, block_px)
+
+
+def _in_blocks(plane: Any, block_px: int) -> Any:
+    """The plane with one axis more for each direction: [block, row in it, block, column in it]."""
     ny, nx = plane.shape[0] // block_px, plane.shape[1] // block_px
-    shape = (ny, block_px, nx, block_px)
-    cut = np.s_[: ny * block_px, : nx * block_px]
-    whole = counted[cut].reshape(shape).all(axis=(1, 3))
-    means = np.where(counted[cut], plane[cut], 0.0).reshape(shape).mean(axis=(1, 3))
-    return np.asarray(means[whole])
+    return plane[: ny * block_px, : nx * block_px].reshape(ny, block_px, nx, block_px)
+
+
+def _means(finite: Plane, whole: Flags, block_px: int) -> Plane:
+    return np.asarray(_in_blocks(finite, block_px).mean(axis=(1, 3))[whole])
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +198,12 @@ class _Blocks:
 
 
 def _blocks(before: Plane, after: Plane, counted: Flags, block_px: int) -> _Blocks:
-    old, new = block_means(before, counted, block_px), block_means(after, counted, block_px)
+    """The blocks of planes that are finite everywhere."""
+    if block_px == 1:
+        old, new = before[counted], after[counted]
+    else:
+        whole = _in_blocks(counted, block_px).all(axis=(1, 3))
+        old, new = _means(before, whole, block_px), _means(after, whole, block_px)
     return _Blocks(block_px, old, new, _levels(old), _levels(new))
 
 

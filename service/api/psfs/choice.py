@@ -10,10 +10,10 @@ from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from service.api.psfs.filters import Filters, InContext
-from service.api.psfs.versions import PsfView
 from service.http.callers import Reading
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.state import Shared
+from service.views.psfs import PsfView
 from workers.catalogue.tables import ImageRow
 from workers.contract.requests import Identity
 from workers.intake.psf_choice import MOST_NAMED, Found, look, look_for_image

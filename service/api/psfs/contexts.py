@@ -14,6 +14,7 @@ from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, problem
 from service.http.quotas import rows_held
 from service.http.state import Shared
+from service.views.changes import PastChange
 from workers.catalogue.contexts import NAME, Pin
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow
 from workers.contract.requests import ContextName, Identity
@@ -119,13 +120,10 @@ class DefaultAsked(BaseModel):
     reason: Reason = ""
 
 
-class Move(BaseModel):
+class Move(PastChange):
     """A past change of the default context."""
 
     context: str | None
-    at: float
-    by: str
-    reason: str
 
     @classmethod
     def of(cls, row: DefaultContextRow) -> Move:

@@ -15,6 +15,7 @@ from service.http.paging import Page
 from service.http.problems import RESPONSES, problem
 from service.http.quotas import rows_held
 from service.http.state import Shared, State
+from service.views.changes import PastChange
 from workers.catalogue.tables import SeriesChangeRow
 from workers.versions.series import WORD
 
@@ -42,13 +43,10 @@ class SeriesChange(BaseModel):
     reason: str = Field("", max_length=400, pattern=TEXT, description="the reason, stored for later readers")
 
 
-class SeriesMove(BaseModel):
+class SeriesMove(PastChange):
     """A past change of a series."""
 
     interpolated: bool
-    at: float
-    by: str
-    reason: str
 
     @classmethod
     def of(cls, row: SeriesChangeRow) -> SeriesMove:
@@ -72,11 +70,8 @@ class SeriesView(SeriesSummary):
 @router.get("", summary="List series")
 def list_series(caller: Reading, state: Shared) -> Page[SeriesSummary]:
     """The series of which a PSF was certified, sorted by name, on one page."""
-    series = state.catalogue.series
-    items = [
-        SeriesSummary(series=name, interpolated=series.interpolated(name, caller.owner))
-        for name in series.all(caller.owner)
-    ]
+    found = state.catalogue.series.all(caller.owner)
+    items = [SeriesSummary(series=name, interpolated=interpolated) for name, interpolated in found.items()]
     return Page(items=items, next=None)
 
 

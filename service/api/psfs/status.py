@@ -14,6 +14,7 @@ from service.http.callers import Caller, Certifying, KeyFirst, Reading
 from service.http.problems import RESPONSES, problem
 from service.http.quotas import rows_held
 from service.http.state import Shared, State
+from service.views.changes import PastChange
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import PsfChangeRow, PsfRow
 from workers.contract.requests import Identity
@@ -64,11 +65,9 @@ class StatusChange(BaseModel):
     kind: Word | None = Field(None, description="for an uploaded draft, such as `total`")
 
 
-class Change(BaseModel):
+class Change(PastChange):
     """A past change of status."""
 
-    at: float
-    by: str
     status_before: PsfStatus
     status: PsfStatus
     version_before: str
@@ -76,7 +75,6 @@ class Change(BaseModel):
     valid_from: str | None
     valid_to: str | None
     successor: str | None
-    reason: str
 
     @classmethod
     def of(cls, row: PsfChangeRow) -> Change:

@@ -11,7 +11,7 @@ import click
 
 from service.cli.connection import CONTEXT, ID, SERVER, id_argument, remote, short, whole_id, whole_ids
 from service.cli.options import FILE, JSON, progress_bar, user_errors, write_json, writes_files
-from workers.versions.series import INTERPOLATED, TOTAL
+from workers.versions.series import TOTAL
 from workers.versions.status import PsfStatus
 
 if TYPE_CHECKING:
@@ -231,9 +231,8 @@ def _given(filters: dict[str, str | None]) -> dict[str, str]:
 
 
 def _validity(row: dict[str, Any]) -> str:
-    """The time range of a PSF; empty for a draft, which has no range."""
-    never_certified = row.get("origin") == INTERPOLATED and row["valid_from"] is None
-    if row["status"] == PsfStatus.DRAFT or never_certified:
+    """The time range of a PSF; empty if the PSF was never certified."""
+    if not row["was_certified"]:
         return ""
     return f"  [{row['valid_from'] or 'always'}, {row['valid_to'] or 'open'})"
 

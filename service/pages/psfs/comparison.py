@@ -13,13 +13,14 @@ from psfcore.errors import DataError
 from psfcore.tables import lookup
 from psfcore.tables.lookup import TOTAL
 from service.api.psfs.curves import tables_of
-from service.api.psfs.versions import PsfView, get_psf
+from service.api.psfs.versions import get_psf
 from service.http.problems import Problem
 from service.http.state import Shared
 from service.pages.parts.plots import Plot, Series, around, light_beyond_plot, shown_radii
 from service.pages.psfs.version import profile_series, psf_facts
 from service.pages.rendering import page, short
 from service.pages.visitors import PageReading
+from service.views.psfs import PsfView
 from workers.contract.requests import Identity
 
 router = APIRouter(prefix="/psfs/{psf_id}/vs", include_in_schema=False)

@@ -15,8 +15,9 @@ from psfcore.tables import lookup
 from service.api.lineage import get_psf_lineage, rerun_psf
 from service.api.psfs.affected import list_affected_by_psf
 from service.api.psfs.curves import get_cutout, tables_of
+from service.api.psfs.series import SeriesChange, SeriesView, change_series, get_series
 from service.api.psfs.status import StatusChange, change_psf_status, get_psf_status
-from service.api.psfs.versions import PsfView, delete_psf, get_psf
+from service.api.psfs.versions import delete_psf, get_psf
 from service.http import downloads
 from service.http.callers import Caller
 from service.http.paging import Cursor
@@ -27,11 +28,12 @@ from service.pages.parts.plots import Plot, Series, around, light_beyond_plot, s
 from service.pages.parts.readings import fit_parameters, fit_plots
 from service.pages.rendering import number, page
 from service.pages.visitors import PageCertifying, PageReading, PageSubmitting
+from service.views.psfs import PsfView
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
 from workers.contract.requests import Identity
-from workers.versions.series import INTERPOLATED
+from workers.versions.series import TOTAL
 from workers.versions.status import PsfStatus
 from workers.versions.variants import without_variant
 
@@ -49,12 +51,14 @@ def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) 
     tables, told = _tables(state, caller, psf_id)
     fit = _fit(state, view)
     others = state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_OTHERS + 1)
+    status = get_psf_status(psf_id, caller, state)
     return page(
         request,
         "psf.html",
         psf=view,
         facts=psf_facts(view),
-        status_view=get_psf_status(psf_id, caller, state),
+        status_view=status,
+        series=_series(state, caller, status.series),
         plots=[] if tables is None else _plots(tables),
         resolution=None if tables is None else lookup.curve(tables)["resolution"],
         no_tables=told,
@@ -98,6 +102,28 @@ async def change(psf_id: Identity, request: Request, caller: PageCertifying, sta
     """Certify the PSF, change its range, deprecate it or name its successor; then show it."""
     body = _change(await request.form())
     await run_in_threadpool(change_psf_status, psf_id, body, caller, state)
+    return RedirectResponse(f"/psfs/{psf_id}", 303)
+
+
+@router.post("/series")
+async def change_interpolation(
+    psf_id: Identity, request: Request, caller: PageCertifying, state: Shared
+) -> Response:
+    """Say whether the PSFs of the PSF's series may be interpolated in time; then show the PSF."""
+    body: SeriesChange = checked(SeriesChange, filled(await request.form(), "interpolated", "reason"))
+
+    def change() -> None:
+        series = get_psf_status(psf_id, caller, state).series
+        if series is None:
+            raise Problem(
+                409,
+                "no-series",
+                "expected a PSF of a series; the instrument of this PSF is unknown: upload the PSF again with its instrument",
+            )
+        instrument, channel, kind = series.split("/")
+        change_series(instrument, channel, kind, body, caller, state)
+
+    await run_in_threadpool(change)
     return RedirectResponse(f"/psfs/{psf_id}", 303)
 
 
@@ -150,8 +176,7 @@ def _channel(channel: str | None) -> str:
 
 def validity(psf: PsfView) -> str:
     """The range of observation times for which the PSF is certified."""
-    # An interpolated PSF may be deprecated together with one of its ends, without having been certified.
-    if psf.status == PsfStatus.DRAFT or (psf.origin == INTERPOLATED and psf.valid_from is None):
+    if not psf.was_certified:
         return "not certified"
     if psf.valid_from is None and psf.valid_to is None:
         return "at all times"
@@ -192,6 +217,21 @@ def _plots(tables: Mapping[str, Any]) -> list[Plot]:
         y_log=True,
     )
     return [rings, light_beyond_plot(beyond)]
+
+
+def _series(state: State, caller: Caller, name: str | None) -> SeriesView | None:
+    """The series of total PSFs with this name; None if there is no such series, or if none of its PSFs was certified."""
+    if name is None:
+        return None
+    instrument, channel, kind = name.split("/")
+    if kind != TOTAL:
+        return None
+    try:
+        return get_series(instrument, channel, kind, caller, state)
+    except Problem as problem:
+        if problem.code != "no-such-series":
+            raise
+        return None
 
 
 def _fit(state: State, view: PsfView) -> dict[str, Any] | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
-from service.api.reports import ReportView, find
+from service.api.reports import find
 from service.http import downloads
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -18,6 +18,7 @@ from service.pages.parts import readings
 from service.pages.rendering import page
 from service.pages.reports.stored import StoredPage, read_stored
 from service.pages.visitors import PageReading
+from service.views.reports import ReportView
 from workers.catalogue.tables import ReportRow
 from workers.contract.requests import Identity
 

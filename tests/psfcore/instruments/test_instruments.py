@@ -47,7 +47,12 @@ def test_headers_are_matched(cards: dict[str, object], name: str | None) -> None
 def variants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A telescope with a file of its own for one filter, for binned images, and for both together."""
     text, cards = instrument_path("hri_euv").read_text("utf-8"), 'DETECTOR = "HRI_EUV"'
-    further = {"": "", "_binned": "CDELT1 = 0.984", "_open": 'FILTER = "Open 2"'}
+    further = {
+        "": "",
+        "_binned": "CDELT1 = 0.984",
+        "_open": 'FILTER = "Open 2"',
+        "_ti": 'EC_FW2_ = "Ti_poly"',
+    }
     further["_both"] = f"{further['_binned']}\n{further['_open']}"
     for name, more in further.items():
         file = text.replace('name = "hri_euv"', f'name = "hri_euv{name}"').replace(cards, f"{cards}\n{more}")
@@ -69,6 +74,8 @@ def variants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         ({"CDELT1": 1.0}, "hri_euv"),
         ({"FILTER": "Open 2", "CDELT1": 0.984}, "hri_euv_both"),
         ({"FILTER": "Open 2", "DETECTOR": "FSI"}, None),
+        ({"EC_FW1_": "Open", "EC_FW2_": "Ti_poly"}, "hri_euv_ti"),
+        ({"EC_FW1_": "Ti_poly", "EC_FW2_": "Open"}, "hri_euv"),
     ],
 )
 def test_filter_and_plate_scale_choose_among_variants_of_an_instrument(

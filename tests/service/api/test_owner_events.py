@@ -15,8 +15,8 @@ from sqlalchemy import event, update
 from sqlalchemy.exc import OperationalError
 
 from service.api import events, owner_events
-from service.api.jobs import JobView
 from service.api.owner_events import Watch
+from service.views.jobs import JobView
 from tests.service.api.live import Following, Live, running
 from tests.service.keyed import bearer, keyed
 from tests.whole.stack import wait_for

@@ -130,6 +130,16 @@ def test_a_new_database_has_the_tables_that_the_code_works_with(url: str, catalo
     assert upgraded == indexes(catalogue)
 
 
+def test_the_database_of_one_process_has_the_same_tables(catalogue: Catalogue) -> None:
+    catalogue.schema.create()
+    assert differences(catalogue) == []
+    created = indexes(catalogue)
+    with catalogue._engine.begin() as connection:
+        Base.metadata.drop_all(connection)
+    catalogue.upgrade()
+    assert indexes(catalogue) == created
+
+
 def test_a_database_from_before_revisions_is_adopted_with_its_data(catalogue: Catalogue) -> None:
     make_as_before_revisions(catalogue)
     with catalogue._engine.begin() as connection:  # as one of an even earlier version

@@ -197,8 +197,8 @@ def test_unknown_series_and_other_kinds_are_refused(certified: Catalogue) -> Non
     refused("no-such-series", lambda: change(SERIES, "somebody", True, "x"))
     refused("no-such-series", lambda: certified.series.changes("fsi/174/total", OWNER))
     refused("series-not-total", lambda: change("hri_euv/174/diffraction", OWNER, True, "x"))
-    assert certified.series.all(OWNER) == ["hri_euv/174/diffraction", SERIES]
-    assert certified.series.all("somebody") == []
+    assert list(certified.series.all(OWNER)) == ["hri_euv/174/diffraction", SERIES]
+    assert certified.series.all("somebody") == {}
 
 
 def test_changes_of_a_series_count_in_the_quota(certified: Catalogue) -> None:

@@ -30,6 +30,8 @@ def cards(filter_name: str | None = None, scale: float | None = None, **more: An
         (cards("open 2", 0.984), "174-open_2-0.984arcsec"),
         (cards(None, 0.984 / 3600, CUNIT1="deg", CUNIT2="deg"), "174-0.984arcsec"),
         (cards(None, 0.984, CDELT2=0.492), None),
+        (cards(EC_FW1_="Open 1", EC_FW2_="Ti_poly"), "174-open_1"),
+        (cards(EC_FW1_="Al_poly", EC_FW2_="Open 2"), "174-open_2"),
     ],
 )
 def test_an_image_belongs_to_the_variant_whose_properties_all_agree(

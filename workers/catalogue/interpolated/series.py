@@ -43,11 +43,19 @@ class Series:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def all(self, owner: str) -> Sequence[str]:
-        """The names of all series of which a PSF was certified, sorted."""
-        query = select(PsfSeriesRow.series).where(PsfSeriesRow.owner == owner)
+    def all(self, owner: str) -> dict[str, bool]:
+        """All series of which a PSF was certified, sorted by name: whether the PSFs of each may be interpolated."""
+        latest = (
+            select(SeriesChangeRow.interpolated)
+            .where(SeriesChangeRow.owner == PsfSeriesRow.owner, SeriesChangeRow.series == PsfSeriesRow.series)
+            .order_by(SeriesChangeRow.number.desc())
+            .limit(1)
+            .scalar_subquery()
+        )
+        query = select(PsfSeriesRow.series, latest).where(PsfSeriesRow.owner == owner)
         with self._database.reading() as session:
-            return session.scalars(query.order_by(PsfSeriesRow.series)).all()
+            rows = session.execute(query.order_by(PsfSeriesRow.series))
+            return {series: bool(interpolated) for series, interpolated in rows}
 
     def variants(
         self, instrument: str, channel: str, kind: str, owner: str, context_id: str | None

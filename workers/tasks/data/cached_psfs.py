@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from psfcore.built.cache import FITS, PROVENANCE, CachedFile, PsfCache
-from psfcore.drawing import plots
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.psfs import read_psf
@@ -116,6 +115,8 @@ class CachedPsfs:
         )
 
     def _new_row(self, identity: str, build: PsfBuild, fits: CachedFile) -> PsfRow:
+        from psfcore.drawing import plots  # matplotlib is loaded only if a picture is drawn
+
         psf = read_psf(fits.path, self.limits)
         provenance = self.cache.find(identity, PROVENANCE)
         if provenance is not None:

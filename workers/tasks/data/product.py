@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.changes import Changes
 from psfcore.deconvolve.assess.error_planes import ErrorPlanes
-from psfcore.deconvolve.assess.plots import changes_png
 from psfcore.deconvolve.assess.quality import MEANINGS
 from psfcore.deconvolve.cards import UsedPsf, deconvolution_cards, deconvolution_history
 from psfcore.deconvolve.result import Deconvolved
-from psfcore.drawing import plots
 from psfcore.drawing.thumbnail import write_thumbnail
 from psfcore.drawing.units import unit_label
 from psfcore.fits.header import optional_text
@@ -107,7 +105,6 @@ def keep(made: Made, path: Path) -> ProductRow:
     file_sha256 = context.store.keep(path)
     picture = _save_changes_picture(made) if inputs.request.changes_picture else None
     thumbnail = _save_thumbnail(made)
-    assert made.preview_sha256 is not None
     row = ProductRow(
         owner=context.owner,
         id=made.identity,
@@ -118,7 +115,7 @@ def keep(made: Made, path: Path) -> ProductRow:
         psf_version=inputs.psf_row.version,
         file_sha256=file_sha256,
         bytes=size_bytes,
-        preview_sha256=made.preview_sha256,
+        preview_sha256=made.preview_sha256 or thumbnail,
         details=made.details | {"changes_picture_sha256": picture, "thumbnail_sha256": thumbnail},
     )
     return context.add(row)
@@ -126,6 +123,8 @@ def keep(made: Made, path: Path) -> ProductRow:
 
 def save_preview(inputs: Inputs, result: Deconvolved) -> str:
     """Draw the preview (before, after, change) into the store; returns its SHA-256."""
+    from psfcore.drawing import plots  # matplotlib is loaded only if a picture is drawn
+
     with inputs.context.store.temporary() as picture:
         image = inputs.image
         plots.preview_png(image.pixels, result.pixels, picture, title=_title(inputs), unit=unit_label(image))
@@ -140,6 +139,8 @@ def _save_thumbnail(made: Made) -> str:
 
 
 def _save_changes_picture(made: Made) -> str:
+    from psfcore.deconvolve.assess.plots import changes_png
+
     inputs = made.inputs
     with inputs.context.store.temporary() as picture:
         changes_png(

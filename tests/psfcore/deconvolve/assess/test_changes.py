@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from psfcore.convolution.convolver import linear_convolve
+from psfcore.deconvolve.assess import artefacts
 from psfcore.deconvolve.assess.artefacts import classes_of, find_artefacts, noise_from_pixels, ringing_pct
 from psfcore.deconvolve.assess.changes import BLOCKS_PX, TAILS_PCT, Changes, block_means, measure_changes
 from psfcore.deconvolve.assess.plots import changes_png
@@ -216,3 +218,15 @@ def test_the_real_image(real: Callable[[str], Path]) -> None:
     dark = [row.up_to_pct for row in report.structures if row.kind == "dark" and row.block_px > 1]
     assert min(bright) > 5 and max(bright) < 90
     assert min(dark) > -90 and max(dark) < -5
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (5, 40), (64, 65), (150, 17)])
+@pytest.mark.parametrize("radius_px", [1, 2, 8])
+def test_local_extremes_are_those_of_scipy(shape: tuple[int, int], radius_px: int) -> None:
+    plane = np.random.default_rng(0).random(shape).astype(np.float32)
+    size = 2 * radius_px + 1
+    assert np.array_equal(artefacts._maxima(plane, radius_px), maximum_filter(plane, size, mode="nearest"))
+    assert np.array_equal(artefacts._minima(plane, radius_px), minimum_filter(plane, size, mode="nearest"))
+    flags = plane > 0.02
+    whole = minimum_filter(flags.astype(np.uint8), size, mode="nearest") > 0
+    assert np.array_equal(artefacts._minima(flags, radius_px), whole)

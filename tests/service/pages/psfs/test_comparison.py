@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 
-from service.api.psfs.versions import PsfView
 from service.pages.psfs.comparison import differences
+from service.views.psfs import PsfView
 from tests.conftest import write_psf
 from tests.service.conftest import upload
 from tests.service.pages.test_login import PERSON

@@ -80,6 +80,34 @@ def test_certify_change_the_range_supersede_and_deprecate(
     assert api.get(f"/v1/psfs/{following}").json()["status"] == "deprecated"
 
 
+def test_a_form_says_whether_a_series_may_be_interpolated(api: TestClient, psf_id: str) -> None:
+    address, series = f"/psfs/{psf_id}/series", "/v1/series/hri_euv/174/total"
+    allow = {"interpolated": "true", "reason": "the mirrors age"}
+    refused = api.post(address, data=allow, headers=PERSON)
+    assert refused.status_code in (404, 409), "no PSF of the series was certified"
+    assert address not in api.get(f"/psfs/{psf_id}").text
+    assert certify(api, psf_id, "1.0.0") == 303
+    page = api.get(f"/psfs/{psf_id}").text
+    assert address in page and "Allow interpolation" in page and "are not interpolated" in page
+
+    page = api.post(address, data=allow, headers=PERSON).text
+    assert "Forbid interpolation" in page and "may be interpolated" in page and "the mirrors age" in page
+    assert api.get(series).json()["interpolated"] is True
+    page = api.post(address, data={"interpolated": "false"}, headers=PERSON).text
+    assert "Allow interpolation" in page and api.get(series).json()["interpolated"] is False
+    wrong = api.post(address, data={"interpolated": "perhaps"}, headers=PERSON)
+    assert wrong.status_code == 422 and "interpolated: " in wrong.text.lower()
+
+
+def test_a_component_has_no_form_of_interpolation(api: TestClient, tmp_path: Path) -> None:
+    write_psf(tmp_path / "part.fits", scale=0.7)
+    part = upload(api, tmp_path / "part.fits", "/v1/psfs")
+    assert certify(api, part, "1.0.0", kind="diffraction") == 303
+    assert f"/psfs/{part}/series" not in api.get(f"/psfs/{part}").text
+    refused = api.post(f"/psfs/{part}/series", data={"interpolated": "true"}, headers=PERSON)
+    assert refused.status_code in (400, 409, 422) and "total" in refused.text
+
+
 def test_an_error_of_a_form_is_a_page_that_names_the_field(api: TestClient, psf_id: str) -> None:
     data = {"status": "certified", "with_range": "1", "valid_from": "yesterday"}
     answer = api.post(f"/psfs/{psf_id}/status", data=data, headers=PERSON)
@@ -112,6 +140,9 @@ def test_forms_are_shown_by_scope(settings: Settings, psf_file: Path) -> None:
         certifier = browser(service, service.key("ann", Scope.READ, Scope.CERTIFY))
         page = certifier.get(f"/psfs/{psf_id}").text
         assert f"/psfs/{psf_id}/status" in page and "/delete" not in page
+        assert f"/psfs/{psf_id}/series" not in page, "no PSF of the series was certified"
+        allow = {"interpolated": "true"}
+        assert reader.post(f"/psfs/{psf_id}/series", data=allow, headers=OWN_PAGE).status_code == 403
         assert browser(service, service.key("bob")).get(f"/psfs/{psf_id}").status_code == 404
 
 
