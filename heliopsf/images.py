@@ -19,6 +19,7 @@ from heliopsf.progress import Told, told
 from heliopsf.psfs import Psf, build_psf, read_psf
 from psfcore.deconvolve.conditions import Conditions, EngineCache
 from psfcore.deconvolve.edges import Edges
+from psfcore.deconvolve.kernels import compiling_beside
 from psfcore.deconvolve.methods.registry import may_be_negative
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.deconvolve.whole import Work, input_warnings, known_noise
@@ -176,7 +177,11 @@ def _deconvolved(
     observed = image_of(image, saturation_dn=saturation_dn)
     if not again:
         check_not_deconvolved(content_of(observed.header))
-    found = _built_for(observed.header, threads, progress) if psf is None else _given(psf)
+    if psf is None:
+        with compiling_beside(method):
+            found = _built_for(observed.header, threads, progress)
+    else:
+        found = _given(psf)
     said = input_warnings(found, observed, other_channel=other_channel)
     for message in [*said.values(), *_plate_scale_warning(found, observed.header)]:
         warnings.warn(message, stacklevel=3)

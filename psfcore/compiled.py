@@ -143,6 +143,11 @@ def trusted(path: Path) -> bool:
     return True
 
 
+def is_kept(kernel: Any) -> bool:
+    """Whether the disk has machine code of a kernel, compiled from the current sources, for any types of its arguments."""
+    return not isinstance(kernel, Dispatcher) or kernel._cache._cache_file.any_kept()  # type: ignore[attr-defined]
+
+
 class KernelFiles(IndexDataCacheFile):
     """The kernel files of one function. A file is named by its key and ends with a hash of sources and content.
 
@@ -175,6 +180,11 @@ class KernelFiles(IndexDataCacheFile):
         if data is None:
             _tell(done=False)
         return data
+
+    def any_kept(self) -> bool:
+        """Whether any kernel file of the function was compiled from the current sources."""
+        pattern = self._index_name.removesuffix("nbi") + "*.nbc"
+        return any(self._is_good(path.name) for path in Path(self._cache_path).glob(pattern))
 
     def _found(self, name: str) -> Any:
         if not (self._is_good(name) and self._is_ours(name)):

@@ -144,7 +144,7 @@ class LocalService(Operations):
         self._store = LocalStore(settings.data_dir)
         self._catalogue = Catalogue(settings.catalogue_url)
         self._catalogue.schema.create()
-        self._runner = Runner(settings, self._catalogue, self._store, previews=previews)
+        self._runner = Runner(settings, self._catalogue, self._store, previews=previews, compile_beside=True)
         self._built = (
             None
             if cache is None
@@ -270,6 +270,13 @@ class LocalService(Operations):
             assert self._built is not None
             self._built.remember(recipe)
         return self._ended(job)
+
+    def stage_seconds(self) -> dict[str, float]:
+        """The time of each stage of all jobs that ran, s, in alphabetical order."""
+        spent: dict[str, float] = {}
+        for (_, stage), one in self._catalogue.stage_times.all().items():
+            spent[stage] = spent.get(stage, 0.0) + one.seconds
+        return spent
 
     def get(self, address: str) -> dict[str, Any]:
         """The description at an address of the service."""

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import sys
+import time
 
 from psfcore.errors import MissingExtra, module_of_extra
+
+STARTED = time.perf_counter()  # when the command began, before the libraries are loaded
 
 
 def main() -> None:

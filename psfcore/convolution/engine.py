@@ -143,7 +143,7 @@ class Engine:
 
         def work(start: int, stop: int, scratch: Scratch) -> None:
             _rows_forward(
-                lanes, self._spectrum, scratch.buffer, scratch.corner, start, stop, *self.row_numbers
+                lanes, self._spectrum, 0, scratch.buffer, scratch.corner, start, stop, *self.row_numbers
             )
 
         self.run(work, self.row_blocks)
@@ -255,9 +255,7 @@ class Engine:
                 here = slice(block * BLOCK_ROWS, (block + 1) * BLOCK_ROWS)
                 rows = _wrapped_rows(kernel, first, (ly, lx), here) * np.float32(1 / self.transfer_scale)
                 lanes = np.ascontiguousarray(rows.reshape(1, 2, LANES, lx).transpose(0, 3, 1, 2))
-                _rows_forward(
-                    lanes, transfer[:, here], scratch.buffer, scratch.corner, 0, 1, *self.row_numbers
-                )
+                _rows_forward(lanes, transfer, block, scratch.buffer, scratch.corner, 0, 1, *self.row_numbers)
 
         def along_columns(start: int, stop: int, _scratch: Scratch) -> None:
             for block in range(start, stop):
@@ -349,14 +347,26 @@ def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # typ
                 z[p, 1, w] = ai + br
 
 
+# An assignment between slices of arrays would compile five seconds longer, because of its check of the shapes.
+
+
 @compiled()
-def _rows_forward(lanes, spectrum, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]
+def _fill(buffer, values, filled, length):  # type: ignore[no-untyped-def]
+    """Copy the first `filled` values into the buffer of a transform, and set the rest of the buffer to 0."""
+    for n in range(filled):
+        buffer[n] = values[n]
+    for n in range(filled, length * 2 * LANES):
+        buffer[n] = np.float32(0.0)
+
+
+@compiled()
+def _rows_forward(lanes, spectrum, first_block, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Transform the rows of blocks. first_block: the block of the spectrum to which block 0 of `lanes` belongs."""
     filled = lanes.shape[1] * 2 * LANES
     for block in range(start, stop):
-        buffer[:filled] = lanes[block].reshape(-1)
-        buffer[filled : length * 2 * LANES] = np.float32(0.0)
+        _fill(buffer, lanes[block].reshape(-1), filled, length)
         forward(buffer, length, radices, lengths, tw, offsets)
-        spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
+        spectrum_from_buffer(spectrum, buffer, corner, first_block + block, length, place)
 
 
 @compiled()
@@ -365,7 +375,9 @@ def _rows_inverse(lanes, spectrum, buffer, corner, start, stop, length, radices,
     for block in range(start, stop):
         buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
         inverse(buffer, length, radices, lengths, tw, offsets)
-        lanes[block].reshape(-1)[:] = buffer[:filled]
+        values = lanes[block].reshape(-1)
+        for n in range(filled):
+            values[n] = buffer[n]
 
 
 @compiled()
@@ -375,8 +387,7 @@ def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radice
     z = buffer.reshape((-1, 2, LANES))
     for group in range(start, stop):
         column = spectrum[group].reshape(-1)
-        buffer[:filled] = column[:filled]
-        buffer[filled : length * 2 * LANES] = np.float32(0.0)
+        _fill(buffer, column, filled, length)
         forward(buffer, length, radices, lengths, tw, offsets)
         for k in range(length):
             for w in range(LANES):
@@ -384,7 +395,8 @@ def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radice
                 z[k, 0, w] *= t
                 z[k, 1, w] *= t
         inverse(buffer, length, radices, lengths, tw, offsets)
-        column[:filled] = buffer[:filled]
+        for n in range(filled):
+            column[n] = buffer[n]
 
 
 @compiled()
@@ -396,8 +408,7 @@ def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, radi
     z = buffer.reshape((-1, 2, LANES))
     for group in range(start, stop):
         column = spectrum[group].reshape(-1)
-        buffer[:filled] = column[:filled]
-        buffer[filled : length * 2 * LANES] = np.float32(0.0)
+        _fill(buffer, column, filled, length)
         forward(buffer, length, radices, lengths, tw, offsets)
         for k in range(length):
             for w in range(LANES):
@@ -406,4 +417,5 @@ def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, radi
                 z[k, 0, w] = r * tr - i * ti
                 z[k, 1, w] = r * ti + i * tr
         inverse(buffer, length, radices, lengths, tw, offsets)
-        column[:filled] = buffer[:filled]
+        for n in range(filled):
+            column[n] = buffer[n]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from service.cli.progress import Report
 from service.client.many import Outcome, deconvolve_many
 from service.client.operations import Operations
 from service.client.outputs import check_output_folder, check_outputs
+from service.start import STARTED
 
 AGAIN = click.option(
     "--again", is_flag=True, help="Deconvolve files whose header says that they are products or PSFs"
@@ -68,6 +70,7 @@ AGAIN = click.option(
 )
 @click.option("--plot", type=OUTPUT, help="Write the image before and after (PNG)")
 @click.option("--changes", type=OUTPUT, help="Write difference, ratio and histograms (PNG)")
+@click.option("--timings", is_flag=True, help="Print how long each stage of the command took; needs --local")
 @AGAIN
 @SERVER
 @LOCAL
@@ -87,6 +90,7 @@ def deconvolve(
     error_draws: int,
     plot: Path | None,
     changes: Path | None,
+    timings: bool,
     again: bool,
     server: str | None,
     local: bool,
@@ -114,6 +118,10 @@ def deconvolve(
         "again": again,
         "overwrite": overwrite,
     }
+    if timings and not local:
+        raise click.UsageError(
+            "--timings: expected --local, because a service measures the stages of all jobs together; see its /metrics"
+        )
     into_folder = len(files) > 1 or any(path.is_dir() for path in images) or output.is_folder
     if into_folder and (plot or changes):
         raise click.UsageError(
@@ -136,11 +144,27 @@ def deconvolve(
             failures: list[Outcome] = []
         else:
             lines, failures = _many(service, files, output.path, report, parameters)
+        if timings:
+            lines += _timings(service)
     click.echo("\n".join(lines))
     if failures:
         raise click.ClickException(
             f"{len(failures)} of {counted(len(files), 'image')} failed; see the list above"
         )
+
+
+def _timings(service: Operations) -> list[str]:
+    """The lines that say how long each stage took: the stages of the job, and the rest of the command."""
+    from service.local import LocalService  # already loaded: the option needs --local
+
+    assert isinstance(service, LocalService)
+    spent = service.stage_seconds()
+    whole = time.perf_counter() - STARTED
+    rows = [
+        *sorted(spent.items(), key=lambda row: -row[1]),
+        ("Python, libraries, output", whole - sum(spent.values())),
+    ]
+    return [f"{seconds:7.2f} s  {stage}" for stage, seconds in rows] + [f"{whole:7.2f} s  whole command"]
 
 
 def _one(

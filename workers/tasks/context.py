@@ -42,6 +42,7 @@ class Context:
     times: measures the time of the reported stages. If the pieces of a job report their own stages, the time of these
     stages is measured instead.
     previews: False if nobody looks at the previews of products; the thumbnail then takes the place of the preview.
+    compile_beside: True if this process runs nothing else: kernels are then compiled by another process while a PSF is built.
     anew: True for a rerun: compute everything again, and use no solution that an earlier job kept.
     """
 
@@ -57,6 +58,7 @@ class Context:
     lease: Lease | None = None
     times: StageTimer = field(default_factory=StageTimer)
     previews: bool = True
+    compile_beside: bool = False
     anew: bool = False
 
     @property

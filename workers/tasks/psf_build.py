@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,8 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
     if request.psf_interpolation is not None:
         return _interpolated(context, request.psf_id, request.psf_interpolation)
     assert request.psf_recipe is not None
-    row = built_psf(context, request.psf_recipe)
+    with _compiling_beside(request.method.name) if context.compile_beside else nullcontext():
+        row = built_psf(context, request.psf_recipe)
     if row.id != request.psf_id:
         raise DataError(
             "instrument-changed",
@@ -51,6 +53,13 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
             "file changed after the job was submitted; submit the job again",
         )
     return row
+
+
+def _compiling_beside(method: str) -> AbstractContextManager[None]:
+    # A job that builds no PSF does not load the kernels here.
+    from psfcore.deconvolve.kernels import compiling_beside
+
+    return compiling_beside(method)
 
 
 def _interpolated(context: Context, psf_id: str, asked: PsfInterpolate) -> PsfRow:

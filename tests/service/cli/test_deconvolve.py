@@ -57,6 +57,19 @@ def test_one_image_goes_into_a_file(folder: Path) -> None:
     assert fits.getheader(folder / "new.fits")["DCNVITER"] == 1
 
 
+def test_the_time_of_each_stage_is_printed(folder: Path) -> None:
+    asked = ("deconvolve", folder / "in" / "0.fits", "-o", folder / "new.fits", "--timings")
+    done = run(*asked, *options(folder))
+    assert done.exit_code == 0, done.output
+    rows = [line.split(" s  ") for line in done.output.splitlines() if " s  " in line]
+    seconds = {stage: float(number) for number, stage in rows}
+    assert {"reading", "deconvolving", "saving", "whole command"} <= set(seconds)
+    whole = seconds.pop("whole command")
+    assert sum(seconds.values()) == pytest.approx(whole, abs=0.01 * len(rows))
+    refused = run(*asked, "--psf", folder / "psf.dat")
+    assert refused.exit_code == 2 and "--timings: expected --local" in refused.output
+
+
 def test_a_failure_is_named_and_ends_with_status_1(folder: Path) -> None:
     (folder / "in" / "a.fits").write_text("Dear archive,\n" * 300)
     done = run("deconvolve", folder / "in", "-o", folder / "out", *options(folder))

@@ -1,0 +1,62 @@
+"""Compile the kernels of a deconvolution in a process of its own, while this process builds the PSF.
+
+On a new installation both take long. numba compiles in one thread at a time and keeps the interpreter busy, so a thread
+would not help. The process finds out which kernels are needed by deconvolving a small image; `psfcore.compiled` keeps them
+on disk.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from astropy.io.fits import Header
+
+from psfcore.compiled import is_kept
+from psfcore.convolution import engine
+from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.methods.registry import method_named
+from psfcore.image import Image
+from psfcore.psf import Psf
+
+SIZE_PX = 32
+
+
+@contextmanager
+def compiling_beside(method: str) -> Iterator[None]:
+    """In the block, the kernels of a method are compiled by another process, if they are not kept on disk yet.
+
+    The block ends when the process has ended. If the process fails, this process compiles the kernels later.
+    """
+    if is_kept(engine._rows_forward):
+        yield
+        return
+    quiet = subprocess.DEVNULL
+    process = subprocess.Popen(
+        [sys.executable, "-m", __name__, method], stdin=quiet, stdout=quiet, stderr=quiet
+    )
+    try:
+        yield
+        process.wait()
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+
+
+def compile_kernels(method: str) -> None:
+    """Deconvolve a small image, so that all kernels of the method are compiled and kept on disk."""
+    # The kernel is not symmetric, as that of most PSFs: there are other kernels for symmetric ones.
+    weights = np.random.default_rng(0).random((SIZE_PX, SIZE_PX))
+    weights[SIZE_PX // 2, SIZE_PX // 2] = SIZE_PX
+    psf = Psf(kernel=weights / weights.sum(), name="small", version="0", instrument=None, status="user")
+    pixels = np.full((SIZE_PX, SIZE_PX), 100.0)
+    image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN/s", 1.0)
+    method_named(method)(image, psf, Conditions(), steps=2)
+
+
+if __name__ == "__main__":
+    compile_kernels(sys.argv[1])

@@ -1,0 +1,85 @@
+"""Kernels are compiled by another process while a PSF is built, if they are not kept yet."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from psfcore.compiled import is_kept
+from psfcore.convolution import engine
+from psfcore.deconvolve import kernels
+from psfcore.deconvolve.methods.registry import method_names
+
+
+@pytest.mark.parametrize("method", method_names())
+def test_a_small_deconvolution_leaves_the_kernels_on_disk(method: str) -> None:
+    kernels.compile_kernels(method)
+    assert is_kept(engine._rows_forward) and is_kept(engine._columns_complex)
+
+
+class _Process:
+    """A process that runs until it is waited for or killed."""
+
+    def __init__(self, command: list[str], **streams: Any) -> None:
+        self.command, self.killed, self.status = command, False, None
+
+    def wait(self) -> int:
+        self.status = -9 if self.killed else 0
+        return self.status
+
+    def poll(self) -> int | None:
+        return self.status
+
+    def kill(self) -> None:
+        self.killed = True
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[_Process]:
+    """The processes that the module started."""
+    found: list[_Process] = []
+
+    def start(command: list[str], **streams: Any) -> _Process:
+        found.append(_Process(command, **streams))
+        return found[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    return found
+
+
+def test_no_process_is_started_if_the_kernels_are_kept(
+    started: list[_Process], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernels, "is_kept", lambda kernel: True)
+    with kernels.compiling_beside("linear"):
+        pass
+    assert started == []
+
+
+def test_the_block_waits_for_the_process_and_an_error_ends_it(
+    started: list[_Process], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernels, "is_kept", lambda kernel: False)
+    with kernels.compiling_beside("linear"):
+        (process,) = started
+        assert process.command == [sys.executable, "-m", "psfcore.deconvolve.kernels", "linear"]
+        assert process.poll() is None
+    assert process.poll() == 0
+    with pytest.raises(InterruptedError), kernels.compiling_beside("linear"):
+        raise InterruptedError
+    assert started[1].killed
+
+
+@pytest.mark.slow  # compiles for half a minute
+def test_the_process_compiles_what_a_later_process_needs(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    command = [sys.executable, "-m", "psfcore.deconvolve.kernels", "richardson-lucy"]
+    subprocess.run(command, check=True)
+    kept = set(tmp_path.rglob("*.nbc"))
+    subprocess.run(command, check=True)
+    assert kept and set(tmp_path.rglob("*.nbc")) == kept
