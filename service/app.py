@@ -49,6 +49,7 @@ from service.pages.psfs import listing as psf_listing
 from service.pages.psfs import version as psf_page
 from service.pages.reports import shown as report_page
 from service.uws import routes as uws
+from service.vo import cutouts, interfaces, links, lists
 from workers.catalogue.catalogue import Catalogue
 from workers.files.modes import private_folder
 from workers.files.opened import open_store
@@ -130,6 +131,10 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         owner_events,
         keys,
         uws,
+        interfaces,
+        lists,
+        links,
+        cutouts,
         health,
         metrics,
         docs,

@@ -33,6 +33,7 @@ class Made(BaseModel):
     status: str | None = None
     origin: str | None = None
     file_sha256: str
+    kind: str | None = Field(None, description="kind of the job that made it; null for an upload")
     job_id: str | None = Field(None, description="the job that made it; the job may have been deleted since")
     algorithm_version: int | None = None
     software_version: str | None = None
@@ -211,6 +212,8 @@ def _made_of(row: ProductRow | PsfRow) -> Made:
     written = {
         name: said.get(name) for name in ("job_id", "algorithm_version", "software_version", "libraries")
     }
+    uploaded = isinstance(row, PsfRow) and row.origin == "uploaded"
+    written["kind"] = None if uploaded else kind_of_origin(_origin(row)).name
     if isinstance(row, ProductRow):
         return Made(
             created_at=row.created_at, file_sha256=row.file_sha256, parameters=_parameters(row), **written

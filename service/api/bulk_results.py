@@ -49,6 +49,10 @@ class Result(BaseModel):
     thumbnail: str | None = Field(
         None, description="address of a small picture of the product; null: the service keeps none"
     )
+    provenance: str | None = Field(
+        None,
+        description="address of the product's lineage as W3C PROV; null: the service does not keep the product",
+    )
     output: str | None = Field(
         description="path of the product in the output folder; null: the run has no output folder"
     )
@@ -85,8 +89,11 @@ class Result(BaseModel):
         own = {name: getattr(row, name) for name in cls.model_fields if hasattr(row, name)}
         product = f"/v1/products/{row.product_id}"
         file = f"{product}/file" if row.kept else None
+        provenance = f"{product}/provenance" if row.kept else None
         thumbnail = f"{product}/thumbnail" if row.kept and told.get("has_thumbnail") else None
-        return cls.model_validate({**told, **own, "file": file, "thumbnail": thumbnail})
+        return cls.model_validate(
+            {**told, **own, "file": file, "thumbnail": thumbnail, "provenance": provenance}
+        )
 
     def flat(self) -> dict[str, Any]:
         """The values of a CSV row."""

@@ -1,10 +1,10 @@
-"""The lineage of PSFs and products, ``.../lineage``, and reruns, ``.../rerun``."""
+"""The lineage of PSFs and products, ``.../lineage`` and ``.../provenance``, and reruns, ``.../rerun``."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Query, Response
 
 from psfcore.errors import DataError
 from service.api.jobs import submit_job
@@ -16,7 +16,23 @@ from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.kinds import KINDS
 from workers.contract.requests import Identity, Rerun
 from workers.lineage import Ancestor, lineage
+from workers.provenance import Format, provenance_text
 
+MEDIA_TYPES: dict[Format, str] = {"json": "application/json", "provn": "text/provenance-notation"}
+FILES: dict[Format, str] = {"json": "prov.json", "provn": "provn"}
+FORMAT = Query(description="`json`: PROV-JSON; `provn`: PROV-N")
+PROV: dict[str, Any] = {
+    "response_class": Response,
+    "responses": {
+        200: {
+            "description": "A PROV document: entities by hash, activities by job, agents by owner and software version",
+            "content": {
+                MEDIA_TYPES["json"]: {"schema": {"type": "object"}},
+                MEDIA_TYPES["provn"]: {"schema": {"type": "string"}},
+            },
+        }
+    },
+}
 router = APIRouter(tags=["lineage"], responses=RESPONSES)
 
 
@@ -39,6 +55,23 @@ def get_product_lineage(product_id: Identity, caller: Reading, state: Shared) ->
     return lineage(state.catalogue, row)
 
 
+@router.get("/v1/psfs/{psf_id}/provenance", summary="The lineage of a PSF as W3C PROV", **PROV)
+def get_psf_provenance(
+    psf_id: Identity, caller: Reading, state: Shared, format: Annotated[Format, FORMAT] = "json"
+) -> Response:
+    """The lineage in the terms of W3C PROV and of the IVOA Provenance Data Model."""
+    return _provenance(state, state.catalogue.get(PsfRow, psf_id, caller.owner), "psf", psf_id, format)
+
+
+@router.get("/v1/products/{product_id}/provenance", summary="The lineage of a product as W3C PROV", **PROV)
+def get_product_provenance(
+    product_id: Identity, caller: Reading, state: Shared, format: Annotated[Format, FORMAT] = "json"
+) -> Response:
+    """The lineage in the terms of W3C PROV and of the IVOA Provenance Data Model."""
+    row = state.catalogue.get(ProductRow, product_id, caller.owner)
+    return _provenance(state, row, "product", product_id, format)
+
+
 @router.post("/v1/psfs/{psf_id}/rerun", status_code=202, summary="Make a PSF again and compare")
 def rerun_psf(psf_id: Identity, response: Response, caller: Submitting, state: Shared) -> JobView:
     """Submit a job that makes the PSF again with the same parameters. The result is a report on the differences between both PSFs."""
@@ -56,6 +89,17 @@ def _rerun(
 ) -> JobView:
     asked = KINDS["rerun"].request(kind="rerun", parameters=Rerun(of=of, id=identity))
     return submit_job(asked, response, caller, state)
+
+
+def _provenance(
+    state: Shared, row: ProductRow | PsfRow | None, of: str, identity: str, form: Format
+) -> Response:
+    if row is None:
+        raise _missing(of, identity)
+    headers = {"Content-Disposition": f'attachment; filename="{of}-{identity[:12]}.{FILES[form]}"'}
+    return Response(
+        provenance_text(state.catalogue, row, form), media_type=MEDIA_TYPES[form], headers=headers
+    )
 
 
 def _missing(of: str, identity: str) -> Exception:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 Progress = Callable[[str, int, int], None]
@@ -18,6 +19,10 @@ class VersionedPsfs(ABC):
     @abstractmethod
     def get(self, address: str) -> dict[str, Any]:
         """The description at an address of the service."""
+
+    @abstractmethod
+    def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the file at an address of the service to ``path``; an existing file only if ``overwrite`` is true."""
 
     @abstractmethod
     def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
@@ -156,6 +161,13 @@ class VersionedPsfs(ABC):
     def lineage(self, of: Literal["psf", "product"], identity: str) -> dict[str, Any]:
         """The images, transits and PSFs from which a PSF or a product was made, back to the uploads."""
         return self.get(f"/v1/{of}s/{identity}/lineage")
+
+    def provenance(
+        self, of: Literal["psf", "product"], identity: str, output: str | Path, *, overwrite: bool = False
+    ) -> None:
+        """Write the lineage of a PSF or a product as W3C PROV: PROV-N if the name of the file ends in .provn, otherwise PROV-JSON."""
+        form = "provn" if Path(output).suffix == ".provn" else "json"
+        self.download(f"/v1/{of}s/{identity}/provenance?format={form}", output, overwrite=overwrite)
 
     def rerun(
         self, of: Literal["psf", "product"], identity: str, *, progress: Progress | None = None

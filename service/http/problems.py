@@ -44,6 +44,7 @@ STATUS_OF = {
     "line-known": 409,
     "name-taken": 409,
     "no-date": 409,
+    "no-helioprojective": 409,
     "no-instrument": 409,
     "no-line": 409,
     "no-psf-for-instrument": 409,
@@ -245,5 +246,5 @@ def install(app: FastAPI, as_page: AsPage) -> None:
 
 def wants_page(request: Request) -> bool:
     """Whether a person asked for a page: a browser accepts HTML, and addresses of the interfaces are for programs."""
-    for_programs = ("/v1/", "/uws", "/openapi.json", "/metrics", "/health")
+    for_programs = ("/v1/", "/uws", "/vo/", "/openapi.json", "/metrics", "/health")
     return "text/html" in request.headers.get("accept", "") and not request.url.path.startswith(for_programs)

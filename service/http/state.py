@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
 import anyio
@@ -38,6 +39,7 @@ class State:
     # The same for decoding planes and headers.
     decoding: anyio.CapacityLimiter
     planes: Planes
+    started_at: float = field(default_factory=time.time)
 
     @property
     def limits(self) -> FitsLimits:

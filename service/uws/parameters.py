@@ -40,6 +40,11 @@ async def read_form(request: Request) -> dict[str, str]:
 
     A field without a value counts as not sent.
     """
+    return single(await read_pairs(request))
+
+
+async def read_pairs(request: Request) -> list[tuple[str, str]]:
+    """The names and values of the fields of the address and of a form. Raises ``Problem`` if the body is not a form."""
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == "multipart/form-data":
         sent = await _multipart(request)
@@ -53,7 +58,7 @@ async def read_form(request: Request) -> dict[str, str]:
             )
         except ValueError as error:
             raise bad(f"expected a form of at most {MAX_FIELDS} fields in UTF-8: {error}") from error
-    return single([*request.query_params.multi_items(), *sent])
+    return [*request.query_params.multi_items(), *sent]
 
 
 Form = Annotated[dict[str, str], Depends(read_form)]
@@ -61,8 +66,13 @@ Form = Annotated[dict[str, str], Depends(read_form)]
 
 def query_of(request: Request, *several: str) -> dict[str, list[str]]:
     """The fields of the address, by their names in lower case. Only the fields in ``several`` may be repeated."""
+    return repeated(request.query_params.multi_items(), *several)
+
+
+def repeated(pairs: Iterable[tuple[str, str]], *several: str) -> dict[str, list[str]]:
+    """The values of the fields, by their names in lower case, without empty ones. Only the fields in ``several`` may be repeated."""
     found: dict[str, list[str]] = {}
-    for name, value in request.query_params.multi_items():
+    for name, value in pairs:
         if value:
             found.setdefault(name.lower(), []).append(value)
     for name, values in found.items():

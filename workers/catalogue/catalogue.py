@@ -58,6 +58,7 @@ AnyRow = TypeVar(
 )
 ListedRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | JobRow | PsfContextRow | BulkRow
 MOST_CANDIDATES = 6
+_IN_A_QUERY = 500  # databases limit the number of values in a query
 
 
 class Catalogue:
@@ -149,6 +150,16 @@ class Catalogue:
         """The row with this identity, or None."""
         with self._database.reading() as session:
             return session.get(table, (owner, identity))
+
+    def rows(self, table: type[Row], identities: Collection[str], owner: str) -> dict[str, Row]:
+        """The rows with these identities, by their id. An identity without a row is left out."""
+        found: dict[str, Row] = {}
+        wanted = sorted(identities)
+        with self._database.reading() as session:
+            for at in range(0, len(wanted), _IN_A_QUERY):
+                query = select(table).where(table.owner == owner, table.id.in_(wanted[at : at + _IN_A_QUERY]))
+                found |= {row.id: row for row in session.scalars(query)}
+        return found
 
     def delete_draft(self, psf_id: str, owner: str) -> PsfRow:
         """Delete a draft PSF that nothing uses; returns the deleted row.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import click
 
 from service.cli.connection import CONTEXT, ID, SERVER, id_argument, remote, short, whole_id, whole_ids
-from service.cli.options import FILE, JSON, progress_bar, user_errors, write_json, writes_files
+from service.cli.options import FILE, JSON, OUTPUT, progress_bar, user_errors, write_json, writes_files
 from workers.versions.series import TOTAL
 from workers.versions.status import PsfStatus
 
@@ -184,14 +184,28 @@ def best(
 @id_argument()
 @PRODUCT
 @JSON
+@click.option(
+    "--prov",
+    "prov_file",
+    type=OUTPUT,
+    help="Write the lineage as W3C PROV: PROV-N if the name ends in .provn, otherwise PROV-JSON",
+)
 @SERVER
 @writes_files
 def lineage(
-    identity: str, product: bool, json_file: Path | None, server: str | None, overwrite: bool
+    identity: str,
+    product: bool,
+    json_file: Path | None,
+    prov_file: Path | None,
+    server: str | None,
+    overwrite: bool,
 ) -> None:
     """Show from which images, transits and PSFs a PSF or a product was made, back to the uploads."""
+    of: Literal["product", "psf"] = "product" if product else "psf"
     with user_errors(), remote(server) as service:
-        told = service.lineage("product" if product else "psf", identity)
+        told = service.lineage(of, identity)
+        if prov_file is not None:
+            service.provenance(of, told["id"], prov_file, overwrite=overwrite)
     for line in _tree(told, 0):
         click.echo(line)
     write_json(json_file, told, overwrite=overwrite)

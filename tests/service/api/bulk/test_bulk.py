@@ -133,6 +133,8 @@ def test_uploads_become_products_and_a_manifest(
         assert product["details"]["job_id"] == bulk["id"]
         assert line["thumbnail"] == product["thumbnail"] == f"/v1/products/{line['product_id']}/thumbnail"
         assert api.get(line["thumbnail"]).headers["Content-Type"] == "image/png"
+        assert line["provenance"] == f"/v1/products/{line['product_id']}/provenance"
+        assert f"product:{line['product_id']}" in api.get(line["provenance"]).json()["entity"]
         assert line["psf_id"] == psf_id and line["seconds"] >= line["kernel_seconds"] > 0
     ordinary = api.post(
         "/v1/jobs",

@@ -1,0 +1,233 @@
+"""Lists of products and PSFs with the columns of ObsCore, as VOTable or JSON: ``/vo/products`` and ``/vo/psfs``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import JSONResponse
+
+from psfcore.errors import DataError
+from psfcore.fits.header import plate_scale_arcsec
+from service.http.callers import Reading
+from service.http.paging import following, position
+from service.http.state import Shared
+from service.uws.parameters import integer
+from service.vo.asked import (
+    JSON,
+    VOTABLE,
+    VOTABLE_TYPE,
+    Fields,
+    VotableErrors,
+    base_url,
+    described,
+    format_of,
+    one,
+)
+from service.vo.columns import PRODUCTS, PSFS, Table
+from service.vo.names import PRODUCT, PSF, did
+from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
+from workers.versions.validity import iso, seconds
+
+LINKS_TYPE = f"{VOTABLE_TYPE};content=datalink"
+LINKS_STANDARD = "ivo://ivoa.net/std/DataLink#links-1.1"
+USUAL, MOST = 1000, 5000
+MJD_1970, DAY_S = 40587.0, 86400.0
+M_PER_ANGSTROM = 1e-10
+COLLECTION = "heliopsf"
+PARAMETERS = described(
+    MAXREC=f"largest number of rows; default {USUAL}, at most {MOST}; 0: only the columns",
+    CURSOR="the cursor in the address of the next page, INFO `next`",
+    RESPONSEFORMAT="votable (default) or json",
+)
+BODY: dict[str, Any] = {
+    "response_class": Response,
+    "responses": {
+        200: {
+            "description": "A VOTable 1.4, or JSON: `columns`, `rows`, `status` (OK or OVERFLOW), `next`",
+            "content": {VOTABLE_TYPE: {}, "application/json": {"schema": {"type": "object"}}},
+        },
+        "4XX": {"content": {VOTABLE_TYPE: {}}, "description": "A VOTable with QUERY_STATUS=ERROR"},
+    },
+    "openapi_extra": PARAMETERS,
+}
+router = APIRouter(prefix="/vo", tags=["VO"], route_class=VotableErrors)
+
+
+@router.get("/products", summary="Products with the columns of ObsCore", **BODY)
+@router.post("/products", include_in_schema=False)
+def list_vo_products(request: Request, caller: Reading, state: Shared, fields: Fields) -> Response:
+    """Your products, newest first. A harvester reads pages until it meets a product that it knows."""
+
+    def page(limit: int, after: tuple[float, str] | None) -> Sequence[ProductRow]:
+        return state.catalogue.page(ProductRow, owner=caller.owner, limit=limit, after=after)
+
+    def records(rows: Sequence[ProductRow]) -> list[dict[str, Any]]:
+        images = state.catalogue.rows(ImageRow, {row.image_id for row in rows}, caller.owner)
+        return [product_record(row, images.get(row.image_id), base_url(request)) for row in rows]
+
+    return _listed(request, fields, PRODUCTS, page, records)
+
+
+@router.get("/psfs", summary="PSFs with the columns of ObsCore", **BODY)
+@router.post("/psfs", include_in_schema=False)
+def list_vo_psfs(request: Request, caller: Reading, state: Shared, fields: Fields) -> Response:
+    """Your PSFs, newest first. `t_min` and `t_max` are the validity of certified PSFs."""
+
+    def page(limit: int, after: tuple[float, str] | None) -> Sequence[PsfRow]:
+        return state.catalogue.page(PsfRow, owner=caller.owner, limit=limit, after=after)
+
+    def records(rows: Sequence[PsfRow]) -> list[dict[str, Any]]:
+        return [psf_record(row, base_url(request)) for row in rows]
+
+    return _listed(request, fields, PSFS, page, records)
+
+
+def product_record(row: ProductRow, image: ImageRow | None, base: str) -> dict[str, Any]:
+    """The values of a product's columns. image: the input; None if the service does not keep it (bulk runs over an archive)."""
+    seen: Mapping[str, Any] = {} if image is None else image.summary
+    shape, cards = seen.get("shape") or (None, None), seen.get("cards") or {}
+    scales = [plate_scale_arcsec(cards, axis) for axis in (1, 2)]
+    fov = [n * scale / 3600 for n, scale in zip(reversed(shape), scales, strict=True) if n and scale]
+    start, exposure_s = _mjd(seen.get("date_obs")), seen.get("exposure_s")
+    instrument = seen.get("detector") or seen.get("instrume") or seen.get("instrument")
+    method = row.details.get("method")
+    artefacts = (row.details.get("changes") or {}).get("artefacts") or {}
+    return _record(row, PRODUCT, row.details.get("filename"), base) | {
+        "obs_id": row.image_id,
+        "target_name": "Sun",
+        "s_fov": max(fov) if len(fov) == 2 else None,
+        "s_xel1": shape[1],
+        "s_xel2": shape[0],
+        "t_min": start,
+        "t_max": None if start is None or exposure_s is None else start + exposure_s / DAY_S,
+        "t_exptime": exposure_s,
+        "t_resolution": exposure_s,
+        **_channel(seen.get("wavelnth")),
+        "o_ucd": "phot.count;em.UV.10-50nm",
+        "facility_name": seen.get("telescop"),
+        "instrument_name": instrument,
+        "image_id": row.image_id,
+        "psf_id": row.psf_id,
+        "psf_version": row.psf_version,
+        "method": method.get("name") if isinstance(method, dict) else method,
+        "artefact_score": artefacts.get("score"),
+    }
+
+
+def psf_record(row: PsfRow, base: str) -> dict[str, Any]:
+    """The values of a PSF's columns."""
+    shape = row.details.get("shape") or (None, None)
+    return _record(row, PSF, f"PSF {row.name} {row.version}", base) | {
+        "obs_id": row.id,
+        "s_xel1": shape[1],
+        "s_xel2": shape[0],
+        "t_min": _mjd_of(row.valid_from),
+        "t_max": _mjd_of(row.valid_to),
+        **_channel(row.details.get("wavelength_angstrom")),
+        "o_ucd": "instr.det.psf",
+        "instrument_name": row.instrument,
+        "name": row.name,
+        "version": row.version,
+        "status": row.status,
+        "kind": row.kind,
+        "origin": row.origin,
+        "successor": row.successor_id,
+    }
+
+
+def _record(row: ProductRow | PsfRow, kind: str, title: str | None, base: str) -> dict[str, Any]:
+    """The values of the columns that both lists have."""
+    name = did(kind, row.id)
+    return {
+        "dataproduct_type": "image",
+        "calib_level": 3,
+        "obs_collection": COLLECTION,
+        "obs_publisher_did": name,
+        "access_url": f"{base}/vo/links?ID={name}",
+        "access_format": LINKS_TYPE,
+        "access_estsize": max(1, round(row.bytes / 1000)),
+        "t_xel": 1,
+        "em_xel": 1,
+        "pol_xel": 0,
+        "obs_title": title,
+        "obs_creation_date": _timestamp(row.created_at),
+        "obs_creator_name": row.owner,
+        "file_url": f"{base}/v1/{kind}s/{row.id}/file",
+        "file_sha256": row.file_sha256,
+        "provenance_url": f"{base}/v1/{kind}s/{row.id}/provenance",
+    }
+
+
+def _listed(
+    request: Request,
+    fields: Mapping[str, list[str]],
+    table: Table,
+    page: Callable[[int, tuple[float, str] | None], Sequence[Any]],
+    records: Callable[[Sequence[Any]], list[dict[str, Any]]],
+) -> Response:
+    """The answer to a request for a list."""
+    asked_format = format_of(fields, VOTABLE, JSON)
+    limit = min(integer("MAXREC", one(fields, "maxrec") or str(USUAL), 0), MOST)
+    found = page(limit + 1, position(one(fields, "cursor")))
+    rows = found[:limit]
+    status = "OVERFLOW" if len(found) > limit else "OK"
+    after = rows[-1] if rows and status == "OVERFLOW" else None
+    link = None if after is None else following(request, repr(after.created_at), after.id)
+    following_page = None if link is None else base_url(request) + link
+    if asked_format == JSON:
+        return JSONResponse(_as_json(table, records(rows), status, following_page))
+    from service.vo.votables import Input, Service, table_document  # loads the numerical libraries
+
+    links = Service(
+        "links",
+        "All files of a row",
+        f"{base_url(request)}/vo/links",
+        (Input("ID", "Product or PSF", ucd="meta.id;meta.main", ref="obs_publisher_did"),),
+        standard_id=LINKS_STANDARD,
+        content_type=LINKS_TYPE,
+    )
+    infos = {} if following_page is None else {"next": following_page}
+    content = table_document(
+        table.name, table.columns, records(rows), status=status, infos=infos, services=[links]
+    )
+    return Response(content, media_type=VOTABLE_TYPE)
+
+
+def _as_json(
+    table: Table, rows: Sequence[Mapping[str, Any]], status: str, following_page: str | None
+) -> dict[str, Any]:
+    about = ("name", "description", "datatype", "unit", "ucd", "utype", "xtype")
+    return {
+        "table": table.name,
+        "columns": [{key: getattr(column, key) for key in about} for column in table.columns],
+        "rows": [{column.name: row.get(column.name) for column in table.columns} for row in rows],
+        "status": status,
+        "next": following_page,
+    }
+
+
+def _channel(angstrom: float | None) -> dict[str, float | None]:
+    """The limits of the wavelength: both are the wavelength that names the channel."""
+    metres = None if angstrom is None else angstrom * M_PER_ANGSTROM
+    return {"em_min": metres, "em_max": metres}
+
+
+def _mjd(date_obs: str | None) -> float | None:
+    """The modified Julian date of a date in a header; None if the header gives no usable date."""
+    try:
+        return None if date_obs is None else _mjd_of(seconds(date_obs))
+    except DataError:
+        return None
+
+
+def _mjd_of(at: float | None) -> float | None:
+    """The modified Julian date of a time; None for an open end."""
+    return None if at is None or math.isinf(at) else MJD_1970 + at / DAY_S
+
+
+def _timestamp(at: float) -> str:
+    """A time as DALI writes it, in UTC without a zone, to the millisecond."""
+    return (iso(round(at, 3)) or "").removesuffix("Z")[:23]

@@ -1,0 +1,99 @@
+"""pyvo from a list of products to its files, on a real service with keys: what an archive or an astronomer does."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+
+import numpy as np
+import prov
+import pytest
+import requests
+from astropy.io import fits
+from pyvo.dal import DALQueryError
+from pyvo.dal.adhoc import DatalinkQuery, DatalinkResults
+from pyvo.dal.query import DALQuery, DALResults
+from pyvo.io.vosi import parse_availability, parse_capabilities, parse_tables
+
+from service.client.http import Client
+from tests.conftest import write_image, write_psf
+from tests.service.vo.made import OBSERVED, WCS_CARDS
+from tests.whole import stack as stacks
+from tests.whole.stack import Stack, wait_for
+from tests.whole.test_uws_keys import key_of, session_with
+from workers.catalogue.access.keys import Scope
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("HELIOPSF_ACCESS", "keys")
+        patched.delenv("HELIOPSF_KEY", raising=False)
+        with stacks.embedded(tmp_path_factory.mktemp("vo")) as running:
+            yield running
+
+
+@pytest.fixture(scope="module")
+def session(stack: Stack, tmp_path_factory: pytest.TempPathFactory) -> requests.Session:
+    """A session with a key, whose owner has one product."""
+    folder = tmp_path_factory.mktemp("images")
+    key = key_of(stack, "astronomer", Scope.READ, Scope.SUBMIT)
+    write_image(folder / "image.fits", **OBSERVED, **WCS_CARDS)
+    write_psf(folder / "psf.fits")
+    with Client(stack.client.server, key=key) as client:
+        psf = client.upload_psf(folder / "psf.fits")
+        # The test's PSF names no instrument; only the request connects it with the image.
+        client.deconvolve(
+            folder / "image.fits", folder / "sharp.fits", psf_id=psf["id"], method="linear", steps=2
+        )
+    return session_with(key, "basic")
+
+
+def test_vosi_says_where_everything_is(stack: Stack) -> None:
+    base = f"{stack.client.server}/vo"
+    get = lambda name: io.BytesIO(requests.get(f"{base}/{name}", timeout=60).content)  # noqa: E731
+    wait_for(lambda: parse_availability(get("availability")).available, "the worker announces itself", 120)
+    found = {one.standardid: one for one in parse_capabilities(get("capabilities"))}
+    links = found["ivo://ivoa.net/std/DataLink#links-1.1"].interfaces[0]
+    assert links.accessurls[0].content == f"{base}/links"
+    assert links.securitymethods[0].standardid == "ivo://ivoa.net/sso#BasicAA"
+    tables = parse_tables(get("tables"))
+    assert {table.name for table in tables.iter_tables()} == {"products", "psfs"}
+
+
+def test_from_the_list_to_the_file_its_input_its_psf_and_its_provenance(
+    stack: Stack, session: requests.Session
+) -> None:
+    products = DALResults.from_result_url(f"{stack.client.server}/vo/products", session=session)
+    [product] = products
+    assert product["instrument_name"] == "HRI_EUV" and product["method"] == "linear"
+    table = DatalinkResults.from_result_url(str(product["access_url"]), session=session)
+    by_name = {str(link["local_semantics"]): link for link in table}
+    for name, count in (("file", 2), ("input", 1), ("psf", 1)):
+        content = session.get(by_name[name].access_url, timeout=60).content
+        assert len(content) == by_name[name].content_length
+        with fits.open(io.BytesIO(content)) as hdus:
+            assert len(hdus) == count
+    assert {link.semantics for link in table.bysemantics("#progenitor", include_narrower=False)} == {
+        "#progenitor"
+    }
+    document = prov.read(session.get(by_name["provenance"].access_url, timeout=60).content)
+    name = str(product["obs_publisher_did"]).removeprefix("urn:heliopsf:")
+    assert len(document.get_record(name)) == 1
+
+    [row] = [link for link in table if link.service_def == "cutout"]
+    cutout = DatalinkQuery.from_resource(row, table.get_adhocservice_by_id("cutout"), session=session)
+    cutout["CIRCLE"], cutout["FRAME"] = "100 -50 4", "helioprojective"
+    answer = session.get(cutout.queryurl, params=dict(cutout), timeout=60)
+    with fits.open(io.BytesIO(answer.content)) as hdus:
+        assert hdus[0].shape == (17, 17) and np.isfinite(hdus[0].data).all()
+
+
+def test_errors_reach_the_user(stack: Stack, session: requests.Session) -> None:
+    query = DALQuery(f"{stack.client.server}/vo/products", session=session, MAXREC="many")
+    with pytest.raises(DALQueryError, match="expected MAXREC, a whole number"):
+        query.execute()
+    anonymous = requests.get(f"{stack.client.server}/vo/products", timeout=60)
+    assert anonymous.status_code == 401 and "Basic" in anonymous.headers["WWW-Authenticate"]
