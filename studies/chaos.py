@@ -35,8 +35,10 @@ from workers.files.store import sha256_of
 
 ENDED = ("COMPLETED", "ERROR", "ABORTED")
 LONGEST_S = 1800.0
+START_S = 180.0  # on a busy machine
 REST_S = (0.2, 3.0)  # time between the kill of a process and its new start
 STEPS = 20
+DATABASES = ("postgresql", "redis", "s3")  # started before all others
 
 
 @dataclass
@@ -115,7 +117,10 @@ def servers(folder: Path, *, redis_keeps: bool, workers: int = 2) -> Iterator[Se
     data = folder / "data"
     data.mkdir()
     database, redis, port = free_port(), free_port(), free_port()
-    made = {"postgresql": _postgresql(folder, database), "redis": _redis(folder, redis, keeps=redis_keeps)}
+    made = {
+        "postgresql": postgresql(folder, database),
+        "redis": redis_server(folder, redis, keeps=redis_keeps),
+    }
     database_url = f"postgresql://heliopsf@127.0.0.1:{database}/postgres"
     environment = (
         os.environ
@@ -136,15 +141,23 @@ def servers(folder: Path, *, redis_keeps: bool, workers: int = 2) -> Iterator[Se
         name = f"worker {k + 1}"
         made[name] = Process(name, [*python, "worker"], environment, folder / "workers.log")
     running = Servers(made, f"http://127.0.0.1:{port}", database_url, data)
-    try:
-        made["postgresql"].start()
-        made["redis"].start()
-        wait_for(lambda: _answers(database_url), "PostgreSQL answers")
-        for name, process in made.items():
-            if name not in ("postgresql", "redis"):
-                process.start()
-        wait_for(lambda: _healthy(running.address), "the service answers")
+    with started(running):
         yield running
+
+
+@contextmanager
+def started(running: Servers) -> Iterator[None]:
+    """Start all processes, the databases first, and wait until they answer; at the end, kill all of them."""
+    made = running.processes
+    databases = [name for name in made if name in DATABASES]
+    try:
+        for name in databases:
+            made[name].start()
+        wait_for(lambda: _answers(running.database_url), "PostgreSQL answers", START_S)
+        for name in made.keys() - databases:
+            made[name].start()
+        wait_for(lambda: _healthy(running.address), "the service answers", START_S)
+        yield
     finally:
         running.stopped.set()
         time.sleep(REST_S[1] + 1)  # the threads that start servers have now seen `stopped`
@@ -153,7 +166,8 @@ def servers(folder: Path, *, redis_keeps: bool, workers: int = 2) -> Iterator[Se
                 process.kill()
 
 
-def _postgresql(folder: Path, port: int) -> Process:
+def postgresql(folder: Path, port: int, address: str = "127.0.0.1", network: str | None = None) -> Process:
+    """A new PostgreSQL server. network: clients of this network need no password. Raises Missing."""
     found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
     initdb = shutil.which("initdb") or (str(found[-1]) if found else None)
     if initdb is None:
@@ -171,18 +185,33 @@ def _postgresql(folder: Path, port: int) -> Process:
         user=user,
         cwd=cluster,
     )
+    if network is not None:
+        with (cluster / "pg_hba.conf").open("a") as rules:
+            rules.write(f"host all all {network} trust\n")
     binary = str(Path(initdb).resolve().parent / "postgres")
-    options = ["-p", str(port), "-h", "127.0.0.1", "-k", str(cluster)]
+    options = ["-p", str(port), "-h", address, "-k", str(cluster)]
     log = folder / "postgresql.log"
     return Process("postgresql", [binary, "-D", str(cluster), *options], dict(os.environ), log, user)
 
 
-def _redis(folder: Path, port: int, *, keeps: bool) -> Process:
+def redis_server(folder: Path, port: int, address: str = "127.0.0.1", *, keeps: bool) -> Process:
+    """A Redis server. keeps: it writes its append-only file. Raises Missing."""
     binary = shutil.which("redis-server")
     if binary is None:
         raise Missing("no redis-server on this machine")
     kept = ["--appendonly", "yes" if keeps else "no", "--save", ""]
-    command = [binary, "--bind", "127.0.0.1", "--port", str(port), "--dir", str(folder), *kept]
+    command = [
+        binary,
+        "--bind",
+        address,
+        "--port",
+        str(port),
+        "--dir",
+        str(folder),
+        "--protected-mode",
+        "no",
+        *kept,
+    ]
     return Process("redis", command, dict(os.environ), folder / "redis.log")
 
 
@@ -262,6 +291,18 @@ def check(running: Servers, sent: dict[str, str]) -> dict[str, int]:
 
     Returns counts for the output. Raises AssertionError.
     """
+    found, digests = check_rows(running, sent)
+    for digest in digests:
+        path = running.data / "blobs" / digest[:2] / digest
+        assert path.is_file() and sha256_of(path) == digest, f"{digest} is whole"
+    return found
+
+
+def check_rows(running: Servers, sent: dict[str, str]) -> tuple[dict[str, int], set[str]]:
+    """Check that every job is completed and that every image has one product.
+
+    Returns counts for the output, and the SHA-256 of all files of products. Raises AssertionError.
+    """
     engine = create_engine(running.database_url.replace("postgresql://", "postgresql+psycopg://"))
     with engine.connect() as connection:
         jobs = connection.execute(text("SELECT id, phase, attempt, submissions, error FROM jobs")).all()
@@ -274,15 +315,14 @@ def check(running: Servers, sent: dict[str, str]) -> dict[str, int]:
     assert {job.id for job in jobs} == set(sent.values())
     made = collections.Counter(product.image_id for product in products)
     assert made == dict.fromkeys(sent, 1), "each image has one product"
-    for digest in {d for product in products for d in (product.file_sha256, product.preview_sha256)}:
-        path = running.data / "blobs" / digest[:2] / digest
-        assert path.is_file() and sha256_of(path) == digest, f"{digest} is whole"
-    return {
+    digests = {d for product in products for d in (product.file_sha256, product.preview_sha256)}
+    found = {
         "jobs": len(jobs),
         "products": len(products),
         "attempts": sum(job.attempt for job in jobs),
         "submissions": sum(job.submissions for job in jobs),
     }
+    return found, digests
 
 
 def run(jobs: int, kills: int, px: int, seed: int, *, redis_keeps: bool) -> dict[str, int]:

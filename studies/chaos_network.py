@@ -1,0 +1,337 @@
+"""Cut the network of workers whose clocks differ, and kill processes: no job may be lost, done twice, or stuck.
+
+    python -m studies.chaos_network [--jobs 300] [--faults 30] [--cuts 2] [--cut-s 60] [--apart-s 90] [--px 64] [--seed 1]
+
+The study simulates three hosts with Linux network namespaces. On the first run PostgreSQL, Redis, an S3 server (moto)
+and the service; on each of the others runs a worker. The workers reach the first host through a bridge, have their own
+host names and data folders, and keep files only in S3. The clocks of the workers are APART seconds apart, around the
+clock of the first host. A fault is one of two kinds: a cut takes a worker out of the bridge for CUT seconds,
+so that its packets vanish without an answer; a kill sends SIGKILL to a process group, which starts again a moment later.
+
+The study needs Linux, root, the commands `ip` and `unshare` (Debian: iproute2, util-linux), a C compiler, PostgreSQL,
+Redis, and the packages of the extra `dev`. All its traffic stays in its namespaces, which it removes at the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import hashlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import s3fs
+
+from studies.chaos import (
+    REST_S,
+    START_S,
+    Process,
+    Servers,
+    check_rows,
+    postgresql,
+    redis_server,
+    send,
+    started,
+    wait_for_all,
+)
+from tests.whole.stack import QUICK, Missing, wait_for
+
+NETWORK, FIRST = "10.77.0.0/24", "10.77.0.1"
+WORKERS = {"worker 1": "10.77.0.11", "worker 2": "10.77.0.12"}
+PORTS = {"postgresql": 5432, "redis": 6379, "s3": 9000, "service": 8765}
+BUCKET = "chaos"
+CLONE_NEWNET = 0x40000000
+KEYS = {
+    "AWS_ENDPOINT_URL": f"http://{FIRST}:{PORTS['s3']}",
+    "AWS_ACCESS_KEY_ID": "test",
+    "AWS_SECRET_ACCESS_KEY": "test",
+    "AWS_DEFAULT_REGION": "us-east-1",
+    "AWS_EC2_METADATA_DISABLED": "true",
+}
+
+
+class Hosts:
+    """The namespaces. Each worker has a cable to the bridge of the first host, which can be pulled."""
+
+    def __init__(self) -> None:
+        self._tag = f"heliopsf-{os.getpid()}"
+        self.names = {name: f"{self._tag}-{k}" for k, name in enumerate(["first", *WORKERS])}
+        self._cables = {name: f"cable{k + 1}" for k, name in enumerate(WORKERS)}
+        self.cuts = dict.fromkeys(WORKERS, 0)
+
+    def make(self) -> None:
+        """Make the namespaces, the bridge and the cables."""
+        first = self.names["first"]
+        for name in self.names.values():
+            _ip("netns", "add", name)
+            _ip("-n", name, "link", "set", "lo", "up")
+        _ip("-n", first, "link", "add", "bridge0", "type", "bridge")
+        _ip("-n", first, "address", "add", f"{FIRST}/24", "dev", "bridge0")
+        _ip("-n", first, "link", "set", "bridge0", "up")
+        for worker, address in WORKERS.items():
+            cable, host = self._cables[worker], self.names[worker]
+            _ip("-n", first, "link", "add", cable, "type", "veth", "peer", "name", "net0", "netns", host)
+            _ip("-n", first, "link", "set", cable, "master", "bridge0", "up")
+            _ip("-n", host, "address", "add", f"{address}/24", "dev", "net0")
+            _ip("-n", host, "link", "set", "net0", "up")
+
+    def remove(self) -> None:
+        """Remove the namespaces that exist."""
+        for name in self.names.values():
+            subprocess.run(["ip", "netns", "delete", name], check=False, stderr=subprocess.DEVNULL)
+
+    def cut(self, worker: str) -> None:
+        """Let all packets from and to a worker vanish."""
+        _ip("-n", self.names["first"], "link", "set", self._cables[worker], "nomaster")
+        self.cuts[worker] += 1
+
+    def join(self, worker: str) -> None:
+        """End the cut."""
+        _ip("-n", self.names["first"], "link", "set", self._cables[worker], "master", "bridge0")
+
+    def enter_first(self) -> None:
+        """Move this thread, and all processes and threads that it starts, to the first host."""
+        libc = ctypes.CDLL(None, use_errno=True)
+        with open(f"/run/netns/{self.names['first']}") as namespace:
+            if libc.setns(namespace.fileno(), CLONE_NEWNET):
+                raise OSError(ctypes.get_errno(), "cannot enter the network namespace")
+
+
+def _ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True)
+
+
+@contextmanager
+def hosts() -> Iterator[Hosts]:
+    """The hosts; this process is moved to the first. Raises Missing."""
+    if sys.platform != "linux" or os.geteuid() != 0:
+        raise Missing("network namespaces need Linux and root")
+    for command in ("ip", "unshare"):
+        if shutil.which(command) is None:
+            raise Missing(f"no command {command} on this machine")
+    made = Hosts()
+    try:
+        try:
+            made.make()
+        except subprocess.CalledProcessError as error:
+            raise Missing(f"this machine cannot make network namespaces: {error}") from error
+        made.enter_first()
+        yield made
+    finally:
+        made.remove()
+
+
+# libfaketime 0.9.10 breaks the sleep of Python 3.11 (clock_nanosleep until a time of the monotonic clock: EINVAL). This
+# library shifts the clock of the day alone, and the deadlines that glibc compares with it.
+CLOCK = r"""
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <semaphore.h>
+#include <stdlib.h>
+#include <sys/time.h>
+#include <time.h>
+static long offset(void) { const char *s = getenv("CLOCK_OFFSET_S"); return s ? atol(s) : 0; }
+#define REAL(f) ((__typeof__(&f)) dlsym(RTLD_NEXT, #f))
+int clock_gettime(clockid_t clock, struct timespec *now) {
+    int rc = REAL(clock_gettime)(clock, now);
+    if (!rc && (clock == CLOCK_REALTIME || clock == CLOCK_REALTIME_COARSE)) now->tv_sec += offset();
+    return rc;
+}
+int gettimeofday(struct timeval *now, void *zone) {
+    struct timespec t;
+    clock_gettime(CLOCK_REALTIME, &t);
+    now->tv_sec = t.tv_sec; now->tv_usec = t.tv_nsec / 1000;
+    return 0;
+}
+time_t time(time_t *out) {
+    struct timespec t;
+    clock_gettime(CLOCK_REALTIME, &t);
+    if (out) *out = t.tv_sec;
+    return t.tv_sec;
+}
+int sem_timedwait(sem_t *sem, const struct timespec *until) {
+    struct timespec t = *until;
+    t.tv_sec -= offset();
+    return REAL(sem_timedwait)(sem, &t);
+}
+"""
+
+
+def _clock_library(folder: Path) -> Path:
+    """Compile the library. Raises Missing."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        raise Missing("no C compiler cc on this machine")
+    source, library = folder / "clock.c", folder / "clock.so"
+    source.write_text(CLOCK)
+    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", str(library), str(source), "-ldl"], check=True)
+    return library
+
+
+def _at(namespace: str, name: str, command: Sequence[str]) -> list[str]:
+    """The command, run on a host with a host name of its own."""
+    named = ["unshare", "--uts", "sh", "-c", 'hostname "$0"; exec "$@"', name.replace(" ", "-")]
+    return ["ip", "netns", "exec", namespace, *named, *command]
+
+
+@contextmanager
+def servers(folder: Path, made: Hosts, apart_s: float) -> Iterator[Servers]:
+    """Start all servers and wait until they answer; at the end, kill all of them. Raises Missing."""
+    database_url = f"postgresql://heliopsf@{FIRST}:{PORTS['postgresql']}/postgres"
+    shared = os.environ | QUICK | KEYS
+    shared |= {
+        "HELIOPSF_DATABASE_URL": database_url,
+        "HELIOPSF_BROKER_URL": f"redis://{FIRST}:{PORTS['redis']}/0",
+        "HELIOPSF_STORE_URL": f"s3://{BUCKET}/files",
+        "HELIOPSF_MAX_ATTEMPTS": "40",  # a job must not fail because its worker was lost several times
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": str(Path(__file__).parents[1]),  # the processes start in another folder
+    }
+    library = _clock_library(folder)
+    python = [sys.executable, "-m", "service.cli"]
+    s3 = [sys.executable, "-m", "moto.server", "-H", FIRST, "-p", str(PORTS["s3"])]
+    serve = [*python, "serve", "--host", "127.0.0.1", "--port", str(PORTS["service"])]
+    processes = {
+        "postgresql": postgresql(folder, PORTS["postgresql"], FIRST, NETWORK),
+        "redis": redis_server(folder, PORTS["redis"], FIRST, keeps=False),
+        "s3": Process("s3", s3, dict(os.environ), folder / "s3.log"),
+    }
+    clocks = {
+        worker: {"LD_PRELOAD": str(library), "CLOCK_OFFSET_S": f"{sign * apart_s / 2:.0f}"}
+        for worker, sign in zip(WORKERS, (-1, 1), strict=True)
+    }
+    own: dict[str, dict[str, str]] = {"service": {}, **clocks}
+    for name, clock in own.items():
+        data = folder / name.replace(" ", "-")
+        data.mkdir()
+        command = serve if name == "service" else _at(made.names[name], name, [*python, "worker"])
+        environment = shared | {"HELIOPSF_DATA_DIR": str(data)} | clock
+        processes[name] = Process(name, command, environment, folder / f"{name}.log".replace(" ", "-"))
+    running = Servers(processes, f"http://127.0.0.1:{PORTS['service']}", database_url, folder / "service")
+    made_bucket = threading.Thread(target=_make_bucket, daemon=True)
+    made_bucket.start()
+    with started(running):
+        made_bucket.join()
+        yield running
+
+
+def _object_store() -> s3fs.S3FileSystem:
+    return s3fs.S3FileSystem(
+        key=KEYS["AWS_ACCESS_KEY_ID"],
+        secret=KEYS["AWS_SECRET_ACCESS_KEY"],
+        endpoint_url=KEYS["AWS_ENDPOINT_URL"],
+        skip_instance_cache=True,
+        use_listings_cache=False,
+    )
+
+
+def _make_bucket() -> None:
+    def done() -> bool:
+        try:
+            _object_store().mkdir(BUCKET)
+        except OSError:
+            return False
+        return True
+
+    wait_for(done, "the S3 server answers", START_S)
+
+
+@contextmanager
+def disturbed(
+    running: Servers, made: Hosts, faults: int, cuts: int, cut_s: float, rng: random.Random
+) -> Iterator[threading.Thread]:
+    """In other threads: kills and cuts in random order. moto keeps objects in memory, so it is not killed."""
+    kinds = ["cut"] * cuts + ["kill"] * (faults - cuts)
+    rng.shuffle(kinds)
+    killable = sorted(running.processes.keys() - {"s3"})
+
+    def disturb() -> None:
+        cut_workers = rng.sample(list(WORKERS), len(WORKERS)) * cuts
+        for kind in kinds:
+            if running.stopped.wait(rng.uniform(0.5, 6.0)):
+                return
+            if kind == "cut":
+                worker = cut_workers.pop()
+                made.cut(worker)
+                running.stopped.wait(cut_s)
+                made.join(worker)
+            else:
+                process = running.processes[rng.choice(killable)]
+                process.resting = True  # otherwise `keep_running` would start it too
+                process.kill()
+                time.sleep(rng.uniform(*REST_S))
+                process.start()
+                process.resting = False
+
+    threads = [threading.Thread(target=disturb), threading.Thread(target=running.keep_running)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield threads[0]
+    finally:
+        running.stopped.set()
+        for thread in threads:
+            thread.join()
+
+
+def run(
+    jobs: int, faults: int, px: int, seed: int, *, cuts: int, cut_s: float, apart_s: float
+) -> dict[str, int]:
+    """Run the study. Returns the counts. Raises AssertionError, Missing."""
+    rng = random.Random(seed)
+    with tempfile.TemporaryDirectory(prefix="heliopsf-chaos-") as temporary, hosts() as made:
+        folder = Path(temporary)
+        with servers(folder, made, apart_s) as running:
+            with disturbed(running, made, faults, cuts, cut_s, rng) as disturber:
+                sent = send(running, folder, jobs, px)
+                disturber.join()
+                wait_for_all(running, jobs)
+            found, digests = check_rows(running, sent)
+            store = _object_store()
+            for digest in digests:
+                content = store.cat_file(f"{BUCKET}/files/blobs/{digest[:2]}/{digest}")
+                assert hashlib.sha256(content).hexdigest() == digest, f"{digest} is whole"
+            found |= {f"kills of {p.name}": p.kills for p in running.processes.values() if p.name != "s3"}
+            return found | {f"cuts of {worker}": count for worker, count in made.cuts.items()}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--jobs", type=int, default=300)
+    parser.add_argument("--faults", type=int, default=30, help="number of kills and cuts together")
+    parser.add_argument("--cuts", type=int, default=2, help="number of cuts among the faults")
+    parser.add_argument("--cut-s", type=float, default=60.0, help="duration of a cut, s")
+    parser.add_argument("--apart-s", type=float, default=90.0, help="difference of the workers' clocks, s")
+    parser.add_argument("--px", type=int, default=64, help="side of an image, pixels")
+    parser.add_argument("--seed", type=int, default=1)
+    asked = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that servers and namespaces are removed
+    begun = time.perf_counter()
+    found = run(
+        asked.jobs,
+        asked.faults,
+        asked.px,
+        asked.seed,
+        cuts=asked.cuts,
+        cut_s=asked.cut_s,
+        apart_s=asked.apart_s,
+    )
+    print(f"clocks {asked.apart_s:g} s apart, cuts of {asked.cut_s:g} s; {time.perf_counter() - begun:.0f} s")
+    print("all jobs completed, each image has one product, every file in S3 is whole, no job is stuck:")
+    for name, count in found.items():
+        print(f"  {name:<20} {count}")
+
+
+if __name__ == "__main__":
+    main()
