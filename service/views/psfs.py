@@ -11,6 +11,12 @@ from workers.versions.status import PsfStatus
 from workers.versions.validity import iso
 
 
+def was_certified(row: PsfRow) -> bool:
+    """Whether a PSF is or was certified. An interpolated PSF may be deprecated together with one of its ends, without having
+    been certified."""
+    return row.status == PsfStatus.CERTIFIED or row.valid_from is not None
+
+
 class PsfView(BaseModel):
     """A PSF. Its content never changes, because the id depends on the content. Its status may change."""
 
@@ -56,8 +62,7 @@ class PsfView(BaseModel):
             channel=row.channel,
             kind=row.kind,
             status=PsfStatus(row.status),
-            # An interpolated PSF may be deprecated together with one of its ends, without having been certified.
-            was_certified=row.status == PsfStatus.CERTIFIED or row.valid_from is not None,
+            was_certified=was_certified(row),
             valid_from=None if row.valid_from is None else iso(row.valid_from),
             valid_to=None if row.valid_to is None else iso(row.valid_to),
             successor=row.successor_id,

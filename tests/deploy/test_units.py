@@ -63,7 +63,7 @@ def test_the_units_differ_only_in_what_they_run() -> None:
 
 
 def test_the_environment_file_names_settings() -> None:
-    lines = (DEPLOY / "systemd" / "heliopsf.env").read_text("utf-8").splitlines()
+    lines = (DEPLOY / "systemd" / "example.env").read_text("utf-8").splitlines()
     names = {line.split("=")[0] for line in lines if line and not line.startswith("#")}
     assert names and names <= KNOWN
 
@@ -159,6 +159,6 @@ def test_a_worker_gets_the_memory_of_its_jobs() -> None:
     assert limit_gib * 1024 >= int(config["data"]["HELIOPSF_MAX_JOB_MEMORY_MIB"]) + 2048
     (unit,) = (unit for unit in UNITS if unit.stem == "heliopsf-worker")
     (limit,) = assignments(unit, "MemoryMax")
-    environment = (DEPLOY / "systemd" / "heliopsf.env").read_text("utf-8")
+    environment = (DEPLOY / "systemd" / "example.env").read_text("utf-8")
     job_mib = int(re.findall(r"HELIOPSF_MAX_JOB_MEMORY_MIB=(\d+)", environment)[0])
     assert int(limit.removesuffix("G")) * 1024 >= job_mib + 2048

@@ -15,6 +15,7 @@ from service.http.problems import RESPONSES, problem
 from service.http.quotas import rows_held
 from service.http.state import Shared, State
 from service.views.changes import PastChange
+from service.views.psfs import was_certified
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import PsfChangeRow, PsfRow
 from workers.contract.requests import Identity
@@ -102,6 +103,9 @@ class StatusView(BaseModel):
     series: str | None = Field(
         description="instrument, channel and kind, as instrument/channel/kind; null: the instrument is unknown"
     )
+    was_certified: bool = Field(
+        description="whether the PSF is or was certified; if not, it has no range of observation times"
+    )
     valid_from: str | None = Field(description="null: no lower limit, or never certified")
     valid_to: str | None = Field(description="null: no upper limit, or never certified")
     successor: str | None
@@ -165,6 +169,7 @@ def _view(state: State, caller: Caller, row: PsfRow) -> StatusView:
         status=PsfStatus(row.status),
         version=row.version,
         series=row.series,
+        was_certified=was_certified(row),
         valid_from=None if row.valid_from is None else iso(row.valid_from),
         valid_to=None if row.valid_to is None else iso(row.valid_to),
         successor=row.successor_id,

@@ -61,7 +61,7 @@ def test_the_true_share_is_that_of_a_hypothesis_with_all_effects() -> None:
     for true, share in wanted.items():
         assert case_of(0, "single", true, shares).true_share(1.0) == pytest.approx(share)
     # A pair that the data do not show is counted to its effect; the second effect is then in no hypothesis.
-    idle = {NONE: 0.2, UNKNOWN: 0.1, A: 0.4, AB: 0.3}
+    idle = {NONE: 0.2, UNKNOWN: 0.1, A: 0.6, AB: 0.1}
     assert case_of(0, "single", A, idle).true_share(1.0) == pytest.approx(0.7)
     assert case_of(0, "pair", AB, idle).true_share(1.0) == 0.0
 

@@ -186,9 +186,8 @@ def test_another_worker_shares_the_folds(
     catalogue.close()
 
 
-def test_a_part_gets_one_result_from_several_workers(settings: Settings) -> None:
-    catalogue = Catalogue(settings.catalogue_url)
-    catalogue.upgrade()
+def test_a_part_gets_one_result_from_several_workers(service: LocalService, settings: Settings) -> None:
+    catalogue = Catalogue(settings.catalogue_url)  # with the tables that the local service made
     catalogue.parts.open("o", "k" * 64, 2)
     catalogue.parts.open("o", "k" * 64, 2)
     first, second = (catalogue.parts.take("o", "k" * 64, 60.0) for _ in range(2))

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from psfcore.deconvolve.assess import plots as assess_plots
 from psfcore.deconvolve.assess.quality import QualityBit
+from psfcore.drawing import plots
 from psfcore.errors import DataError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
-from workers.tasks.data import product as product_task
 
 AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171}
 FEW = {"steps": 2}
@@ -126,7 +127,7 @@ def test_pictures_name_the_unit_of_the_image(
     label: str,
 ) -> None:
     said = []
-    for module, name in ((product_task.plots, "preview_png"), (product_task, "changes_png")):
+    for module, name in ((plots, "preview_png"), (assess_plots, "changes_png")):
         real = getattr(module, name)
 
         def noted(*arguments: Any, real: Any = real, **named: Any) -> None:

@@ -62,6 +62,7 @@ def view(**details: object) -> PsfView:
         channel="174",
         kind="total",
         status=PsfStatus.DRAFT,
+        was_certified=False,
         valid_from=None,
         valid_to=None,
         successor=None,
