@@ -18,6 +18,7 @@ from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress
 
 VISIBLE_SIGMA = 2.0
+MOST_TRIES = 2
 
 
 class Refits:
@@ -49,11 +50,11 @@ class Refits:
         return tuple(fit for fit in self._made.values() if fit is not None)
 
     def of(self, hypotheses: Sequence[Names]) -> tuple[Corrected, ...]:
-        """The refits of these hypotheses, in this order: of the first one whose refit succeeds, and of those after it that
-        were refitted before. Only the first refit is made for this purpose, because each takes as long as the fit."""
+        """The refits of these hypotheses, in this order, if they succeed: of the first MOST_TRIES until one succeeds, and of
+        those that were refitted before. No other refits are made, because each takes as long as the fit."""
         found: list[Corrected] = []
-        for names in hypotheses:
-            fit = self._made.get(names) if found else self._fit(names)
+        for place, names in enumerate(hypotheses):
+            fit = self._fit(names) if not found and place < MOST_TRIES else self._made.get(names)
             found += [] if fit is None else [fit]
         return tuple(found)
 

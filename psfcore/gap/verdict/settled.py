@@ -9,6 +9,8 @@ refit, or after MOST_REFITS refits.
 The report names the effects of a hypothesis that is more probable than all others together. Its refit is made even if the
 linear model is exact enough, and if this refit fails, the hypothesis is excluded. If it succeeds, the evidence of the linear
 model stays: the evidence of a refit scatters by a few units, and the other hypotheses have no refit.
+
+If the refit of a pair fails, the triples with this pair are excluded too.
 """
 
 from __future__ import annotations
@@ -52,13 +54,25 @@ def settled_posterior(model: LinearModel, refit: Refit | None) -> tuple[Posterio
         real = refit(chosen)
         if real is None:  # the images do not contain the effects as the linear fit states them
             failed.append(chosen)
-            weights = {names: weight for names, weight in found.log_weights.items() if names != chosen}
-            found = replace(found, log_weights=weights)
+            found = _without_failed(found, chosen)
         elif inexact is not None:
             # The refit of a hypothesis itself is more exact than its evidence at the refit of another one.
             new = {names: weighed for names, weighed in real.items() if names == chosen or names not in done}
             found = _without_stale(found, chosen, done, new).with_evidence(new, effects)
     return found, tuple(failed)
+
+
+def _without_failed(found: Posterior, chosen: Names) -> Posterior:
+    """The posterior without a hypothesis whose refit failed. The linear evidence of a triple that contains this pair is not
+    trusted either."""
+    return replace(
+        found,
+        log_weights={
+            names: weight
+            for names, weight in found.log_weights.items()
+            if names != chosen and not (len(chosen) > 1 and set(chosen) < set(names))
+        },
+    )
 
 
 def _without_stale(

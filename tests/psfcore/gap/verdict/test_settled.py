@@ -137,6 +137,14 @@ def test_a_pair_keeps_the_evidence_of_its_own_refit(start: Start) -> None:
     assert found.log_weights[AB] < 40.0
 
 
+def test_triples_with_a_pair_whose_refit_failed_are_left_out(start: Start) -> None:
+    start({NONE: 0.0, A: 30.0, B: 20.0, AB: 45.0, ABC: 44.0})
+    refit = Refitted({A: {A: 30.0, AB: 45.0, ABC: 44.0}})
+    found, failed = settled_posterior(MODEL, refit)
+    assert refit.asked[:2] == [A, AB] and failed == (AB,)
+    assert not {AB, ABC} & set(found.log_weights) and next(iter(found.probabilities())) == A
+
+
 def test_the_number_of_refits_is_bounded(start: Start) -> None:
     """Many effects of equal probability, and no refit changes anything."""
     names = [(f"effect_{k}",) for k in range(3 * MOST_REFITS)]
