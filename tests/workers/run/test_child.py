@@ -31,7 +31,7 @@ import numpy as np
 import workers.tasks.psf_build
 
 def task(context, parameters):
-    context.report("at work", 1, 2)
+    context.report("at work", 2, 2)  # the last step: the process runs no short job between this report and the work
     match parameters["what"]:
         case "greedy":
             kept = []
@@ -88,6 +88,10 @@ class Worker:
         """The job's row when it has this phase."""
         wait_for(lambda: self.row(job).phase == phase, f"{phase}; {self.log.read_text()}", 60.0)
         return self.row(job)
+
+    def wait_at_work(self, job: JobRow) -> None:
+        """Wait until the job's task has begun: before, a cancellation ends the job without its process."""
+        wait_for(lambda: self.row(job).stage == "at work", f"the work; {self.log.read_text()}", 60.0)
 
     def child(self) -> int:
         """The process that runs the jobs."""
@@ -146,7 +150,7 @@ def test_a_greedy_job_fails_at_its_limit_and_the_next_one_runs(worker: Worker) -
 
 def test_a_job_that_ignores_its_cancellation_is_ended_with_its_process(worker: Worker) -> None:
     job = worker.submit("deaf")
-    worker.wait(job, "EXECUTING")
+    worker.wait_at_work(job)
     before = worker.child()
     worker.catalogue.jobs.cancel(job.id)
     row = worker.wait(job, "ABORTED")
@@ -157,7 +161,7 @@ def test_a_job_that_ignores_its_cancellation_is_ended_with_its_process(worker: W
 
 def test_a_job_that_blocks_the_interpreter_loses_its_process(worker: Worker) -> None:
     job = worker.submit("deaf in C")
-    worker.wait(job, "EXECUTING")
+    worker.wait_at_work(job)
     before = worker.child()
     worker.catalogue.jobs.cancel(job.id)
     worker.wait(worker.submit("nothing"), "COMPLETED")
