@@ -55,6 +55,8 @@ CHECKS = [
 ]
 # The requests are made when the test runs. Made while tests are collected, they take each worker of xdist ten seconds.
 DESCRIBED = schemathesis.pytest.from_fixture("described")
+# Requests that are not derived from each property of a schema. The slow test makes those too: they take minutes.
+QUICKLY_DESCRIBED = schemathesis.pytest.from_fixture("described_without_coverage")
 # Their bodies are those of POST /v1/jobs: the same models check them.
 SAME_BODIES = r"^/v1/(estimates|jobs/identity)$"
 LONGEST_ADDRESS = 60_000  # characters
@@ -173,14 +175,14 @@ def ask(case: Any, service: dict[str, Any]) -> None:
     )
 
 
-@DESCRIBED.exclude(path_regex=SAME_BODIES).parametrize()
-@settings(max_examples=3, **STEADY)  # few, because there are many operations; the slow test makes 100 of each
+@QUICKLY_DESCRIBED.exclude(path_regex=SAME_BODIES).parametrize()
+@settings(max_examples=5, **STEADY)  # few, because there are many operations; the slow test makes 100 of each
 def test_the_service_is_as_it_is_described(case: Any, service: dict[str, Any]) -> None:
     ask(case, service)
 
 
-@schemathesis.pytest.from_fixture("described_without_coverage").include(path_regex=SAME_BODIES).parametrize()
-@settings(max_examples=20, **STEADY)  # the slow test derives requests from each property of these bodies too
+@QUICKLY_DESCRIBED.include(path_regex=SAME_BODIES).parametrize()
+@settings(max_examples=20, **STEADY)
 def test_operations_with_the_bodies_of_a_job_are_as_described(case: Any, service: dict[str, Any]) -> None:
     ask(case, service)
 

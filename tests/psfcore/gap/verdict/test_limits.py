@@ -43,7 +43,9 @@ def model(evidence: Evidence) -> LinearModel:
     return LinearModel(evidence, FLOOR, scale_error=0.1)
 
 
-@pytest.mark.parametrize(("name", "k"), [("dark_offset", 0), ("column_smear", 0)])
+@pytest.mark.parametrize(
+    ("name", "k"), [pytest.param("dark_offset", 0, marks=pytest.mark.slow), ("column_smear", 0)]
+)
 def test_an_effect_of_this_strength_is_found_nine_times_in_ten(model: LinearModel, name: str, k: int) -> None:
     """With noise drawn anew each time, by the answer that the posterior itself gives."""
     strength = limits_of(model).effects[name].parameters[k].found_90
@@ -56,6 +58,7 @@ def test_an_effect_of_this_strength_is_found_nine_times_in_ten(model: LinearMode
     assert 0.82 <= found / DRAWS <= 0.97
 
 
+@pytest.mark.slow
 def test_the_rms_of_a_random_field_is_found_and_bounded(model: LinearModel) -> None:
     """The smear as a random field: its two coefficients are drawn anew each time, with the standard deviation that should be found."""
     smear = next(e for e in model.evidence.effects if e.name == "column_smear")
