@@ -1,4 +1,8 @@
-"""Deconvolves one image of a bulk run, which is an upload or a file. The product goes into the service, into a folder, or both."""
+"""Deconvolves an image of a bulk run, which is an upload or a file. The product goes into the service, into a folder, or both.
+
+The work has three parts, which a turn runs in three threads for three images at the same time: `read_one`,
+`compute_one` and `write_one`.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,7 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.fits.header import read_summary
+from psfcore.image import Image
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Taken
 from workers.catalogue.tables import ImageRow, ProductRow
@@ -29,6 +34,7 @@ from workers.intake.requests import resolved_deconvolution
 from workers.tasks import deconvolve as deconvolve_task
 from workers.tasks.context import Context
 from workers.tasks.data import product
+from workers.tasks.data.product import Made
 from workers.tasks.psf_build import requested_psf
 
 # The changes of an image are summarised for blocks of 4 × 4 px: the brightest and the darkest 1 % of the blocks.
@@ -65,10 +71,21 @@ class _Source:
     name: str
 
 
-def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Outcome:
-    """Deconvolve an image of a bulk run. If its product exists already, use this product.
+@dataclass(frozen=True)
+class Ready:
+    """An image that was read and can be deconvolved. target: the path of the product in the output folder, or None."""
 
-    If another job is making the product now, wait for that job and use its product.
+    wanted: ResolvedDeconvolve
+    identity: str
+    image: Image
+    target: Path | None
+
+
+def read_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Ready | Outcome:
+    """Read an image of a bulk run and choose its PSF. If its product exists already, return this product.
+
+    If another job is making the product now, wait for that job and use its product. Raises DataError for an image
+    that cannot be deconvolved, and OSError if the disk is full.
     """
     with _source(context, taken) as source:
         wanted = _resolved(context, bulk, request, source)
@@ -77,13 +94,48 @@ def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Ta
         if target is not None and taken.attempt > 1 and target.parent.is_dir():
             # A killed worker may have left partial copies.
             beneath.remove_partials(target, _output_roots(context))
-        before = _done_before(context, wanted, identity, request, target)
+        before = done_before(context, wanted, request, target)
         if before is None and target is not None:
             with _write_errors():  # checked before the deconvolution, so that no work is lost if this fails
                 beneath.make_folder(target.parent, _output_roots(context))
         if before is None and _waited(context, request, identity):
-            before = _done_before(context, wanted, identity, request, target)
-        return before or _done_now(context, wanted, request, source, target)
+            before = done_before(context, wanted, request, target)
+        if before is not None:
+            return before
+        needs = wanted.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
+        estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
+        # The path is taken only now, because the store's local copy may have been removed during a wait.
+        image_file = source.copy or context.store.verified(source.sha256)
+        return Ready(wanted, identity, deconvolve_task.load(context, wanted, image_file), target)
+
+
+def compute_one(context: Context, request: BulkWork, ready: Ready) -> Made:
+    """Deconvolve an image that was read. Builds the PSF first if it does not exist. Raises DataError."""
+    psf_row = requested_psf(context, ready.wanted)
+    return deconvolve_task.make(context, ready.wanted, psf_row, ready.image, preview=request.keeps_products)
+
+
+def write_one(context: Context, request: BulkWork, ready: Ready, made: Made) -> Outcome:
+    """Write a finished deconvolution as a product. Raises DataError "output-not-written", and OSError if the disk is full."""
+    with context.store.temporary() as path:
+        product.write(made, path)
+        if request.keeps_products:
+            return _kept(context, product.keep(made, path), ready.target, reused=False)
+        assert ready.target is not None
+        sha256, size_bytes = sha256_of(path), path.stat().st_size
+        _put(context, path, ready.target)
+    return Outcome(
+        image_sha256=ready.wanted.image_id,
+        psf_id=ready.wanted.psf_id,
+        product_id=made.identity,
+        reused=False,
+        kept=False,
+        output=str(ready.target),
+        sha256=sha256,
+        bytes=size_bytes,
+        score=made.found.artefacts.score,
+        statistics=statistics_of(made.details),
+    )
 
 
 def _waited(context: Context, request: BulkWork, identity: str) -> bool:
@@ -156,10 +208,11 @@ def _target(context: Context, request: BulkWork, source: _Source, identity: str)
     return folder / archive_files.safe_name(source.name, identity)
 
 
-def _done_before(
-    context: Context, wanted: ResolvedDeconvolve, identity: str, request: BulkWork, target: Path | None
+def done_before(
+    context: Context, wanted: ResolvedDeconvolve, request: BulkWork, target: Path | None
 ) -> Outcome | None:
     """The existing product, copied to the output folder if it is not there yet; None if there is no product."""
+    identity = product_identity(wanted)
     if request.keeps_products:
         row = context.made(ProductRow, identity)
         return None if row is None else _kept(context, row, target, reused=True)
@@ -180,44 +233,6 @@ def _done_before(
         statistics={
             name: value for name, value in (earlier.statistics or {}).items() if not name.endswith("seconds")
         },
-    )
-
-
-def _done_now(
-    context: Context,
-    wanted: ResolvedDeconvolve,
-    request: BulkWork,
-    source: _Source,
-    target: Path | None,
-) -> Outcome:
-    needs = wanted.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
-    estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
-    psf_row = requested_psf(context, wanted)
-    # The path is taken only now, because the store's local copy may have been removed during a wait or a PSF build.
-    image_file = source.copy or context.store.verified(source.sha256)
-    image = deconvolve_task.load(context, wanted, image_file)
-    started = time.perf_counter()
-    made = deconvolve_task.make(context, wanted, psf_row, image, preview=request.keeps_products)
-    kernel = {"kernel_seconds": round(time.perf_counter() - started, 3)}
-    with context.store.temporary() as path:
-        product.write(made, path)
-        if request.keeps_products:
-            outcome = _kept(context, product.keep(made, path), target, reused=False)
-            return dataclasses.replace(outcome, statistics=outcome.statistics | kernel)
-        assert target is not None
-        sha256, size_bytes = sha256_of(path), path.stat().st_size
-        _put(context, path, target)
-    return Outcome(
-        image_sha256=wanted.image_id,
-        psf_id=wanted.psf_id,
-        product_id=made.identity,
-        reused=False,
-        kept=False,
-        output=str(target),
-        sha256=sha256,
-        bytes=size_bytes,
-        score=made.found.artefacts.score,
-        statistics=statistics_of(made.details) | kernel,
     )
 
 
