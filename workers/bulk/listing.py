@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
 from psfcore.errors import DataError
+from psfcore.fits.header import FitsLimits
 from workers.catalogue.bulk_tables import MOST_LETTERS, BulkRow
 from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, Listed
 from workers.catalogue.jobs import Lease
@@ -16,6 +17,7 @@ from workers.contract.bulk import BulkWork, Condition
 from workers.contract.phases import Fault, JobError
 from workers.files import archive as archive_files
 from workers.files import beneath
+from workers.settings import Settings
 from workers.tasks.context import Context
 
 LIST_AT_ONCE = 200
@@ -59,28 +61,41 @@ def list_files(context: Context, bulk: BulkRow, lease: Lease) -> bool:
 
 
 def _listed(context: Context, request: BulkWork) -> Iterator[Listed]:
-    """The files that match, each once even if several patterns match it."""
-    allowed = archive_files.roots(context.settings.bulk_roots)
+    def tell(seen: int, looked_at: int) -> None:
+        context.report("listing", seen, max(looked_at, seen + 1))
+
+    return found_files(request, context.settings, tell)
+
+
+def found_files(request: BulkWork, settings: Settings, tell: Callable[[int, int], None]) -> Iterator[Listed]:
+    """The files that match the patterns of a request, each once even if several patterns match it.
+
+    A file that cannot be used comes with its error. tell(found, looked_at) is called for every file that was looked at, and
+    at least every ``TELL_EVERY_S`` while no file is found; if it raises an exception, the search ends. Raises DataError
+    "bad-path", "path-not-allowed", "unreadable-folder", "too-many-images".
+    """
+    allowed = archive_files.roots(settings.bulk_roots)
+    limits = FitsLimits(max_pixels=settings.max_pixels)
     seen: set[Path] = set()
     looked_at, told_at = 0, 0.0
 
-    def tell() -> None:
+    def told() -> None:
         nonlocal told_at
         told_at = time.monotonic()
-        context.report("listing", len(seen), max(looked_at, len(seen) + 1))
+        tell(len(seen), looked_at)
 
     def tick() -> None:
         """Report while a long search finds no files, so that the search can be stopped."""
         if time.monotonic() - told_at >= TELL_EVERY_S:
-            tell()
+            told()
 
     for files in request.files:
         for found in archive_files.find(files.glob, allowed, tick):
             looked_at += 1
-            tell()
+            told()
             if found.path in seen:
                 continue
-            listed = _listed_one(context, found, files.where)
+            listed = _listed_one(allowed, limits, found, files.where)
             if listed is None:
                 continue
             seen.add(found.path)
@@ -92,15 +107,17 @@ def _listed(context: Context, request: BulkWork) -> Iterator[Listed]:
             yield listed
 
 
-def _listed_one(context: Context, found: archive_files.Found, where: dict[str, Condition]) -> Listed | None:
+def _listed_one(
+    allowed: Sequence[Path], limits: FitsLimits, found: archive_files.Found, where: dict[str, Condition]
+) -> Listed | None:
     """The found file as an image of the run, with an error if the file cannot be used; None if its header does not match."""
     error = None
     try:
         if found.error is not None:
             raise found.error
         if where:
-            with beneath.opened(found.path, archive_files.roots(context.settings.bulk_roots)) as file:
-                if not archive_files.matches(beneath.reopened(file), where, context.limits):
+            with beneath.opened(found.path, allowed) as file:
+                if not archive_files.matches(beneath.reopened(file), where, limits):
                     return None
     except DataError as unreadable:
         error = JobError(fault=Fault.USER, code=unreadable.code, message=unreadable.message)
