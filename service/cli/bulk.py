@@ -95,6 +95,10 @@ def bulk() -> None:
 @click.option(
     "--only", is_flag=True, help="Write products only to the --output folder; the service keeps no copy"
 )
+@click.option(
+    "--layout",
+    help="Path of each product in the --output folder, for example {telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits",
+)
 @METHOD
 @STEPS
 @NOISE
@@ -116,6 +120,7 @@ def submit(
     conditions: tuple[tuple[str, str, Any], ...],
     output: str | None,
     only: bool,
+    layout: str | None,
     method: str,
     steps: int | None,
     noise: tuple[float, float] | None,
@@ -137,6 +142,8 @@ def submit(
     """
     if (psf is None) == (context is None):
         raise click.UsageError("expected either --psf or --context")
+    if layout is not None and output is None:
+        raise click.UsageError("--layout names the files of the folder --output: give --output, too")
     if dry_run and (uploads or wait):
         raise click.UsageError(
             "--dry-run uploads and starts nothing: use it with PATTERNS or --image, without --upload and --wait"
@@ -158,6 +165,7 @@ def submit(
             "context": context,
             "output": output,
             "only": only,
+            "layout": layout,
             "name": name,
             "method": {"name": method} | ({} if steps is None else {"steps": steps}),
             "noise": figures,

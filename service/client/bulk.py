@@ -68,6 +68,7 @@ class BulkClient(ABC):
         context: str | None = None,
         output: str | None = None,
         only: bool = False,
+        layout: str | None = None,
         name: str = "",
         **parameters: Any,
     ) -> dict[str, Any]:
@@ -75,10 +76,11 @@ class BulkClient(ABC):
 
         images: ids of uploaded images. files: patterns of paths on the machine of the service, or {"glob": pattern,
         "where": conditions on the header}. Give either psf_id or context (id or name). output: folder on that machine for the
-        products. only: write the products only to this folder. parameters: ``method={"name": ..., "steps": ...}``, ``noise``, ``saturation_dn``,
+        products. only: write the products only to this folder. layout: names of the products in this folder, for example
+        ``{telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits``. parameters: ``method={"name": ..., "steps": ...}``, ``noise``, ``saturation_dn``,
         ``error_draws``, ``other_channel``.
         """
-        asked = _asked(images, files, psf_id, context, output, only, name, parameters)
+        asked = _asked(images, files, psf_id, context, output, only, layout, name, parameters)
         return self._json("POST", "/v1/bulk", json=asked)
 
     def estimate_bulk(
@@ -90,6 +92,7 @@ class BulkClient(ABC):
         context: str | None = None,
         output: str | None = None,
         only: bool = False,
+        layout: str | None = None,
         name: str = "",
         sample: int | None = None,
         **parameters: Any,
@@ -100,7 +103,7 @@ class BulkClient(ABC):
         were found, "seconds" the expected time of the run with the workers of now, "output_bytes" the expected size of the
         products; "refused" has the examined images that the run would refuse, with the reasons.
         """
-        asked = _asked(images, files, psf_id, context, output, only, name, parameters)
+        asked = _asked(images, files, psf_id, context, output, only, layout, name, parameters)
         query = {} if sample is None else {"sample": str(sample)}
         return self._json("POST", "/v1/bulk/estimate", json=asked, params=query)
 
@@ -230,6 +233,7 @@ def _asked(
     context: str | None,
     output: str | None,
     only: bool,
+    layout: str | None,
     name: str,
     parameters: Mapping[str, Any],
 ) -> dict[str, Any]:
@@ -241,7 +245,7 @@ def _asked(
         "psf_id": psf_id,
         "context": context,
         "parameters": {key: value for key, value in parameters.items() if value is not None},
-        "output": None if output is None else {"folder": output, "only": only},
+        "output": None if output is None else {"folder": output, "only": only, "layout": layout},
     }
 
 

@@ -8,6 +8,7 @@ Therefore an image whose pixels cannot be used is found only by the run.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import random
 import time
 from collections.abc import Iterator, Sequence
@@ -18,11 +19,12 @@ from typing import Any
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, read_summary
 from workers.bulk.intake import check_places, check_uploaded, not_uploaded, pinned
-from workers.bulk.listing import found_files
+from workers.bulk.matching import found_files
+from workers.bulk.targets import target_of
 from workers.catalogue.bulks import Listed
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow
-from workers.contract.bulk import BulkRequest
+from workers.contract.bulk import BulkRequest, Output
 from workers.contract.identities import product_identity
 from workers.contract.phases import Fault, JobError
 from workers.contract.requests import Deconvolve
@@ -142,6 +144,7 @@ class _Asked:
         self._uploads = list(dict.fromkeys(request.images))
         check_uploaded(self._uploads, catalogue, owner)
         check_places(request, settings)
+        self._names: dict[Path, str] = {}  # the image that first got this name
 
     @property
     def late(self) -> bool:
@@ -173,12 +176,36 @@ class _Asked:
         needs = resolved.model_dump(mode="json") | {"image_shape": summary["shape"]}
         estimate = estimates.checked("deconvolve", needs, self._catalogue, self._owner, self._settings)
         exists = image.uploaded and self._exists(resolved)
+        if self._request.output is not None:
+            self._check_name(image, summary, resolved, self._request.output)
         return _Examined(
             exists,
             0 if exists else product_bytes(summary["shape"], resolved.error_draws),
             0.0 if exists else estimate["seconds"],
             estimate["memory_mib"],
         )
+
+    def _check_name(
+        self, image: Listed, summary: dict[str, Any], resolved: ResolvedDeconvolve, output: Output
+    ) -> None:
+        """Raise DataError if the layout gives no name, or the name of another examined image."""
+        identity = product_identity(resolved)
+        target = target_of(
+            output,
+            self._settings,
+            name=summary["filename"] if image.uploaded else Path(image.source).name,
+            source=None if image.uploaded else Path(image.source),
+            summary=summary,
+            identity=identity if image.uploaded else hashlib.sha256(image.source.encode()).hexdigest(),
+            psf_id=resolved.psf_id,
+        )
+        first = self._names.setdefault(target, image.source)
+        if first != image.source:
+            raise DataError(
+                "output-name-taken",
+                f"expected a name of its own for each product; got {archive_files.shown(target)}, which is also the name for "
+                f"{first}: use a layout with further fields, for example {{product}}",
+            )
 
     def _exists(self, resolved: ResolvedDeconvolve) -> bool:
         return self._catalogue.get(ProductRow, product_identity(resolved), self._owner) is not None
@@ -188,7 +215,7 @@ class _Asked:
             row = self._catalogue.get(ImageRow, image.source, self._owner)
             if row is None:  # it was deleted meanwhile
                 raise not_uploaded(image.source)
-            return row.id, row.summary
+            return row.id, row.summary | {"filename": row.filename or "image"}
         try:
             with beneath.opened(Path(image.source), archive_files.roots(self._settings.bulk_roots)) as file:
                 found = read_summary(beneath.reopened(file), FitsLimits(max_pixels=self._settings.max_pixels))

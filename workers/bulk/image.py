@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.header import read_summary
+from psfcore.fits.header import FitsLimits, first_image_header, optional_text, read_summary
 from psfcore.image import Image
+from workers.bulk.targets import target_of
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Taken
 from workers.catalogue.tables import ImageRow, ProductRow
@@ -66,6 +67,7 @@ class _Source:
     """
 
     copy: Path | None  # the copy of an archive file; None for an upload, which is in the store
+    path: Path | None  # the path of an archive file; None for an upload
     sha256: str
     summary: dict[str, Any]
     name: str
@@ -90,12 +92,15 @@ def read_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -
     with _source(context, taken) as source:
         wanted = _resolved(context, bulk, request, source)
         identity = product_identity(wanted)
-        target = _target(context, request, source, identity)
+        target = _target(context, request, source, wanted, identity)
         if target is not None and taken.attempt > 1 and target.parent.is_dir():
             # A killed worker may have left partial copies.
             beneath.remove_partials(target, _output_roots(context))
         before = done_before(context, wanted, request, target)
         if before is None and target is not None:
+            assert request.output is not None
+            if request.output.layout is not None:
+                _check_free(target, identity, context.limits)
             with _write_errors():  # checked before the deconvolution, so that no work is lost if this fails
                 beneath.make_folder(target.parent, _output_roots(context))
         if before is None and _waited(context, request, identity):
@@ -120,10 +125,11 @@ def write_one(context: Context, request: BulkWork, ready: Ready, made: Made) -> 
     with context.store.temporary() as path:
         product.write(made, path)
         if request.keeps_products:
-            return _kept(context, product.keep(made, path), ready.target, reused=False)
+            row = product.keep(made, path)
+            return _kept(context, row, ready.target, request, reused=False)
         assert ready.target is not None
         sha256, size_bytes = sha256_of(path), path.stat().st_size
-        _put(context, path, ready.target)
+        _put(context, path, ready.target, sha256, request)
     return Outcome(
         image_sha256=ready.wanted.image_id,
         psf_id=ready.wanted.psf_id,
@@ -168,7 +174,7 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
                 f"expected the id of an uploaded image; got {taken.source}, which is not in the catalogue: "
                 "upload the image first",
             )
-        yield _Source(None, row.id, row.summary, row.filename or "image")
+        yield _Source(None, None, row.id, row.summary, row.filename or "image")
         return
     allowed = archive_files.roots(context.settings.bulk_roots)
     path = archive_files.check_under(Path(taken.source), allowed)
@@ -184,7 +190,7 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
                 "unreadable-file", f"expected a readable file; the system says: {reason}"
             ) from error
         summary = dataclasses.asdict(read_summary(copy, context.limits))
-        yield _Source(copy, sha256, summary, path.name)
+        yield _Source(copy, path, sha256, summary, path.name)
 
 
 def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Source) -> ResolvedDeconvolve:
@@ -199,13 +205,41 @@ def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Sourc
     return resolved_deconvolution(wanted, source.summary, context.catalogue, context.owner)
 
 
-def _target(context: Context, request: BulkWork, source: _Source, identity: str) -> Path | None:
+def _target(
+    context: Context, request: BulkWork, source: _Source, wanted: ResolvedDeconvolve, identity: str
+) -> Path | None:
     """The path of the product's file in the output folder; None if only the service keeps it."""
     if request.output is None:
         return None
-    wanted = Path(request.output.folder)
-    folder = archive_files.check_under(wanted, _output_roots(context), "an output folder")
-    return folder / archive_files.safe_name(source.name, identity)
+    return target_of(
+        request.output,
+        context.settings,
+        name=source.name,
+        source=source.path,
+        summary=source.summary,
+        identity=identity,
+        psf_id=wanted.psf_id,
+    )
+
+
+def _check_free(target: Path, identity: str, limits: FitsLimits) -> None:
+    """Raise DataError "output-name-taken" if another product has the path that a layout gives to this product."""
+    if not target.is_file():
+        return
+    try:
+        there = optional_text(first_image_header(target, limits), "PRODID")
+    except DataError:  # a file that is no product; it must not be replaced either
+        there = None
+    if there != identity:
+        raise _taken(target)
+
+
+def _taken(target: Path) -> DataError:
+    return DataError(
+        "output-name-taken",
+        f"expected a name of its own for each product; got {archive_files.shown(target)}, where another file is: use a layout with "
+        "further fields, for example {product}, or another folder",
+    )
 
 
 def done_before(
@@ -215,7 +249,7 @@ def done_before(
     identity = product_identity(wanted)
     if request.keeps_products:
         row = context.made(ProductRow, identity)
-        return None if row is None else _kept(context, row, target, reused=True)
+        return None if row is None else _kept(context, row, target, request, reused=True)
     earlier = context.catalogue.bulks.progress.done_before(context.owner, identity, str(target))
     if earlier is None or target is None or not target.is_file() or sha256_of(target) != earlier.sha256:
         return None
@@ -236,12 +270,14 @@ def done_before(
     )
 
 
-def _kept(context: Context, row: ProductRow, target: Path | None, *, reused: bool) -> Outcome:
+def _kept(
+    context: Context, row: ProductRow, target: Path | None, request: BulkWork, *, reused: bool
+) -> Outcome:
     """The outcome for a product that the service keeps."""
     if target is not None and not (
         target.is_file() and target.stat().st_size == row.bytes and sha256_of(target) == row.file_sha256
     ):
-        _put(context, context.store.verified(row.file_sha256), target)
+        _put(context, context.store.verified(row.file_sha256), target, row.file_sha256, request)
     return Outcome(
         image_sha256=row.image_id,
         psf_id=row.psf_id,
@@ -277,10 +313,19 @@ def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _put(context: Context, source: Path, target: Path) -> None:
-    """Copy a file to its path in the output folder. Raises DataError "output-not-written", and OSError if the disk is full."""
+def _put(context: Context, source: Path, target: Path, sha256: str, request: BulkWork) -> None:
+    """Copy a file to its path in the output folder. A file whose name a layout gives is not replaced by another one.
+
+    Raises DataError "output-not-written", "output-name-taken", and OSError if the disk is full.
+    """
+    assert request.output is not None
     with _write_errors():
-        beneath.put(source, target, _output_roots(context))
+        try:
+            replace = request.output.layout is None
+            beneath.put(source, target, _output_roots(context), replace=replace)
+        except FileExistsError:
+            if sha256_of(target) != sha256:
+                raise _taken(target) from None
 
 
 def _output_roots(context: Context) -> tuple[Path, ...]:

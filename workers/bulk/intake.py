@@ -94,4 +94,9 @@ def _key(asked: Mapping[str, Any], images: Sequence[str]) -> str:
     # Runs that were started before these parameters existed keep their keys.
     newer = ("again", "other_channel")
     parameters = {name: value for name, value in asked["parameters"].items() if name not in newer or value}
-    return canonical_hash({**asked, "name": None, "parameters": parameters, "images": list(images)})
+    output = asked["output"] and {
+        name: value for name, value in asked["output"].items() if name != "layout" or value is not None
+    }
+    return canonical_hash(
+        {**asked, "name": None, "parameters": parameters, "output": output, "images": list(images)}
+    )

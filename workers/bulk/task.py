@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from workers.bulk.image import Outcome, Ready, compute_one, done_before, read_one, write_one
-from workers.bulk.listing import TELL_EVERY_S, list_files, work_of
+from workers.bulk.listing import list_files, work_of
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Taken
 from workers.contract.bulk import BulkPhase, BulkWork
@@ -29,6 +29,7 @@ from workers.tasks.context import Context, TurnOver
 from workers.tasks.data.product import Made
 from workers.tasks.stage_timer import STARTING
 
+TELL_EVERY_S = 1.0  # interval at which a turn reports its progress and checks whether it must stop
 BETWEEN = "between images"  # the stage between two images: the worker checks whether the run continues
 TURN_S = (
     60.0  # a turn ends after this time, so that other bulk runs get turns; an attempt may take much longer
