@@ -7,8 +7,9 @@ service are used. For comparison, one and two plain processes do the same work w
 machine slows down the service and the plain processes equally.
 
 The kernel time is the time that a worker needs to deconvolve the images and to measure the changes. The overhead is the
-remaining time of the worker (reading, checking, writing, hashes, database rows, messages) divided by the kernel time.
-The first image of each worker is left out, because the worker then loads its kernels and the PSF.
+time of the worker without the kernel time (waiting for a file to be read, checked or written, hashes, database rows,
+messages) divided by the kernel time. A worker reads the next image and writes the last product while it computes, so
+this work slows the kernels down where all cores are busy: the CPU time per image shows it. The first image of each worker is left out, because the worker then loads its kernels and the PSF.
 """
 
 from __future__ import annotations
@@ -103,28 +104,36 @@ def pace(rows: Sequence[Any]) -> float:
     return len(done) / (max(done) - warm)
 
 
-def overhead(rows: Sequence[Any]) -> tuple[float, float]:
-    """The overhead of the workers, and the part of it between two images, both divided by the kernel time."""
-    span = kernel = between = 0.0
+def overhead(rows: Sequence[Any]) -> float:
+    """The overhead of the workers, divided by the kernel time."""
+    span = kernel = 0.0
     for of_worker in by_worker(rows):
         for before, row in pairwise(of_worker):
             span += row.ended_at - before.ended_at
             kernel += row.statistics["kernel_seconds"]
-            between += row.taken_at - before.ended_at
-    return (span - kernel) / kernel, between / kernel
+    return (span - kernel) / kernel
+
+
+def cpu_s(stack: Stack) -> float:
+    """The CPU time that all worker processes have used, in seconds."""
+    times = [process.cpu_times() for process in stack.worker_processes()]
+    return sum(one.user + one.system for one in times)
 
 
 def worked_through(folder: Path, workers: int, archive: Path, psf: Path, steps: int) -> float:
     """Images per second that the service deconvolves."""
     with running(folder, workers, archive) as stack:
         bulk = submit(stack, archive, psf, steps)
+        wait_for(lambda: stack.client.bulk(bulk["id"])["images"]["done"] >= workers, "some are done", 3600.0)
+        warm, warm_s = stack.client.bulk(bulk["id"])["images"]["done"], cpu_s(stack)
         end = stack.client.wait_for_bulk(bulk["id"])
+        of_one_s = (cpu_s(stack) - warm_s) / max(1, end["images"]["done"] - warm)
         assert end["images"]["done"] == end["images"]["total"] > 0, end
         rows = items(stack)
-    found, (all_of_it, between) = pace(rows), overhead(rows)
+    found = pace(rows)
     print(
         f"{workers} worker{'s' if workers > 1 else ' '}: {3600 * found:8.0f} images per hour, {1 / found:6.2f} s per image; "
-        f"overhead {100 * all_of_it:.1f} % of the kernel time (between images: {100 * between:.2f} % of the kernel time)",
+        f"overhead {100 * overhead(rows):.1f} % of the kernel time; CPU time {of_one_s:.2f} s per image",
         flush=True,
     )
     return found

@@ -107,7 +107,12 @@ class Work:
         """Measure the changes, and make the quality plane."""
         edge_px = counted_edge_px(result)
         found = measure_changes(
-            self.image, result.pixels, self.psf, noise=self.conditions.noise, edge_px=edge_px
+            self.image,
+            result.pixels,
+            self.psf,
+            noise=self.conditions.noise,
+            edge_px=edge_px,
+            threads=self.conditions.threads,
         )
         quality = quality_plane(
             self.image,

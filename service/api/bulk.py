@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from typing import Annotated, Any
 
@@ -15,6 +16,7 @@ from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_room, rows_held
 from service.http.state import Shared
 from workers.bulk import turns as bulk_turns
+from workers.bulk.dry_run import BUDGET_S, MOST_REFUSED, DryRun, dry_run
 from workers.bulk.intake import begin
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.contract.bulk import BulkPhase, BulkRequest, ItemState
@@ -23,6 +25,7 @@ from workers.contract.phases import JobError
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES, route_class=KeyFirst)
 BulkId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
+SAMPLE, MOST_SAMPLED = 200, 10_000  # images that an estimate examines
 LOOK_FROM = 1.0  # a person should inspect images with this artefact score or a higher one
 
 
@@ -145,6 +148,58 @@ class Failed(BaseModel):
             ended_at=row.ended_at,
             error=JobError.model_validate(row.error),
         )
+
+
+class Refused(BaseModel):
+    """An image that a bulk run would refuse."""
+
+    source: str = Field(description="id of the upload, or path of the file")
+    error: JobError
+
+
+class BulkEstimate(BaseModel):
+    """What a bulk run would do. Only a sample of the images is examined; the figures of the run are scaled up from it."""
+
+    images: int = Field(description="images that were found")
+    complete: bool = Field(
+        description=f"false: {BUDGET_S:g} s were not enough to list all files and to examine the sample, so the run is larger or "
+        "the sample smaller"
+    )
+    examined: int = Field(description="images of the sample whose headers were read")
+    refused_images: int = Field(description="examined images that the run would refuse")
+    refused: list[Refused] = Field(description=f"the first {MOST_REFUSED} of them, with the reasons")
+    existing: int = Field(
+        description="examined uploads whose product exists already; for files this is not known before the run"
+    )
+    output_bytes: int = Field(description="expected size of all products, without their pictures")
+    seconds: float = Field(description="expected time of the run with the workers of now")
+    workers: int = Field(description="worker processes now; 1 if there are none")
+    memory_mib: int = Field(description="memory that the largest examined image needs")
+
+    @classmethod
+    def of(cls, found: DryRun) -> BulkEstimate:
+        """The description of a dry run."""
+        return cls.model_validate(dataclasses.asdict(found))
+
+
+@router.post("/estimate", summary="Estimate a bulk run without starting it")
+def estimate_bulk(
+    body: BulkRequest,
+    caller: Bulk,
+    state: Shared,
+    sample: Annotated[
+        int, Query(ge=1, le=MOST_SAMPLED, description="largest number of images that are examined")
+    ] = SAMPLE,
+) -> BulkEstimate:
+    """Count the images of a bulk run, examine a sample of them, and estimate the run. Nothing is started or stored.
+
+    The request and its errors are the same as for `POST /v1/bulk`. The pixels are not read. Therefore the run may also
+    refuse images whose pixels cannot be used.
+    """
+    try:
+        return BulkEstimate.of(dry_run(body, state.catalogue, caller.owner, state.settings, sample=sample))
+    except DataError as error:
+        raise problem(error) from error
 
 
 @router.post(

@@ -95,12 +95,19 @@ def bulk() -> None:
 @click.option(
     "--only", is_flag=True, help="Write products only to the --output folder; the service keeps no copy"
 )
+@click.option(
+    "--layout",
+    help="Path of each product in the --output folder, for example {telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits",
+)
 @METHOD
 @STEPS
 @NOISE
 @SATURATION
 @AGAIN
 @click.option("--name", default="", help="Label of the bulk run")
+@click.option(
+    "--dry-run", is_flag=True, help="Estimate the run and list inputs that it would refuse; start nothing"
+)
 @WAIT
 @SERVER
 def submit(
@@ -113,12 +120,14 @@ def submit(
     conditions: tuple[tuple[str, str, Any], ...],
     output: str | None,
     only: bool,
+    layout: str | None,
     method: str,
     steps: int | None,
     noise: tuple[float, float] | None,
     saturation_dn: float | None,
     again: bool,
     name: str,
+    dry_run: bool,
     wait: bool,
     server: str | None,
 ) -> None:
@@ -127,9 +136,18 @@ def submit(
     A pattern is an absolute path in a folder that the operator allows. * ? and [ab] match parts of a name, ** matches any
     number of folders. Put the pattern in quotation marks. Choose the PSF with either --psf or --context. If the service
     refuses files of --upload, the command names them, starts the run with the others, and ends with status 1.
+
+    --dry-run examines the headers of a sample of the images and starts nothing; it ends with status 1 if the run would
+    refuse an examined image.
     """
     if (psf is None) == (context is None):
         raise click.UsageError("expected either --psf or --context")
+    if layout is not None and output is None:
+        raise click.UsageError("--layout names the files of the folder --output: give --output, too")
+    if dry_run and (uploads or wait):
+        raise click.UsageError(
+            "--dry-run uploads and starts nothing: use it with PATTERNS or --image, without --upload and --wait"
+        )
     figures = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]} if noise else None
     with user_errors(), remote(server) as service:
         sent, refused = _uploaded(service, fits_files(uploads))
@@ -140,20 +158,26 @@ def submit(
             click.echo(
                 f"warning: PSF {short(psf_id)} was deprecated; every product has this warning", err=True
             )
-        made = service.submit_bulk(
-            images=[*whole_ids(service, "images", images), *sent],
-            files=[{"glob": pattern, "where": _where(conditions)} for pattern in patterns],
-            psf_id=psf_id,
-            context=context,
-            output=output,
-            only=only,
-            name=name,
-            method={"name": method} | ({} if steps is None else {"steps": steps}),
-            noise=figures,
-            saturation_dn=saturation_dn,
-            other_channel=other_channel or None,
-            again=again or None,
-        )
+        asked: dict[str, Any] = {
+            "images": [*whole_ids(service, "images", images), *sent],
+            "files": [{"glob": pattern, "where": _where(conditions)} for pattern in patterns],
+            "psf_id": psf_id,
+            "context": context,
+            "output": output,
+            "only": only,
+            "layout": layout,
+            "name": name,
+            "method": {"name": method} | ({} if steps is None else {"steps": steps}),
+            "noise": figures,
+            "saturation_dn": saturation_dn,
+            "other_channel": other_channel or None,
+            "again": again or None,
+        }
+        if dry_run:
+            estimate = service.estimate_bulk(**asked)
+            click.echo("\n".join(_estimated(estimate)))
+            sys.exit(1 if estimate["refused_images"] else 0)
+        made = service.submit_bulk(**asked)
         click.echo(f"bulk {short(made['id'])}")
         if wait:
             with progress_bar() as report:
@@ -308,6 +332,26 @@ def _uploaded(service: Client, files: Sequence[Path]) -> tuple[list[str], int]:
             refused += 1
             click.echo(f"not uploaded: {file}: {error}", err=True)
     return sent, refused
+
+
+def _estimated(found: dict[str, Any]) -> list[str]:
+    """What a dry run found, in lines."""
+    workers = found["workers"]
+    lines = [
+        f"{found['images']} images, about {duration(found['seconds'])} with {workers} worker "
+        f"{'process' if workers == 1 else 'processes'}, at most {found['memory_mib']} MiB of memory for one image",
+        f"products: about {found['output_bytes'] / 2**20:.1f} MiB, without their pictures",
+        f"examined: {found['examined']} of {found['images']} images; {found['refused_images']} would be refused"
+        + (f", {found['existing']} products exist already" if found["existing"] else ""),
+    ]
+    if not found["complete"]:
+        lines.append(
+            "the time of a dry run was not enough to find and examine all of them: the run may be larger"
+        )
+    lines += [f"refused: {one['source']}: {one['error']['message']}" for one in found["refused"]]
+    if found["refused_images"] > len(found["refused"]):
+        lines.append(f"... and {found['refused_images'] - len(found['refused'])} more")
+    return lines
 
 
 def _said(found: dict[str, Any]) -> list[str]:

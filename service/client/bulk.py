@@ -68,6 +68,7 @@ class BulkClient(ABC):
         context: str | None = None,
         output: str | None = None,
         only: bool = False,
+        layout: str | None = None,
         name: str = "",
         **parameters: Any,
     ) -> dict[str, Any]:
@@ -75,22 +76,36 @@ class BulkClient(ABC):
 
         images: ids of uploaded images. files: patterns of paths on the machine of the service, or {"glob": pattern,
         "where": conditions on the header}. Give either psf_id or context (id or name). output: folder on that machine for the
-        products. only: write the products only to this folder. parameters: ``method={"name": ..., "steps": ...}``, ``noise``, ``saturation_dn``,
+        products. only: write the products only to this folder. layout: names of the products in this folder, for example
+        ``{telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits``. parameters: ``method={"name": ..., "steps": ...}``, ``noise``, ``saturation_dn``,
         ``error_draws``, ``other_channel``.
         """
-        return self._json(
-            "POST",
-            "/v1/bulk",
-            json={
-                "name": name,
-                "images": list(images),
-                "files": [{"glob": one} if isinstance(one, str) else dict(one) for one in files],
-                "psf_id": psf_id,
-                "context": context,
-                "parameters": {key: value for key, value in parameters.items() if value is not None},
-                "output": None if output is None else {"folder": output, "only": only},
-            },
-        )
+        asked = _asked(images, files, psf_id, context, output, only, layout, name, parameters)
+        return self._json("POST", "/v1/bulk", json=asked)
+
+    def estimate_bulk(
+        self,
+        *,
+        images: Sequence[str] = (),
+        files: Sequence[str | Mapping[str, Any]] = (),
+        psf_id: str | None = None,
+        context: str | None = None,
+        output: str | None = None,
+        only: bool = False,
+        layout: str | None = None,
+        name: str = "",
+        sample: int | None = None,
+        **parameters: Any,
+    ) -> dict[str, Any]:
+        """Estimate a bulk run without starting it. The other arguments and the errors are those of ``submit_bulk``.
+
+        sample: largest number of images whose headers are examined; default: 200. "images" is the number of images that
+        were found, "seconds" the expected time of the run with the workers of now, "output_bytes" the expected size of the
+        products; "refused" has the examined images that the run would refuse, with the reasons.
+        """
+        asked = _asked(images, files, psf_id, context, output, only, layout, name, parameters)
+        query = {} if sample is None else {"sample": str(sample)}
+        return self._json("POST", "/v1/bulk/estimate", json=asked, params=query)
 
     def bulk(self, bulk_id: str) -> dict[str, Any]:
         """The current description of a bulk run."""
@@ -209,6 +224,29 @@ class BulkClient(ABC):
                     self.say(still_waiting(error))
                 wait_s, lost = min(2 * wait_s, LONGEST_WAIT_S), True
             time.sleep(wait_s)
+
+
+def _asked(
+    images: Sequence[str],
+    files: Sequence[str | Mapping[str, Any]],
+    psf_id: str | None,
+    context: str | None,
+    output: str | None,
+    only: bool,
+    layout: str | None,
+    name: str,
+    parameters: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The body of a request for a bulk run."""
+    return {
+        "name": name,
+        "images": list(images),
+        "files": [{"glob": one} if isinstance(one, str) else dict(one) for one in files],
+        "psf_id": psf_id,
+        "context": context,
+        "parameters": {key: value for key, value in parameters.items() if value is not None},
+        "output": None if output is None else {"folder": output, "only": only, "layout": layout},
+    }
 
 
 def still_waiting(error: ServiceError) -> str:

@@ -21,7 +21,7 @@ from service.http.problems import Problem
 from service.http.uploads import has_own_limit
 from workers.settings import Settings
 
-BULK = "/v1/bulk"  # the only address at which large JSON is expected
+BULK = frozenset({"/v1/bulk", "/v1/bulk/estimate"})  # the only addresses at which large JSON is expected
 # The largest request, a bulk run of 100,000 uploaded images, has one list and one value for each image. Python makes a
 # list or an object for each bracket, and pydantic may report an error for each member of an object.
 MOST_OF = {b"[": 25_000, b"{": 25_000, b":": 25_000, b",": 200_000}
@@ -53,7 +53,7 @@ class BodyLimits:
         bytes have arrived, and 408 as soon as the client is too slow.
         """
         own = has_own_limit(path, headers.get("content-type", ""))
-        most = None if own else self.bulk_bytes if path == BULK else self.usual_bytes
+        most = None if own else self.bulk_bytes if path in BULK else self.usual_bytes
         declared = headers.get("content-length", "")
         got, waited_s, more = 0, 0.0, True
 
@@ -98,7 +98,7 @@ class JsonRequest(Request):
 
 
 def _too_large(path: str, most: int) -> Problem:
-    setting = "HELIOPSF_MAX_BULK_BODY_MIB" if path == BULK else "HELIOPSF_MAX_BODY_KIB"
+    setting = "HELIOPSF_MAX_BULK_BODY_MIB" if path in BULK else "HELIOPSF_MAX_BODY_KIB"
     return Problem(
         413,
         "too-large",

@@ -1,4 +1,8 @@
-"""Deconvolves one image of a bulk run, which is an upload or a file. The product goes into the service, into a folder, or both."""
+"""Deconvolves an image of a bulk run, which is an upload or a file. The product goes into the service, into a folder, or both.
+
+The work has three parts, which a turn runs in three threads for three images at the same time: `read_one`,
+`compute_one` and `write_one`.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.header import read_summary
+from psfcore.fits.header import FitsLimits, first_image_header, optional_text, read_summary
+from psfcore.image import Image
+from workers.bulk.targets import target_of
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Taken
 from workers.catalogue.tables import ImageRow, ProductRow
@@ -29,6 +35,7 @@ from workers.intake.requests import resolved_deconvolution
 from workers.tasks import deconvolve as deconvolve_task
 from workers.tasks.context import Context
 from workers.tasks.data import product
+from workers.tasks.data.product import Made
 from workers.tasks.psf_build import requested_psf
 
 # The changes of an image are summarised for blocks of 4 × 4 px: the brightest and the darkest 1 % of the blocks.
@@ -60,30 +67,81 @@ class _Source:
     """
 
     copy: Path | None  # the copy of an archive file; None for an upload, which is in the store
+    path: Path | None  # the path of an archive file; None for an upload
     sha256: str
     summary: dict[str, Any]
     name: str
 
 
-def deconvolve_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Outcome:
-    """Deconvolve an image of a bulk run. If its product exists already, use this product.
+@dataclass(frozen=True)
+class Ready:
+    """An image that was read and can be deconvolved. target: the path of the product in the output folder, or None."""
 
-    If another job is making the product now, wait for that job and use its product.
+    wanted: ResolvedDeconvolve
+    identity: str
+    image: Image
+    target: Path | None
+
+
+def read_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Ready | Outcome:
+    """Read an image of a bulk run and choose its PSF. If its product exists already, return this product.
+
+    If another job is making the product now, wait for that job and use its product. Raises DataError for an image
+    that cannot be deconvolved, and OSError if the disk is full.
     """
     with _source(context, taken) as source:
         wanted = _resolved(context, bulk, request, source)
         identity = product_identity(wanted)
-        target = _target(context, request, source, identity)
+        target = _target(context, request, source, wanted, identity)
         if target is not None and taken.attempt > 1 and target.parent.is_dir():
             # A killed worker may have left partial copies.
             beneath.remove_partials(target, _output_roots(context))
-        before = _done_before(context, wanted, identity, request, target)
+        before = done_before(context, wanted, request, target)
         if before is None and target is not None:
+            assert request.output is not None
+            if request.output.layout is not None:
+                _check_free(target, identity, context.limits)
             with _write_errors():  # checked before the deconvolution, so that no work is lost if this fails
                 beneath.make_folder(target.parent, _output_roots(context))
         if before is None and _waited(context, request, identity):
-            before = _done_before(context, wanted, identity, request, target)
-        return before or _done_now(context, wanted, request, source, target)
+            before = done_before(context, wanted, request, target)
+        if before is not None:
+            return before
+        needs = wanted.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
+        estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
+        # The path is taken only now, because the store's local copy may have been removed during a wait.
+        image_file = source.copy or context.store.verified(source.sha256)
+        return Ready(wanted, identity, deconvolve_task.load(context, wanted, image_file), target)
+
+
+def compute_one(context: Context, request: BulkWork, ready: Ready) -> Made:
+    """Deconvolve an image that was read. Builds the PSF first if it does not exist. Raises DataError."""
+    psf_row = requested_psf(context, ready.wanted)
+    return deconvolve_task.make(context, ready.wanted, psf_row, ready.image, preview=request.keeps_products)
+
+
+def write_one(context: Context, request: BulkWork, ready: Ready, made: Made) -> Outcome:
+    """Write a finished deconvolution as a product. Raises DataError "output-not-written", and OSError if the disk is full."""
+    with context.store.temporary() as path:
+        product.write(made, path)
+        if request.keeps_products:
+            row = product.keep(made, path)
+            return _kept(context, row, ready.target, request, reused=False)
+        assert ready.target is not None
+        sha256, size_bytes = sha256_of(path), path.stat().st_size
+        _put(context, path, ready.target, sha256, request)
+    return Outcome(
+        image_sha256=ready.wanted.image_id,
+        psf_id=ready.wanted.psf_id,
+        product_id=made.identity,
+        reused=False,
+        kept=False,
+        output=str(ready.target),
+        sha256=sha256,
+        bytes=size_bytes,
+        score=made.found.artefacts.score,
+        statistics=statistics_of(made.details),
+    )
 
 
 def _waited(context: Context, request: BulkWork, identity: str) -> bool:
@@ -116,7 +174,7 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
                 f"expected the id of an uploaded image; got {taken.source}, which is not in the catalogue: "
                 "upload the image first",
             )
-        yield _Source(None, row.id, row.summary, row.filename or "image")
+        yield _Source(None, None, row.id, row.summary, row.filename or "image")
         return
     allowed = archive_files.roots(context.settings.bulk_roots)
     path = archive_files.check_under(Path(taken.source), allowed)
@@ -132,7 +190,7 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
                 "unreadable-file", f"expected a readable file; the system says: {reason}"
             ) from error
         summary = dataclasses.asdict(read_summary(copy, context.limits))
-        yield _Source(copy, sha256, summary, path.name)
+        yield _Source(copy, path, sha256, summary, path.name)
 
 
 def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Source) -> ResolvedDeconvolve:
@@ -147,22 +205,51 @@ def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Sourc
     return resolved_deconvolution(wanted, source.summary, context.catalogue, context.owner)
 
 
-def _target(context: Context, request: BulkWork, source: _Source, identity: str) -> Path | None:
+def _target(
+    context: Context, request: BulkWork, source: _Source, wanted: ResolvedDeconvolve, identity: str
+) -> Path | None:
     """The path of the product's file in the output folder; None if only the service keeps it."""
     if request.output is None:
         return None
-    wanted = Path(request.output.folder)
-    folder = archive_files.check_under(wanted, _output_roots(context), "an output folder")
-    return folder / archive_files.safe_name(source.name, identity)
+    return target_of(
+        request.output,
+        context.settings,
+        name=source.name,
+        source=source.path,
+        summary=source.summary,
+        identity=identity,
+        psf_id=wanted.psf_id,
+    )
 
 
-def _done_before(
-    context: Context, wanted: ResolvedDeconvolve, identity: str, request: BulkWork, target: Path | None
+def _check_free(target: Path, identity: str, limits: FitsLimits) -> None:
+    """Raise DataError "output-name-taken" if another product has the path that a layout gives to this product."""
+    if not target.is_file():
+        return
+    try:
+        there = optional_text(first_image_header(target, limits), "PRODID")
+    except DataError:  # a file that is no product; it must not be replaced either
+        there = None
+    if there != identity:
+        raise _taken(target)
+
+
+def _taken(target: Path) -> DataError:
+    return DataError(
+        "output-name-taken",
+        f"expected a name of its own for each product; got {archive_files.shown(target)}, where another file is: use a layout with "
+        "further fields, for example {product}, or another folder",
+    )
+
+
+def done_before(
+    context: Context, wanted: ResolvedDeconvolve, request: BulkWork, target: Path | None
 ) -> Outcome | None:
     """The existing product, copied to the output folder if it is not there yet; None if there is no product."""
+    identity = product_identity(wanted)
     if request.keeps_products:
         row = context.made(ProductRow, identity)
-        return None if row is None else _kept(context, row, target, reused=True)
+        return None if row is None else _kept(context, row, target, request, reused=True)
     earlier = context.catalogue.bulks.progress.done_before(context.owner, identity, str(target))
     if earlier is None or target is None or not target.is_file() or sha256_of(target) != earlier.sha256:
         return None
@@ -183,50 +270,14 @@ def _done_before(
     )
 
 
-def _done_now(
-    context: Context,
-    wanted: ResolvedDeconvolve,
-    request: BulkWork,
-    source: _Source,
-    target: Path | None,
+def _kept(
+    context: Context, row: ProductRow, target: Path | None, request: BulkWork, *, reused: bool
 ) -> Outcome:
-    needs = wanted.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
-    estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
-    psf_row = requested_psf(context, wanted)
-    # The path is taken only now, because the store's local copy may have been removed during a wait or a PSF build.
-    image_file = source.copy or context.store.verified(source.sha256)
-    image = deconvolve_task.load(context, wanted, image_file)
-    started = time.perf_counter()
-    made = deconvolve_task.make(context, wanted, psf_row, image, preview=request.keeps_products)
-    kernel = {"kernel_seconds": round(time.perf_counter() - started, 3)}
-    with context.store.temporary() as path:
-        product.write(made, path)
-        if request.keeps_products:
-            outcome = _kept(context, product.keep(made, path), target, reused=False)
-            return dataclasses.replace(outcome, statistics=outcome.statistics | kernel)
-        assert target is not None
-        sha256, size_bytes = sha256_of(path), path.stat().st_size
-        _put(context, path, target)
-    return Outcome(
-        image_sha256=wanted.image_id,
-        psf_id=wanted.psf_id,
-        product_id=made.identity,
-        reused=False,
-        kept=False,
-        output=str(target),
-        sha256=sha256,
-        bytes=size_bytes,
-        score=made.found.artefacts.score,
-        statistics=statistics_of(made.details) | kernel,
-    )
-
-
-def _kept(context: Context, row: ProductRow, target: Path | None, *, reused: bool) -> Outcome:
     """The outcome for a product that the service keeps."""
     if target is not None and not (
         target.is_file() and target.stat().st_size == row.bytes and sha256_of(target) == row.file_sha256
     ):
-        _put(context, context.store.verified(row.file_sha256), target)
+        _put(context, context.store.verified(row.file_sha256), target, row.file_sha256, request)
     return Outcome(
         image_sha256=row.image_id,
         psf_id=row.psf_id,
@@ -262,10 +313,19 @@ def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _put(context: Context, source: Path, target: Path) -> None:
-    """Copy a file to its path in the output folder. Raises DataError "output-not-written", and OSError if the disk is full."""
+def _put(context: Context, source: Path, target: Path, sha256: str, request: BulkWork) -> None:
+    """Copy a file to its path in the output folder. A file whose name a layout gives is not replaced by another one.
+
+    Raises DataError "output-not-written", "output-name-taken", and OSError if the disk is full.
+    """
+    assert request.output is not None
     with _write_errors():
-        beneath.put(source, target, _output_roots(context))
+        try:
+            replace = request.output.layout is None
+            beneath.put(source, target, _output_roots(context), replace=replace)
+        except FileExistsError:
+            if sha256_of(target) != sha256:
+                raise _taken(target) from None
 
 
 def _output_roots(context: Context) -> tuple[Path, ...]:

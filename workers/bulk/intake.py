@@ -23,15 +23,10 @@ def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Sett
 
     Raises ``DataError``: "no-such-psf", "no-such-context", "no-such-image", "bad-path", "path-not-allowed"; and ``OverQuota``.
     """
-    psf_id, context_id = _pinned(request, catalogue, owner)
+    psf_id, context_id = pinned(request, catalogue, owner)
     images = list(dict.fromkeys(request.images))
-    missing = catalogue.bulks.progress.first_not_uploaded(images, owner)
-    if missing is not None:
-        raise DataError(
-            "no-such-image",
-            f"expected ids of uploaded images; got {missing}, which is not in the catalogue: upload the image first",
-        )
-    _check_places(request, settings)
+    check_uploaded(images, catalogue, owner)
+    check_places(request, settings)
     asked = request.model_dump(mode="json", exclude={"images", "context"}) | {"context": context_id}
     now = time.time()
     row = BulkRow(
@@ -50,7 +45,7 @@ def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Sett
     return catalogue.bulks.create(row, images, settings.quota_mib)
 
 
-def _pinned(request: BulkRequest, catalogue: Catalogue, owner: str) -> tuple[str | None, str | None]:
+def pinned(request: BulkRequest, catalogue: Catalogue, owner: str) -> tuple[str | None, str | None]:
     """The id of the PSF or of the context. Ids are fixed, so a later change of a name does not change the run."""
     if request.psf_id is not None:
         if catalogue.get(PsfRow, request.psf_id, owner) is None:
@@ -64,7 +59,23 @@ def _pinned(request: BulkRequest, catalogue: Catalogue, owner: str) -> tuple[str
     return None, catalogue.contexts.named(request.context, owner).id
 
 
-def _check_places(request: BulkRequest, settings: Settings) -> None:
+def check_uploaded(images: Sequence[str], catalogue: Catalogue, owner: str) -> None:
+    """Raise DataError "no-such-image" if one of the ids is not an uploaded image of the owner."""
+    missing = catalogue.bulks.progress.first_not_uploaded(images, owner)
+    if missing is not None:
+        raise not_uploaded(missing)
+
+
+def not_uploaded(image_id: str) -> DataError:
+    """The error about an id that is not an uploaded image of the owner."""
+    return DataError(
+        "no-such-image",
+        f"expected ids of uploaded images; got {image_id}, which is not in the catalogue: upload the image first",
+    )
+
+
+def check_places(request: BulkRequest, settings: Settings) -> None:
+    """Raise DataError "bad-path" or "path-not-allowed" if a pattern or the output folder cannot be used."""
     allowed = archive_files.roots(settings.bulk_roots)
     for files in request.files:
         archive_files.check_glob(files.glob, allowed)
@@ -83,4 +94,9 @@ def _key(asked: Mapping[str, Any], images: Sequence[str]) -> str:
     # Runs that were started before these parameters existed keep their keys.
     newer = ("again", "other_channel")
     parameters = {name: value for name, value in asked["parameters"].items() if name not in newer or value}
-    return canonical_hash({**asked, "name": None, "parameters": parameters, "images": list(images)})
+    output = asked["output"] and {
+        name: value for name, value in asked["output"].items() if name != "layout" or value is not None
+    }
+    return canonical_hash(
+        {**asked, "name": None, "parameters": parameters, "output": output, "images": list(images)}
+    )

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from itertools import islice
-from pathlib import Path
 
 from psfcore.errors import DataError
-from workers.catalogue.bulk_tables import MOST_LETTERS, BulkRow
-from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, Listed
+from workers.bulk.matching import found_files
+from workers.catalogue.bulk_tables import BulkRow
+from workers.catalogue.bulks import Listed
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import OverQuota
-from workers.contract.bulk import BulkWork, Condition
+from workers.contract.bulk import BulkWork
 from workers.contract.phases import Fault, JobError
-from workers.files import archive as archive_files
-from workers.files import beneath
 from workers.tasks.context import Context
 
 LIST_AT_ONCE = 200
-MOST_IMAGES = 1_000_000
 NOT_LISTED = "not all files that the patterns match could be listed"  # a reason for Usage.no_room
-TELL_EVERY_S = 1.0  # interval at which a turn reports its progress and checks whether it must stop
 
 
 def work_of(bulk: BulkRow) -> BulkWork:
@@ -59,80 +54,7 @@ def list_files(context: Context, bulk: BulkRow, lease: Lease) -> bool:
 
 
 def _listed(context: Context, request: BulkWork) -> Iterator[Listed]:
-    """The files that match, each once even if several patterns match it."""
-    allowed = archive_files.roots(context.settings.bulk_roots)
-    seen: set[Path] = set()
-    looked_at, told_at = 0, 0.0
+    def tell(seen: int, looked_at: int) -> None:
+        context.report("listing", seen, max(looked_at, seen + 1))
 
-    def tell() -> None:
-        nonlocal told_at
-        told_at = time.monotonic()
-        context.report("listing", len(seen), max(looked_at, len(seen) + 1))
-
-    def tick() -> None:
-        """Report while a long search finds no files, so that the search can be stopped."""
-        if time.monotonic() - told_at >= TELL_EVERY_S:
-            tell()
-
-    for files in request.files:
-        for found in archive_files.find(files.glob, allowed, tick):
-            looked_at += 1
-            tell()
-            if found.path in seen:
-                continue
-            listed = _listed_one(context, found, files.where)
-            if listed is None:
-                continue
-            seen.add(found.path)
-            if len(seen) > MOST_IMAGES:
-                raise DataError(
-                    "too-many-images",
-                    f"expected at most {MOST_IMAGES} images in a bulk run; the patterns match more: split the request",
-                )
-            yield listed
-
-
-def _listed_one(context: Context, found: archive_files.Found, where: dict[str, Condition]) -> Listed | None:
-    """The found file as an image of the run, with an error if the file cannot be used; None if its header does not match."""
-    error = None
-    try:
-        if found.error is not None:
-            raise found.error
-        if where:
-            with beneath.opened(found.path, archive_files.roots(context.settings.bulk_roots)) as file:
-                if not archive_files.matches(beneath.reopened(file), where, context.limits):
-                    return None
-    except DataError as unreadable:
-        error = JobError(fault=Fault.USER, code=unreadable.code, message=unreadable.message)
-    except OSError as unreadable:
-        error = _unreadable_file(unreadable)
-    source = archive_files.shown(found.path)
-    path_error = _path_error(found.path, source)
-    if len(source) > MOST_LETTERS:
-        source = source[: MOST_LETTERS - 1] + "…"
-    return Listed(source, uploaded=False, error=path_error or error)
-
-
-def _path_error(path: Path, source: str) -> JobError | None:
-    """The error for a path that the catalogue cannot store; None if the catalogue can store it."""
-    if source != str(path):
-        code, message = (
-            NOT_UTF_8,
-            f"expected a path in UTF-8; got a path that ends in {source[-100:]}: rename the file",
-        )
-    elif len(source) > MOST_LETTERS:
-        code = TOO_LONG
-        message = f"expected a path of at most {MOST_LETTERS} characters; got {len(source)}, ending in {source[-100:]}"
-    else:
-        return None
-    return JobError(fault=Fault.USER, code=code, message=message)
-
-
-def _unreadable_file(error: OSError) -> JobError:
-    """The error for a file that cannot be read, without its path."""
-    reason = archive_files.reason_of(error)
-    return JobError(
-        fault=Fault.USER,
-        code="unreadable-file",
-        message=f"expected a readable file; the system says: {reason}",
-    )
+    return found_files(request, context.settings, tell)

@@ -12,8 +12,17 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, FailFast, Field, StringConstraints, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    FailFast,
+    Field,
+    StringConstraints,
+    field_validator,
+    model_validator,
+)
 
+from workers.contract.layout import FIELDS, check_layout
 from workers.contract.requests import Identity, Treatment
 
 MOST_UPLOADED = 100_000
@@ -91,6 +100,19 @@ class Output(_Strict):
         description="absolute path below a folder that the operator allows; the folder is created if it does not exist",
     )
     only: bool = Field(False, description="true: write products only to the folder; the service keeps none")
+    layout: str | None = Field(
+        None,
+        max_length=300,
+        description="relative path of each product in the folder, for example {telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits; "
+        f"fields: {', '.join(FIELDS)}; an existing file with other content is never replaced; null: STEM-PRODUCT.fits",
+    )
+
+    @field_validator("layout")
+    @classmethod
+    def _usable(cls, layout: str | None) -> str | None:
+        if layout is not None:
+            check_layout(layout)
+        return layout
 
 
 class BulkWork(_Strict):

@@ -107,8 +107,12 @@ def safe_name(name: str, identity: str) -> str:
 
     The name has only letters, digits, full stops, underscores and hyphens.
     """
-    stem = _NOT_IN_A_NAME.sub("_", _FITS_ENDING.sub("", PurePath(name).name)).strip("._-")[:80] or "image"
-    return f"{stem}-{identity[:16]}.fits"
+    return f"{stem_of(name)}-{identity[:16]}.fits"
+
+
+def stem_of(name: str) -> str:
+    """The name of a file without its ending, made of letters, digits, full stops, underscores and hyphens."""
+    return _NOT_IN_A_NAME.sub("_", _FITS_ENDING.sub("", PurePath(name).name)).strip("._-")[:80] or "image"
 
 
 def shown(path: PurePath) -> str:

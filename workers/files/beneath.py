@@ -62,10 +62,11 @@ def make_folder(folder: Path, allowed: Sequence[Path]) -> None:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
-def put(source: Path, target: Path, allowed: Sequence[Path]) -> None:
+def put(source: Path, target: Path, allowed: Sequence[Path], *, replace: bool = True) -> None:
     """Copy a file to a path below an allowed folder in one step: a reader sees either the whole file or no file.
 
-    Raises the same DataErrors as ``opened``, and OSError.
+    replace: whether an existing file is replaced. Raises the same DataErrors as ``opened``, and OSError; FileExistsError if
+    there is a file that must not be replaced, even if another process writes it at the same moment.
     """
     with source.open("rb") as file, _folder(target.parent, allowed, make=True) as folder:
         partial = f".{target.name}.{uuid.uuid4().hex}{PARTIAL}"
@@ -75,7 +76,12 @@ def put(source: Path, target: Path, allowed: Sequence[Path]) -> None:
                 shutil.copyfileobj(file, copy, _CHUNK)
                 copy.flush()
                 os.fsync(copy.fileno())
-            os.replace(partial, target.name, src_dir_fd=folder, dst_dir_fd=folder)
+            if replace:
+                os.replace(partial, target.name, src_dir_fd=folder, dst_dir_fd=folder)
+            else:
+                # A link fails if the name exists; a rename would replace the file.
+                os.link(partial, target.name, src_dir_fd=folder, dst_dir_fd=folder, follow_symlinks=False)
+                _remove(partial, folder)
         except BaseException:
             _remove(partial, folder)
             raise

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -106,13 +107,19 @@ class Changes:
 
 
 def measure_changes(
-    image: Image, result: Plane, psf: Psf, *, noise: Noise | None = None, edge_px: int = 0
+    image: Image,
+    result: Plane,
+    psf: Psf,
+    *,
+    noise: Noise | None = None,
+    edge_px: int = 0,
+    threads: int = 2,
 ) -> Changes:
     """Compare an image with its deconvolution, `result` [y, x], in the trusted pixels.
 
     psf: the PSF with which the image was deconvolved. edge_px: width of the band at the edges that is left out.
-    noise: noise of the camera; if it is None, the artefact check estimates the noise from the pixels. Raises DataError
-    "field-shape", "no-signal", "no-exposure".
+    noise: noise of the camera; if it is None, the artefact check estimates the noise from the pixels. threads: with 2 or
+    more, a second thread runs the artefact check. Raises DataError "field-shape", "no-signal", "no-exposure".
     """
     if result.shape != image.pixels.shape:
         raise DataError("field-shape", f"expected a result of {image.pixels.shape}; got {result.shape}")
@@ -130,9 +137,10 @@ def measure_changes(
         sigma = np.sqrt(noise.variance(np.where(counted, image.pixels, 0.0), dn_per_unit(image)))
     centre = (psf.kernel.shape[0] // 2, psf.kernel.shape[1] // 2)
     peak_weight = float(psf.kernel[centre])
-    # The filters of the artefact check run at the same time as the percentiles.
+    check = partial(find_artefacts, image.pixels, result, counted, peak_weight, sigma=sigma)
     with ThreadPoolExecutor(1) as beside:
-        artefacts = beside.submit(find_artefacts, image.pixels, result, counted, peak_weight, sigma=sigma)
+        # The filters of the artefact check run at the same time as the percentiles.
+        artefacts = beside.submit(check).result if threads > 1 else check
         old, new = (np.where(counted, plane, 0.0) for plane in (image.pixels, result))
         blocks = [_blocks(old, new, counted, block_px) for block_px in BLOCKS_PX]
         structures = tuple(row for part in blocks for row in _structures(part))
@@ -148,7 +156,7 @@ def measure_changes(
         not_positive_after=int(np.count_nonzero(after <= 0)),
         structures=structures,
         ranges=ranges,
-        artefacts=artefacts.result(),
+        artefacts=artefacts(),
     )
 
 

@@ -122,7 +122,14 @@ def treat(
     fitting = psf_for_image(psf, image.header)
     result = method_named(method)(image, fitting, conditions, **parameters)
     edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
-    found = measure_changes(image, result.pixels, fitting, noise=conditions.noise, edge_px=edge_px)
+    found = measure_changes(
+        image,
+        result.pixels,
+        fitting,
+        noise=conditions.noise,
+        edge_px=edge_px,
+        threads=conditions.threads,
+    )
     step = max(1, -(-max(image.pixels.shape) // THUMBNAIL_PX))
     return Treated(
         name=name,

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,6 +56,17 @@ def found(image: Image, psf: Psf, steps: int) -> Changes:
 
 
 # --- figures ---
+
+
+def test_one_thread_gives_the_same_changes_without_a_second_thread(
+    seen: Image, psf: Psf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = richardson_lucy(seen, psf, steps=2, threads=1).pixels
+    with_two = measure_changes(seen, result, psf, edge_px=EDGE_PX, threads=2)
+    with monkeypatch.context() as patched:
+        patched.delattr(threading.Thread, "start")
+        with_one = measure_changes(seen, result, psf, edge_px=EDGE_PX, threads=1)
+    assert with_one.as_json() == with_two.as_json()
 
 
 def test_a_result_equal_to_the_image_has_no_changes(seen: Image) -> None:

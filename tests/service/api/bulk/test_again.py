@@ -123,7 +123,7 @@ def test_a_run_can_be_cancelled_while_it_lists_and_finds_no_file(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
-    monkeypatch.setattr("workers.bulk.listing.TELL_EVERY_S", 0.0)
+    monkeypatch.setattr("workers.bulk.matching.TELL_EVERY_S", 0.0)
     psf_id = upload(api, psf_file, "/v1/psfs")
     request = {"files": [{"glob": f"{archive}/**/*.none"}], "psf_id": psf_id, "parameters": FEW}
     bulk = api.post("/v1/bulk", json=request).json()

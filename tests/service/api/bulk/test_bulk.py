@@ -333,14 +333,14 @@ def test_failed_images_are_listed_and_retried(
 def test_an_internal_error_stops_one_image_and_not_the_run(
     api: TestClient, archive: Path, psf_id: str, work: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = bulk_image.deconvolve_one
+    real = bulk_image.read_one
 
     def breaks(context: Any, bulk: Any, request: Any, taken: Any) -> Any:
         if taken.position == 1:
             raise ZeroDivisionError("secret place")
         return real(context, bulk, request, taken)
 
-    monkeypatch.setattr("workers.bulk.task.deconvolve_one", breaks)
+    monkeypatch.setattr("workers.bulk.task.read_one", breaks)
     bulk = asked(api, files=[{"glob": f"{archive}/*/image*"}], psf_id=psf_id)
     work()
     bulk = seen(api, bulk)

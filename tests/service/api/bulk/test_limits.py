@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from tests.conftest import write_image
 from tests.service.conftest import upload
-from workers.bulk import listing
+from workers.bulk import matching
 from workers.bulk import task as bulk_task
 from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
@@ -131,7 +131,7 @@ def test_a_listing_that_takes_too_long_is_stopped_even_if_it_finds_no_file(
     limited = settings.model_copy(update={"max_job_s": 30.0, "bulk_roots": str(archive)})
     clock = _Clock()
     monkeypatch.setattr(attempt, "time", clock)
-    monkeypatch.setattr(listing, "TELL_EVERY_S", 0.0)
+    monkeypatch.setattr(matching, "TELL_EVERY_S", 0.0)
     looked: list[Any] = []
     real = os.scandir
 

@@ -1,0 +1,136 @@
+"""Dry runs of bulk runs: the same refusals as the run, and a size and a time, without a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from tests.conftest import write_image, write_psf
+from tests.service.conftest import upload
+from workers.bulk import dry_run
+from workers.bulk.turns import keep_turns
+from workers.catalogue.catalogue import Catalogue
+from workers.files.store import Store
+from workers.run.runner import Runner
+from workers.settings import Settings
+
+FEW = {"method": {"name": "richardson-lucy", "steps": 1}}
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    """Three images of a channel, one of another, and a letter."""
+    root = tmp_path / "archive"
+    root.mkdir()
+    for number, channel in enumerate((174, 174, 174, 304)):
+        write_image(root / f"{number}.fits", shape=(256, 256), seed=number, WAVELNTH=channel)
+    (root / "letter.fits").write_text("Dear archive,\n" * 300)
+    return root
+
+
+@pytest.fixture
+def settings(settings: Settings, archive: Path, tmp_path: Path) -> Settings:
+    return settings.model_copy(
+        update={"bulk_roots": str(archive), "bulk_output_roots": str(tmp_path / "out")}
+    )
+
+
+@pytest.fixture
+def api(settings: Settings) -> Iterator[TestClient]:
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture
+def psf_id(api: TestClient, tmp_path: Path) -> str:
+    write_psf(tmp_path / "psf.fits")
+    return upload(api, tmp_path / "psf.fits", "/v1/psfs")
+
+
+def estimated(api: TestClient, query: str = "", **request: Any) -> dict[str, Any]:
+    answer = api.post(f"/v1/bulk/estimate{query}", json={"parameters": FEW, **request})
+    assert answer.status_code == 200, answer.text
+    assert api.get("/v1/bulk").json()["items"] == [], "an estimate starts nothing"
+    return dict(answer.json())
+
+
+def worked(settings: Settings) -> None:
+    catalogue = Catalogue(settings.catalogue_url)
+    runner = Runner(settings, catalogue, Store(settings.data_dir))
+    while catalogue.bulks.at_work():
+        keep_turns(catalogue, settings)
+        for turn in catalogue.jobs.of_kind("bulk"):
+            runner.run(turn.id)
+    catalogue.close()
+
+
+@pytest.mark.parametrize("draws", [0, 2])
+def test_a_dry_run_tells_what_the_run_then_does(
+    api: TestClient, archive: Path, psf_id: str, settings: Settings, draws: int
+) -> None:
+    noise = {"photon_gain_dn": 6.0, "read_noise_dn": 2.0}
+    parameters = FEW | {"error_draws": draws, "noise": noise}
+    request = {"files": [{"glob": f"{archive}/*"}], "psf_id": psf_id, "parameters": parameters}
+    told = estimated(api, **request)
+    assert told["complete"] and (told["images"], told["examined"], told["refused_images"]) == (5, 5, 1)
+    assert told["seconds"] > 0 and told["workers"] == 1 and told["memory_mib"] > 0
+    bulk = api.post("/v1/bulk", json=request).json()
+    worked(settings)
+    images = api.get(f"/v1/bulk/{bulk['id']}").json()["images"]
+    assert (images["total"], images["done"], images["failed"]) == (5, 4, 1)
+    (failed,) = api.get(f"/v1/bulk/{bulk['id']}/failures").json()["items"]
+    assert told["refused"] == [{"source": failed["source"], "error": failed["error"]}]
+    products = sum(one["bytes"] for one in api.get("/v1/products").json()["items"])
+    assert told["output_bytes"] == pytest.approx(products, rel=0.05)
+
+
+def test_conditions_and_patterns_choose_the_images(api: TestClient, archive: Path, psf_id: str) -> None:
+    files = [{"glob": f"{archive}/?.fits", "where": {"WAVELNTH": 304}}, {"glob": f"{archive}/[0-3].fits"}]
+    assert estimated(api, files=files[:1], psf_id=psf_id)["images"] == 1
+    assert estimated(api, files=files, psf_id=psf_id)["images"] == 4
+
+
+def test_a_sample_stands_for_all(api: TestClient, archive: Path, psf_id: str) -> None:
+    files = [{"glob": f"{archive}/[0-3].fits"}]
+    all_of_them = estimated(api, files=files, psf_id=psf_id)
+    one = estimated(api, "?sample=1", files=files, psf_id=psf_id)
+    assert (one["images"], one["examined"]) == (4, 1)
+    assert one["output_bytes"] == all_of_them["output_bytes"]
+    assert one["seconds"] == pytest.approx(all_of_them["seconds"], abs=0.2)
+    assert api.post("/v1/bulk/estimate?sample=0", json={"files": files, "psf_id": psf_id}).status_code == 422
+
+
+def test_a_product_that_exists_costs_nothing(
+    api: TestClient, archive: Path, psf_id: str, run_jobs: Callable[[], None]
+) -> None:
+    ids = [upload(api, archive / f"{number}.fits") for number in range(2)]
+    before = estimated(api, images=ids, psf_id=psf_id)
+    assert before["existing"] == 0
+    body = {"kind": "deconvolve", "parameters": {"image_id": ids[0], "psf_id": psf_id, **FEW}}
+    assert api.post("/v1/jobs", json=body).status_code == 202
+    run_jobs()
+    after = estimated(api, images=ids, psf_id=psf_id)
+    assert (after["existing"], after["output_bytes"]) == (1, before["output_bytes"] // 2)
+
+
+def test_a_dry_run_ends_in_time(
+    api: TestClient, archive: Path, psf_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dry_run, "BUDGET_S", -1.0)
+    told = estimated(api, files=[{"glob": f"{archive}/*"}], psf_id=psf_id)
+    assert not told["complete"] and told["examined"] == 0
+
+
+def test_errors_of_the_whole_run_are_those_of_the_run(api: TestClient, archive: Path, psf_id: str) -> None:
+    elsewhere = {"files": [{"glob": "/etc/*"}], "psf_id": psf_id}
+    for request in (elsewhere, {"images": ["a" * 64], "psf_id": psf_id}):
+        answers = [api.post(where, json=request) for where in ("/v1/bulk", "/v1/bulk/estimate")]
+        assert answers[0].status_code == answers[1].status_code >= 400
+        assert answers[0].json()["detail"] == answers[1].json()["detail"]
+    none = api.post("/v1/bulk/estimate", json={"files": [{"glob": f"{archive}/x*"}], "psf_id": psf_id})
+    assert none.json()["type"] == "urn:heliopsf:no-images" and none.status_code == 422

@@ -1,0 +1,139 @@
+"""Products of bulk runs in the archive's own layout."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from tests.conftest import write_image, write_psf
+from tests.service.conftest import upload
+from workers.bulk.turns import keep_turns
+from workers.catalogue.catalogue import Catalogue
+from workers.files.store import Store
+from workers.run.runner import Runner
+from workers.settings import Settings
+
+FEW = {"method": {"name": "richardson-lucy", "steps": 1}}
+LAYOUT = "{telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits"
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    """Files of equal names in the folders of two years; the third has no date."""
+    root = tmp_path / "archive"
+    for number, year in enumerate((2020, 2021, 2022)):
+        (root / str(year)).mkdir(parents=True)
+        date = {} if year == 2022 else {"DATE-BEG": f"{year}-03-01T12:00:00"}
+        write_image(root / str(year) / "one.fits", seed=number, **date)
+    return root
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "out"
+
+
+@pytest.fixture
+def settings(settings: Settings, archive: Path, out: Path) -> Settings:
+    return settings.model_copy(update={"bulk_roots": str(archive), "bulk_output_roots": str(out)})
+
+
+@pytest.fixture
+def api(settings: Settings) -> Iterator[TestClient]:
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture
+def psf_id(api: TestClient, tmp_path: Path) -> str:
+    write_psf(tmp_path / "psf.fits")
+    return upload(api, tmp_path / "psf.fits", "/v1/psfs")
+
+
+def done(api: TestClient, settings: Settings, **request: Any) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """The results of a run, and the codes of its failures by file."""
+    answer = api.post("/v1/bulk", json={"parameters": FEW, **request})
+    assert answer.status_code == 202, answer.text
+    catalogue = Catalogue(settings.catalogue_url)
+    while catalogue.bulks.at_work():
+        keep_turns(catalogue, settings)
+        for turn in catalogue.jobs.of_kind("bulk"):
+            Runner(settings, catalogue, Store(settings.data_dir)).run(turn.id)
+    catalogue.close()
+    here = f"/v1/bulk/{answer.json()['id']}"
+    failed = api.get(f"{here}/failures").json()["items"]
+    lines = [json.loads(line) for line in api.get(f"{here}/results").text.splitlines()]
+    return lines, {one["source"]: one["error"]["code"] for one in failed}
+
+
+@pytest.mark.parametrize("only", [False, True])
+def test_products_have_the_names_of_the_layout(
+    api: TestClient, settings: Settings, archive: Path, out: Path, psf_id: str, only: bool
+) -> None:
+    output = {"folder": str(out), "layout": LAYOUT, "only": only}
+    request = {"files": [{"glob": f"{archive}/*/*"}], "psf_id": psf_id, "output": output}
+    lines, failed = done(api, settings, **request)
+    wanted = [out / f"TEST/{year}/03/01/one_deconvolved.fits" for year in (2020, 2021)]
+    assert [line["output"] for line in lines] == list(map(str, wanted))
+    assert failed == {f"{archive}/2022/one.fits": "no-output-name"}
+    assert [hashlib.sha256(path.read_bytes()).hexdigest() for path in wanted] == [
+        line["sha256"] for line in lines
+    ]
+    assert sorted(path for path in out.rglob("*") if path.is_file()) == wanted, "nothing else is left"
+    again, _ = done(api, settings, **request)
+    assert [line["reused"] for line in again] == [True, True]
+    assert [line["output"] for line in again] == list(map(str, wanted))
+
+
+@pytest.mark.parametrize("only", [False, True])
+def test_the_second_image_with_a_name_fails_and_replaces_nothing(
+    api: TestClient, settings: Settings, archive: Path, out: Path, psf_id: str, only: bool
+) -> None:
+    output = {"folder": str(out), "layout": "{stem}.fits", "only": only}
+    request = {"files": [{"glob": f"{archive}/*/*"}], "psf_id": psf_id, "output": output}
+    told = api.post("/v1/bulk/estimate", json={"parameters": FEW, **request}).json()
+    assert [one["error"]["code"] for one in told["refused"]] == ["output-name-taken"] * 2
+    (line,), failed = done(api, settings, **request)
+    assert set(failed.values()) == {"output-name-taken"} and len(failed) == 2
+    assert hashlib.sha256((out / "one.fits").read_bytes()).hexdigest() == line["sha256"]
+    assert [path.name for path in out.iterdir()] == ["one.fits"]
+
+
+def test_a_file_of_somebody_else_is_not_replaced(
+    api: TestClient, settings: Settings, archive: Path, out: Path, psf_id: str
+) -> None:
+    out.mkdir()
+    (out / "one.fits").write_text("a letter")
+    output = {"folder": str(out), "layout": "{stem}.fits"}
+    lines, failed = done(api, settings, files=[{"glob": f"{archive}/2020/*"}], psf_id=psf_id, output=output)
+    assert lines == [] and list(failed.values()) == ["output-name-taken"]
+    assert (out / "one.fits").read_text() == "a letter"
+
+
+def test_a_link_in_the_output_folder_is_not_followed_out_of_it(
+    api: TestClient, settings: Settings, archive: Path, out: Path, psf_id: str
+) -> None:
+    (out / "elsewhere").mkdir(parents=True)
+    (out / "run").mkdir()
+    (out / "run" / "2020").symlink_to(out / "elsewhere")
+    output = {"folder": str(out / "run"), "layout": "{folder}/{stem}.fits"}
+    lines, failed = done(
+        api, settings, files=[{"glob": f"{archive}/202[01]/*"}], psf_id=psf_id, output=output
+    )
+    assert failed == {f"{archive}/2020/one.fits": "path-not-allowed"}
+    assert [line["output"] for line in lines] == [str(out / "run" / "2021" / "one.fits")]
+    assert list((out / "elsewhere").iterdir()) == []
+
+
+def test_an_unknown_field_is_refused_at_once(api: TestClient, archive: Path, out: Path, psf_id: str) -> None:
+    output = {"folder": str(out), "layout": "{telescope}/{stem}.fits"}
+    request = {"files": [{"glob": f"{archive}/*/*"}], "psf_id": psf_id, "output": output}
+    answer = api.post("/v1/bulk", json=request)
+    assert answer.status_code == 422 and "got 'telescope'" in answer.text
