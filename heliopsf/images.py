@@ -178,7 +178,7 @@ def _deconvolved(
     if not again:
         check_not_deconvolved(content_of(observed.header))
     if psf is None:
-        with compiling_beside(method):
+        with compiling_beside(method, (observed.pixels.shape[0], observed.pixels.shape[1])):
             found = _built_for(observed.header, threads, progress)
     else:
         found = _given(psf)

@@ -24,19 +24,20 @@ import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 from numba import njit
 from numba.core.caching import IndexDataCacheFile
+from numba.core.ccallback import CFunc
 from numba.core.dispatcher import Dispatcher
 
 # The function that is called when this thread compiles a kernel. A new thread has no listener, so a kernel that another
 # thread of a job compiles is not reported.
 _LISTENER: ContextVar[Callable[[bool], None] | None] = ContextVar("listener", default=None)
 SEAL_BYTES = 2 * hashlib.sha256().digest_size
-MARK = b"@compiled("
+MARK = b"@compiled"  # the decorators of this module
 SOURCE = Path(__file__)
 log = logging.getLogger(__name__)
 
@@ -58,15 +59,52 @@ def compiled(
         function.__qualname__ = name or function.__qualname__
         kernel: Any = njit(nogil=True, cache=True, **options)(function)
         if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
-            cache = kernel._cache  # type: ignore[attr-defined]
-            cache._cache_file = KernelFiles(
-                kernel_folder(Path(cache.cache_path)),
-                cache._impl.filename_base,
-                cache._impl.locator.get_source_stamp(),
-            )
+            _keep_in_files(kernel._cache)  # type: ignore[attr-defined]
         return kernel
 
     return decorate
+
+
+class Addressed:
+    """A kernel that other kernels call by its address. Such kernels need not be compiled again if this one changes."""
+
+    def __init__(self, function: Callable[..., None], signature: Any, options: dict[str, Any]) -> None:
+        self._kernel = CFunc(function, (signature.args, signature.return_type), {}, options)
+        self.__qualname__ = function.__qualname__
+
+    @cached_property
+    def address(self) -> int:
+        """The address of the machine code, which is valid until this process ends. The kernel is loaded from disk, or
+        compiled if it is not kept there."""
+        kernel: Any = self._kernel
+        kernel.enable_caching()
+        _keep_in_files(kernel._cache)
+        kernel.compile()
+        return int(kernel.address)
+
+
+def compiled_at_address(
+    signature: Any, *, name: str, **options: Any
+) -> Callable[[Callable[..., None]], Addressed]:
+    """Decorator for a kernel that is called by its address: `numba.cfunc` with this signature and these options.
+
+    The kernel is compiled when its address is asked for. name: see `compiled`; each kernel of a file needs another name.
+    """
+
+    def decorate(function: Callable[..., None]) -> Addressed:
+        function.__qualname__ = name
+        return Addressed(function, signature, options)
+
+    return decorate
+
+
+def _keep_in_files(cache: Any) -> None:
+    """Let numba keep the machine code of one function in `KernelFiles`."""
+    cache._cache_file = KernelFiles(
+        kernel_folder(Path(cache.cache_path)),
+        cache._impl.filename_base,
+        cache._impl.locator.get_source_stamp(),
+    )
 
 
 @contextmanager

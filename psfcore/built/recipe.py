@@ -13,7 +13,7 @@ from typing import Any
 
 from psfcore.weight_rules import REACH_GRID_PX
 
-BUILD_VERSION = 2  # raise this number when a change of the code changes the PSF of a recipe
+BUILD_VERSION = 3  # raise this number when a change of the code changes the PSF of a recipe
 
 
 def canonical_hash(content: dict[str, Any]) -> str:

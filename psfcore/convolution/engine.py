@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
 from psfcore.convolution.convolver import needed_kernel
-from psfcore.convolution.fft_kernels import LANES, Plan, forward, good_length, inverse, make_plan
+from psfcore.convolution.fft_kernels import LANES, forward, good_length, inverse, make_plan
 from psfcore.errors import DataError
 
 BLOCK_ROWS = 2 * LANES
@@ -172,7 +172,7 @@ class Engine:
         sign = np.float32(-1.0 if conjugate else 1.0)
 
         def work(start: int, stop: int, scratch: Scratch) -> None:
-            kernel(self._spectrum, transfer, sign, scratch.buffer, start, stop, *_numbers(self.column_plan))
+            kernel(self._spectrum, transfer, sign, scratch.buffer, start, stop, *self.column_plan.numbers)
 
         self.run(work, self.column_blocks)
 
@@ -193,7 +193,7 @@ class Engine:
     @property
     def row_numbers(self) -> tuple[Any, ...]:
         """The row plan as arguments of a compiled kernel."""
-        return (*_numbers(self.row_plan), self.row_plan.place)
+        return (*self.row_plan.numbers, self.row_plan.place)
 
     def run(self, work: Callable[[int, int, Scratch], Any], blocks: int) -> list[Any]:
         """Call `work(start, stop, scratch)` on ranges that cover all blocks, using all threads."""
@@ -259,7 +259,7 @@ class Engine:
 
         def along_columns(start: int, stop: int, _scratch: Scratch) -> None:
             for block in range(start, stop):
-                forward(transfer[block, :ly].reshape(-1), *_numbers(self.column_plan))
+                forward(transfer[block, :ly].reshape(-1), *self.column_plan.numbers)
 
         self.run(along_rows, blocks)
         self.run(along_columns, self.column_blocks)
@@ -282,10 +282,6 @@ def _wrapped_rows(
             out[n, (fx % lx) : (fx % lx) + split] = kernel[source, :split]
             out[n, fx + split : fx + kx] = kernel[source, split:]
     return out
-
-
-def _numbers(plan: Plan) -> tuple[Any, ...]:
-    return plan.length, plan.radices, plan.lengths, plan.twiddles, plan.offsets
 
 
 # Kernels; each processes the blocks [start, stop) --------------------------------------------------------
@@ -360,47 +356,47 @@ def _fill(buffer, values, filled, length):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _rows_forward(lanes, spectrum, first_block, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _rows_forward(lanes, spectrum, first_block, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """Transform the rows of blocks. first_block: the block of the spectrum to which block 0 of `lanes` belongs."""
     filled = lanes.shape[1] * 2 * LANES
     for block in range(start, stop):
         _fill(buffer, lanes[block].reshape(-1), filled, length)
-        forward(buffer, length, radices, lengths, tw, offsets)
+        forward(buffer, length, passes, lengths, tw, offsets)
         spectrum_from_buffer(spectrum, buffer, corner, first_block + block, length, place)
 
 
 @compiled()
-def _rows_inverse(lanes, spectrum, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]
+def _rows_inverse(lanes, spectrum, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]
     filled = lanes.shape[1] * 2 * LANES
     for block in range(start, stop):
         buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, radices, lengths, tw, offsets)
+        inverse(buffer, length, passes, lengths, tw, offsets)
         values = lanes[block].reshape(-1)
         for n in range(filled):
             values[n] = buffer[n]
 
 
 @compiled()
-def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
+def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, passes, lengths, tw, offsets):  # type: ignore[no-untyped-def]
     # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
     filled = min(spectrum.shape[1], length) * 2 * LANES
     z = buffer.reshape((-1, 2, LANES))
     for group in range(start, stop):
         column = spectrum[group].reshape(-1)
         _fill(buffer, column, filled, length)
-        forward(buffer, length, radices, lengths, tw, offsets)
+        forward(buffer, length, passes, lengths, tw, offsets)
         for k in range(length):
             for w in range(LANES):
                 t = transfer[group, k, 0, w]
                 z[k, 0, w] *= t
                 z[k, 1, w] *= t
-        inverse(buffer, length, radices, lengths, tw, offsets)
+        inverse(buffer, length, passes, lengths, tw, offsets)
         for n in range(filled):
             column[n] = buffer[n]
 
 
 @compiled()
-def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, radices, lengths, tw, offsets):  # type: ignore[no-untyped-def]
+def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, passes, lengths, tw, offsets):  # type: ignore[no-untyped-def]
     """As `_columns_real`, for an asymmetric PSF. sign: 1; or -1, which multiplies by the conjugate (for the
     adjoint)."""
     # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
@@ -409,13 +405,13 @@ def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, radi
     for group in range(start, stop):
         column = spectrum[group].reshape(-1)
         _fill(buffer, column, filled, length)
-        forward(buffer, length, radices, lengths, tw, offsets)
+        forward(buffer, length, passes, lengths, tw, offsets)
         for k in range(length):
             for w in range(LANES):
                 tr, ti = transfer[group, k, 0, w], sign * transfer[group, k, 1, w]
                 r, i = z[k, 0, w], z[k, 1, w]
                 z[k, 0, w] = r * tr - i * ti
                 z[k, 1, w] = r * ti + i * tr
-        inverse(buffer, length, radices, lengths, tw, offsets)
+        inverse(buffer, length, passes, lengths, tw, offsets)
         for n in range(filled):
             column[n] = buffer[n]

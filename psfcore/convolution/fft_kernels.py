@@ -12,6 +12,10 @@ legs are constants. Therefore there is one compiled function for each length of 
 or radix-2 pass comes before the radix-8 passes. This order keeps the number of lengths small, and so the time to
 compile on the first run. Indices are unsigned, because a check for negative indices would prevent vector instructions.
 
+A plan holds the addresses of its passes, and `forward` and `inverse` call the passes by address. A pass is compiled when
+the first plan needs it, and kernels that transform do not contain copies of the passes: otherwise the first
+deconvolution of an installation would compile all passes of all lengths, five times.
+
     X[k] = sum_j x[j] exp(-2 pi i j k / L)                                                          Eq. (1)
 
 A pass of radix r on length n = r m replaces the legs x[p + q m], q = 0 .. r-1, by DFT_r(legs)[q] exp(-2 pi i p q / n).
@@ -20,16 +24,17 @@ The inverse of Eq. (1), times L, is the same transform with real and imaginary p
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import carray, njit, types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from psfcore.compiled import compiled
+from psfcore.compiled import Addressed, compiled, compiled_at_address
 
 LANES = 16
 LARGEST_LENGTH = 16384
@@ -41,6 +46,9 @@ _W = np.uint64(LANES)
 # change the order of sums are not used.
 _FAST: Any = {"contract"}
 
+# A pass gets the buffer, its twiddle factors, the length of the transform, and the length of its own blocks.
+_PASS = types.void(types.CPointer(types.float32), types.CPointer(types.float32), types.int64, types.int64)
+
 Flat = NDArray[np.float32]
 
 
@@ -48,17 +56,25 @@ Flat = NDArray[np.float32]
 class Plan:
     """How to transform signals of one length: radix and length of each pass, twiddle factors, and order of the result.
 
+    `passes[0]` and `passes[1]` hold the addresses of the passes of `forward` and `inverse`.
+
     `frequency[i]` is the frequency at index i after a forward transform. `place` is the inverse permutation:
     `place[k]` is the index of frequency k.
     """
 
     length: int
     radices: NDArray[np.int64]
+    passes: NDArray[np.int64]
     lengths: NDArray[np.int64]
     twiddles: Flat
     offsets: NDArray[np.int64]
     frequency: NDArray[np.int64]
     place: NDArray[np.int64]
+
+    @property
+    def numbers(self) -> tuple[Any, ...]:
+        """The arguments of `forward` and `inverse` after the buffer."""
+        return self.length, self.passes, self.lengths, self.twiddles, self.offsets
 
 
 def good_length(at_least: int) -> int:
@@ -72,7 +88,7 @@ def good_length(at_least: int) -> int:
 
 @lru_cache(maxsize=16)
 def make_plan(length: int) -> Plan:
-    """The plan for a length that `good_length` returned."""
+    """The plan for a length that `good_length` returned. Compiles the passes that are not kept on disk yet."""
     radices = _radices(length)
     lengths, offsets, twiddles = [], [], []
     n, offset = length, 0
@@ -95,6 +111,13 @@ def make_plan(length: int) -> Plan:
     return Plan(
         length=length,
         radices=np.array(radices, dtype=np.int64),
+        passes=np.array(
+            [
+                [_pass(radix, n, inverse).address for radix, n in zip(radices, lengths, strict=True)]
+                for inverse in (False, True)
+            ],
+            dtype=np.int64,
+        ),
         lengths=np.array(lengths, dtype=np.int64),
         twiddles=np.concatenate(twiddles),
         offsets=np.array(offsets, dtype=np.int64),
@@ -135,7 +158,7 @@ def _times(ar, ai, wr, wi):  # type: ignore[no-untyped-def]
     return ar * wr - ai * wi, ar * wi + ai * wr
 
 
-def _radix8(n: int, inverse: bool) -> Callable[..., None]:
+def _radix8(n: int, inverse: bool) -> Addressed:
     """Make the radix-8 pass for blocks of length n; n is a constant for the compiler."""
     m = n // 8
     h = _HALF_ROOT
@@ -143,8 +166,9 @@ def _radix8(n: int, inverse: bool) -> Callable[..., None]:
     # The inverse exchanges real and imaginary parts.
     R, I = (np.uint64(LANES), np.uint64(0)) if inverse else (np.uint64(0), np.uint64(LANES))  # noqa: E741
 
-    @compiled(name=f"forward_{n}", fastmath=_FAST)
-    def forward(x, tw, length):  # type: ignore[no-untyped-def]
+    @compiled_at_address(_PASS, name=f"forward_{n}", fastmath=_FAST)
+    def forward(buffer, twiddles, length, _n):  # type: ignore[no-untyped-def]
+        x, tw = carray(buffer, (length * 2 * LANES,)), carray(twiddles, (14 * m,))
         for base in range(0, length, n):
             for p in range(m):
                 o = np.uint64((base + p) * 2 * LANES)
@@ -176,8 +200,9 @@ def _radix8(n: int, inverse: bool) -> Callable[..., None]:
                     x[r + M6], x[i + M6] = _times(y6r, y6i, w6r, w6i)
                     x[r + M7], x[i + M7] = _times(y7r, y7i, w7r, w7i)
 
-    @compiled(name=f"backward_{n}", fastmath=_FAST)
-    def backward(x, tw, length):  # type: ignore[no-untyped-def]
+    @compiled_at_address(_PASS, name=f"backward_{n}", fastmath=_FAST)
+    def backward(buffer, twiddles, length, _n):  # type: ignore[no-untyped-def]
+        x, tw = carray(buffer, (length * 2 * LANES,)), carray(twiddles, (14 * m,))
         for base in range(0, length, n):
             for p in range(m):
                 o = np.uint64((base + p) * 2 * LANES)
@@ -212,9 +237,10 @@ def _radix8(n: int, inverse: bool) -> Callable[..., None]:
     return backward if inverse else forward
 
 
-@compiled(fastmath=_FAST)
-def _forward3(x, tw, length, n):  # type: ignore[no-untyped-def]
+@compiled_at_address(_PASS, name="forward3", fastmath=_FAST)
+def _forward3(buffer, twiddles, length, n):  # type: ignore[no-untyped-def]
     m = n // 3
+    x, tw = carray(buffer, (length * 2 * LANES,)), carray(twiddles, (4 * m,))
     for base in range(0, length, n):
         for p in range(m):
             a = x[(base + p) * 2 * LANES :]
@@ -231,9 +257,10 @@ def _forward3(x, tw, length, n):  # type: ignore[no-untyped-def]
                 c[r], c[i] = _times(tr - dr, ti - di, w2r, w2i)
 
 
-@compiled(fastmath=_FAST)
-def _backward3(x, tw, length, n):  # type: ignore[no-untyped-def]
+@compiled_at_address(_PASS, name="backward3", fastmath=_FAST)
+def _backward3(buffer, twiddles, length, n):  # type: ignore[no-untyped-def]
     m = n // 3
+    x, tw = carray(buffer, (length * 2 * LANES,)), carray(twiddles, (4 * m,))
     for base in range(0, length, n):
         for p in range(m):
             a = x[(base + p) * 2 * LANES :]
@@ -252,14 +279,15 @@ def _backward3(x, tw, length, n):  # type: ignore[no-untyped-def]
                 c[r], c[i] = tr - dr, ti - di
 
 
-def _radix4(n: int, inverse: bool) -> Callable[..., None]:
+def _radix4(n: int, inverse: bool) -> Addressed:
     """Make the radix-4 pass for blocks of length n; n is a constant for the compiler."""
     m = n // 4
     M1, M2, M3 = (np.uint64(q * m * 2 * LANES) for q in range(1, 4))
     R, I = (np.uint64(LANES), np.uint64(0)) if inverse else (np.uint64(0), np.uint64(LANES))  # noqa: E741
 
-    @compiled(name=f"forward4_{n}", fastmath=_FAST)
-    def forward(x, tw, length):  # type: ignore[no-untyped-def]
+    @compiled_at_address(_PASS, name=f"forward4_{n}", fastmath=_FAST)
+    def forward(buffer, twiddles, length, _n):  # type: ignore[no-untyped-def]
+        x, tw = carray(buffer, (length * 2 * LANES,)), carray(twiddles, (6 * m,))
         for base in range(0, length, n):
             for p in range(m):
                 o = np.uint64((base + p) * 2 * LANES)
@@ -276,8 +304,9 @@ def _radix4(n: int, inverse: bool) -> Callable[..., None]:
                     x[r + M2], x[i + M2] = _times(y2r, y2i, w2r, w2i)
                     x[r + M3], x[i + M3] = _times(y3r, y3i, w3r, w3i)
 
-    @compiled(name=f"backward4_{n}", fastmath=_FAST)
-    def backward(x, tw, length):  # type: ignore[no-untyped-def]
+    @compiled_at_address(_PASS, name=f"backward4_{n}", fastmath=_FAST)
+    def backward(buffer, twiddles, length, _n):  # type: ignore[no-untyped-def]
+        x, tw = carray(buffer, (length * 2 * LANES,)), carray(twiddles, (6 * m,))
         for base in range(0, length, n):
             for p in range(m):
                 o = np.uint64((base + p) * 2 * LANES)
@@ -296,9 +325,10 @@ def _radix4(n: int, inverse: bool) -> Callable[..., None]:
     return backward if inverse else forward
 
 
-@compiled(fastmath=_FAST)
-def _forward2(x, tw, length, n):  # type: ignore[no-untyped-def]
+@compiled_at_address(_PASS, name="forward2", fastmath=_FAST)
+def _forward2(buffer, twiddles, length, n):  # type: ignore[no-untyped-def]
     m = n // 2
+    x, tw = carray(buffer, (length * 2 * LANES,)), carray(twiddles, (2 * m,))
     for base in range(0, length, n):
         for p in range(m):
             a = x[(base + p) * 2 * LANES :]
@@ -311,9 +341,10 @@ def _forward2(x, tw, length, n):  # type: ignore[no-untyped-def]
                 b[r], b[i] = _times(dr, di, wr, wi)
 
 
-@compiled(fastmath=_FAST)
-def _backward2(x, tw, length, n):  # type: ignore[no-untyped-def]
+@compiled_at_address(_PASS, name="backward2", fastmath=_FAST)
+def _backward2(buffer, twiddles, length, n):  # type: ignore[no-untyped-def]
     m = n // 2
+    x, tw = carray(buffer, (length * 2 * LANES,)), carray(twiddles, (2 * m,))
     for base in range(0, length, n):
         for p in range(m):
             a = x[(base + p) * 2 * LANES :]
@@ -325,65 +356,48 @@ def _backward2(x, tw, length, n):  # type: ignore[no-untyped-def]
                 a[r], a[i], b[r], b[i] = a[r] + br, a[i] + bi, a[r] - br, a[i] - bi
 
 
-_forward4_32, _backward4_32 = _radix4(32, False), _radix4(32, True)
-_forward4_256, _backward4_256 = _radix4(256, False), _radix4(256, True)
-_forward4_2048, _backward4_2048 = _radix4(2048, False), _radix4(2048, True)
-_forward4_16384, _backward4_16384 = _radix4(16384, False), _radix4(16384, True)
-_forward_8, _backward_8 = _radix8(8, False), _radix8(8, True)
-_forward_64, _backward_64 = _radix8(64, False), _radix8(64, True)
-_forward_512, _backward_512 = _radix8(512, False), _radix8(512, True)
-_forward_4096, _backward_4096 = _radix8(4096, False), _radix8(4096, True)
+# The passes by radix and length of their blocks. A pass of radix 3 or 2 handles every length.
+_ANY = 0
+_FORWARD: dict[tuple[int, int], Addressed] = {(3, _ANY): _forward3, (2, _ANY): _forward2}
+_INVERSE: dict[tuple[int, int], Addressed] = {(3, _ANY): _backward3, (2, _ANY): _backward2}
+for _n in (8, 64, 512, 4096):
+    _FORWARD[8, _n], _INVERSE[8, _n] = _radix8(_n, False), _radix8(_n, True)
+for _n in (32, 256, 2048, 16384):
+    _FORWARD[4, _n], _INVERSE[4, _n] = _radix4(_n, False), _radix4(_n, True)
+
+
+def _pass(radix: int, n: int, inverse: bool) -> Addressed:
+    return (_INVERSE if inverse else _FORWARD)[radix, n if radix in (8, 4) else _ANY]
+
+
+@intrinsic
+def _call(_typing, address, x, twiddles, length, n):  # type: ignore[no-untyped-def]
+    """Call the pass at an address."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        at, *arrays, length, n = arguments
+        kinds = signature.args[1:3]
+        pointers = [
+            context.make_array(kind)(context, builder, array).data
+            for kind, array in zip(kinds, arrays, strict=True)
+        ]
+        number, pointer = ir.IntType(64), pointers[0].type
+        function = ir.FunctionType(ir.VoidType(), [pointer, pointer, number, number])
+        builder.call(builder.inttoptr(at, function.as_pointer()), [*pointers, length, n])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, x, twiddles, types.int64, types.int64), generate
 
 
 @compiled()
-def forward(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
+def forward(x, length, passes, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
     """Compute Eq. (1) for sixteen lanes, in place. The result is in the order of `Plan.frequency`."""
-    for stage in range(len(radices)):
-        tw, n = twiddles[offsets[stage] :], lengths[stage]
-        if radices[stage] == 3:
-            _forward3(x, tw, length, n)
-        elif radices[stage] == 2:
-            _forward2(x, tw, length, n)
-        elif n == 32:
-            _forward4_32(x, tw, length)
-        elif n == 256:
-            _forward4_256(x, tw, length)
-        elif n == 2048:
-            _forward4_2048(x, tw, length)
-        elif n == 16384:
-            _forward4_16384(x, tw, length)
-        elif n == 8:
-            _forward_8(x, tw, length)
-        elif n == 64:
-            _forward_64(x, tw, length)
-        elif n == 512:
-            _forward_512(x, tw, length)
-        elif n == 4096:
-            _forward_4096(x, tw, length)
+    for stage in range(lengths.size):
+        _call(passes[0, stage], x, twiddles[offsets[stage] :], length, lengths[stage])
 
 
 @compiled()
-def inverse(x, length, radices, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
+def inverse(x, length, passes, lengths, twiddles, offsets):  # type: ignore[no-untyped-def]
     """Compute `length` times the inverse of `forward`, in place. The result is in natural order."""
-    for stage in range(len(radices) - 1, -1, -1):
-        tw, n = twiddles[offsets[stage] :], lengths[stage]
-        if radices[stage] == 3:
-            _backward3(x, tw, length, n)
-        elif radices[stage] == 2:
-            _backward2(x, tw, length, n)
-        elif n == 32:
-            _backward4_32(x, tw, length)
-        elif n == 256:
-            _backward4_256(x, tw, length)
-        elif n == 2048:
-            _backward4_2048(x, tw, length)
-        elif n == 16384:
-            _backward4_16384(x, tw, length)
-        elif n == 8:
-            _backward_8(x, tw, length)
-        elif n == 64:
-            _backward_64(x, tw, length)
-        elif n == 512:
-            _backward_512(x, tw, length)
-        elif n == 4096:
-            _backward_4096(x, tw, length)
+    for stage in range(lengths.size - 1, -1, -1):
+        _call(passes[1, stage], x, twiddles[offsets[stage] :], length, lengths[stage])

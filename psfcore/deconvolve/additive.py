@@ -59,14 +59,14 @@ class Additive(Iteration):
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """Replace H x by w (y - H x), where y is NaN if w is 0. Add up (y - H x)^2 / variance over the judged pixels."""
     nx = observed.shape[1]
     zero, least = np.float32(0.0), np.float32(1e-30)
     z = buffer.reshape((-1, 2, LANES))
     for block in range(start, stop):
         buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, radices, lengths, tw, offsets)
+        inverse(buffer, length, passes, lengths, tw, offsets)
         sum_here = 0.0
         for i in range(nx):
             sum_row = zero
@@ -81,19 +81,19 @@ def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums,
                 sum_here += sum_row
         sums[block] = sum_here
         buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-        forward(buffer, length, radices, lengths, tw, offsets)
+        forward(buffer, length, passes, lengths, tw, offsets)
         spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _add_rows(spectrum, x, again, moved, total, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _add_rows(spectrum, x, again, moved, total, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """Compute x <- x + G w (y - H x), Eq. (1). Add up (change)^2 and x^2 for each block."""
     nx = x.shape[1]
     zero = np.float32(0.0)
     z = buffer.reshape((-1, 2, LANES))
     for block in range(start, stop):
         buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, radices, lengths, tw, offsets)
+        inverse(buffer, length, passes, lengths, tw, offsets)
         moved_here, total_here = 0.0, 0.0
         for i in range(nx):
             moved_row, total_row = zero, zero
@@ -110,5 +110,5 @@ def _add_rows(spectrum, x, again, moved, total, buffer, corner, start, stop, len
         moved[block], total[block] = moved_here, total_here
         if again:
             buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-            forward(buffer, length, radices, lengths, tw, offsets)
+            forward(buffer, length, passes, lengths, tw, offsets)
             spectrum_from_buffer(spectrum, buffer, corner, block, length, place)

@@ -1,8 +1,8 @@
 """Compile the kernels of a deconvolution in a process of its own, while this process builds the PSF.
 
 On a new installation both take long. numba compiles in one thread at a time and keeps the interpreter busy, so a thread
-would not help. The process finds out which kernels are needed by deconvolving a small image; `psfcore.compiled` keeps them
-on disk.
+would not help. The process finds out which kernels are needed by deconvolving a small image, and compiles the passes of
+the transforms for the shape of the real image; `psfcore.compiled` keeps all of them on disk.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from astropy.io.fits import Header
 
 from psfcore.compiled import is_kept
 from psfcore.convolution import engine
+from psfcore.convolution.fft_kernels import LARGEST_LENGTH, good_length, make_plan
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.image import Image
-from psfcore.psf import Psf
+from psfcore.psf import REACH_GRID_PX, Psf
 
 SIZE_PX = 32
 
 
 @contextmanager
-def compiling_beside(method: str) -> Iterator[None]:
+def compiling_beside(method: str, shape: tuple[int, int]) -> Iterator[None]:
     """In the block, the kernels of a method are compiled by another process, if they are not kept on disk yet.
 
-    The block ends when the process has ended. If the process fails, this process compiles the kernels later.
+    shape: (ny, nx) of the image. The block ends when the process has ended. If the process fails, this process compiles the kernels later.
     """
     if is_kept(engine._rows_forward):
         yield
         return
     quiet = subprocess.DEVNULL
-    process = subprocess.Popen(
-        [sys.executable, "-m", __name__, method], stdin=quiet, stdout=quiet, stderr=quiet
-    )
+    command = [sys.executable, "-m", __name__, method, *map(str, shape)]
+    process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
     try:
         yield
         process.wait()
@@ -47,8 +47,12 @@ def compiling_beside(method: str) -> Iterator[None]:
             process.wait()
 
 
-def compile_kernels(method: str) -> None:
-    """Deconvolve a small image, so that all kernels of the method are compiled and kept on disk."""
+def compile_kernels(method: str, shape: tuple[int, int]) -> None:
+    """Compile the kernels that a method needs for an image of this shape, if they are not kept on disk.
+
+    The margin of the image, and so the length of its transforms, depends on the PSF, which does not exist yet. The usual
+    length is taken; if another one is needed, at most two passes are compiled later.
+    """
     # The kernel is not symmetric, as that of most PSFs: there are other kernels for symmetric ones.
     weights = np.random.default_rng(0).random((SIZE_PX, SIZE_PX))
     weights[SIZE_PX // 2, SIZE_PX // 2] = SIZE_PX
@@ -56,7 +60,9 @@ def compile_kernels(method: str) -> None:
     pixels = np.full((SIZE_PX, SIZE_PX), 100.0)
     image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN/s", 1.0)
     method_named(method)(image, psf, Conditions(), steps=2)
+    for size in set(shape):
+        make_plan(good_length(min(size + min(size, REACH_GRID_PX // 2), LARGEST_LENGTH)))
 
 
 if __name__ == "__main__":
-    compile_kernels(sys.argv[1])
+    compile_kernels(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])))

@@ -73,7 +73,7 @@ class Ratio:
 
 
 @compiled(fastmath=_SUMS)
-def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """Replace H x, raised to `floor` where it is smaller, by Eq. (1). Add up (y - H x)^2 / variance over the judged
     pixels."""
     nx = light.shape[1]
@@ -82,7 +82,7 @@ def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums
     z = buffer.reshape((-1, 2, LANES))
     for block in range(start, stop):
         buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, radices, lengths, tw, offsets)
+        inverse(buffer, length, passes, lengths, tw, offsets)
         sum_here = 0.0
         for i in range(nx):
             sum_row = zero
@@ -98,5 +98,5 @@ def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums
                 sum_here += sum_row
         sums[block] = sum_here
         buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-        forward(buffer, length, radices, lengths, tw, offsets)
+        forward(buffer, length, passes, lengths, tw, offsets)
         spectrum_from_buffer(spectrum, buffer, corner, block, length, place)

@@ -13,7 +13,7 @@ from psfcore.errors import DataError
 from psfcore.fits.images import read_image
 from psfcore.fits.psfs import write_psf
 from psfcore.instruments.model import Instrument, parse_instrument
-from workers.catalogue.tables import PsfRow
+from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.identities import interpolated_psf_identity, recipe_of
 from workers.contract.requests import PsfBuild, PsfInterpolate
 from workers.contract.resolved import ResolvedDeconvolve
@@ -44,7 +44,7 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
     if request.psf_interpolation is not None:
         return _interpolated(context, request.psf_id, request.psf_interpolation)
     assert request.psf_recipe is not None
-    with _compiling_beside(request.method.name) if context.compile_beside else nullcontext():
+    with _compiling_beside(context, request) if context.compile_beside else nullcontext():
         row = built_psf(context, request.psf_recipe)
     if row.id != request.psf_id:
         raise DataError(
@@ -55,11 +55,15 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
     return row
 
 
-def _compiling_beside(method: str) -> AbstractContextManager[None]:
+def _compiling_beside(context: Context, request: ResolvedDeconvolve) -> AbstractContextManager[None]:
+    upload = context.catalogue.get(ImageRow, request.image_id, context.owner)
+    if upload is None:  # the task raises the error when it loads the image
+        return nullcontext()
     # A job that builds no PSF does not load the kernels here.
     from psfcore.deconvolve.kernels import compiling_beside
 
-    return compiling_beside(method)
+    ny, nx = upload.summary["shape"]
+    return compiling_beside(request.method.name, (ny, nx))
 
 
 def _interpolated(context: Context, psf_id: str, asked: PsfInterpolate) -> PsfRow:

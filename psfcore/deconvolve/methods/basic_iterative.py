@@ -97,7 +97,7 @@ class _BasicIterative(Iteration):
 
 
 @compiled(fastmath={"contract", "reassoc"})
-def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """Compute `new` by Eq. (1) and transform its rows.
 
     Add up (change)^2 and x^2 over all pixels, and (y - H x)^2 / variance over the judged pixels.
@@ -107,7 +107,7 @@ def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, sl
     z = buffer.reshape((-1, 2, LANES))
     for block in range(start, stop):
         buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, radices, lengths, tw, offsets)
+        inverse(buffer, length, passes, lengths, tw, offsets)
         sum_here, moved_here, total_here = 0.0, 0.0, 0.0
         for i in range(nx):
             sum_row, moved_row, total_row = zero, zero, zero
@@ -128,5 +128,5 @@ def _step_rows(spectrum, observed, x, new, moved, total, judged, first, last, sl
             total_here += total_row
         sums[block], moved[block], total[block] = sum_here, moved_here, total_here
         buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-        forward(buffer, length, radices, lengths, tw, offsets)
+        forward(buffer, length, passes, lengths, tw, offsets)
         spectrum_from_buffer(spectrum, buffer, corner, block, length, place)

@@ -117,14 +117,14 @@ def agreed(problem: Problem) -> Single:
 
 
 @compiled(fastmath=_SUMS)
-def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, start, stop, length, radices, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """Compute x <- x * correction, Eq. (1). Set values below `dark` to 0. Add up (change)^2 and x^2 for each block."""
     nx = estimate.shape[1]
     zero = np.float32(0.0)
     z = buffer.reshape((-1, 2, LANES))
     for block in range(start, stop):
         buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
-        inverse(buffer, length, radices, lengths, tw, offsets)
+        inverse(buffer, length, passes, lengths, tw, offsets)
         moved_here = 0.0
         total_here = 0.0
         for i in range(nx):
@@ -146,5 +146,5 @@ def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, 
         total[block] = total_here
         if again:
             buffer[nx * 2 * LANES : length * 2 * LANES] = zero
-            forward(buffer, length, radices, lengths, tw, offsets)
+            forward(buffer, length, passes, lengths, tw, offsets)
             spectrum_from_buffer(spectrum, buffer, corner, block, length, place)

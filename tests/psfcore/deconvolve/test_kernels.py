@@ -16,7 +16,7 @@ from psfcore.deconvolve.methods.registry import method_names
 
 @pytest.mark.parametrize("method", method_names())
 def test_a_small_deconvolution_leaves_the_kernels_on_disk(method: str) -> None:
-    kernels.compile_kernels(method)
+    kernels.compile_kernels(method, (64, 96))
     assert is_kept(engine._rows_forward) and is_kept(engine._columns_complex)
 
 
@@ -54,7 +54,7 @@ def test_no_process_is_started_if_the_kernels_are_kept(
     started: list[_Process], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(kernels, "is_kept", lambda kernel: True)
-    with kernels.compiling_beside("linear"):
+    with kernels.compiling_beside("linear", (64, 96)):
         pass
     assert started == []
 
@@ -63,23 +63,24 @@ def test_the_block_waits_for_the_process_and_an_error_ends_it(
     started: list[_Process], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(kernels, "is_kept", lambda kernel: False)
-    with kernels.compiling_beside("linear"):
+    with kernels.compiling_beside("linear", (64, 96)):
         (process,) = started
-        assert process.command == [sys.executable, "-m", "psfcore.deconvolve.kernels", "linear"]
+        assert process.command == [sys.executable, "-m", "psfcore.deconvolve.kernels", "linear", "64", "96"]
         assert process.poll() is None
     assert process.poll() == 0
-    with pytest.raises(InterruptedError), kernels.compiling_beside("linear"):
+    with pytest.raises(InterruptedError), kernels.compiling_beside("linear", (64, 96)):
         raise InterruptedError
     assert started[1].killed
 
 
-@pytest.mark.slow  # compiles for half a minute
+@pytest.mark.slow  # compiles for some seconds
 def test_the_process_compiles_what_a_later_process_needs(
     tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    command = [sys.executable, "-m", "psfcore.deconvolve.kernels", "richardson-lucy"]
+    command = [sys.executable, "-m", "psfcore.deconvolve.kernels", "richardson-lucy", "1024", "1024"]
     subprocess.run(command, check=True)
     kept = set(tmp_path.rglob("*.nbc"))
     subprocess.run(command, check=True)
     assert kept and set(tmp_path.rglob("*.nbc")) == kept
+    assert len(list(tmp_path.rglob("*forward4_2048*"))) == 1, "a row of 1024 px is transformed with 2048 px"

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
+from psfcore.diffraction import fraunhofer, mirrored
 from psfcore.diffraction.airy import airy_kernel, airy_light_beyond, first_dark_ring_v
 from psfcore.diffraction.fraunhofer import FarField, far_field, samples_per_pixel
 from psfcore.diffraction.mesh_series import mesh_line
@@ -68,6 +69,31 @@ def test_a_small_pupil_equals_the_direct_sum(pupil: Pupil, symmetry: str) -> Non
     assert found.symmetry == symmetry
     wanted = directly(pupil, 32, found.samples, found.open_area_mm2)
     np.testing.assert_allclose(unwindowed(found.pattern), wanted, rtol=2e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize(("size", "period"), [(40, 64), (96, 96), (30, 512)])
+def test_a_mirrored_pupil_gives_the_pattern_of_the_complex_sum(
+    size: int, period: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pupil = entrance_pupil(HRI.aperture, mount=HRI.mount, meshes=HRI.meshes[:1])
+    found = far(pupil, size, period=period)
+    monkeypatch.setattr(fraunhofer, "can_transform", lambda period: False)
+    complex_sum = far(pupil, size, period=period)
+    largest = complex_sum.pattern.max()
+    np.testing.assert_allclose(found.pattern, complex_sum.pattern, rtol=2e-5, atol=1e-8 * largest)
+    assert found.pattern.sum() == pytest.approx(complex_sum.pattern.sum(), rel=3e-7)
+
+
+def test_little_memory_gives_the_same_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mask is then read in several passes, each for some of the samples."""
+    whole = far(small(), 32).pattern
+    monkeypatch.setattr(mirrored, "FIELD_BYTES", 1)
+    np.testing.assert_array_equal(far(small(), 32).pattern, whole)
+
+
+def test_the_threads_do_not_change_the_pattern_of_a_mirrored_pupil() -> None:
+    one, three = (far(small(), 96, threads=threads).pattern for threads in (1, 3))
+    np.testing.assert_array_equal(one, three)
 
 
 def test_a_bar_diffracts_perpendicular_to_itself() -> None:
