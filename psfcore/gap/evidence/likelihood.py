@@ -321,6 +321,8 @@ class Likelihood:
         whole = theta + np.append(np.zeros(base), taken)
         positive = self._positive[columns]
         one_sided = [c for c in columns if self._positive[c]]
+        measured = np.array([self._evidence.numbers_of([c]) for c in one_sided], dtype=np.float64)
+        cost_of_measured = MEASURED * measured / (2 * scales[1] ** (1 + CORRELATED))
         found = []
         for scale in SCALES if columns or at_zero else (1.0,):
             # Around theta, ln L is quadratic with the matrix N; with this prior its maximum is a step away.
@@ -345,6 +347,8 @@ class Likelihood:
             above_zero_odds = log_odds_above_zero(
                 values[positive], errors[positive], self._likely[one_sided] * scale
             )
+            # The evidence contains the cost of their measured numbers.
+            above_zero_odds = above_zero_odds - cost_of_measured
             some_at_zero = self._any_number(
                 dict(zip(at_zero, at_zero_odds, strict=True)),
                 dict(zip(one_sided, above_zero_odds, strict=True)),
@@ -373,7 +377,8 @@ class Likelihood:
         for effect in effects:
             own = [odds[c] for c in effect if c in odds]
             if own:
-                total += log_of_any_number(np.array(own)) - sum(above[c] for c in effect if c in above)
+                number = log_of_any_number(np.array(own), least=1 if len(own) == len(effect) else 0)
+                total += number - sum(above[c] for c in effect if c in above)
         return total
 
     def _visible_error(self, columns: Sequence[int], values: Vector, error: float) -> float:

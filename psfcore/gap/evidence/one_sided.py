@@ -10,10 +10,10 @@ function. The correlations between several such parameters are neglected.
 
 If an effect has several of these parameters, for example the light from each side of the field, usually only some of them act.
 The number of parameters that act is then any number from 1 to all with the same prior probability, and so is each choice
-of so many parameters. The odds of a parameter, o, are the evidence if it acts divided by the evidence if it is 0. With
+of so many parameters. If the effect has other parameters too, this number may also be 0. The odds of a parameter, o, are the evidence if it acts divided by the evidence if it is 0. With
 e_k the elementary symmetric polynomial of degree k of the odds of the P parameters, the factor is
 
-    sum_k e_k(o) / (P binomial(P, k)),    k = 1 ... P                                      Eq. (2)
+    sum_k e_k(o) / (M binomial(P, k)),    k = 1 ... P (M = P) or k = 0 ... P (M = P + 1)   Eq. (2)
 
 The odds of a parameter at 0 are Eq. (1). For a parameter with the best value m above 0 and the error s they are the
 Savage-Dickey ratio (Dickey 1971, Ann. Math. Stat. 42, 204): the density of the prior at 0 divided by that of the posterior,
@@ -48,13 +48,13 @@ def log_odds_above_zero(best: Vector, error: Vector, width: Vector) -> Vector:
     return np.asarray(math.log(2) + np.log(error / width) + log_ndtr(above) + above**2 / 2)
 
 
-def log_of_any_number(log_odds: Vector) -> float:
-    """ln of Eq. (2): the evidence if any number of the parameters act, divided by that if all are 0."""
+def log_of_any_number(log_odds: Vector, least: int = 1) -> float:
+    """ln of Eq. (2): the evidence if any number of the parameters act, divided by that if all are 0. least: the least number, 0 or 1."""
     count = log_odds.size
     sums = np.full(count + 1, -np.inf)  # ln e_k of the odds so far
     sums[0] = 0.0
     for odds in log_odds:
         sums[1:] = np.logaddexp(sums[1:], sums[:-1] + odds)
-    k = np.arange(1, count + 1)
+    k = np.arange(least, count + 1)
     log_choices = gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1)
-    return float(np.logaddexp.reduce(sums[1:] - log_choices) - math.log(count))
+    return float(np.logaddexp.reduce(sums[k] - log_choices) - math.log(k.size))

@@ -35,6 +35,8 @@ def test_the_sum_is_over_every_choice_of_the_parameters_that_act() -> None:
     odds = np.array([8.0, 0.3, 1e-4, 2.0])
     each_number = [np.mean([math.prod(some) for some in combinations(odds, k)]) for k in range(1, 5)]
     assert log_of_any_number(np.log(odds)) == pytest.approx(math.log(np.mean(each_number)))
+    with_none = np.mean([1.0, *each_number])
+    assert log_of_any_number(np.log(odds), least=0) == pytest.approx(math.log(with_none))
     assert log_of_any_number(np.log(odds[:1])) == pytest.approx(math.log(8.0)), (
         "a single parameter always acts"
     )
