@@ -236,8 +236,8 @@ def linear_model_of(
 
     Raises the errors of `expected_gap` and `gather`.
     """
-    expected = expected_gap(view, seed=seed, floor=FLOOR, progress=progress)
     evidence = gather(view.solution, library, view=view, progress=progress)
+    expected = expected_gap(view, evidence, seed=seed, floor=FLOOR, progress=progress)
     model = LinearModel(
         evidence,
         FLOOR,

@@ -133,7 +133,7 @@ def gather(
     for n in range(count):
         progress("effects", n, count)
         if n in part:
-            discs.append(_disc(view, n, changes))
+            discs.append(disc_with_jacobian(view, n, changes))
             distances.append(far.of(view, n))
         else:
             distances.append(float("nan"))
@@ -177,7 +177,7 @@ def _changes(
     return changes, columns, untestable
 
 
-def _disc(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
+def disc_with_jacobian(view: View, n: int, changes: Sequence[Change]) -> DiscCells:
     """The cells of image n, with the Jacobian of all columns."""
     solution = view.solution
     cells, planes = disc_cells(solution, n)

@@ -4,6 +4,9 @@ The simulation takes the mean scene of each pointing and puts the occulter where
 with the fitted PSF and adds photon and read noise. The same fit is then made to the simulated images. In their cells,
 chi2 exceeds its degrees of freedom although the model is right: the position of an occulter is never found exactly, and
 the light near the edge of the field is never restored completely. The expected gap states this excess.
+
+The simulated images are so similar to the real ones that their cells have the same covariance and respond in the same way
+to a change of the PSF. Only their residuals are computed again.
 """
 
 from __future__ import annotations
@@ -12,10 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psfcore.gap.evidence.evidence import gather
+from psfcore.gap.evidence.cells import DiscCells, cells_of
+from psfcore.gap.evidence.evidence import Evidence, disc_with_jacobian
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.evidence.unocculted_blocks import unocculted_blocks
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Progress, invert
+from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.transit.transit import Transit
 
 
@@ -48,9 +53,14 @@ def simulated(view: View, seed: int) -> Transit:
 
 
 def expected_gap(
-    view: View, *, seed: int = 1, floor: float, progress: Progress = lambda stage, step, steps: None
+    view: View,
+    evidence: Evidence,
+    *,
+    seed: int = 1,
+    floor: float,
+    progress: Progress = lambda stage, step, steps: None,
 ) -> ExpectedGap:
-    """The expected gap from one simulation. view: the view of the fit. floor: as in `LinearModel`.
+    """The expected gap from one simulation. view, evidence: of the fit. floor: as in `LinearModel`.
 
     Raises the errors of `psfcore.scatter.inversion.invert`.
     """
@@ -67,7 +77,7 @@ def expected_gap(
         threads=solution.threads,
         progress=say,
     )
-    model = LinearModel(gather(again, (), progress=say), floor)
+    model = LinearModel(_at(again, evidence, say), floor)
     left = model.left(model.base)
     cells = max(sum(one.size for one in left) - len(model.base.columns), 1)
     unocculted = model.evidence.all_unocculted
@@ -77,4 +87,35 @@ def expected_gap(
         unocculted_scale=unocculted.chi2 / unocculted.freedom,
         scale_error=float(np.sqrt(2 / cells)),
         residual_pct=float(np.sqrt(np.mean(np.square(residual)))),
+    )
+
+
+def _at(again: Solution, evidence: Evidence, progress: Progress) -> Evidence:
+    """The evidence of the fit to the simulated images, without effects."""
+    base = list(evidence.base)
+    part = set(again.part)
+    view = View(again)
+    return replace(
+        evidence,
+        effects=(),
+        columns={},
+        numbers={},
+        untestable={},
+        discs=tuple(_disc_at(view, disc, base) for disc in evidence.discs if disc.index in part),
+        unocculted=unocculted_blocks(view, len(base), progress),
+    )
+
+
+def _disc_at(view: View, disc: DiscCells, base: list[int]) -> DiscCells:
+    again = view.solution
+    place = again.sky.found[disc.index].place
+    cells = cells_of(again.sky.dark[disc.index], place.x_px, place.y_px)
+    if cells.pixels.size != disc.pixels.size:  # its outermost dark pixels moved
+        return disc_with_jacobian(view, disc.index, ())
+    residual, expected = again.residual(disc.index)
+    return replace(
+        disc,
+        residual=cells.weights @ residual,
+        expected=cells.weights @ expected,
+        jacobian=disc.jacobian[base],
     )

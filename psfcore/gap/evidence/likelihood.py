@@ -29,14 +29,9 @@ have the same factor, because the field can be stronger than is likely:
     ln E = ln L + ln det(1 + w N w)^-1/2 + terms of the prior                             Eq. (3)
 
 N is the normal matrix of the strengths with the PSF free (its Schur complement). The integral is computed in the
-Laplace approximation. The prior of a parameter that cannot be negative is half a Gaussian. If the best value of such a
-parameter is 0, ln L falls with the slope g <= 0 from there, and the factor of E for this parameter is
-
-    2 / (w K^1/2) exp(b^2 / 2) Phi(b),    K = N + w^-2,    b = g K^-1/2                   Eq. (4)
-
-N is the normal matrix of this parameter with all others free, and Phi is the normal distribution function. If there are
-several such parameters, their correlations are neglected. If a template was chosen among many, the logarithm of their number is subtracted from ln E. For each number that was measured in the blocks to
-build a template, MEASURED is added to the chi2 of the blocks: noise alone lowers this chi2 by 1 for each number, and
+Laplace approximation. Parameters that cannot be negative follow `evidence.one_sided`. If a template was chosen among many,
+the logarithm of their number is subtracted from ln E. For each number that was measured in the blocks to build a template,
+MEASURED is added to the chi2 of the blocks: noise alone lowers this chi2 by 1 for each number, and
 the likely size of the number is unknown.
 """
 
@@ -52,6 +47,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp
 
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
+from psfcore.gap.evidence.one_sided import log_odds_above_zero, log_odds_at_zero, log_of_any_number
 from psfcore.gap.evidence.unocculted_blocks import LEAST_IMAGES
 from psfcore.least_squares import scaled_inverse
 
@@ -216,7 +212,7 @@ class Likelihood:
         if at_zero:
             parts = self._parts(groups, theta, taken, error, at_zero)
         amounts = np.array([out.get(c, 0.0) for c in at_zero])
-        weighed = self._weighed(parts, theta, scales, columns, taken, at_zero, amounts)
+        weighed = self._weighed(parts, theta, scales, columns, taken, at_zero, amounts, effects)
         return replace(weighed, log_evidence=weighed.log_evidence - math.log(trials))
 
     def normal(self, columns: Sequence[int]) -> Matrix:
@@ -311,6 +307,7 @@ class Likelihood:
         taken: Vector,
         at_zero: list[int],
         taken_at_zero: Vector,
+        effects: Sequence[Sequence[int]],
     ) -> Weighed:
         base, free = len(self._base), theta.size
         every, score = _together(parts, scales)
@@ -323,6 +320,9 @@ class Likelihood:
         )
         whole = theta + np.append(np.zeros(base), taken)
         positive = self._positive[columns]
+        one_sided = [c for c in columns if self._positive[c]]
+        measured = np.array([self._evidence.numbers_of([c]) for c in one_sided], dtype=np.float64)
+        cost_of_measured = MEASURED * measured / (2 * scales[1] ** (1 + CORRELATED))
         found = []
         for scale in SCALES if columns or at_zero else (1.0,):
             # Around theta, ln L is quadratic with the matrix N; with this prior its maximum is a step away.
@@ -335,21 +335,51 @@ class Likelihood:
             # The PSF has no prior. The volume of its coordinates must not count, because it differs between refits.
             log_det -= float(np.linalg.slogdet(normal[:base, :base])[1])
             quadratic = float(step @ normal @ step - 2 * gradient @ step + prior @ (whole + step) ** 2)
-            above = (whole + step)[base:][positive] / np.sqrt(np.diag(inverse)[base:][positive])
-            half = float(np.sum(math.log(2) + log_ndtr(above)))
-            one_sided = _one_sided(
-                slope - across @ step,
-                np.diag(every)[free:] - np.einsum("ij,jk,ik->i", across, inverse, across),
-                self._likely[at_zero] * scale,
-                taken_at_zero,
+            values, errors = (whole + step)[base:], np.sqrt(np.diag(inverse)[base:])
+            half = float(np.sum(math.log(2) + log_ndtr((values / errors)[positive])))
+            # What was subtracted is put back: then these parameters are 0, and their slope and ln L are others.
+            left = slope - across @ step
+            curvature = np.diag(every)[free:] - np.einsum("ij,jk,ik->i", across, inverse, across)
+            put_back = -float(np.sum(left * taken_at_zero + curvature * taken_at_zero**2 / 2))
+            at_zero_odds = log_odds_at_zero(
+                left + curvature * taken_at_zero, curvature, self._likely[at_zero] * scale
             )
-            found.append(best - (quadratic + log_det - np.log(prior[base:]).sum()) / 2 + half + one_sided)
+            above_zero_odds = log_odds_above_zero(
+                values[positive], errors[positive], self._likely[one_sided] * scale
+            )
+            # The evidence contains the cost of their measured numbers.
+            above_zero_odds = above_zero_odds - cost_of_measured
+            some_at_zero = self._any_number(
+                dict(zip(at_zero, at_zero_odds, strict=True)),
+                dict(zip(one_sided, above_zero_odds, strict=True)),
+                effects,
+            )
+            found.append(
+                best - (quadratic + log_det - np.log(prior[base:]).sum()) / 2 + half + put_back + some_at_zero
+            )
         return Weighed(
             float(logsumexp(found)) - math.log(len(found)),
             tuple(columns),
             theta[base:],
             0.0,
         )
+
+    def _any_number(
+        self, at_zero: Mapping[int, float], above: Mapping[int, float], effects: Sequence[Sequence[int]]
+    ) -> float:
+        """ln of the factor of the evidence for the one-sided parameters at 0, and for the number that act.
+
+        at_zero, above: the logarithm of the odds of each one-sided parameter at 0, or above 0, by column. The evidence
+        already contains the odds of the parameters above 0.
+        """
+        total = 0.0
+        odds = {**at_zero, **above}
+        for effect in effects:
+            own = [odds[c] for c in effect if c in odds]
+            if own:
+                number = log_of_any_number(np.array(own), least=1 if len(own) == len(effect) else 0)
+                total += number - sum(above[c] for c in effect if c in above)
+        return total
 
     def _visible_error(self, columns: Sequence[int], values: Vector, error: float) -> float:
         """The chi2 that a relative error of the change by these columns would add."""
@@ -406,19 +436,6 @@ class Likelihood:
             sum(part.count for part in blocks),
             in_blocks - self._log_det[1] + MEASURED * measured,
         )
-
-
-def _one_sided(slope: Vector, normal: Vector, width: Vector, taken: Vector) -> float:
-    """ln of the product of the factors of Eq. (4). All arguments have one entry for each parameter.
-
-    slope, normal: the slope of ln L and the curvature of -ln L at the fit. A slope above 0, which remains if a parameter was set
-    to 0 before the others, counts as 0. width: the width of the prior. taken: the amount that was subtracted before the fit.
-    """
-    slope, curvature = np.minimum(slope, 0.0), np.maximum(normal, 0.0)
-    total = curvature + width**-2.0
-    above = (slope + curvature * taken) / np.sqrt(total)
-    factors = math.log(2) - np.log(width * np.sqrt(total)) + above**2 / 2 + log_ndtr(above)
-    return float(np.sum(factors - slope * taken - curvature * taken**2 / 2))
 
 
 def _together(parts: tuple[_Part, _Part], scales: tuple[float, float]) -> tuple[Matrix, Vector]:

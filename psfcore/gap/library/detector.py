@@ -7,9 +7,11 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from psfcore.gap.effect import Change, Effect, EffectParameter
+from psfcore.gap.evidence.unocculted_blocks import blocks, not_compared
 from psfcore.gap.view import Field, View
 
 # Decay levels of two losses; their sum approximates a loss with any decay level in between.
@@ -132,8 +134,8 @@ def _persistence(view: View) -> Sequence[Change]:
 
 
 def _filled(view: View) -> Sequence[Change]:
-    """Errors of filled or clipped pixels. Two changes: a constant relative error, and a relative error that grows
-    inwards.
+    """Errors of filled or clipped pixels. Three changes: a constant relative error, a relative error that grows
+    inwards, and `_flicker`.
 
     The second error is zero at the rim of a filled area and grows towards its middle, as for a clipped brightening.
     """
@@ -151,7 +153,47 @@ def _filled(view: View) -> Sequence[Change]:
         return np.asarray(images[n] * np.maximum(depth, 0.0), dtype=np.float32)
 
     # In the unocculted field, blocks with a filled pixel are not compared.
-    return [Change(lambda n, images, k=k: change(n, images, k), unocculted=False) for k in (False, True)]  # type: ignore[misc]
+    errors = [Change(lambda n, images, k=k: change(n, images, k), unocculted=False) for k in (False, True)]  # type: ignore[misc]
+    return [*errors, _flicker(view)]
+
+
+def _flicker(view: View) -> Change:
+    """The change of the Sun in the pixels that some image of a pointing fills. Such pixels are bright, and bright pixels often flicker.
+
+    The change is measured in the images that show these pixels: the difference from their mean.
+    """
+    frames = view.solution.transit.frames
+    nothing = np.zeros(view.solution.transit.shape, np.float32)
+    filled: dict[int, NDArray[np.bool_]] = {}
+    for frame in frames:
+        if frame.filled is not None and frame.filled.any():
+            filled[frame.pointing] = filled.get(frame.pointing, nothing > 0) | frame.filled
+    shown: dict[
+        int, NDArray[np.bool_]
+    ] = {}  # by image: the pixels that are filled elsewhere and visible here
+    scale: dict[int, np.float32] = {}  # by image: its brightness
+    mean: dict[int, Field] = {}  # by pointing
+    numbers = 0
+    for pointing, bright in filled.items():
+        total, count = nothing.astype(np.float64), nothing.astype(np.int32)
+        seen = np.zeros(blocks(nothing).shape, np.int64)
+        for n in (n for n, frame in enumerate(frames) if frame.pointing == pointing):
+            out = not_compared(view.solution, n)
+            shown[n] = bright & ~out
+            usual = view.pointing_means[n][~out].sum(dtype=np.float64)
+            scale[n] = np.float32(view.unocculted[n][~out].sum(dtype=np.float64) / max(usual, 1e-9))
+            total[shown[n]] += view.unocculted[n][shown[n]] / scale[n]
+            count += shown[n]
+            seen += (blocks(bright.astype(np.float64)) > 0) & (blocks(out.astype(np.float64)) == 0)
+        mean[pointing] = np.asarray(total / np.maximum(count, 1), np.float32)
+        numbers += int(np.maximum(seen - 1, 0).sum())  # the mean over the images is a part of the scene
+
+    def change(n: int) -> Field:
+        if n not in shown:
+            return nothing
+        return np.where(shown[n], view.unocculted[n] / scale[n] - mean[frames[n].pointing], np.float32(0))
+
+    return Change(lambda n, images: change(n), disc=False, numbers=numbers)
 
 
 def _nothing_filled(view: View) -> str | None:
@@ -184,6 +226,6 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("persistence", "detector", (_p("share", "", 0.01, True), *(_p(f"share_fading_in_{waits}", "", 0.01, True) for waits in FADES_IN)),
            "A share of each image remains in the following images and decays.",
            "a dark exposure after a bright one", ("time", "pointing"), _persistence),
-    Effect("saturation_fill", "detector", (_p("excess", "", 0.1), _p("excess_inside", "", 0.1)), "The values filled in for saturated pixels are wrong.",
+    Effect("saturation_fill", "detector", (_p("excess", "", 0.1), _p("excess_inside", "", 0.1), _p("flicker", "", 1.0, True)), "The values filled in for saturated pixels are wrong.",
            "a shorter exposure at the same time", ("pointing", "intensity"), _filled, _nothing_filled),
 )  # fmt: skip

@@ -83,10 +83,10 @@ def test_an_effect_that_can_only_add_light_explains_no_loss_of_light(
     assert added.values[0] == pytest.approx(8 * sigma, rel=0.2)
 
 
-def test_a_one_sided_parameter_at_zero_costs_as_much_as_its_integral(
+def test_one_sided_parameters_are_integrated_for_every_choice_of_those_that_act(
     evidence: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The integral over both one-sided shares of a smear, of which one has its best value at 0, on a grid of values."""
+    """Two one-sided shares of a smear, of which one has its best value at 0: either acts, or both, on a grid of values."""
     monkeypatch.setattr(likelihoods, "TEMPLATE_ERRORS", (0.0,))
     monkeypatch.setattr(likelihoods, "SCALES", (1.0,))
     sigma = sigma_of(evidence, "column_smear")
@@ -121,13 +121,20 @@ def test_a_one_sided_parameter_at_zero_costs_as_much_as_its_integral(
         + score[1] * second
         - (normal[0, 0] * first**2 + 2 * normal[0, 1] * first * second + normal[1, 1] * second**2) / 2
     )
-    wanted = float(logsumexp(ln_l, b=prior[:, None] * prior[None, :]))
+    only_first, only_second, both = (
+        float(logsumexp(ln_l[:, 0], b=prior)),
+        float(logsumexp(ln_l[0], b=prior)),
+        float(logsumexp(ln_l, b=prior[:, None] * prior[None, :])),
+    )
+    wanted = float(logsumexp([only_first, only_second, both], b=[1 / 4, 1 / 4, 1 / 2]))
     likelihood = Likelihood(model)
     found = likelihood.weigh([[below, above]])
     assert found.columns == (below,)
-    assert found.log_evidence - likelihood.weigh([]).log_evidence == pytest.approx(wanted, abs=0.3)
+    assert found.log_evidence - likelihood.weigh([]).log_evidence == pytest.approx(wanted, abs=0.2)
     without = likelihood.weigh([[below]]).log_evidence
-    assert found.log_evidence < without - 0.5, "the second share costs nothing"
+    assert without - math.log(4) < found.log_evidence < without - math.log(4 / 3), (
+        "the second share costs nothing"
+    )
 
 
 def test_what_an_error_of_the_first_template_explains_is_credited_less_to_a_second_effect(
@@ -191,3 +198,14 @@ def test_what_a_refit_subtracted_counts_as_a_part_of_the_strength(evidence: Evid
     part = rest.weigh(columns, subtracted=[6 * sigma])
     assert part.log_evidence == pytest.approx(whole.log_evidence, abs=0.1)
     assert part.values[0] == pytest.approx(whole.values[0] - 6 * sigma, rel=0.02)
+
+
+def test_a_one_sided_parameter_that_was_subtracted_too_much_is_put_back(evidence: Evidence) -> None:
+    """A refit subtracted a smear that the images do not contain; the evidence is that of the images before."""
+    sigma = sigma_of(evidence, "column_smear")
+    columns = [list(evidence.columns["column_smear"])[:1]]
+    whole = Likelihood(with_residuals(evidence, {"column_smear": -3 * sigma})).weigh(columns)
+    rest = Likelihood(with_residuals(evidence, {"column_smear": -5 * sigma}))
+    part = rest.weigh(columns, subtracted=[2 * sigma])
+    assert whole.columns == part.columns == ()
+    assert part.log_evidence == pytest.approx(whole.log_evidence, abs=0.1)
