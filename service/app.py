@@ -21,6 +21,7 @@ from service.api import (
     owner_events,
     products,
     reports,
+    resumable,
     transits,
 )
 from service.api.files import headers, pixels
@@ -125,6 +126,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         pixels,
         headers,
         reports,
+        resumable,
         bulk,
         bulk_results,
         events,
