@@ -21,6 +21,7 @@ from service.api import (
     owner_events,
     products,
     reports,
+    resumable,
     transits,
 )
 from service.api.files import headers, pixels
@@ -50,6 +51,7 @@ from service.pages.psfs import version as psf_page
 from service.pages.reports import shown as report_page
 from service.uws import routes as uws
 from service.vo import cutouts, interfaces, links, lists
+from workers import traces
 from workers.catalogue.catalogue import Catalogue
 from workers.files.modes import private_folder
 from workers.files.opened import open_store
@@ -72,6 +74,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         from workers.broker import app as queue
         from workers.broker.reconciler import Reconciler
 
+        traces.configure(settings, "server")
         private_folder(settings.data_dir)
         catalogue = Catalogue(settings.catalogue_url)
         catalogue.upgrade()
@@ -97,6 +100,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         yield
         reconciler.stop()
         catalogue.close()
+        traces.shutdown()
 
     app = FastAPI(
         title="heliopsf",
@@ -125,6 +129,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         pixels,
         headers,
         reports,
+        resumable,
         bulk,
         bulk_results,
         events,

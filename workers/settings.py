@@ -102,6 +102,12 @@ class Settings(BaseSettings):
         ge=0,
         description="time after SIGTERM in which running requests and jobs may finish, s; then unfinished jobs are queued again",
     )
+    traces_url: str | None = Field(
+        None,
+        pattern=r"^https?://\S+$",
+        description="address to which traces are sent by OTLP over HTTP, such as http://127.0.0.1:4318/v1/traces (needs the extra "
+        "`traces`); default: no traces",
+    )
     log_format: Literal["text", "json"] | None = Field(
         None, description="format of the logs on standard error; default: text on a terminal, otherwise json"
     )

@@ -18,6 +18,7 @@ import httpx
 
 from psfcore.errors import DataError
 from psfcore.transit.archive import pack
+from service.client import resumable
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS, how_to_start, service_address
 from service.client.bulk import FIRST_WAIT_S, LONGEST_WAIT_S, PASSING, PATIENCE_S, BulkClient, still_waiting
 from service.client.errors import ServiceError, WaitInterrupted
@@ -101,9 +102,15 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return self._upload("/v1/images", Path(path), {})
 
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
-        """Upload a transit: a folder, or an archive of a folder. Returns the description of the transit, with its ``id``."""
+        """Upload a transit: a folder, or an archive of a folder. Returns the description of the transit, with its ``id``.
+
+        A file of 64 MiB or more is sent in parts. If the connection is cut, the upload continues where it was; if this
+        process ends before, the next upload of the same file continues it, for a day.
+        """
         with as_archive(Path(path)) as archive:
-            return self._upload("/v1/transits", archive, {}, media_type="application/octet-stream")
+            if archive.stat().st_size < resumable.FROM_BYTES:
+                return self._upload("/v1/transits", archive, {}, media_type="application/octet-stream")
+            return self.get(resumable.upload(self._answer, archive, "transit", archive.name, self.say))
 
     def upload_psf(
         self,

@@ -10,7 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from workers import logs
+from workers import logs, traces
 
 log = logging.getLogger(__name__)
 REQUEST_ID = "X-Request-ID"
@@ -70,6 +70,10 @@ class _Observed:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
+        with traces.of_request(Headers(scope=scope)):
+            await self._observe(scope, receive, send)
+
+    async def _observe(self, scope: Scope, receive: Receive, send: Send) -> None:
         request_id = logs.request_id(Headers(scope=scope).get(REQUEST_ID))
         # Each request has its own context. The id stays bound, so that the server's log of a failure contains it too.
         logs.bind(request=request_id)
@@ -95,6 +99,7 @@ class _Observed:
             seconds = time.perf_counter() - started
             route = getattr(scope.get("route"), "path", NOWHERE)
             self._metrics.count(route, scope["method"], status, seconds, received)
+            _trace(scope, route, status, request_id)
             routine = route in ROUTINE and status < 500
             log.log(
                 logging.DEBUG if routine else logging.INFO,
@@ -111,6 +116,19 @@ class _Observed:
                     }
                 },
             )
+
+
+def _trace(scope: Scope, route: str, status: int, request_id: str) -> None:
+    """Describe the request in its span, in the words of the semantic conventions of OpenTelemetry."""
+    method = scope["method"] if scope["method"] in METHODS else "other"
+    attributes: dict[str, traces.Attribute] = {
+        "http.request.method": method,
+        "http.route": route,
+        "http.response.status_code": status,
+        "heliopsf.request": request_id,
+        **{f"heliopsf.{name}": value for name, value in _caller(scope).items()},
+    }
+    traces.note(attributes, name=f"{method} {route}", failed=f"status {status}" if status >= 500 else None)
 
 
 def _caller(scope: Scope) -> dict[str, str]:

@@ -80,6 +80,7 @@ SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+_OF_TUS = {460: "Checksum Mismatch"}  # a status that is not in the registry of HTTP
 
 
 class ProblemDocument(BaseModel):
@@ -117,7 +118,7 @@ def document(
     """The response for a problem."""
     body = {
         "type": f"urn:heliopsf:{code}",
-        "title": HTTPStatus(status).phrase,
+        "title": _OF_TUS.get(status) or HTTPStatus(status).phrase,
         "status": status,
         "detail": detail,
         **more,

@@ -44,6 +44,14 @@ class Allowed:
                 raise _file_too_large(over.usage, counted_bytes(row)) from over
 
 
+def check_length(state: State, caller: Caller, count: int) -> None:
+    """Raise ``Problem`` 413 if a file of this many bytes exceeds the owner's quota, and 507 if the disk has no room for it."""
+    check_disk(state, count)
+    usage = _usage(state, caller.owner)
+    if not usage.allows(count):
+        raise _file_too_large(usage, count)
+
+
 def check_disk(state: State, more_bytes: int = 0) -> None:
     """Raise ``Problem`` 507 if, after ``more_bytes`` more bytes, the data folder's disk would have less free space
     than the setting requires."""

@@ -39,6 +39,7 @@ FORM_BYTES = 2**16  # largest size of a form without its file
 LARGE = frozenset(
     {f"{root}/{kind}" for root in ("", "/v1") for kind in ("images", "psfs", "transits")}
 )  # upload addresses; they have their own limits
+PARTS = "/v1/uploads/"  # addresses that receive parts of a resumable upload
 UNDECLARED_BYTES = 2**20  # bytes that are counted in one step if the request does not declare its length
 Take = Callable[[int], object]
 
@@ -267,7 +268,11 @@ def _inspected(path: Path, expected: _Format[Found]) -> Found:
 def has_own_limit(address: str, content_type: str) -> bool:
     """Whether the route itself limits the size of a body of this type, because the body may contain files."""
     form = content_type.lower().startswith("multipart/form-data")
-    return address in LARGE or (form and re.fullmatch(r"/uws/jobs(/[^/]+/parameters)?", address) is not None)
+    return (
+        address in LARGE
+        or address.startswith(PARTS)
+        or (form and re.fullmatch(r"/uws/jobs(/[^/]+/parameters)?", address) is not None)
+    )
 
 
 def _too_large(max_bytes: int) -> Problem:

@@ -15,7 +15,7 @@ from functools import cache
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 
 from psfcore.errors import DataError
-from workers import logs
+from workers import logs, traces
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import NOT_KEPT
@@ -108,7 +108,7 @@ class Runner:
         if job is None:
             log.info("job %s: nothing to do: it was deleted", lease.job_id)
             return
-        with logs.bound(job=job.id, owner=job.owner):
+        with logs.bound(job=job.id, owner=job.owner), traces.of_job(job.id, job.kind):
             log.info("job %s: %s starts, attempt %d", job.id, job.kind, job.attempt)
             settings = self._settings
             attempt = Attempt(
@@ -267,8 +267,10 @@ class Runner:
 
     def _keep_times(self, job: JobRow, times: StageTimer) -> None:
         """Add the stage times of an attempt to the sums. The outcome of the attempt is already recorded, so a failure here is only logged."""
+        spent = times.end()
+        traces.note({f"heliopsf.stage.{name}_s": round(stage.seconds, 3) for name, stage in spent.items()})
         try:
-            self._catalogue.stage_times.add(job.kind, times.end())
+            self._catalogue.stage_times.add(job.kind, spent)
         except SQLAlchemyError as error:
             log.warning("job %s: could not keep its stage times: %s", job.id, error)
 
@@ -340,6 +342,7 @@ class Runner:
     def _fail(self, lease: Lease, error: JobError) -> None:
         self._persist(lambda: self._catalogue.jobs.fail(lease, error))
         log.warning(FAILED, lease.job_id, error.message, error.code)
+        traces.note({"heliopsf.error": error.code}, failed=error.code)
 
     def _persist(self, write: Callable[[], bool]) -> bool:
         """Write the outcome of a job. While the database does not answer, try again for the length of a lease."""

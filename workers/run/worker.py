@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from celery import Task
 from celery.signals import setup_logging, worker_init, worker_process_init, worker_shutting_down
 
-from workers import logs
+from workers import logs, traces
 from workers.broker import app as queue
 from workers.broker.order import TakeWhatCanStart
 from workers.contract.queues import broker_name, queue_of_broker
@@ -120,6 +120,7 @@ def _end_at_the_latest() -> None:
 @worker_process_init.connect
 def _prepare_child(**_: object) -> None:
     """Load all tasks when the child starts, so that the first job does not wait for their libraries."""
+    traces.configure(settings, "worker")  # after the fork, because the sender has a thread
     _runner()
     threading.Thread(target=_be_present, name="presence", daemon=True).start()
 

@@ -1,0 +1,309 @@
+"""Uploads that continue after a cut of the connection, by the tus protocol 1.0: ``/v1/uploads``.
+
+Extensions: creation, termination, expiration, checksum. See https://tus.io/protocols/resumable-upload. The metadata
+``kind`` says what is uploaded ("transit" or "image"). If the metadata ``sha256`` declares the SHA-256 of the whole file,
+the service checks it, and a second request for the same file gets the upload that is open already.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+from collections.abc import Callable
+from contextlib import ExitStack
+from email.utils import formatdate
+from typing import Annotated, Any, BinaryIO
+
+from fastapi import APIRouter, Path, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+
+from psfcore.errors import DataError
+from service.http import uploads
+from service.http.callers import Caller, Submitting
+from service.http.problems import RESPONSES, Problem
+from service.http.quotas import Allowed, check_length
+from service.http.state import Shared, State
+from workers.catalogue.tables import ImageRow, TransitRow
+from workers.files.partial_uploads import PartialUpload, PartialUploads
+from workers.files.store import sha256_of
+from workers.intake.uploads import image_row, transit_row
+
+router = APIRouter(prefix="/v1/uploads", tags=["uploads"], responses=RESPONSES)
+UploadId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
+VERSION = "1.0.0"
+EXTENSIONS = "creation,termination,expiration,checksum"
+ALGORITHMS: dict[str, Callable[[], Any]] = {
+    "sha256": hashlib.sha256,
+    "sha1": hashlib.sha1,
+    "md5": hashlib.md5,
+}
+PART = "application/offset+octet-stream"
+KINDS = ("transit", "image")
+_PART_BODY = {
+    "parameters": [
+        {"name": name, "in": "header", "required": required, "schema": {"type": "string"}}
+        for name, required in (("Tus-Resumable", True), ("Upload-Offset", True), ("Upload-Checksum", False))
+    ],
+    "requestBody": {"required": True, "content": {PART: {"schema": {"type": "string", "format": "binary"}}}},
+}
+_CREATION = {
+    "parameters": [
+        {"name": name, "in": "header", "required": True, "schema": {"type": "string"}, "description": text}
+        for name, text in (
+            ("Tus-Resumable", VERSION),
+            ("Upload-Length", "size of the file, bytes"),
+            (
+                "Upload-Metadata",
+                "kind (transit or image), filename and sha256, each with its value in base64",
+            ),
+        )
+    ]
+}
+
+
+@router.options("", status_code=204, summary="What this service supports of tus", response_class=Response)
+def tus_options(state: Shared) -> Response:
+    """The version and the extensions of tus, and the largest upload."""
+    headers = {
+        "Tus-Resumable": VERSION,
+        "Tus-Version": VERSION,
+        "Tus-Extension": EXTENSIONS,
+        "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
+        "Tus-Max-Size": str(state.settings.max_transit_bytes),
+    }
+    return Response(status_code=204, headers=headers)
+
+
+@router.post(
+    "",
+    status_code=201,
+    summary="Begin a resumable upload",
+    response_class=Response,
+    openapi_extra=_CREATION,
+    responses={200: {"description": "An upload of the same file is open; the answer is that upload."}},
+)
+def begin_upload(request: Request, caller: Submitting, state: Shared) -> Response:
+    """Begin an upload. `Location` is its address; send the bytes there with `PATCH`.
+
+    If the file with the declared `sha256` was uploaded before, the answer has its address in `Content-Location`, and no bytes
+    are needed.
+    """
+    _check_version(request)
+    length = _number(request, "upload-length")
+    metadata = _metadata(request.headers.get("upload-metadata", ""))
+    kind, sha256 = metadata.get("kind", "transit"), metadata.get("sha256")
+    if kind not in KINDS:
+        raise Problem(422, "bad-upload", f"expected the kind transit or image; got {kind[:40]!r}")
+    if sha256 is not None and not (len(sha256) == 64 and set(sha256) <= set("0123456789abcdef")):
+        raise Problem(422, "bad-upload", f"expected a SHA-256 of 64 hexadecimal digits; got {sha256[:80]!r}")
+    uploads.check_size(length, _most_bytes(state, kind))
+    open_uploads = PartialUploads(state.settings.data_dir)
+    if sha256 is not None:
+        if _is_known(state, caller, kind, sha256) and state.store.size(sha256) == length:
+            return _answer(200, {"Content-Location": f"/v1/{kind}s/{sha256}", "Upload-Offset": str(length)})
+        equal = open_uploads.equal(caller.owner, kind, length, sha256)
+        if equal is not None:
+            return _described(200, open_uploads, equal)
+    check_length(state, caller, length)
+    try:
+        upload = open_uploads.create(
+            caller.owner, kind, length, uploads.label(metadata.get("filename")), sha256
+        )
+    except DataError as error:
+        raise Problem(429, error.code, error.message) from error
+    return _described(201, open_uploads, upload)
+
+
+@router.head("/{upload_id}", status_code=200, summary="How much has arrived", response_class=Response)
+def upload_offset(upload_id: UploadId, request: Request, caller: Submitting, state: Shared) -> Response:
+    """`Upload-Offset`: number of bytes that the service has. Continue from there."""
+    _check_version(request)
+    open_uploads = PartialUploads(state.settings.data_dir)
+    answer = _described(200, open_uploads, _found(open_uploads, upload_id, caller))
+    answer.headers["Cache-Control"] = "no-store"
+    return answer
+
+
+@router.patch(
+    "/{upload_id}",
+    status_code=204,
+    summary="Send the next bytes",
+    response_class=Response,
+    openapi_extra=_PART_BODY,
+)
+async def send_part(upload_id: UploadId, request: Request, caller: Submitting, state: Shared) -> Response:
+    """Send the bytes from `Upload-Offset` on. The answer to the last bytes has the address of the file in `Content-Location`.
+
+    If the connection is cut, the bytes that arrived are kept; those of a request with `Upload-Checksum` are not, because they
+    cannot be checked. The answer is 409 if the offset is another one, 460 if the checksum does not fit, and 423 if another
+    request sends bytes now.
+    """
+    _check_version(request)
+    if request.headers.get("content-type", "") != PART:
+        raise Problem(415, "bad-upload", f"expected Content-Type: {PART}; got another one")
+    open_uploads = PartialUploads(state.settings.data_dir)
+    upload = await run_in_threadpool(_found, open_uploads, upload_id, caller)
+    with ExitStack() as held:
+        try:
+            file = held.enter_context(open_uploads.opened(upload))
+        except DataError as error:
+            raise Problem(423, error.code, error.message) from error
+        offset = file.tell()
+        if (sent := _number(request, "upload-offset")) != offset:
+            raise Problem(409, "wrong-offset", f"expected bytes from {offset} on; got bytes from {sent} on")
+        await _append(request, file, upload, Allowed(state, caller))
+        if file.tell() < upload.length:
+            return _described(204, open_uploads, upload)
+        location = await run_in_threadpool(_complete, open_uploads, upload, caller, state)
+    return _answer(204, {"Upload-Offset": str(upload.length), "Content-Location": location})
+
+
+@router.delete("/{upload_id}", status_code=204, summary="Delete an open upload", response_class=Response)
+def delete_upload(upload_id: UploadId, request: Request, caller: Submitting, state: Shared) -> Response:
+    """Delete the bytes that have arrived. The upload cannot be continued."""
+    _check_version(request)
+    open_uploads = PartialUploads(state.settings.data_dir)
+    open_uploads.remove(_found(open_uploads, upload_id, caller))
+    return _answer(204, {})
+
+
+def _is_known(state: State, caller: Caller, kind: str, sha256: str) -> bool:
+    """Whether the owner has uploaded this file before."""
+    if kind == "transit":
+        return state.catalogue.get(TransitRow, sha256, caller.owner) is not None
+    return state.catalogue.get(ImageRow, sha256, caller.owner) is not None
+
+
+async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take: Allowed) -> None:
+    """Append the body to the received bytes. Raises ``Problem`` 413 and 460; then the bytes of this request are removed."""
+    offset, checksum = file.tell(), _checksum(request.headers.get("upload-checksum"))
+    digest = None if checksum is None else checksum[0]()
+    whole = False
+    try:
+        async for chunk in request.stream():
+            if file.tell() + len(chunk) > upload.length:
+                raise Problem(413, "too-large", f"expected {upload.length} bytes in all; got more")
+            if chunk:
+                await run_in_threadpool(take, len(chunk))
+                file.write(chunk)
+                if digest is not None:
+                    digest.update(chunk)
+        if checksum is not None and digest is not None and digest.digest() != checksum[1]:
+            raise Problem(
+                460,
+                "wrong-checksum",
+                "expected bytes with the declared checksum; got others: send them again",
+            )
+        whole = True
+    except ClientDisconnect as error:
+        whole = checksum is None
+        raise Problem(
+            400,
+            "upload-ended-early",
+            "expected all announced bytes; the connection closed before: ask for the offset, then continue there",
+        ) from error
+    finally:
+        if not whole:
+            file.truncate(offset)
+            file.seek(offset)
+        file.flush()
+
+
+def _complete(open_uploads: PartialUploads, upload: PartialUpload, caller: Caller, state: State) -> str:
+    """Check a complete file and add it to the catalogue; returns its address. A file that cannot be used is removed."""
+    path, settings = open_uploads.path(upload), state.settings
+    sha256 = sha256_of(path)
+    try:
+        if upload.sha256 not in (None, sha256):
+            raise Problem(
+                422,
+                "wrong-checksum",
+                f"expected a file with the SHA-256 {upload.sha256}; got one with {sha256}: upload it again",
+            )
+        if upload.kind == "transit":
+            contents = uploads.archive_contents(path, settings.archive_limits)
+            transit = transit_row(caller.owner, sha256, upload.length, upload.filename, contents)
+            Allowed(state, caller).keep(path, sha256, transit)
+        else:
+            summary = uploads.fits_summary(path, state.limits)
+            image = image_row(caller.owner, sha256, upload.length, upload.filename, summary)
+            Allowed(state, caller).keep(path, sha256, image)
+    finally:
+        open_uploads.remove(upload)
+    return f"/v1/{upload.kind}s/{sha256}"
+
+
+def _found(open_uploads: PartialUploads, upload_id: str, caller: Caller) -> PartialUpload:
+    upload = open_uploads.find(upload_id, caller.owner)
+    if upload is None:
+        raise Problem(
+            404,
+            "no-such-upload",
+            f"expected the id of an open upload; got {upload_id}, which was completed, deleted or has expired: begin the upload "
+            "again",
+        )
+    return upload
+
+
+def _described(status: int, open_uploads: PartialUploads, upload: PartialUpload) -> Response:
+    headers = {
+        "Location": f"/v1/uploads/{upload.id}",
+        "Upload-Offset": str(open_uploads.offset(upload)),
+        "Upload-Length": str(upload.length),
+        "Upload-Expires": formatdate(open_uploads.expires_at(upload), usegmt=True),
+    }
+    return _answer(status, headers)
+
+
+def _answer(status: int, headers: dict[str, str]) -> Response:
+    return Response(status_code=status, headers={"Tus-Resumable": VERSION, **headers})
+
+
+def _most_bytes(state: State, kind: str) -> int:
+    return state.settings.max_transit_bytes if kind == "transit" else state.settings.max_upload_bytes
+
+
+def _check_version(request: Request) -> None:
+    sent = request.headers.get("tus-resumable")
+    if sent != VERSION:
+        raise Problem(
+            412,
+            "tus-version",
+            f"expected the header Tus-Resumable: {VERSION}; got {'none' if sent is None else repr(sent[:20])}",
+        )
+
+
+def _number(request: Request, name: str) -> int:
+    text = request.headers.get(name, "")
+    if not (text.isascii() and text.isdecimal() and len(text) < 16):
+        raise Problem(
+            400, "bad-upload", f"expected a number of bytes in the header {name.title()}; got {text[:40]!r}"
+        )
+    return int(text)
+
+
+def _metadata(text: str) -> dict[str, str]:
+    """The metadata of a creation: pairs of a key and its value in base64."""
+    found: dict[str, str] = {}
+    for pair in filter(None, (part.strip() for part in text.split(","))):
+        key, _, value = pair.partition(" ")
+        found[key] = _decoded(value.strip()).decode("utf-8", "replace")
+    return found
+
+
+def _checksum(text: str | None) -> tuple[Callable[[], Any], bytes] | None:
+    if text is None:
+        return None
+    name, _, value = text.partition(" ")
+    if name not in ALGORITHMS:
+        raise Problem(400, "bad-upload", f"expected a checksum by {', '.join(ALGORITHMS)}; got {name[:20]!r}")
+    return ALGORITHMS[name], _decoded(value)
+
+
+def _decoded(text: str) -> bytes:
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise Problem(400, "bad-upload", f"expected a value in base64; got {text[:40]!r}") from error
