@@ -16,7 +16,7 @@ from heliopsf.inputs import header_of, image_of, is_many
 from heliopsf.machine import cores
 from heliopsf.outputs import Deconvolution, in_form_of
 from heliopsf.progress import Told, told
-from heliopsf.psfs import Psf, build_psf, read_psf
+from heliopsf.psfs import Psf, built_psf, read_psf
 from psfcore.deconvolve.conditions import Conditions, EngineCache
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.kernels import compiling_beside
@@ -78,8 +78,9 @@ def deconvolve(
     smap: the image. A sunpy Map, an NDData or a CCDData gives an object of the same class. An array gives an array, and
     needs ``psf``. A path of a FITS file or an ``Image`` gives a ``Deconvolution``. A list of these gives a list.
     Cut-outs work like whole images. Pixels that are NaN or masked are not used; they are NaN in the result.
-    psf: a ``Psf``, a path of a FITS file, or an array whose centre is [ny // 2, nx // 2]; default: the PSF that is built for
-    the telescope in the header, see ``psf_for``. The PSF is rebinned if the image is binned.
+    psf: a ``Psf``, a path of a FITS file, or an array whose centre is [ny // 2, nx // 2]; default: the PSF that is
+    built for the telescope in the header, see ``psf_for``, but without its components. The PSF is rebinned if the
+    image is binned.
     iterations: number of steps; default: the number of the method (Richardson-Lucy: 20; aiapy: 25).
     clip_negative: whether pixels below 0 count as 0; default: the rule of the method. The Richardson-Lucy methods
     always count these pixels as 0. For ``linear`` and ``basic-iterative`` the default is False.
@@ -150,7 +151,7 @@ def psf_for(
     Raises ``DataError`` "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch".
     """
     header = header_of(image)
-    psf = _built_for(header, threads or cores(), progress)
+    psf = _built_for(header, threads or cores(), progress, parts=True)
     for message in input_warnings(psf, _header_only(header), other_channel=False).values():
         warnings.warn(message, stacklevel=2)
     return _on_pixels(psf, header)
@@ -179,7 +180,7 @@ def _deconvolved(
         check_not_deconvolved(content_of(observed.header))
     if psf is None:
         with compiling_beside(method, (observed.pixels.shape[0], observed.pixels.shape[1])):
-            found = _built_for(observed.header, threads, progress)
+            found = _built_for(observed.header, threads, progress, parts=False)
     else:
         found = _given(psf)
     said = input_warnings(found, observed, other_channel=other_channel)
@@ -217,12 +218,15 @@ def _deconvolved(
     )
 
 
-def _built_for(header: Header, threads: int, progress: Told) -> Psf:
-    """The PSF of the shipped instrument file that the header names. Raises ``DataError`` "no-psf-for-instrument"."""
+def _built_for(header: Header, threads: int, progress: Told, *, parts: bool) -> Psf:
+    """The PSF of the shipped instrument file that the header names. parts: whether it needs its components.
+
+    Raises ``DataError`` "no-psf-for-instrument".
+    """
     summary = seen_by(header)
     if summary["instrument"] is None:
         raise unknown_instrument(summary)
-    return build_psf(summary["instrument"], threads=threads, progress=progress is True)
+    return built_psf(summary["instrument"], parts=parts, threads=threads, progress=progress is True)
 
 
 def _given(psf: AnyPsf) -> Psf:

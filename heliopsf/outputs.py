@@ -38,7 +38,8 @@ class Deconvolution(Deconvolved):
     """A deconvolved image: ``pixels`` [y, x] in the unit of the image, and the inputs, errors and warnings that
     belong to it.
 
-    image: the input, with its mask. psf: the PSF on the pixels of the image. errors: planes with the standard deviation of
+    image: the input, with its mask. psf: the PSF on the pixels of the image; without components, if it was built for the
+    telescope in the header. errors: planes with the standard deviation of
     each pixel, if they were asked for. warnings: sentences by their codes.
     """
 

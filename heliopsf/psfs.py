@@ -96,6 +96,19 @@ def build_psf(
     Raises ``DataError`` "bad-size", "unknown-component" or "bad-mount", and the errors of
     ``psfcore.instruments.model.load_instrument``.
     """
+    return built_psf(instrument, size=size, component=component, threads=threads, progress=progress)
+
+
+def built_psf(
+    instrument: str | Path,
+    *,
+    size: int = 2048,
+    component: str | None = None,
+    parts: bool = True,
+    threads: int | None = None,
+    progress: Told = None,
+) -> Psf:
+    """As ``build_psf``. parts: False: without the components, which a deconvolution does not need."""
     known = load_instrument(instrument)
     own = isinstance(instrument, Path) or instrument.endswith(".toml")
     mask, mask_id = None, None
@@ -113,6 +126,7 @@ def build_psf(
         kept_psf(
             recipe,
             LIMITS,
+            parts=parts,
             mount_image=mask,
             threads=threads or cores(),
             progress=told(progress, f"building the PSF of {known.name}"),

@@ -41,6 +41,7 @@ def build_psf(
     *,
     size: int = REACH_GRID_PX,
     component: str | None = None,
+    parts: bool = True,
     mount_image: NDArray[np.floating] | None = None,
     progress: Progress | None = None,
     threads: int = 1,
@@ -49,6 +50,8 @@ def build_psf(
 
     size: an even number from 64 to 4096 (px).
     component: build only this component, one of component_names(); the result is then a PSF without components.
+    parts: False: compute only what the total PSF needs, and return it without components. The kernel is the same bit for
+    bit.
     mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see fits.mask_file).
     progress: called with (step, steps); it may raise to stop the work.
     Raises DataError "bad-size", "unknown-component", "bad-mount", or "bad-instrument-file" if the file describes an
@@ -58,6 +61,8 @@ def build_psf(
     check_workload(instrument, instrument.name)
     names = component_names(instrument) if component is None else (component,)
     _check_component(instrument, names)
+    if component is None and not parts:
+        names = tuple(name for name in names if name in (DIFFRACTION, SCATTER))
     grid = max(size, REACH_GRID_PX)
     patterns = diffraction_patterns(
         instrument,
@@ -94,7 +99,7 @@ def build_psf(
         status=instrument.status,
         plate_scale_arcsec=instrument.detector.plate_scale_arcsec,
         wavelength_angstrom=instrument.wavelength_angstrom,
-        components={name: crop_centred(part, shape) for name, part in kernels.items()},
+        components={name: crop_centred(part, shape) for name, part in kernels.items()} if parts else {},
         provenance=provenance,
     )
 
@@ -102,18 +107,20 @@ def build_psf(
 def build_recipe(
     recipe: Recipe,
     *,
+    parts: bool = True,
     mount_image: NDArray[np.floating] | None = None,
     progress: Progress | None = None,
     threads: int = 1,
 ) -> Psf:
     """Compute the PSF of a recipe. Its version and its provenance name the recipe.
 
-    Raises the errors of `build_psf` and of `parse_instrument`.
+    parts: see `build_psf`. Raises the errors of `build_psf` and of `parse_instrument`.
     """
     psf = build_psf(
         parse_instrument(recipe.text, recipe.name or "instrument_file"),
         size=recipe.size,
         component=recipe.component and recipe.component.upper(),
+        parts=parts,
         mount_image=mount_image,
         threads=threads,
         progress=progress,

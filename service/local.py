@@ -144,7 +144,9 @@ class LocalService(Operations):
         self._store = LocalStore(settings.data_dir)
         self._catalogue = Catalogue(settings.catalogue_url)
         self._catalogue.schema.create()
-        self._runner = Runner(settings, self._catalogue, self._store, previews=previews, compile_beside=True)
+        self._runner = Runner(
+            settings, self._catalogue, self._store, previews=previews, compile_beside=True, total_psfs=True
+        )
         self._built = (
             None
             if cache is None
@@ -244,7 +246,7 @@ class LocalService(Operations):
         if self._built is not None:
             self._recipes[row.id] = recipes_in(kind, resolved[0])
             for recipe in self._recipes[row.id]:
-                self._built.recall(recipe)
+                self._built.recall(recipe, whole=kind != "deconvolve")
         return JobView.of(row).model_dump(mode="json")
 
     def _resolved(self, kind: str, parameters: dict[str, Any]) -> tuple[dict[str, Any], str]:

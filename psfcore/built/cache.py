@@ -23,6 +23,8 @@ from psfcore.errors import DataError
 from psfcore.whole_files import PARTIAL
 
 FITS, PROVENANCE = "fits", "provenance.json"  # parts that every builder keeps
+# The same for a PSF that was built for a deconvolution: its kernel is equal, but it has no components.
+TOTAL_FITS, TOTAL_PROVENANCE = "total.fits", "total.provenance.json"
 _NAME = re.compile(r"([0-9a-f]{64})\.([0-9a-f]{64})\.([a-z.]+)")
 _OTHERS = 0o077  # permissions of the group and of all other users
 _ABANDONED_S = 86_400.0  # a temporary file of this age belongs to no running process

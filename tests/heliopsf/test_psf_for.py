@@ -57,6 +57,20 @@ def test_the_psf_is_that_of_the_service(small: Path, tmp_path: Path) -> None:
     assert result.meta["psfid"] == product["psf_id"]
 
 
+def test_a_deconvolution_builds_the_total_psf_alone(small: Path, tmp_path: Path) -> None:
+    """Its components are computed when they are asked for; the result of a deconvolution does not depend on this."""
+    image = image_file(tmp_path / "image.fits")
+    first = heliopsf.deconvolve(image, full=True)
+    assert first.psf.components == {}
+    psf = heliopsf.psf_for(image)
+    assert "DIFFRACTION" in psf.components
+    np.testing.assert_array_equal(psf.kernel, first.psf.kernel)
+    assert psf.provenance["psf_id"] == first.psf.provenance["psf_id"]
+    again = heliopsf.deconvolve(image, full=True)  # reads the file with components
+    np.testing.assert_array_equal(again.pixels, first.pixels)
+    assert again.psf.components == {} and len(psf_cache().psfs()) == 1
+
+
 def test_a_header_is_enough(small: Path, tmp_path: Path) -> None:
     image = image_file(tmp_path / "image.fits")
     header = fits.getheader(image)

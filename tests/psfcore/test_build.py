@@ -23,7 +23,7 @@ from psfcore.instruments.model import (
     SpectralLine,
     load_instrument,
 )
-from psfcore.psf import Psf, cumulative_curve
+from psfcore.psf import Psf, crop_centred, cumulative_curve
 from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel
 
 HRI = load_instrument("hri_euv")
@@ -153,6 +153,13 @@ def test_every_component_is_kept_and_sums_to_1(hri_psf: Psf) -> None:
         inner = kernel[129:1920, 129:1920]
         np.testing.assert_allclose(inner, inner[::-1], rtol=1e-3, atol=1e-12, err_msg=name)
         np.testing.assert_allclose(inner, inner.T, rtol=1e-3, atol=1e-12, err_msg=name)
+
+
+def test_the_total_psf_alone_is_the_same_bit_for_bit(hri_psf: Psf) -> None:
+    alone = build_psf(HRI, size=512, parts=False, threads=2)
+    np.testing.assert_array_equal(alone.kernel, crop_centred(hri_psf.kernel, (512, 512)))
+    assert alone.components == {} and alone.version == hri_psf.version
+    assert "entrance" in alone.provenance and "mount" not in alone.provenance, "only what the total PSF needs"
 
 
 def test_the_core_weight_is_the_product_of_the_two_core_weights(hri_psf: Psf) -> None:

@@ -21,10 +21,11 @@ from psfcore.fits.cutout import cutout
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.fits.psfs import write_psf as write_built
+from psfcore.instruments import files
 from psfcore.psf_sampling import rebinned
 from psfcore.transit.archive import pack
 from service.client.errors import ServiceError
-from service.local import LocalStore, local_service
+from service.local import LocalService, LocalStore, local_service
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.service.conftest import upload
 from tests.transit_files import write_transit
@@ -186,6 +187,45 @@ def test_a_damaged_psf_of_the_cache_is_built_again(tmp_path: Path) -> None:
         file.write_bytes(content[:-1] + b"?")
     _, stages, same = _built(tmp_path)
     assert "building the PSF" in stages and same == content
+
+
+def test_a_deconvolution_builds_the_total_psf_and_a_later_command_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "instruments"
+    folder.mkdir()
+    (folder / "small.toml").write_text(f'{SMALL_INSTRUMENT}\n[match]\nDETECTOR = "SMALL"\n')
+    monkeypatch.setattr(files, "_FOLDER", folder)
+    files.match_table.cache_clear()
+    write_image(tmp_path / "image.fits", DETECTOR="SMALL", WAVELNTH=171, CDELT1=2.0, CDELT2=2.0)
+
+    def product(service: LocalService, name: str) -> tuple[str, list[str]]:
+        stages: list[str] = []
+        made = service.deconvolve(
+            tmp_path / "image.fits",
+            tmp_path / name,
+            progress=lambda stage, step, steps: stages.append(stage),
+        )
+        return made["psf_id"], stages
+
+    with local_service() as service:
+        psf_id, stages = product(service, "first.fits")
+        assert "building the PSF" in stages
+        assert service.get(f"/v1/psfs/{psf_id}")["details"]["components"] == []
+    with local_service() as service:
+        assert product(service, "second.fits")[0] == psf_id
+        assert service.get(f"/v1/psfs/{psf_id}")["details"]["components"] == []
+        psf = service.build_psf("small", tmp_path / "psf.fits")  # in a catalogue that has the total PSF
+        assert psf["id"] == psf_id and "DIFFRACTION" in psf["details"]["components"]
+        assert service.ask(psf_id, "curve", radii=[1.0])["radii_px"] == [1.0]
+    with local_service() as service:
+        _, stages = product(service, "third.fits")
+        assert "building the PSF" not in stages
+        assert service.build_psf("small", tmp_path / "same.fits")["details"]["components"]
+    first, second, third = ((tmp_path / f"{name}.fits").read_bytes() for name in ("first", "second", "third"))
+    assert first == second == third
+    assert (tmp_path / "psf.fits").read_bytes() == (tmp_path / "same.fits").read_bytes()
+    files.match_table.cache_clear()
 
 
 def test_a_psf_that_python_built_is_used(tmp_path: Path) -> None:

@@ -63,16 +63,17 @@ class Runner:
         child: Child | None = None,
         previews: bool = True,
         compile_beside: bool = False,
+        total_psfs: bool = False,
     ) -> None:
         """submit: a function that sends an unfinished job to the broker again; if it returns False, the reconciler
         does so. child: this process, if the runner may limit the memory of the process and end it; None if it may do
-        neither. previews, compile_beside: see ``Context``.
+        neither. previews, compile_beside, total_psfs: see ``Context``.
         """
         self._settings, self._catalogue, self._store = settings, catalogue, store
         self._call_for_help, self._submit = call_for_help, submit
         self._stopping = stopping or Stopping()
         self._child = child
-        self._previews, self._compile_beside = previews, compile_beside
+        self._previews, self._compile_beside, self._total_psfs = previews, compile_beside, total_psfs
         self._pausing = False  # a job pauses while this process runs a short one
 
     def run(self, job_id: str, on_progress: Progress | None = None) -> None:
@@ -212,6 +213,7 @@ class Runner:
             times=attempt.times,
             previews=self._previews,
             compile_beside=self._compile_beside,
+            total_psfs=self._total_psfs,
         )
         try:
             self._check_room(job)

@@ -43,6 +43,8 @@ class Context:
     stages is measured instead.
     previews: False if nobody looks at the previews of products; the thumbnail then takes the place of the preview.
     compile_beside: True if this process runs nothing else: kernels are then compiled by another process while a PSF is built.
+    total_psfs: True if nobody looks at the PSF that a deconvolution builds: it is built without components, tables and
+    picture.
     anew: True for a rerun: compute everything again, and use no solution that an earlier job kept.
     """
 
@@ -59,6 +61,7 @@ class Context:
     times: StageTimer = field(default_factory=StageTimer)
     previews: bool = True
     compile_beside: bool = False
+    total_psfs: bool = False
     anew: bool = False
 
     @property

@@ -13,13 +13,14 @@ from psfcore.errors import DataError
 from psfcore.fits.images import read_image
 from psfcore.fits.psfs import write_psf
 from psfcore.instruments.model import Instrument, parse_instrument
+from psfcore.psf import Psf
 from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.identities import interpolated_psf_identity, recipe_of
 from workers.contract.requests import PsfBuild, PsfInterpolate
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.settings import library_versions
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import named_psf, psf_row
+from workers.tasks.data.psfs import is_total_alone, named_psf, psf_row
 from workers.tasks.interpolation import interpolated_row
 from workers.versions.series import TOTAL
 
@@ -45,7 +46,7 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
         return _interpolated(context, request.psf_id, request.psf_interpolation)
     assert request.psf_recipe is not None
     with _compiling_beside(context, request) if context.compile_beside else nullcontext():
-        row = built_psf(context, request.psf_recipe)
+        row = built_psf(context, request.psf_recipe, whole=not context.total_psfs)
     if row.id != request.psf_id:
         raise DataError(
             "instrument-changed",
@@ -76,27 +77,30 @@ def _interpolated(context: Context, psf_id: str, asked: PsfInterpolate) -> PsfRo
     return interpolated_row(context, asked)
 
 
-def built_psf(context: Context, build: PsfBuild) -> PsfRow:
-    """The row of the PSF of a recipe. If the catalogue does not contain this PSF, build it and add it."""
+def built_psf(context: Context, build: PsfBuild, *, whole: bool = True) -> PsfRow:
+    """The row of the PSF of a recipe. If the catalogue does not contain this PSF, build it and add it.
+
+    whole: False: without components, tables and picture, for a deconvolution. If the whole PSF is asked for later, it is
+    built then, and its files replace those of the total PSF.
+    """
     recipe = recipe_of(build)
     identity = recipe.identity
-    row = context.made(PsfRow, identity)
-    if row is not None:
-        return row
+    there = context.made(PsfRow, identity)
+    if there is not None and not (whole and is_total_alone(there)):
+        return there
     instrument = parse_instrument(recipe.text, recipe.name or "instrument_file")
-    # A deconvolution with a PSF that is already built loads neither matplotlib nor the libraries of the diffraction.
+    # A deconvolution with a PSF that is already built does not load the libraries of the diffraction.
     from psfcore.build import build_recipe
-    from psfcore.drawing import plots
 
     psf = build_recipe(
         recipe,
+        parts=whole,
         mount_image=_mount_image(context, build, instrument),
         threads=context.settings.threads,
         progress=lambda step, steps: context.report("building the PSF", step, steps),
     )
-    with context.store.temporary() as path, context.store.temporary() as picture:
+    with context.store.temporary() as path:
         write_psf(path, psf, instrument_file=recipe.text.encode())
-        plots.psf_png(psf, picture)
         row = psf_row(
             psf,
             identity,
@@ -104,12 +108,22 @@ def built_psf(context: Context, build: PsfBuild) -> PsfRow:
             origin="built",
             file_sha256=context.store.keep(path),
             store=context.store,
-            preview_sha256=context.store.keep(picture),
+            preview_sha256=_picture(context, psf) if whole else None,
             kind=build.component or TOTAL,
             details={"job_id": context.job_id, "libraries": library_versions()},
             threads=context.settings.threads,
+            whole=whole,
         )
-    return context.add(row)
+    return context.add(row) if there is None else context.catalogue.refile(row)
+
+
+def _picture(context: Context, psf: Psf) -> str:
+    """Draw a PSF into the store; returns the SHA-256 of the picture."""
+    from psfcore.drawing import plots  # matplotlib is loaded only if a picture is drawn
+
+    with context.store.temporary() as picture:
+        plots.psf_png(psf, picture)
+        return context.store.keep(picture)
 
 
 def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> NDArray[np.float64] | None:

@@ -19,6 +19,7 @@ from workers.tasks.context import Context
 from workers.versions.series import TOTAL, channel_of, series_of
 from workers.versions.status import PsfStatus
 
+_TOTAL_ALONE = "total_alone"  # an entry of the details of a row
 CURVE_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -60,10 +61,12 @@ def psf_row(
     kind: str = TOTAL,
     details: Mapping[str, Any] | None = None,
     threads: int = 1,
+    whole: bool = True,
 ) -> PsfRow:
     """The catalogue's row of a draft PSF whose file is in the store. Writes the PSF's tables into the store too.
 
-    details: further entries for the details of the row.
+    details: further entries for the details of the row. whole: False if the file holds the total PSF alone, although the
+    PSF has components; no tables are made then.
     """
     channel = channel_of(psf.instrument, psf.wavelength_angstrom)
     curve = cumulative_curve(psf.kernel, np.array(CURVE_RADII_PX, dtype=float))
@@ -90,10 +93,15 @@ def psf_row(
             "components": sorted(psf.components),
             "cumulative_curve_pct": {str(r): float(c) for r, c in zip(CURVE_RADII_PX, curve, strict=True)},
             "provenance": psf.provenance,
-            "tables_sha256": keep_tables(psf, store, threads),
+            **({"tables_sha256": keep_tables(psf, store, threads)} if whole else {_TOTAL_ALONE: True}),
             **(details or {}),
         },
     )
+
+
+def is_total_alone(row: PsfRow) -> bool:
+    """Whether the file of a PSF was written without the components that the PSF has."""
+    return bool(row.details.get(_TOTAL_ALONE))
 
 
 def keep_tables(psf: Psf, store: Store, threads: int) -> str:
