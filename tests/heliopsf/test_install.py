@@ -85,7 +85,7 @@ def test_the_core_depends_on_five_packages_and_extras_name_all_that_is_imported(
     names = {Requirement(one).name for one in project["dependencies"]}
     assert names == {"astropy", "numba", "numpy", "platformdirs", "scipy"}
     extras = project["optional-dependencies"]
-    assert {"map", "plot", "fit", "service", "s3", "all", "docs", "dev"} == set(extras)
+    assert {"map", "plot", "fit", "service", "s3", "traces", "all", "docs", "dev"} == set(extras)
     named = set(re.findall(r'module_of_extra\(\s*"(\w+)"', _sources())) | {"fit", "service"}
     assert named <= set(extras)
 
