@@ -84,7 +84,7 @@ openapi: $(DEV)
 # The hashes of the pinned packages and of the build tool, for the image. The file names no index.
 pins: constraints.txt pyproject.toml pins/build.in
 	test -x .venv-pins/bin/uv || { $(PYTHON) -m venv .venv-pins && .venv-pins/bin/python -m pip install --quiet --disable-pip-version-check uv; }
-	.venv-pins/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c constraints.txt --extra s3 -o pins/service.txt pyproject.toml pins/build.in
+	.venv-pins/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c constraints.txt --extra s3 --extra traces -o pins/service.txt pyproject.toml pins/build.in
 
 clean:
 	rm -rf $(VENV) .venv-peers .venv-pins .mypy_cache .ruff_cache .hypothesis docs/_build docs/_gallery
