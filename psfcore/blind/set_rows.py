@@ -9,7 +9,6 @@ they were computed.
 |---|---|---|
 | set covers the truth: all, clean, single, pair, not in the library | all, or of one kind | a member covers the truth |
 | mean number of members | all; cases with a noncentrality of SEEN or more | number of members of the set |
-| mean number of members of the ideal observer's set | the same | `ideal_sets`: no calibrated diagnosis can have smaller sets |
 | right and alone / ideal observer | cases with an ideal observer, and clean cases | the number of sets that are right and alone, divided by the number expected of the ideal observer (the sum of `bounds.Known.alone`) |
 | right verdict / ideal observer | the same | the number of verdicts that are right, divided by the same number |
 | clean data: set without [] | clean | no member is [] |
@@ -24,7 +23,6 @@ from collections.abc import Callable, Sequence
 from statistics import mean
 
 from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE
-from psfcore.blind.ideal_sets import IdealCase, mean_sizes
 from psfcore.blind.rows import Row, of_values, share, share_of_expected
 from psfcore.blind.scoring import (
     NOTHING,
@@ -75,7 +73,6 @@ def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
             "<= 1.5",
             lambda value: value <= 1.5,
         ),
-        *_ideal_sizes(stated),
         _against_ideal("right and alone / ideal observer", stated, is_right_and_alone),
         _against_ideal(
             "the same, without clean data",
@@ -121,17 +118,6 @@ def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
 
 def _size(case: Judged) -> float:
     return float(len(case.members or ()))
-
-
-def _ideal_sizes(cases: Sequence[Judged]) -> tuple[Row, Row]:
-    """The rows of the sizes of the ideal observer's sets, of the cases for which they were computed."""
-    known = [case for case in cases if case.known is not None]
-    sizes = mean_sizes([IdealCase(case.kind, case.required_names, case.ideal) for case in known])
-    seen = [size for size, case in zip(sizes, known, strict=False) if case.noncentrality >= SEEN]
-    return (
-        of_values("mean number of members of the ideal observer's set", sizes, mean),
-        of_values("ideal observer's set, noncentrality >= 30", seen, mean),
-    )
 
 
 def _against_ideal(figure: str, cases: Sequence[Judged], holds: Callable[[Judged], bool]) -> Row:
