@@ -50,13 +50,19 @@ _PART_BODY = {
 }
 _CREATION = {
     "parameters": [
-        {"name": name, "in": "header", "required": True, "schema": {"type": "string"}, "description": text}
+        {
+            "name": name,
+            "in": "header",
+            "required": name != "Upload-Metadata",
+            "schema": {"type": "string"},
+            "description": text,
+        }
         for name, text in (
             ("Tus-Resumable", VERSION),
             ("Upload-Length", "size of the file, bytes"),
             (
                 "Upload-Metadata",
-                "kind (transit or image), filename and sha256, each with its value in base64",
+                "kind (transit, which is the default, or image), filename and sha256, each with its value in base64",
             ),
         )
     ]
@@ -64,7 +70,7 @@ _CREATION = {
 
 
 @router.options("", status_code=204, summary="What this service supports of tus", response_class=Response)
-def tus_options(state: Shared) -> Response:
+def tus_options(caller: Submitting, state: Shared) -> Response:
     """The version and the extensions of tus, and the largest upload."""
     headers = {
         "Tus-Resumable": VERSION,

@@ -236,7 +236,7 @@ class KeyFirst(APIRoute):
             caller = await run_in_threadpool(admit, request, state_of(request), scopes)
             request.state.let_in = caller
             reading = JsonRequest(request.scope, request.receive)
-            if self.path != BULK or self.methods != {"POST"}:
+            if self.path not in BULK or self.methods != {"POST"}:
                 return await handle(reading)
             async with turns.setdefault(caller.owner, asyncio.Lock()):
                 return await handle(reading)

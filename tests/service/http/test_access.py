@@ -169,7 +169,8 @@ def test_a_key_without_the_scope_is_refused_and_told_which(service: Keyed) -> No
                 if needed and scope not in needed:
                     answer = client.request(method, re.sub(r"\{\w+\}", "0" * 32, path))
                     assert answer.status_code == 403, (scope, method, path, answer.text)
-                    assert needed.pop() in answer.text
+                    if method != "head":  # its answer has no body
+                        assert needed.pop() in answer.text
 
 
 def test_a_key_goes_as_a_bearer_token_or_as_a_password(service: Keyed) -> None:

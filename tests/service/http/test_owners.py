@@ -89,7 +89,10 @@ def anns(
     pack(transit, tmp_path / "transit.tar")
     sent = ann.post("/v1/transits", content=(tmp_path / "transit.tar").read_bytes())
     bulk = ann.post("/v1/bulk", json={"images": [image_id], "psf_id": psf_id})
+    tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "10", "Upload-Metadata": "kind dHJhbnNpdA=="}
+    open_upload = ann.post("/v1/uploads", headers=tus).headers["location"]
     return {
+        "upload_id": open_upload.rpartition("/")[2],
         "bulk_id": bulk.json()["id"],
         "image_id": image_id,
         "psf_id": "4" * 64,
@@ -142,6 +145,10 @@ def knock_everywhere(bob: TestClient, anns: dict[str, str]) -> int:
         for headers in ({}, {"If-None-Match": "*"}, {"Range": "bytes=0-1"}):
             data = {"PHASE": "RUN", "ACTION": "DELETE", "DESTRUCTION": "2090-01-01", "EXECUTIONDURATION": "9"}
             body = {"data": data} if address.startswith("/uws") and method == "POST" else {}
+            if address.startswith("/v1/uploads"):
+                # Without these a request is refused before its upload is looked for.
+                part = "application/offset+octet-stream"
+                headers = headers | {"Tus-Resumable": "1.0.0", "Upload-Offset": "0", "Content-Type": part}
             others = bob.request(method, address, headers=headers, follow_redirects=False, **body)
             nobodys = bob.request(method, unknown, headers=headers, follow_redirects=False, **body)
             ids = [*anns.values(), *UNKNOWN.values(), "nothing"]
@@ -165,6 +172,8 @@ def test_what_another_asked_to_change_has_not_changed(service: Keyed, anns: dict
     assert job["phase"] == "QUEUED" and not job["cancel_requested"]
     assert ann.get(f"/uws/jobs/{anns['uws']}/phase").text == "PENDING"
     assert ann.get(f"/uws/jobs/{anns['uws']}/executionduration").text != "9"
+    upload_now = ann.head(f"/v1/uploads/{anns['upload_id']}", headers={"Tus-Resumable": "1.0.0"})
+    assert (upload_now.status_code, upload_now.headers["upload-offset"]) == (200, "0")
 
 
 def test_lists_show_one_s_own_alone(service: Keyed, anns: dict[str, str]) -> None:

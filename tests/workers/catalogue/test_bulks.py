@@ -16,7 +16,7 @@ from sqlalchemy import func, select, update
 from psfcore.errors import DataError
 from tests.conftest import write_image
 from tests.whole.many_rows import plan, statements
-from workers.bulk import listing
+from workers.bulk import listing, matching
 from workers.catalogue import bulk_progress
 from workers.catalogue import bulks as bulk_rows
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
@@ -451,7 +451,7 @@ def test_files_whose_paths_cannot_be_stored_are_failed_images(
     assert message.endswith("5/long.fits")
     sources = [item.source for item in catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)]
     assert f"{root}/\\xff\\xfe/Sonne\\xf6.fits" in sources
-    assert max(map(len, sources)) == listing.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
+    assert max(map(len, sources)) == matching.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
     check_counts(catalogue, bulk_id)
     assert done(catalogue, taken) and catalogue.bulks.retry(bulk_id) == 1, "no row tells where the others lie"
     assert [one.source for one in all_taken(catalogue, bulk_id, lease)] == [str(root / "loop.fits")]
