@@ -12,6 +12,7 @@ from service.app import create_app
 from tests.blank_figures import blank_unless_told
 from tests.shared_routes import shared_routes
 from tests.tables import copied_tables
+from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
 from workers.contract.phases import Phase
@@ -65,6 +66,17 @@ def run_jobs(settings: Settings, api: TestClient) -> Callable[[], None]:
         catalogue.close()
 
     return run
+
+
+def work_through_bulks(settings: Settings) -> None:
+    """Run turns until no bulk run has work."""
+    catalogue = Catalogue(settings.catalogue_url)
+    runner = Runner(settings, catalogue, Store(settings.data_dir))
+    while catalogue.bulks.at_work():
+        keep_turns(catalogue, settings)
+        for turn in catalogue.jobs.of_kind("bulk"):
+            runner.run(turn.id)
+    catalogue.close()
 
 
 def upload(api: TestClient, path: Path, where: str = "/v1/images") -> str:

@@ -220,10 +220,7 @@ class _Asked:
             with beneath.opened(Path(image.source), archive_files.roots(self._settings.bulk_roots)) as file:
                 found = read_summary(beneath.reopened(file), FitsLimits(max_pixels=self._settings.max_pixels))
         except OSError as error:
-            raise DataError(
-                "unreadable-file",
-                f"expected a readable file; the system says: {archive_files.reason_of(error)}",
-            ) from error
+            raise archive_files.unreadable(error) from error
         return NO_ID, dataclasses.asdict(found)
 
 

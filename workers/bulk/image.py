@@ -185,10 +185,7 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
         except OSError as error:
             if is_disk_full(error):  # the copy cannot be written; the same error would occur for every image
                 raise
-            reason = archive_files.reason_of(error)
-            raise DataError(
-                "unreadable-file", f"expected a readable file; the system says: {reason}"
-            ) from error
+            raise archive_files.unreadable(error) from error
         summary = dataclasses.asdict(read_summary(copy, context.limits))
         yield _Source(copy, path, sha256, summary, path.name)
 

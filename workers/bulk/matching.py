@@ -64,23 +64,23 @@ def _listed_one(
     allowed: Sequence[Path], limits: FitsLimits, found: archive_files.Found, where: dict[str, Condition]
 ) -> Listed | None:
     """The found file as an image of the run, with an error if the file cannot be used; None if its header does not match."""
-    error = None
-    try:
-        if found.error is not None:
-            raise found.error
-        if where:
+    failure = found.error
+    if failure is None and where:
+        try:
             with beneath.opened(found.path, allowed) as file:
                 if not archive_files.matches(beneath.reopened(file), where, limits):
                     return None
-    except DataError as unreadable:
-        error = JobError(fault=Fault.USER, code=unreadable.code, message=unreadable.message)
-    except OSError as unreadable:
-        error = _unreadable_file(unreadable)
+        except DataError as unusable:
+            failure = unusable
+        except OSError as unreadable:
+            failure = archive_files.unreadable(unreadable)
     source = archive_files.shown(found.path)
-    path_error = _path_error(found.path, source)
+    error = _path_error(found.path, source)
     if len(source) > MOST_LETTERS:
         source = source[: MOST_LETTERS - 1] + "…"
-    return Listed(source, uploaded=False, error=path_error or error)
+    if error is None and failure is not None:
+        error = JobError(fault=Fault.USER, code=failure.code, message=failure.message)
+    return Listed(source, uploaded=False, error=error)
 
 
 def _path_error(path: Path, source: str) -> JobError | None:
@@ -96,13 +96,3 @@ def _path_error(path: Path, source: str) -> JobError | None:
     else:
         return None
     return JobError(fault=Fault.USER, code=code, message=message)
-
-
-def _unreadable_file(error: OSError) -> JobError:
-    """The error for a file that cannot be read, without its path."""
-    reason = archive_files.reason_of(error)
-    return JobError(
-        fault=Fault.USER,
-        code="unreadable-file",
-        message=f"expected a readable file; the system says: {reason}",
-    )

@@ -212,6 +212,11 @@ def reason_of(error: OSError) -> str:
     return error.strerror or type(error).__name__
 
 
+def unreadable(error: OSError) -> DataError:
+    """The error "unreadable-file" for a file that the operating system cannot read; it does not name the path."""
+    return DataError("unreadable-file", f"expected a readable file; the system says: {reason_of(error)}")
+
+
 def _named(name: str, pattern: str) -> bool:
     """Whether a name matches a pattern. A wildcard does not match the first full stop of a name."""
     return fnmatchcase(name, pattern) and (not name.startswith(".") or pattern.startswith("."))

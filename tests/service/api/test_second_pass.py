@@ -18,12 +18,9 @@ from psfcore.fits.psfs import write_psf
 from service.app import create_app
 from service.cli.main import main
 from tests.psfcore.conftest import make_psf
-from tests.service.conftest import upload
-from workers.bulk.turns import keep_turns
+from tests.service.conftest import upload, work_through_bulks
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow
-from workers.files.store import Store
-from workers.run.runner import Runner
 from workers.settings import Settings
 
 FEW = {"method": {"name": "richardson-lucy", "steps": 2}}
@@ -123,13 +120,7 @@ def test_a_bulk_run_sets_products_apart_and_goes_on(
     def done(**parameters: Any) -> dict[str, Any]:
         asked = api.post("/v1/bulk", json=request | {"parameters": FEW | parameters})
         assert asked.status_code == 202, asked.text
-        catalogue = Catalogue(settings.catalogue_url)
-        runner = Runner(settings, catalogue, Store(settings.data_dir))
-        while catalogue.bulks.at_work():
-            keep_turns(catalogue, settings)
-            for turn in catalogue.jobs.of_kind("bulk"):
-                runner.run(turn.id)
-        catalogue.close()
+        work_through_bulks(settings)
         return dict(api.get(f"/v1/bulk/{asked.json()['id']}").json())
 
     bulk = done()

@@ -22,6 +22,7 @@ from psfcore.built.cache import FITS, PROVENANCE, TOTAL_FITS, TOTAL_PROVENANCE, 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.psfs import read_psf
+from psfcore.psf import Psf
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import PsfRow
 from workers.contract.identities import psf_identity
@@ -112,12 +113,8 @@ class CachedPsfs:
             about: dict[str, Any] = json.loads(kept.path.read_bytes())
             if (about.get("format"), about.get("file_sha256")) == (_ROW_FORMAT, fits.sha256):
                 return self._row_of(identity, about)
-        psf = read_psf(fits.path, self.limits, parts=False)
-        provenance = self.cache.find(identity, TOTAL_PROVENANCE)
-        if provenance is not None:
-            psf = replace(psf, provenance=json.loads(provenance.path.read_bytes()))
         return psf_row(
-            psf,
+            self._psf(identity, fits, TOTAL_PROVENANCE, parts=False),
             identity,
             self.owner,
             origin="built",
@@ -148,6 +145,12 @@ class CachedPsfs:
             self.adopt(file.path, file.sha256)
         return self._row_of(identity, about)
 
+    def _psf(self, identity: str, fits: CachedFile, provenance: str, *, parts: bool) -> Psf:
+        """The PSF of a FITS file in the cache. provenance: the name of the cache's part with its provenance."""
+        psf = read_psf(fits.path, self.limits, parts=parts)
+        kept = self.cache.find(identity, provenance)
+        return psf if kept is None else replace(psf, provenance=json.loads(kept.path.read_bytes()))
+
     def _row_of(self, identity: str, about: Mapping[str, Any]) -> PsfRow:
         columns = {name: about[name] for name in _COLUMNS}
         return PsfRow(owner=self.owner, id=identity, created_at=time.time(), **columns)
@@ -155,10 +158,7 @@ class CachedPsfs:
     def _new_row(self, identity: str, build: PsfBuild, fits: CachedFile) -> PsfRow:
         from psfcore.drawing import plots  # matplotlib is loaded only if a picture is drawn
 
-        psf = read_psf(fits.path, self.limits)
-        provenance = self.cache.find(identity, PROVENANCE)
-        if provenance is not None:
-            psf = replace(psf, provenance=json.loads(provenance.path.read_bytes()))
+        psf = self._psf(identity, fits, PROVENANCE, parts=True)
         with self.store.temporary() as picture:
             plots.psf_png(psf, picture)
             return psf_row(

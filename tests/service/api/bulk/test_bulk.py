@@ -16,7 +16,6 @@ import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
-from service.app import create_app
 from tests.conftest import write_image, write_psf
 from tests.fitted_psfs import EARLY, LATE, write_fitted
 from tests.service.conftest import upload
@@ -60,18 +59,6 @@ def settings(tmp_path: Path, archive: Path) -> Settings:
         bulk_roots=str(archive),
         bulk_output_roots=str(tmp_path / "out"),
     )
-
-
-@pytest.fixture
-def api(settings: Settings) -> Iterator[TestClient]:
-    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
-        yield client
-
-
-@pytest.fixture
-def psf_id(api: TestClient, tmp_path: Path) -> str:
-    write_psf(tmp_path / "psf.fits")
-    return upload(api, tmp_path / "psf.fits", "/v1/psfs")
 
 
 @pytest.fixture

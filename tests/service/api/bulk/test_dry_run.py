@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
-from service.app import create_app
-from tests.conftest import write_image, write_psf
-from tests.service.conftest import upload
+from tests.conftest import write_image
+from tests.service.conftest import upload, work_through_bulks
 from workers.bulk import dry_run
-from workers.bulk.turns import keep_turns
-from workers.catalogue.catalogue import Catalogue
-from workers.files.store import Store
-from workers.run.runner import Runner
 from workers.settings import Settings
 
 FEW = {"method": {"name": "richardson-lucy", "steps": 1}}
@@ -40,33 +35,11 @@ def settings(settings: Settings, archive: Path, tmp_path: Path) -> Settings:
     )
 
 
-@pytest.fixture
-def api(settings: Settings) -> Iterator[TestClient]:
-    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
-        yield client
-
-
-@pytest.fixture
-def psf_id(api: TestClient, tmp_path: Path) -> str:
-    write_psf(tmp_path / "psf.fits")
-    return upload(api, tmp_path / "psf.fits", "/v1/psfs")
-
-
 def estimated(api: TestClient, query: str = "", **request: Any) -> dict[str, Any]:
     answer = api.post(f"/v1/bulk/estimate{query}", json={"parameters": FEW, **request})
     assert answer.status_code == 200, answer.text
     assert api.get("/v1/bulk").json()["items"] == [], "an estimate starts nothing"
     return dict(answer.json())
-
-
-def worked(settings: Settings) -> None:
-    catalogue = Catalogue(settings.catalogue_url)
-    runner = Runner(settings, catalogue, Store(settings.data_dir))
-    while catalogue.bulks.at_work():
-        keep_turns(catalogue, settings)
-        for turn in catalogue.jobs.of_kind("bulk"):
-            runner.run(turn.id)
-    catalogue.close()
 
 
 @pytest.mark.parametrize("draws", [0, 2])
@@ -80,7 +53,7 @@ def test_a_dry_run_tells_what_the_run_then_does(
     assert told["complete"] and (told["images"], told["examined"], told["refused_images"]) == (5, 5, 1)
     assert told["seconds"] > 0 and told["workers"] == 1 and told["memory_mib"] > 0
     bulk = api.post("/v1/bulk", json=request).json()
-    worked(settings)
+    work_through_bulks(settings)
     images = api.get(f"/v1/bulk/{bulk['id']}").json()["images"]
     assert (images["total"], images["done"], images["failed"]) == (5, 4, 1)
     (failed,) = api.get(f"/v1/bulk/{bulk['id']}/failures").json()["items"]

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
-from service.app import create_app
-from tests.conftest import write_image, write_psf
-from tests.service.conftest import upload
-from workers.bulk.turns import keep_turns
-from workers.catalogue.catalogue import Catalogue
-from workers.files.store import Store
-from workers.run.runner import Runner
+from tests.conftest import write_image
+from tests.service.conftest import work_through_bulks
 from workers.settings import Settings
 
 FEW = {"method": {"name": "richardson-lucy", "steps": 1}}
@@ -45,28 +39,11 @@ def settings(settings: Settings, archive: Path, out: Path) -> Settings:
     return settings.model_copy(update={"bulk_roots": str(archive), "bulk_output_roots": str(out)})
 
 
-@pytest.fixture
-def api(settings: Settings) -> Iterator[TestClient]:
-    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
-        yield client
-
-
-@pytest.fixture
-def psf_id(api: TestClient, tmp_path: Path) -> str:
-    write_psf(tmp_path / "psf.fits")
-    return upload(api, tmp_path / "psf.fits", "/v1/psfs")
-
-
 def done(api: TestClient, settings: Settings, **request: Any) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """The results of a run, and the codes of its failures by file."""
     answer = api.post("/v1/bulk", json={"parameters": FEW, **request})
     assert answer.status_code == 202, answer.text
-    catalogue = Catalogue(settings.catalogue_url)
-    while catalogue.bulks.at_work():
-        keep_turns(catalogue, settings)
-        for turn in catalogue.jobs.of_kind("bulk"):
-            Runner(settings, catalogue, Store(settings.data_dir)).run(turn.id)
-    catalogue.close()
+    work_through_bulks(settings)
     here = f"/v1/bulk/{answer.json()['id']}"
     failed = api.get(f"{here}/failures").json()["items"]
     lines = [json.loads(line) for line in api.get(f"{here}/results").text.splitlines()]

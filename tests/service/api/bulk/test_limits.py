@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from tests.conftest import write_image
-from tests.service.conftest import upload
+from tests.service.conftest import upload, work_through_bulks
 from workers.bulk import matching
 from workers.bulk import task as bulk_task
 from workers.bulk.turns import keep_turns
@@ -72,13 +72,7 @@ def test_an_image_over_a_limit_fails_like_a_single_job(
         assert alone.status_code == (413 if code == "too-much-memory" else 422)
         asked = {"images": ids} if where == "uploads" else {"files": [{"glob": f"{archive}/*.fits"}]}
         bulk = api.post("/v1/bulk", json={"psf_id": psf_id, "parameters": FEW, **asked}).json()
-        catalogue = Catalogue(limited.catalogue_url)
-        turns = Runner(limited, catalogue, Store(limited.data_dir))
-        while catalogue.bulks.at_work():
-            keep_turns(catalogue, limited)
-            for turn in catalogue.jobs.of_kind("bulk"):
-                turns.run(turn.id)
-        catalogue.close()
+        work_through_bulks(limited)
         ended = api.get(f"/v1/bulk/{bulk['id']}").json()
         assert (ended["phase"], ended["images"]["done"], ended["images"]["failed"]) == ("COMPLETED", 2, 1)
         (failed,) = api.get(f"/v1/bulk/{bulk['id']}/failures").json()["items"]
