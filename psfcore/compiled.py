@@ -57,7 +57,9 @@ def compiled(
                 f"expected an argument name: {function.__qualname__} uses constants of its enclosing function"
             )
         function.__qualname__ = name or function.__qualname__
-        kernel: Any = njit(nogil=True, cache=True, **options)(function)
+        # Without the wrapper for callers in C: nothing calls it, and it takes time to compile.
+        options.update(nogil=True, cache=True, no_cfunc_wrapper=True)
+        kernel: Any = njit(**options)(function)
         if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
             _keep_in_files(kernel._cache)  # type: ignore[attr-defined]
         return kernel
