@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.ndimage import convolve, maximum_filter, minimum_filter
 
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.deconvolve.assess import artefacts
@@ -230,6 +230,14 @@ def test_the_real_image(real: Callable[[str], Path]) -> None:
     dark = [row.up_to_pct for row in report.structures if row.kind == "dark" and row.block_px > 1]
     assert min(bright) > 5 and max(bright) < 90
     assert min(dark) > -90 and max(dark) < -5
+
+
+def test_second_differences_are_those_of_a_filter() -> None:
+    plane = np.random.default_rng(1).gamma(2.0, 400.0, (150, 70)).astype(np.float32)
+    weights = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
+    np.testing.assert_array_equal(
+        artefacts._second_difference(plane), convolve(plane, weights, mode="reflect")
+    )
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (5, 40), (64, 65), (150, 17)])
