@@ -12,7 +12,7 @@ from scipy.ndimage import convolve, maximum_filter, minimum_filter
 
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.deconvolve.assess import artefacts
-from psfcore.deconvolve.assess.artefacts import classes_of, find_artefacts, noise_from_pixels, ringing_pct
+from psfcore.deconvolve.assess.artefacts import classes_of, find_artefacts, noise_levels, ringing_pct
 from psfcore.deconvolve.assess.changes import BLOCKS_PX, TAILS_PCT, Changes, block_means, measure_changes
 from psfcore.deconvolve.assess.plots import changes_png
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
@@ -189,9 +189,8 @@ def test_noise_is_estimated_from_the_pixels() -> None:
     expected = np.full((256, 256), 300.0) + np.linspace(0, 600, 256)
     noise = Noise(6.0, 2.0)
     pixels = noise.observe(expected, 1.4, np.random.default_rng(1))
-    found_sigma = noise_from_pixels(
-        pixels, expected, np.ones(pixels.shape, bool), classes_of(expected.ravel())
-    )
+    levels = noise_levels(pixels, np.ones(pixels.shape, bool), classes_of(expected.ravel()))
+    found_sigma = levels.at(expected)
     ratio = found_sigma / np.sqrt(noise.variance(expected, 1.4))
     assert np.abs(ratio - 1).max() < 0.1
 
