@@ -29,9 +29,10 @@ from pathlib import Path
 from typing import Any
 
 from numba import njit
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
 from numba.core.dispatcher import Dispatcher
+from numba.core.runtime import rtsys
 
 # The function that is called when this thread compiles a kernel. A new thread has no listener, so a kernel that another
 # thread of a job compiles is not reported.
@@ -43,12 +44,13 @@ log = logging.getLogger(__name__)
 
 
 def compiled(
-    *, name: str | None = None, **options: Any
+    *, name: str | None = None, inner: bool = False, **options: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator: `numba.njit` with these options. The kernel releases the interpreter's lock and is kept on disk.
 
     name: required for a function that uses constants of its enclosing function. Each set of constants needs another
-    name. Raises TypeError if the name is required and missing.
+    name. inner: only other kernels call the kernel; Python cannot call it, and it compiles faster.
+    Raises TypeError if the name is required and missing.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -58,10 +60,10 @@ def compiled(
             )
         function.__qualname__ = name or function.__qualname__
         # Without the wrapper for callers in C: nothing calls it, and it takes time to compile.
-        options.update(nogil=True, cache=True, no_cfunc_wrapper=True)
+        options.update(nogil=True, cache=True, no_cfunc_wrapper=True, no_cpython_wrapper=inner)
         kernel: Any = njit(**options)(function)
         if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
-            _keep_in_files(kernel._cache)  # type: ignore[attr-defined]
+            kernel._cache = KernelCache(function)  # type: ignore[attr-defined]
         return kernel
 
     return decorate
@@ -71,6 +73,7 @@ class Addressed:
     """A kernel that other kernels call by its address. Such kernels need not be compiled again if this one changes."""
 
     def __init__(self, function: Callable[..., None], signature: Any, options: dict[str, Any]) -> None:
+        self._function = function
         self._kernel = CFunc(function, (signature.args, signature.return_type), {}, options)
         self.__qualname__ = function.__qualname__
 
@@ -79,8 +82,7 @@ class Addressed:
         """The address of the machine code, which is valid until this process ends. The kernel is loaded from disk, or
         compiled if it is not kept there."""
         kernel: Any = self._kernel
-        kernel.enable_caching()
-        _keep_in_files(kernel._cache)
+        kernel._cache = KernelCache(self._function)
         kernel.compile()
         return int(kernel.address)
 
@@ -100,13 +102,26 @@ def compiled_at_address(
     return decorate
 
 
-def _keep_in_files(cache: Any) -> None:
-    """Let numba keep the machine code of one function in `KernelFiles`."""
-    cache._cache_file = KernelFiles(
-        kernel_folder(Path(cache.cache_path)),
-        cache._impl.filename_base,
-        cache._impl.locator.get_source_stamp(),
-    )
+class KernelCache(FunctionCache):
+    """Keeps the machine code of one function in `KernelFiles`."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = KernelFiles(
+            kernel_folder(Path(self.cache_path)),
+            self._impl.filename_base,
+            self._impl.locator.get_source_stamp(),
+        )
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """The machine code for these types of arguments; None if it is not on disk.
+
+        numba's own method first makes all types and functions known to the compiler, which takes longer than to load all
+        kernels of a deconvolution. Machine code only needs the memory of numba's arrays; the compiler prepares itself.
+        """
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(signature, target_context)
 
 
 @contextmanager
