@@ -2,7 +2,7 @@
 
 numba's own cache is not safe when several processes compile. This cache keeps the machine code of a function in
 numbered files; it reads, changes and writes the index of these files without a lock; and it names symbols by a counter
-of the process. Two processes can compile two kernels of the same name at once, for example FFT passes of two lengths
+of the process. Two processes can compile two kernels of the same name at once, for example FFT passes of two radices
 (`fft_kernels`). Both may then write file number 1 or use the same symbol. One kernel is then called in place of the
 other, and the transforms are wrong without any error message. The cache in this module has no index. The name of a file
 is a hash of what was compiled, and a function that is defined inside another function gets a unique name.
@@ -44,13 +44,12 @@ log = logging.getLogger(__name__)
 
 
 def compiled(
-    *, name: str | None = None, inner: bool = False, **options: Any
+    *, name: str | None = None, **options: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator: `numba.njit` with these options. The kernel releases the interpreter's lock and is kept on disk.
 
     name: required for a function that uses constants of its enclosing function. Each set of constants needs another
-    name. inner: only other kernels call the kernel; Python cannot call it, and it compiles faster.
-    Raises TypeError if the name is required and missing.
+    name. Raises TypeError if the name is required and missing.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -60,7 +59,7 @@ def compiled(
             )
         function.__qualname__ = name or function.__qualname__
         # Without the wrapper for callers in C: nothing calls it, and it takes time to compile.
-        options.update(nogil=True, cache=True, no_cfunc_wrapper=True, no_cpython_wrapper=inner)
+        options.update(nogil=True, cache=True, no_cfunc_wrapper=True)
         kernel: Any = njit(**options)(function)
         if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
             kernel._cache = KernelCache(function)  # type: ignore[attr-defined]

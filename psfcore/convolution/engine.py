@@ -306,7 +306,7 @@ def _wrapped_rows(
 # Kernels; each processes the blocks [start, stop) --------------------------------------------------------
 
 
-@compiled(inner=True)
+@compiled()
 def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
     """Separate a transformed block of rows into the spectra of its 32 rows.
 
@@ -328,7 +328,7 @@ def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # typ
             transpose(corner, spectrum, part * LANES, 2 * _SIZE, here, _SIZE)
 
 
-@compiled(inner=True)
+@compiled()
 def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
     """Do the inverse of ``spectrum_from_buffer``: Z[k] = A[k] + i B[k], Z[L-k] = A*[k] + i B*[k]."""
     last = length // 2
@@ -346,7 +346,7 @@ def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # typ
 # An assignment between slices of arrays would compile five seconds longer, because of its check of the shapes.
 
 
-@compiled(inner=True)
+@compiled()
 def _fill(buffer, values, filled, length):  # type: ignore[no-untyped-def]
     """Copy the first `filled` values into the buffer of a transform, and set the rest of the buffer to 0."""
     for n in range(filled):

@@ -11,9 +11,9 @@ a loop over the lanes, the compiler would have to prove for each length that the
 overlap, which takes most of the time to compile on the first run. The radix-4 or radix-2 pass comes before the radix-8
 passes.
 
-A plan holds the addresses of its passes, and `forward` and `inverse` call the passes by address. A pass is compiled when
-the first plan needs it, and kernels that transform do not contain copies of the passes: otherwise the first
-deconvolution of an installation would compile all passes of all lengths, five times.
+There is one pass for each radix. A plan holds the addresses of its passes, and `forward` and `inverse` call the passes by
+address. A pass is compiled when the first plan needs it, and kernels that transform do not contain copies of the passes:
+otherwise the first deconvolution of an installation would compile all passes, five times.
 
     X[k] = sum_j x[j] exp(-2 pi i j k / L)                                                          Eq. (1)
 

@@ -292,7 +292,7 @@ def _cover(strip, area, ranges, first_row, line, edges, outline_of_edge, first_e
             area[cells] = area[cells + 1] = 0.0
 
 
-@compiled(inner=True)
+@compiled()
 def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
     """Insert a range of cells into a list that is sorted by first cell."""
     j = count
@@ -302,7 +302,7 @@ def _insert(begins, ends, count, begin, end):  # type: ignore[no-untyped-def]
     begins[j], ends[j] = begin, end
 
 
-@compiled(inner=True)
+@compiled()
 def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-untyped-def]
     """Apply one outline to the cells from `start` to `stop` - 1. inside: the share of their area inside the outline.
 
@@ -319,7 +319,7 @@ def _apply(row, line, line_y, start, stop, inside, outline):  # type: ignore[no-
             row[i] *= np.float32(1.0) - covered
 
 
-@compiled(inner=True)
+@compiled()
 def _add_edge(area, edge, row, cells):  # type: ignore[no-untyped-def]
     """Add the part of an edge that lies in a row, Eq. (1), to `area`. The running sum of `area` is the covered share.
 
@@ -381,7 +381,7 @@ def _shade(strip, first_row, open_share, cells_per_pixel):  # type: ignore[no-un
             before = upto
 
 
-@compiled(inner=True)
+@compiled()
 def _running_at(running, x):  # type: ignore[no-untyped-def]
     """The running sum at a position between pixels, interpolated linearly."""
     last = len(running) - 1
