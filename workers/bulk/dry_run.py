@@ -155,11 +155,11 @@ class _Asked:
         """All images of the run. Raises ``_OutOfTime``, and the errors of listing."""
         for identity in self._uploads:
             yield Listed(identity, uploaded=True)
-        yield from found_files(self._request, self._settings, self._tick)
-
-    def _tick(self, _seen: int, _looked_at: int) -> None:
-        if self.late:
-            raise _OutOfTime
+        for step in found_files(self._request, self._settings):
+            if self.late:
+                raise _OutOfTime
+            if step.image is not None:
+                yield step.image
 
     def examined(self, image: Listed) -> _Examined:
         """The estimate of one image. Raises DataError if the run would refuse the image."""
