@@ -181,6 +181,10 @@ class BulkEstimate(BaseModel):
     seconds: float = Field(description="expected time of the run with the workers of now")
     workers: int = Field(description="worker processes now; 1 if there are none")
     memory_mib: int = Field(description="memory that the largest examined image needs")
+    example_output: str | None = Field(
+        description="path of the product of an examined image in the output folder; null: there is no output folder, or the "
+        "path has the id of the product, which is not known before the run"
+    )
 
     @classmethod
     def of(cls, found: DryRun) -> BulkEstimate:

@@ -344,6 +344,8 @@ def _estimated(found: dict[str, Any]) -> list[str]:
         f"examined: {found['examined']} of {found['images']} images; {found['refused_images']} would be refused"
         + (f", {found['existing']} products exist already" if found["existing"] else ""),
     ]
+    if found.get("example_output"):
+        lines.append(f"for example: {found['example_output']}")
     if not found["complete"]:
         lines.append(
             "the time of a dry run was not enough to find and examine all of them: the run may be larger"
