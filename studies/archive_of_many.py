@@ -1,19 +1,20 @@
 """Run a bulk run over an archive of many small files, and measure the service.
 
-    python -m studies.archive_of_many [--images 50000] [--different 500] [--minutes 4] [--workers 1] [-o RESULT.json]
+    python -m studies.archive_of_many [--images 50000] [--different 500] [--minutes 4] [--workers 1] [--kill-early] [-o RESULT.json]
 
 The service runs with Redis, PostgreSQL and workers of one thread. The archive has ``--images`` files of 64 px in folders of
 500 files. ``--different`` of them have different contents; the others are hard links to them, so their products exist
 already when their turn comes. The study submits a bulk run, asks for its status, lists and report, pauses it, kills the
-server and all workers, and starts them again. It stops after ``--minutes``, even if images are left.
+server and all workers, and starts them again. With ``--kill-early``, they are also killed while files are listed. The study
+stops after ``--minutes``, even if images are left.
 
 Every request is timed from the client; a streamed answer is timed until its first bytes. Of each time, the study says
 how long the server and the database computed for it, and how long they waited for a processor because other programs
-used all of them (Linux counts both, ``/proc/PID/schedstat``); a request to ``/healthz``, which reads no data, shows the same. While the
-run is paused, the study measures the CPU time that the server needs for a request, which does not depend on other work
-on the machine. The exit status is 1 if a request takes longer than 200 ms although the server did not wait for a
-processor for the rest of the time, if a request needs more than 200 ms of CPU time, if the memory of the server grows by
-more than 40 MiB, or if a finished image is processed again after the kill.
+used all of them (Linux counts both, ``/proc/PID/schedstat``); a request to ``/healthz``, which reads no data, shows the
+same. While the run is paused, the study measures the CPU time that the server needs for a request, which does not depend
+on other work on the machine. The exit status is 1 if a request takes longer than 200 ms although the server did not wait
+for a processor for the rest of the time, if a request needs more than 200 ms of CPU time, if the memory of the server
+grows by more than 40 MiB, if a finished image is processed again after a kill, or if a file is not listed exactly once.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -64,7 +65,8 @@ class Timed:
 
     @property
     def own_s(self) -> float:
-        """The time without that in which the server waited for a processor."""
+        """The time without that in which the server waited for a processor. It is too short if the server waited with
+        several threads at once."""
         return max(0.0, self.wall_s - self.waited_s)
 
 
@@ -220,6 +222,21 @@ def first_bytes(client: Client, address: str) -> None:
         next(answer.iter_bytes())
 
 
+def ended(stack: Stack) -> dict[int, float]:
+    """When the images that are done ended, by their positions."""
+    return {row.position: row.ended_at for row in items(stack) if row.state == "done"}
+
+
+def kill_and_start(stack: Stack, workers: int) -> None:
+    """Kill the server and all workers, as a power failure does, and start them again."""
+    kill_everything(stack)
+    stack.start_server()
+    stack.workers.clear()
+    for _ in range(workers):
+        stack.start_worker()
+    warm_up(stack.client)
+
+
 def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) -> dict[str, Any]:
     """Run the study; returns its figures."""
     times, client = Times(stack), stack.client
@@ -234,13 +251,21 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
     submit_s = time.perf_counter() - began
 
     def done() -> int:
-        found: int = client.bulk(bulk_id)["images"]["done"]
+        found: int = stack.client.bulk(bulk_id)["images"]["done"]
         return found
 
     with asking(client, bulk_id, times):
         wait_for(lambda: done() > 0, "the first product", 600.0)
         first_s = time.perf_counter() - began
         then_listed = client.bulk(bulk_id)["images"]["total"]
+    listed_at_kill, kept = 0, dict[int, float]()
+    if asked.kill_early:
+        kill_and_start(stack, asked.workers)
+        client = stack.client
+        now = client.bulk(bulk_id)
+        assert not now["listed"], "all files were listed before the kill: use more images"
+        listed_at_kill, kept = now["images"]["total"], ended(stack)
+    with asking(client, bulk_id, times):
         wait_for(lambda: client.bulk(bulk_id)["listed"], "the files are listed", 1800.0)
         listed_s = time.perf_counter() - began
         half_s = 30.0 * asked.minutes
@@ -256,18 +281,13 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
         wait_for(lambda: client.bulk(bulk_id)["images"]["at_work"] == 0, "the images at work are done")
     after_mib = memory_mib(stack)
     cpu = cpu_s(stack, bulk_id)
-    kept = {row.position: row.ended_at for row in items(stack) if row.state == "done"}
+    kept = ended(stack) | kept
     times.of_request("POST /v1/bulk/ID/resume", lambda: client.resume_bulk(bulk_id))
     wait_for(lambda: done() > len(kept), "the run goes on")
-    kept |= {row.position: row.ended_at for row in items(stack) if row.state == "done"}
-    kill_everything(stack)
-    stack.start_server()
-    stack.workers.clear()
-    for _ in range(asked.workers):
-        stack.start_worker()
+    kept = ended(stack) | kept
+    kill_and_start(stack, asked.workers)
     client = stack.client
     restarted = time.perf_counter()
-    warm_up(client)
     wait_for(lambda: stack.client.bulk(bulk_id)["images"]["done"] > len(kept) + 10, "it goes on", 300.0)
     goes_on_s = time.perf_counter() - restarted
     with asking(client, bulk_id, times):
@@ -294,6 +314,7 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
         times.of_request("POST /v1/bulk/ID/cancel", lambda: client.cancel_bulk(bulk_id))
     rows = items(stack)
     repeated = [row.position for row in rows if row.position in kept and row.ended_at != kept[row.position]]
+    sources = Counter(row.source for row in rows)
     images = end["images"]
     print("\n".join(times.lines()))
     print(
@@ -311,6 +332,8 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
         "listed_s": listed_s,
         "first_product_s": first_s,
         "listed_at_first_product": then_listed,
+        "listed_at_kill": listed_at_kill,
+        "listed_wrongly": sum(count - 1 for count in sources.values()) + abs(len(sources) - asked.images),
         "slowest_request": name,
         "slowest_request_s": slowest.wall_s,
         "slowest_request_cpu_s": slowest.cpu_s,
@@ -318,6 +341,8 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
         "slowest_without_wait": own_name,
         "slowest_without_wait_s": own.own_s,
         "slowest_control_s": max(one.wall_s for one in times.of[CONTROL]),
+        "slower_than_200_ms": sum(one.wall_s > MOST_REQUEST_S for of in times.of.values() for one in of),
+        "requests_asked": sum(map(len, times.of.values())),
         "most_cpu_s": max(cpu.values()),
         "rows_per_s": rows_a_s,
         "goes_on_after_kill_s": goes_on_s,
@@ -349,6 +374,8 @@ def misses(found: dict[str, Any]) -> list[str]:
         missed.append(f"a request needs {1e3 * found['most_cpu_s']:.0f} ms of CPU time")
     if grown > MOST_MORE_MIB:
         missed.append(f"the memory of the server grew by {grown:.0f} MiB")
+    if found["listed_wrongly"]:
+        missed.append(f"{found['listed_wrongly']} files were not listed exactly once")
     if found["processed_again"]:
         missed.append(f"{found['processed_again']} finished images were processed again")
     return missed
@@ -362,6 +389,9 @@ def main() -> None:
     parser.add_argument("--different", type=int, default=500)
     parser.add_argument("--minutes", type=float, default=4.0)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument(
+        "--kill-early", action="store_true", help="kill everything also while files are listed"
+    )
     parser.add_argument("-o", "--output", type=Path)
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="heliopsf-archive-") as temporary:
