@@ -241,8 +241,8 @@ class Bulks:
     def _forget_files(self, session: Session, bulk: BulkRow) -> None:
         """Remove the files that a version without ``listed_to`` has listed. None of them was taken before all were listed."""
         files = delete(BulkItemRow).where(BulkItemRow.bulk_id == bulk.id, BulkItemRow.uploaded.is_(False))
-        failed = files.returning(BulkItemRow.state).execution_options(synchronize_session=False)
-        states = session.scalars(failed).all()
+        told = files.returning(BulkItemRow.state).execution_options(synchronize_session=False)
+        states = session.scalars(told).all()
         bulk.total -= len(states)
         bulk.failed -= sum(state == ItemState.FAILED for state in states)
         add_bytes(session, bulk.owner, -ROW_BYTES * len(states))
