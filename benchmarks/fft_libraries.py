@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.convolution.convolver import needed_kernel
 from psfcore.convolution.fft_kernels import good_length
+from psfcore.convolution.offsets import needed_kernel
 
 STEPS = 20
 IMAGE_PX = 2048

@@ -2,7 +2,7 @@
 
 numba's own cache is not safe when several processes compile. This cache keeps the machine code of a function in
 numbered files; it reads, changes and writes the index of these files without a lock; and it names symbols by a counter
-of the process. Two processes can compile two kernels of the same name at once, for example FFT passes of two lengths
+of the process. Two processes can compile two kernels of the same name at once, for example FFT passes of two radices
 (`fft_kernels`). Both may then write file number 1 or use the same symbol. One kernel is then called in place of the
 other, and the transforms are wrong without any error message. The cache in this module has no index. The name of a file
 is a hash of what was compiled, and a function that is defined inside another function gets a unique name.
@@ -29,9 +29,10 @@ from pathlib import Path
 from typing import Any
 
 from numba import njit
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
 from numba.core.dispatcher import Dispatcher
+from numba.core.runtime import rtsys
 
 # The function that is called when this thread compiles a kernel. A new thread has no listener, so a kernel that another
 # thread of a job compiles is not reported.
@@ -57,9 +58,11 @@ def compiled(
                 f"expected an argument name: {function.__qualname__} uses constants of its enclosing function"
             )
         function.__qualname__ = name or function.__qualname__
-        kernel: Any = njit(nogil=True, cache=True, **options)(function)
+        # Without the wrapper for callers in C: nothing calls it, and it takes time to compile.
+        options.update(nogil=True, cache=True, no_cfunc_wrapper=True)
+        kernel: Any = njit(**options)(function)
         if isinstance(kernel, Dispatcher):  # it is a plain function if compilation is switched off
-            _keep_in_files(kernel._cache)  # type: ignore[attr-defined]
+            kernel._cache = KernelCache(function)  # type: ignore[attr-defined]
         return kernel
 
     return decorate
@@ -69,6 +72,7 @@ class Addressed:
     """A kernel that other kernels call by its address. Such kernels need not be compiled again if this one changes."""
 
     def __init__(self, function: Callable[..., None], signature: Any, options: dict[str, Any]) -> None:
+        self._function = function
         self._kernel = CFunc(function, (signature.args, signature.return_type), {}, options)
         self.__qualname__ = function.__qualname__
 
@@ -77,8 +81,7 @@ class Addressed:
         """The address of the machine code, which is valid until this process ends. The kernel is loaded from disk, or
         compiled if it is not kept there."""
         kernel: Any = self._kernel
-        kernel.enable_caching()
-        _keep_in_files(kernel._cache)
+        kernel._cache = KernelCache(self._function)
         kernel.compile()
         return int(kernel.address)
 
@@ -98,13 +101,26 @@ def compiled_at_address(
     return decorate
 
 
-def _keep_in_files(cache: Any) -> None:
-    """Let numba keep the machine code of one function in `KernelFiles`."""
-    cache._cache_file = KernelFiles(
-        kernel_folder(Path(cache.cache_path)),
-        cache._impl.filename_base,
-        cache._impl.locator.get_source_stamp(),
-    )
+class KernelCache(FunctionCache):
+    """Keeps the machine code of one function in `KernelFiles`."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = KernelFiles(
+            kernel_folder(Path(self.cache_path)),
+            self._impl.filename_base,
+            self._impl.locator.get_source_stamp(),
+        )
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """The machine code for these types of arguments; None if it is not on disk.
+
+        numba's own method first makes all types and functions known to the compiler, which takes longer than to load all
+        kernels of a deconvolution. Machine code only needs the memory of numba's arrays; the compiler prepares itself.
+        """
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(signature, target_context)
 
 
 @contextmanager

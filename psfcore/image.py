@@ -59,7 +59,8 @@ class Image:
             raise DataError("too-small", f"expected at least {SMALLEST_SIDE_PX} px per side; got {nx} x {ny}")
         if self.mask.shape != self.pixels.shape:
             raise DataError("mask-shape", f"expected a mask of {self.pixels.shape}; got {self.mask.shape}")
-        if not np.isfinite(self.pixels[(self.mask & MaskBit.NONFINITE) == 0]).all():
+        bad = ~np.isfinite(self.pixels)
+        if bad.any() and (bad & ((self.mask & MaskBit.NONFINITE) == 0)).any():
             raise DataError(
                 "unmasked-nonfinite",
                 "expected every NaN or infinite pixel to be masked; got at least one such pixel without a mask",

@@ -91,7 +91,8 @@ def _check_weights(kernel: Kernel) -> None:
         )
     largest, smallest = float(kernel.max()), float(kernel.min())
     # The sum is defined over the full reach; a larger array may sum to more than 1.
-    total = float(crop_centred(kernel, _within_reach(kernel.shape)).sum())
+    within = _within_reach(kernel.shape)
+    total = float((kernel if kernel.shape == within else crop_centred(kernel, within)).sum())
     check_weights(smallest, largest, total)
 
 

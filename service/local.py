@@ -100,6 +100,9 @@ class LocalStore(Store):
         digest = digest or sha256_of(temporary)
         return digest if digest in self._files else super().keep(temporary, digest)
 
+    def _force(self, path: Path) -> None:
+        """Do nothing: the folder is removed when the command ends."""
+
     def discard(self, digest: str) -> None:
         """Delete the store's own copy of a file. A file of the user with the same content stays."""
         super().path(digest).unlink(missing_ok=True)

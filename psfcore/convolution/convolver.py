@@ -24,6 +24,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import DTypeLike, NDArray
 
+from psfcore.convolution.offsets import needed_kernel
 from psfcore.errors import DataError
 
 Field = NDArray[np.floating]
@@ -87,20 +88,6 @@ class Convolver:
         columns = scipy.fft.ifft(spectrum, axis=0, workers=self.threads, overwrite_x=True)[:ny]
         rows = scipy.fft.irfft(columns, n=self.length[1], axis=1, workers=self.threads, overwrite_x=True)
         return np.ascontiguousarray(rows[:, :nx])
-
-
-def needed_kernel(
-    psf_kernel: NDArray[np.floating], field_shape: tuple[int, int]
-) -> tuple[NDArray[np.floating], tuple[int, int]]:
-    """Cut a kernel to the offsets that can connect two pixels of the field; also return the offset of its first pixel."""
-    (y0, y1), (x0, x1) = (_needed(n, size) for n, size in zip(psf_kernel.shape, field_shape, strict=True))
-    return psf_kernel[y0:y1, x0:x1], (y0 - psf_kernel.shape[0] // 2, x0 - psf_kernel.shape[1] // 2)
-
-
-def _needed(kernel_size: int, field_size: int) -> tuple[int, int]:
-    """Range of indices, along one axis, of the offsets that can connect two pixels of the field."""
-    centre = kernel_size // 2
-    return max(0, centre - (field_size - 1)), min(kernel_size, centre + field_size)
 
 
 def _length(field_size: int, lowest: int, highest: int) -> int:

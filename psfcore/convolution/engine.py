@@ -20,6 +20,7 @@ result does not depend on the number of threads.
 from __future__ import annotations
 
 import itertools
+import math
 import queue
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -30,16 +31,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.convolver import needed_kernel
 from psfcore.convolution.fft_kernels import LANES, forward, good_length, inverse, make_plan
+from psfcore.convolution.lanes import join, scale, split, transpose, turn, turn_back
+from psfcore.convolution.offsets import needed_kernel
 from psfcore.errors import DataError
 
 BLOCK_ROWS = 2 * LANES
+_SIZE = 2 * LANES  # numbers of sixteen complex values
 # Largest imaginary part of the transfer function of a symmetric PSF, as a share of the sum of weights. This
 # limit is smaller than the float32 rounding of the transfer function.
 SYMMETRIC_TO = 1e-7
 # Chunks per thread for small and for large images. To start a chunk takes about as long as to process one or two small
 # blocks.
+_LINE_BYTES = 64
 _CHUNKS_A_THREAD = (2, 4)
 _BLOCKS_A_CHUNK = 8
 
@@ -86,12 +90,12 @@ class Engine:
         self.row_blocks = -(-ny // BLOCK_ROWS)
         self.column_blocks = -(-(lx // 2 + 1) // LANES)
         self.lanes_shape = (self.row_blocks, nx, 2, LANES)
-        self._spectrum = np.zeros((self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES), np.float32)
+        self._spectrum = aligned(self.column_blocks, self.row_blocks * BLOCK_ROWS, 2, LANES)
         self._pool = ThreadPoolExecutor(max(threads - 1, 1))
         self._scratch: queue.SimpleQueue[Scratch] = queue.SimpleQueue()
         for _ in range(threads):
-            buffer = np.zeros(max(lx, ly) * 2 * LANES, np.float32)
-            self._scratch.put(Scratch(buffer, np.zeros((LANES, 4, LANES), np.float32)))
+            buffer = aligned(max(lx, ly) * 2 * LANES)
+            self._scratch.put(Scratch(buffer, aligned(LANES, 4, LANES)))
         self.transfer = self._transfer_function(kernel, first)
 
     @property
@@ -131,7 +135,7 @@ class Engine:
         ny, nx = self.field_shape
         padded = np.full((self.row_blocks, 2, LANES, nx), padding, np.float32)
         padded.reshape(-1, nx)[:ny] = field
-        return np.ascontiguousarray(padded.transpose(0, 3, 1, 2))
+        return _aligned_copy(padded.transpose(0, 3, 1, 2))
 
     def from_lanes(self, lanes: Single) -> Single:
         """Convert from the engine's layout to a field, shape (ny, nx)."""
@@ -266,7 +270,22 @@ class Engine:
         transfer = transfer[:, :ly]
         odd_part = float(np.abs(transfer[:, :, 1]).max()) * self.transfer_scale
         symmetric = odd_part < SYMMETRIC_TO * float(np.abs(kernel).sum())
-        return np.ascontiguousarray(transfer[:, :, :1] if symmetric else transfer)
+        return _aligned_copy(transfer[:, :, :1] if symmetric else transfer)
+
+
+def aligned(*shape: int) -> Single:
+    """Zeros whose first number begins a line of the cache, so that no vector of lanes lies in two lines."""
+    count = math.prod(shape)
+    spare = _LINE_BYTES // 4
+    whole = np.zeros(count + spare, np.float32)
+    first = -whole.ctypes.data // 4 % spare
+    return whole[first : first + count].reshape(shape)
+
+
+def _aligned_copy(plane: Single) -> Single:
+    copy = aligned(*plane.shape)
+    copy[...] = plane
+    return copy
 
 
 def _wrapped_rows(
@@ -294,53 +313,34 @@ def spectrum_from_buffer(spectrum, buffer, corner, block, length, place):  # typ
     Each complex signal of the block contains two real rows. If Z is the transform of a + i b with real a and b, then
     A[k] = (Z[k] + Z*[L-k]) / 2, B[k] = (Z[k] - Z*[L-k]) / (2 i).
     """
-    z = buffer.reshape((-1, 2, LANES))
-    half = np.float32(0.5)
     last = length // 2
+    rows = spectrum.shape[1]
     for group in range(spectrum.shape[0]):
         for kk in range(LANES):
             k = group * LANES + kk
             if k > last:
                 corner[kk] = np.float32(0.0)
-                continue
-            p, q = place[k], place[(length - k) % length]
-            for w in range(LANES):
-                pr, pi, qr, qi = z[p, 0, w], z[p, 1, w], z[q, 0, w], z[q, 1, w]
-                corner[kk, 0, w] = half * (pr + qr)
-                corner[kk, 1, w] = half * (pi - qi)
-                corner[kk, 2, w] = half * (pi + qi)
-                corner[kk, 3, w] = half * (qr - pr)
-        for side in range(2):
-            for w in range(LANES):
-                row = block * BLOCK_ROWS + side * LANES + w
-                for kk in range(LANES):
-                    spectrum[group, row, 0, kk] = corner[kk, 2 * side, w]
-                    spectrum[group, row, 1, kk] = corner[kk, 2 * side + 1, w]
+            else:
+                split(buffer, corner, place[k] * _SIZE, place[(length - k) % length] * _SIZE, kk * 2 * _SIZE)
+        row = group * rows + block * BLOCK_ROWS
+        for part in range(4):
+            here = (row + part // 2 * LANES) * _SIZE + part % 2 * LANES
+            transpose(corner, spectrum, part * LANES, 2 * _SIZE, here, _SIZE)
 
 
 @compiled()
 def buffer_from_spectrum(spectrum, buffer, corner, block, length, place):  # type: ignore[no-untyped-def]
     """Do the inverse of ``spectrum_from_buffer``: Z[k] = A[k] + i B[k], Z[L-k] = A*[k] + i B*[k]."""
-    z = buffer.reshape((-1, 2, LANES))
     last = length // 2
+    rows = spectrum.shape[1]
     for group in range(spectrum.shape[0]):
-        for side in range(2):
-            for w in range(LANES):
-                row = block * BLOCK_ROWS + side * LANES + w
-                for kk in range(LANES):
-                    corner[kk, 2 * side, w] = spectrum[group, row, 0, kk]
-                    corner[kk, 2 * side + 1, w] = spectrum[group, row, 1, kk]
-        for kk in range(LANES):
-            k = group * LANES + kk
-            if k > last:
-                break
-            p, q = place[k], place[(length - k) % length]
-            for w in range(LANES):
-                ar, ai, br, bi = corner[kk, 0, w], corner[kk, 1, w], corner[kk, 2, w], corner[kk, 3, w]
-                z[q, 0, w] = ar + bi
-                z[q, 1, w] = br - ai
-                z[p, 0, w] = ar - bi
-                z[p, 1, w] = ai + br
+        row = group * rows + block * BLOCK_ROWS
+        for part in range(4):
+            here = (row + part // 2 * LANES) * _SIZE + part % 2 * LANES
+            transpose(spectrum, corner, here, _SIZE, part * LANES, 2 * _SIZE)
+        for k in range(group * LANES, min((group + 1) * LANES, last + 1)):
+            at = (k - group * LANES) * 2 * _SIZE
+            join(corner, buffer, at, place[k] * _SIZE, place[(length - k) % length] * _SIZE)
 
 
 # An assignment between slices of arrays would compile five seconds longer, because of its check of the shapes.
@@ -379,17 +379,13 @@ def _rows_inverse(lanes, spectrum, buffer, corner, start, stop, length, passes, 
 @compiled()
 def _columns_real(spectrum, transfer, _sign, buffer, start, stop, length, passes, lengths, tw, offsets):  # type: ignore[no-untyped-def]
     # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
-    filled = min(spectrum.shape[1], length) * 2 * LANES
-    z = buffer.reshape((-1, 2, LANES))
+    filled = min(spectrum.shape[1], length) * _SIZE
     for group in range(start, stop):
         column = spectrum[group].reshape(-1)
         _fill(buffer, column, filled, length)
         forward(buffer, length, passes, lengths, tw, offsets)
         for k in range(length):
-            for w in range(LANES):
-                t = transfer[group, k, 0, w]
-                z[k, 0, w] *= t
-                z[k, 1, w] *= t
+            scale(buffer, transfer, k * _SIZE, (group * length + k) * LANES)
         inverse(buffer, length, passes, lengths, tw, offsets)
         for n in range(filled):
             column[n] = buffer[n]
@@ -400,18 +396,16 @@ def _columns_complex(spectrum, transfer, sign, buffer, start, stop, length, pass
     """As `_columns_real`, for an asymmetric PSF. sign: 1; or -1, which multiplies by the conjugate (for the
     adjoint)."""
     # A block may have more rows than the transform; the rows beyond the transform are padding and stay zero.
-    filled = min(spectrum.shape[1], length) * 2 * LANES
-    z = buffer.reshape((-1, 2, LANES))
+    filled = min(spectrum.shape[1], length) * _SIZE
     for group in range(start, stop):
         column = spectrum[group].reshape(-1)
         _fill(buffer, column, filled, length)
         forward(buffer, length, passes, lengths, tw, offsets)
         for k in range(length):
-            for w in range(LANES):
-                tr, ti = transfer[group, k, 0, w], sign * transfer[group, k, 1, w]
-                r, i = z[k, 0, w], z[k, 1, w]
-                z[k, 0, w] = r * tr - i * ti
-                z[k, 1, w] = r * ti + i * tr
+            if sign > 0:
+                turn(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
+            else:
+                turn_back(buffer, transfer, k * _SIZE, (group * length + k) * _SIZE)
         inverse(buffer, length, passes, lengths, tw, offsets)
         for n in range(filled):
             column[n] = buffer[n]

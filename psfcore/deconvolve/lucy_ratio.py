@@ -72,7 +72,7 @@ class Ratio:
         self.engine.row_stage(_ratio_rows, self._light_or_agreed, self.floor, *self.judgement.numbers)
 
 
-@compiled(fastmath=_SUMS)
+@compiled(fastmath=_SUMS, error_model="numpy")
 def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """Replace H x, raised to `floor` where it is smaller, by Eq. (1). Add up (y - H x)^2 / variance over the judged
     pixels."""

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.changes import Changes, measure_changes
-from psfcore.deconvolve.assess.error_planes import ErrorPlanes, error_planes, psf_error_plane, with_psf_error
 from psfcore.deconvolve.assess.quality import quality_plane
 from psfcore.deconvolve.conditions import Conditions, Progress
 from psfcore.deconvolve.methods.registry import method_named
@@ -25,6 +24,9 @@ from psfcore.image import Image
 from psfcore.instruments.model import load_instrument
 from psfcore.noise import Noise
 from psfcore.psf import Psf
+
+if TYPE_CHECKING:
+    from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 
 ERROR_ESTIMATE = "error estimate"  # a stage whose steps are noise realisations
 
@@ -79,6 +81,9 @@ class Work:
         noise = self.conditions.noise
         if noise is None:
             raise no_noise_figures()
+        # Most deconvolutions compute no errors, and do not load SciPy.
+        from psfcore.deconvolve.assess.error_planes import error_planes, psf_error_plane, with_psf_error
+
         told = begin(ERROR_ESTIMATE, draws)
         planes = error_planes(
             self.image,

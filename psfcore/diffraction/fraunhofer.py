@@ -161,6 +161,7 @@ def _survey(mask: MaskGrid, pool: ThreadPoolExecutor) -> _Survey:
         strip = mask.rows(first, min(first + STRIP_ROWS, mask.cells)).astype(np.float64)
         return strip @ right, r[first : first + len(strip)] @ strip, float(strip.sum())
 
+    mask.rows(0, 1)  # compile the kernels in this thread, whose listener tells the user
     after, before, open_cells = [], np.zeros(mask.cells), 0.0
     for strip_after, strip_before, strip_sum in pool.map(multiply, _strips(mask.cells)):
         after.append(strip_after)

@@ -190,8 +190,11 @@ class MaskGrid:
     def rows(self, first: int, stop: int, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
         """The open shares of the rows `first` to `stop` - 1, shape (stop - first, cells), written to `out` if it is given."""
         strip = np.empty((stop - first, self.cells), dtype=np.float32) if out is None else out[: stop - first]
+        most = int(np.diff(self._first_entry[first : stop + 1]).max(initial=1))
         _cover(
             strip,
+            np.zeros(self.cells + 2),
+            np.empty((2, most), np.int64),
             first,
             self._line,
             self._edges,
@@ -240,43 +243,31 @@ def _wires(mesh: Mesh, width_mm: float) -> list[Outline]:
     ]
 
 
-@compiled()
-def _edges_by_row(edges, rows):  # type: ignore[no-untyped-def]
+def _edges_by_row(edges: NDArray[np.float64], rows: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """List the edges that cross each row of cells: entries[first[row] : first[row + 1]], in order."""
-    first = np.zeros(rows + 1, dtype=np.int64)
-    low = np.empty(len(edges), dtype=np.int64)
-    high = np.empty(len(edges), dtype=np.int64)
-    for e in range(len(edges)):
-        low[e] = max(math.floor(min(edges[e, 1], edges[e, 3])), 0)
-        high[e] = min(math.ceil(max(edges[e, 1], edges[e, 3])), rows)
-        for row in range(low[e], high[e]):
-            first[row + 1] += 1
-    first = np.cumsum(first)
-    entries = np.empty(first[rows], dtype=np.int64)
-    filled = first[:rows].copy()
-    for e in range(len(edges)):
-        for row in range(low[e], high[e]):
-            entries[filled[row]] = e
-            filled[row] += 1
-    return first, entries
+    low = np.maximum(np.floor(np.minimum(edges[:, 1], edges[:, 3])).astype(np.int64), 0)
+    high = np.minimum(np.ceil(np.maximum(edges[:, 1], edges[:, 3])).astype(np.int64), rows)
+    count = np.maximum(high - low, 0)
+    before = np.cumsum(count) - count  # crossings of the edges before each edge
+    row = np.repeat(low - before, count) + np.arange(count.sum())
+    first = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=rows))]).astype(np.int64)
+    return first, np.repeat(np.arange(len(edges)), count)[np.argsort(row, kind="stable")]
 
 
 @compiled()
-def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]
+def _cover(strip, area, ranges, first_row, line, edges, outline_of_edge, first_entry, entries):  # type: ignore[no-untyped-def]
     """Write the open share of each cell into `strip`.
 
     The open share of a cell is the product of its open shares in the meshes, in the opening (outline 0) and in all
-    other outlines.
+    other outlines. area: zeros, two more than a row has cells; ranges: room for the ranges of cells that the edges of an
+    outline cross in a row.
     """
     rows, cells = strip.shape
-    area = np.zeros(cells + 2)
-    most = 1
-    for k in range(first_row, first_row + rows):
-        most = max(most, first_entry[k + 1] - first_entry[k])
-    begins, ends = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
+    begins, ends = ranges[0], ranges[1]
     for k in range(rows):
         row = first_row + k
-        strip[k, :] = 0.0
+        for i in range(cells):
+            strip[k, i] = 0.0
         entry, stop = first_entry[row], first_entry[row + 1]
         while entry < stop:
             outline = outline_of_edge[entries[entry]]
@@ -298,7 +289,7 @@ def _cover(strip, first_row, line, edges, outline_of_edge, first_entry, entries)
                 done = max(ends[j] + 2, done if j else 0)
             # The cells after the last edge may lie inside the outline too, because it may extend beyond the mask.
             _apply(strip[k], line, line[row], done, cells, inside, outline)
-            area[cells:] = 0.0
+            area[cells] = area[cells + 1] = 0.0
 
 
 @compiled()

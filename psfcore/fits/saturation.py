@@ -26,6 +26,7 @@ saturated pixels different from each other, the test cannot find these pixels.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -33,7 +34,6 @@ from dataclasses import replace
 import numpy as np
 from astropy.io.fits import Header
 from numpy.typing import NDArray
-from scipy.special import pdtrc
 
 from psfcore.errors import DataError
 from psfcore.fits.header import optional_number, optional_text
@@ -116,7 +116,16 @@ def largest_value(pixels: NDArray[np.float64], valid: NDArray[np.bool_]) -> tupl
     if brightest.size == 0:
         return top, count, 1.0
     mean_per_value = brightest.size / np.unique(brightest).size
-    return top, count, float(pdtrc(count - 1, mean_per_value))  # Eq. (1)
+    return top, count, _at_least(count, mean_per_value)
+
+
+def _at_least(count: int, mean: float) -> float:
+    """P(n) of Eq. (1) for n = count, at least 1."""
+    if count == 1:  # most images have one brightest pixel, and need no library here
+        return -math.expm1(-mean)
+    from scipy.special import pdtrc
+
+    return float(pdtrc(count - 1, mean))
 
 
 def _brightest_below(

@@ -167,13 +167,17 @@ class Store:
         digest = digest or sha256_of(temporary)
         target = self.path(digest)
         target.parent.mkdir(exist_ok=True)
-        sync(temporary)
+        self._force(temporary)
         # The time is set to the nanosecond, so that remove() can distinguish this file from an identical file that is
         # stored almost at the same moment. The system itself sets times only to a few milliseconds.
         os.utime(temporary, ns=(time.time_ns(), time.time_ns()))
         os.replace(temporary, target)
-        sync(target.parent)
+        self._force(target.parent)
         return digest
+
+    def _force(self, path: Path) -> None:
+        """Force a file, or the names in a folder, to the disk."""
+        sync(path)
 
     def kept_at(self, digest: str) -> float | None:
         """The time when a file was last stored; None if it is not in the store."""

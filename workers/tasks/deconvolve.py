@@ -20,7 +20,6 @@ from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf
 from psfcore.psf_sampling import psf_for_image
-from psfcore.scatter.samples import possible_psfs
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.identities import product_identity
 from workers.contract.resolved import ResolvedDeconvolve
@@ -133,6 +132,8 @@ class _Asked:
         psf = read_psf(self.context.store.verified(self.inputs.psf_row.file_sha256), self.context.limits)
         if psf.fitted is None:
             return []
+        from psfcore.scatter.samples import possible_psfs  # most deconvolutions compute no errors
+
         possible = possible_psfs(psf, threads=self.context.settings.threads)
         return [psf_for_image(one, self.inputs.image.header) for one in possible]
 

@@ -21,7 +21,6 @@ from workers.contract.resolved import ResolvedDeconvolve
 from workers.settings import library_versions
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import is_total_alone, named_psf, psf_row
-from workers.tasks.interpolation import interpolated_row
 from workers.versions.series import TOTAL
 
 
@@ -74,6 +73,9 @@ def _interpolated(context: Context, psf_id: str, asked: PsfInterpolate) -> PsfRo
             f"expected the interpolation that gave PSF {psf_id} when the job was submitted; this version interpolates in another "
             "way: submit the job again",
         )
+    # A deconvolution with another PSF does not load what an interpolation needs.
+    from workers.tasks.interpolation import interpolated_row
+
     return interpolated_row(context, asked)
 
 

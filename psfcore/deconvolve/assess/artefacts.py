@@ -31,12 +31,12 @@ the image increases this estimate, so it is an upper limit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve
 
 HOLE_SHARE = 0.02
 DETECTION_SIGMA = 5.0
@@ -48,10 +48,11 @@ _BLOCK_ROWS = 64
 _SOURCES = 100
 _FEWEST_SOURCES = 3
 _BRIGHTNESS_CLASSES = 16
-_SECOND_DIFFERENCE = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
 
 Plane = NDArray[np.floating[Any]]
 Flags = NDArray[np.bool_]
+Places = tuple[NDArray[np.intp], ...]
+NoiseAt = Callable[[Places], Plane]  # the noise of the pixels at these positions [y, x], shape (n,)
 Pixels = TypeVar("Pixels", NDArray[np.floating[Any]], NDArray[np.bool_])
 
 
@@ -75,23 +76,20 @@ class Artefacts:
 
 
 def find_artefacts(
-    before: Plane, after: Plane, counted: Flags, peak_weight: float, *, sigma: Plane | None = None
+    before: Plane, after: Plane, counted: Flags, peak_weight: float, *, sigma: NoiseAt | None = None
 ) -> Artefacts:
     """Find signs of artefacts in the counted pixels of `after` [y, x].
 
-    sigma: noise of `before` [y, x], in the unit of `before`; None: the noise is estimated from the pixels.
+    sigma: function that returns the noise of `before` at positions [y, x], in the unit of `before`; None: the noise is
+    estimated from the pixels.
     """
     # Single precision is accurate enough for these filters, and twice as fast.
     filled_before, filled_after = (_filled(plane).astype(np.float32) for plane in (before, after))
     classes = classes_of(filled_before[counted])
-    noise_after = noise_from_pixels(filled_after, filled_before, counted, classes)
-    noise_before = (
-        noise_from_pixels(filled_before, filled_before, counted, classes) if sigma is None else sigma
-    )
-    detected = filled_before > DETECTION_SIGMA * noise_before
-    holes = counted & detected & (filled_after < HOLE_SHARE * filled_before)  # Eq. (1)
-    limit = (filled_before + DETECTION_SIGMA * noise_before) / peak_weight
-    overshoots = counted & (filled_after > limit)  # Eq. (2)
+    noise_after = _estimated_noise(filled_after, filled_before, counted, classes)
+    noise_before = sigma or _estimated_noise(filled_before, filled_before, counted, classes)
+    holes = _holes(filled_before, filled_after, counted, noise_before)
+    overshoots = _overshoots(filled_before, filled_after, counted, noise_before, peak_weight)
     extremes = counted & _new_extremes(filled_before, filled_after, noise_before, noise_after)
     ringing, sources = ringing_pct(filled_before, filled_after, counted)
     area = max(1, int(np.count_nonzero(counted)))
@@ -124,21 +122,60 @@ def classes_of(brightness: Plane) -> BrightnessClasses:
         return BrightnessClasses([], np.empty(0))
     ordered = np.argsort(brightness)
     members = np.array_split(ordered, _BRIGHTNESS_CLASSES)
-    return BrightnessClasses(members, np.array([np.median(brightness[part]) for part in members]))
+    return BrightnessClasses(members, np.array([np.median(brightness[_middle(part)]) for part in members]))
 
 
-def noise_from_pixels(pixels: Plane, brightness: Plane, counted: Flags, classes: BrightnessClasses) -> Plane:
-    """Upper limit of the noise of `pixels` [y, x] as a function of `brightness`; both must be finite."""
-    second = np.abs(convolve(pixels, _SECOND_DIFFERENCE, mode="reflect"))[counted] / 6
+def _middle(ordered: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The one or two members in the middle, whose median is that of all."""
+    return ordered[(ordered.size - 1) // 2 : ordered.size // 2 + 1]
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLevels:
+    """The noise of pixels as a function of their brightness.
+
+    centres, levels: brightness and noise of the classes; empty: no classes. smallest: the noise is not below this value.
+    """
+
+    centres: Plane
+    levels: Plane
+    smallest: float
+
+    def at(self, brightness: Plane) -> Plane:
+        """The noise of pixels of this brightness."""
+        centres = self.centres
+        if centres.size == 0:
+            return np.full(brightness.shape, self.smallest)
+        # The brightest class contains a wide range of brightness. Within it, the noise is assumed to grow like photon
+        # noise.
+        beyond = np.sqrt(np.maximum(brightness, centres[-1]) / centres[-1]) if centres[-1] > 0 else 1.0
+        return np.asarray(np.maximum(np.interp(brightness, centres, self.levels) * beyond, self.smallest))
+
+
+def noise_levels(pixels: Plane, counted: Flags, classes: BrightnessClasses) -> NoiseLevels:
+    """Upper limit of the noise of `pixels` [y, x], which must be finite."""
+    second = np.abs(_second_difference(pixels))[counted] / 6
     smallest = 1e-6 * float(np.abs(pixels).max()) + np.finfo(float).tiny
-    if not classes.members:
-        return np.full(pixels.shape, smallest)
-    centres = classes.centres
     levels = np.array([1.4826 * np.median(second[part]) for part in classes.members])
-    # The brightest class contains a wide range of brightness. Within it, the noise is assumed to grow like photon
-    # noise.
-    beyond = np.sqrt(np.maximum(brightness, centres[-1]) / centres[-1]) if centres[-1] > 0 else 1.0
-    return np.asarray(np.maximum(np.interp(brightness, centres, levels) * beyond, smallest))
+    return NoiseLevels(classes.centres, levels, smallest)
+
+
+def _estimated_noise(pixels: Plane, brightness: Plane, counted: Flags, classes: BrightnessClasses) -> NoiseAt:
+    """The noise of pixels, estimated from the pixels themselves, as a function of their brightness."""
+    levels = noise_levels(pixels, counted, classes)
+    return lambda at: levels.at(brightness[at])
+
+
+def _second_difference(plane: Plane) -> Plane:
+    """The second difference along both axes [y, x]; the plane is mirrored at its edges. Sums are in double precision."""
+    found = np.empty_like(plane)
+    padded = np.pad(plane, 1, mode="symmetric")
+    for top in range(0, len(plane), _BLOCK_ROWS):  # blocks of rows stay in the cache
+        rows = found[top : top + _BLOCK_ROWS]
+        block = padded[top : top + len(rows) + 2].astype(np.float64)
+        along_y = block[:-2] - 2 * block[1:-1] + block[2:]
+        rows[:] = along_y[:, :-2] - 2 * along_y[:, 1:-1] + along_y[:, 2:]
+    return found
 
 
 def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | None, int]:
@@ -150,22 +187,42 @@ def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | No
     return 100 * max(0.0, rise_after - rise_before), len(sources)
 
 
-def _new_extremes(before: Plane, after: Plane, noise_before: Plane, noise_after: Plane) -> Flags:
+# The noise is computed only for the few pixels that the other conditions leave.
+
+
+def _holes(before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt) -> Flags:
+    """Find the counted pixels that fulfil Eq. (1)."""
+    found = counted & (after < HOLE_SHARE * before)
+    places = np.nonzero(found)
+    found[places] = before[places] > DETECTION_SIGMA * noise_before(places)
+    return found
+
+
+def _overshoots(
+    before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt, peak_weight: float
+) -> Flags:
+    """Find the counted pixels that fulfil Eq. (2)."""
+    found = counted & (after > before.astype(np.float64) / peak_weight)
+    places = np.nonzero(found)
+    limit = (before[places] + DETECTION_SIGMA * noise_before(places)) / peak_weight
+    found[places] = after[places] > limit
+    return found
+
+
+def _new_extremes(before: Plane, after: Plane, noise_before: NoiseAt, noise_after: NoiseAt) -> Flags:
     """Find the pixels that fulfil Eq. (3)."""
-    limit = EXTREME_SIGMA * noise_after
+    found = np.zeros(after.shape, dtype=np.bool_)
     # A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the
     # limit, it cannot fulfil Eq. (3). Medians are therefore needed only for the few remaining pixels.
-    peak = (after == _maxima(after, 1)) & (after - _minima(after, 2) > limit)
-    pit = (after == _minima(after, 1)) & (_maxima(after, 2) - after > limit)
-    places = np.nonzero(peak | pit)
-    away_after = after[places] - _medians(after, places)
-    away_before = before[places] - _medians(before, places)
-    limits, noise = limit[places], noise_before[places]
-    # A real peak or pit is also visible in the image before, except for the noise.
-    new_peak = peak[places] & (away_after > limits) & (away_before < noise)
-    new_pit = pit[places] & (away_after < -limits) & (away_before > -noise)
-    found = np.zeros(after.shape, dtype=np.bool_)
-    found[places] = new_peak | new_pit
+    for sign, nearest, farthest in ((1, _maxima, _minima), (-1, _minima, _maxima)):
+        places = np.nonzero(after == nearest(after, 1))
+        limit = EXTREME_SIGMA * noise_after(places)
+        left = sign * (after[places] - farthest(after, 2)[places]) > limit
+        places, limit = tuple(axis[left] for axis in places), limit[left]
+        away_after = sign * (after[places] - _medians(after, places))
+        away_before = sign * (before[places] - _medians(before, places))
+        # A real peak or pit is also visible in the image before, except for the noise.
+        found[places] |= (away_after > limit) & (away_before < noise_before(places))
     return found
 
 
@@ -263,4 +320,6 @@ def _rise(profile: Plane) -> float:
 def _filled(plane: Plane) -> Plane:
     """Replace the pixels of a plane that are not finite by the median of the finite pixels."""
     good = np.isfinite(plane)
+    if good.all():
+        return plane
     return np.where(good, plane, float(np.median(plane[good])) if good.any() else 0.0)

@@ -6,11 +6,10 @@ from enum import IntFlag
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from psfcore.image import Image, MaskBit
 
-NEAR_MASKED_PX = 3.0
+NEAR_MASKED_PX = 3
 
 Plane = NDArray[np.float64]
 
@@ -61,15 +60,25 @@ def quality_plane(
     ):
         plane[(image.mask & mask_bit) != 0] |= np.uint8(bit)
     if not image.valid.all():
-        plane[image.valid & (distance_transform_edt(image.valid) <= NEAR_MASKED_PX)] |= np.uint8(
-            QualityBit.NEAR_MASKED
-        )
+        plane[image.valid & _near(~image.valid, NEAR_MASKED_PX)] |= np.uint8(QualityBit.NEAR_MASKED)
     plane[_edge_band(result.shape, edge_px)] |= np.uint8(QualityBit.EDGE)
     if suspected is not None:
         plane[suspected] |= np.uint8(QualityBit.ARTEFACT)
     if error is not None:
         plane[~np.isfinite(error)] |= np.uint8(QualityBit.NO_ERROR)
     return plane
+
+
+def _near(marked: NDArray[np.bool_], radius_px: int) -> NDArray[np.bool_]:
+    """Pixels [y, x] whose distance from a marked pixel is at most `radius_px`: the marked pixels, shifted by each offset."""
+    ny, nx = marked.shape
+    near = np.zeros_like(marked)
+    reach = range(-radius_px, radius_px + 1)
+    for dy, dx in ((dy, dx) for dy in reach for dx in reach if dy**2 + dx**2 <= radius_px**2):
+        near[max(dy, 0) : ny + min(dy, 0), max(dx, 0) : nx + min(dx, 0)] |= marked[
+            max(-dy, 0) : ny + min(-dy, 0), max(-dx, 0) : nx + min(-dx, 0)
+        ]
+    return near
 
 
 def _edge_band(shape: tuple[int, ...], edge_px: int) -> NDArray[np.bool_]:

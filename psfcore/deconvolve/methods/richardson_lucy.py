@@ -47,6 +47,7 @@ METHOD = "richardson-lucy"
 EDGES: Edges = "symmetric"
 MARGIN_SHARE = 0.05
 _SUMS: Any = {"contract", "reassoc"}
+_SUMMED = 16 * LANES
 
 Single = NDArray[np.float32]
 
@@ -116,35 +117,36 @@ def agreed(problem: Problem) -> Single:
     return np.asarray(1 / np.maximum(problem.engine.adjoint(ones), np.finfo(np.float32).eps))
 
 
-@compiled(fastmath=_SUMS)
+@compiled(fastmath=_SUMS, error_model="numpy")
 def _update_rows(spectrum, estimate, dark, again, moved, total, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
     """Compute x <- x * correction, Eq. (1). Set values below `dark` to 0. Add up (change)^2 and x^2 for each block."""
-    nx = estimate.shape[1]
+    used = estimate.shape[1] * 2 * LANES
     zero = np.float32(0.0)
-    z = buffer.reshape((-1, 2, LANES))
     for block in range(start, stop):
         buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
         inverse(buffer, length, passes, lengths, tw, offsets)
+        whole = estimate[block].reshape(-1)
         moved_here = 0.0
         total_here = 0.0
-        for i in range(nx):
-            moved_row = zero
-            total_row = zero
-            for side in range(2):
-                for w in range(LANES):
-                    old = estimate[block, i, side, w]
-                    # Rounding may turn a correction of 0 into a negative number.
-                    new = old * max(z[i, side, w], zero)
-                    new = zero if new < dark else new
-                    estimate[block, i, side, w] = new
-                    z[i, side, w] = new
-                    moved_row += (new - old) * (new - old)
-                    total_row += new * new
-            moved_here += moved_row
-            total_here += total_row
+        # The sums of short parts are in single precision, so that the compiler can use vector instructions.
+        for first in range(0, used, _SUMMED):
+            moved_part = zero
+            total_part = zero
+            x, z = whole[first : first + _SUMMED], buffer[first : first + _SUMMED]
+            for n in range(x.size):
+                old = x[n]
+                # Rounding may turn a correction of 0 into a negative number.
+                new = old * max(z[n], zero)
+                new = zero if new < dark else new
+                x[n] = new
+                z[n] = new
+                moved_part += (new - old) * (new - old)
+                total_part += new * new
+            moved_here += moved_part
+            total_here += total_part
         moved[block] = moved_here
         total[block] = total_here
         if again:
-            buffer[nx * 2 * LANES : length * 2 * LANES] = zero
+            buffer[used : length * 2 * LANES] = zero
             forward(buffer, length, passes, lengths, tw, offsets)
             spectrum_from_buffer(spectrum, buffer, corner, block, length, place)

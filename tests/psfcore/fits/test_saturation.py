@@ -119,6 +119,8 @@ def test_the_chance_is_the_poisson_probability() -> None:
     assert (top, count) == (5000.0, 9)
     assert chance == pytest.approx(sum(poisson.pmf(n, 2.0) for n in range(9, 60)), rel=1e-9)
     assert largest_value(pixels, pixels < 5000)[:2] == (2399.0, 2)
+    pixels.ravel()[np.flatnonzero(pixels == 5000)[1:]] = -1.0
+    assert largest_value(pixels, valid) == (5000.0, 1, pytest.approx(1 - poisson.pmf(0, 2.0), rel=1e-12))
     assert largest_value(np.full((20, 20), 3.0), np.ones((20, 20), bool)) == (3.0, 400, 1.0)
 
 

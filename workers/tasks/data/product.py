@@ -7,13 +7,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.changes import Changes
-from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 from psfcore.deconvolve.assess.quality import MEANINGS
 from psfcore.deconvolve.cards import UsedPsf, deconvolution_cards, deconvolution_history
 from psfcore.deconvolve.result import Deconvolved
@@ -29,6 +28,9 @@ from workers.contract.resolved import ResolvedDeconvolve
 from workers.files.archive import safe_name
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
+
+if TYPE_CHECKING:
+    from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ import numpy as np
 from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf
 from psfcore.psf import Psf, cumulative_curve
-from psfcore.tables.make import tables_of
 from workers.catalogue.tables import PsfRow
 from workers.files.store import Store
 from workers.tasks.context import Context
@@ -106,6 +105,9 @@ def is_total_alone(row: PsfRow) -> bool:
 
 def keep_tables(psf: Psf, store: Store, threads: int) -> str:
     """Write the tables from which the service answers queries about a PSF; returns the SHA-256 of their file."""
+    # A deconvolution makes no tables, and does not load the libraries for them.
+    from psfcore.tables.make import tables_of
+
     with store.temporary() as path:
         path.write_text(json.dumps(tables_of(psf, threads=threads), separators=(",", ":"), allow_nan=False))
         return store.keep(path)

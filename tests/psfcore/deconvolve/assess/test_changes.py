@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.ndimage import convolve, maximum_filter, minimum_filter
 
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.deconvolve.assess import artefacts
-from psfcore.deconvolve.assess.artefacts import classes_of, find_artefacts, noise_from_pixels, ringing_pct
+from psfcore.deconvolve.assess.artefacts import classes_of, find_artefacts, noise_levels, ringing_pct
 from psfcore.deconvolve.assess.changes import BLOCKS_PX, TAILS_PCT, Changes, block_means, measure_changes
 from psfcore.deconvolve.assess.plots import changes_png
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
@@ -189,9 +189,8 @@ def test_noise_is_estimated_from_the_pixels() -> None:
     expected = np.full((256, 256), 300.0) + np.linspace(0, 600, 256)
     noise = Noise(6.0, 2.0)
     pixels = noise.observe(expected, 1.4, np.random.default_rng(1))
-    found_sigma = noise_from_pixels(
-        pixels, expected, np.ones(pixels.shape, bool), classes_of(expected.ravel())
-    )
+    levels = noise_levels(pixels, np.ones(pixels.shape, bool), classes_of(expected.ravel()))
+    found_sigma = levels.at(expected)
     ratio = found_sigma / np.sqrt(noise.variance(expected, 1.4))
     assert np.abs(ratio - 1).max() < 0.1
 
@@ -230,6 +229,14 @@ def test_the_real_image(real: Callable[[str], Path]) -> None:
     dark = [row.up_to_pct for row in report.structures if row.kind == "dark" and row.block_px > 1]
     assert min(bright) > 5 and max(bright) < 90
     assert min(dark) > -90 and max(dark) < -5
+
+
+def test_second_differences_are_those_of_a_filter() -> None:
+    plane = np.random.default_rng(1).gamma(2.0, 400.0, (150, 70)).astype(np.float32)
+    weights = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
+    np.testing.assert_array_equal(
+        artefacts._second_difference(plane), convolve(plane, weights, mode="reflect")
+    )
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (5, 40), (64, 65), (150, 17)])

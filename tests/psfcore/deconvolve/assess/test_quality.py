@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from psfcore.convolution.convolver import Convolver, linear_convolve
-from psfcore.deconvolve.assess.quality import QualityBit, quality_plane
+from psfcore.deconvolve.assess.quality import NEAR_MASKED_PX, QualityBit, quality_plane
 from psfcore.deconvolve.edges import edge_band_px
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.image import MaskBit
@@ -125,3 +125,12 @@ def test_the_edge_band_ends_where_little_of_the_light_is_from_outside(psf: Psf) 
     assert (
         edge_band_px(make_psf(gaussian(64, 3.0)), 0.10) == 4
     )  # 1 - Phi(3.5 / 3) = 0.12, 1 - Phi(4.5 / 3) = 0.07
+
+
+def test_pixels_near_masked_ones_are_those_within_the_distance() -> None:
+    mask = np.zeros((40, 50), np.uint8)
+    mask[[0, 7, 8, 39, 20], [0, 30, 30, 49, 3]] = MaskBit.SATURATED
+    image = make_image(np.ones(mask.shape), mask)
+    marked = quality_plane(image, image.pixels, edge_px=0) & QualityBit.NEAR_MASKED != 0
+    distance = distance_transform_edt(image.valid)
+    assert (marked == (image.valid & (distance <= NEAR_MASKED_PX))).all()
