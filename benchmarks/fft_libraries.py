@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import needed_kernel
-from psfcore.convolution.fft_kernels import good_length
+from psfcore.convolution.lengths import good_length
 
 STEPS = 20
 IMAGE_PX = 2048
