@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.convolution.fft_kernels import good_length
+from psfcore.convolution.lengths import good_length
 from psfcore.convolution.offsets import needed_kernel
 
 STEPS = 20

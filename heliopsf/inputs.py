@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from heliopsf.psfs import LIMITS
 from psfcore.errors import DataError
 from psfcore.fits.cards import card_trouble
-from psfcore.fits.header import first_image_header
+from psfcore.fits.header import first_image_header, read_summary
 from psfcore.fits.observation import observation_of, read_observation
 from psfcore.image import Image
 
@@ -71,6 +71,21 @@ def image_of(image: Any, *, saturation_dn: float | None) -> Image:
             stored_as_integer=data.dtype.kind in "iu",
         )
     raise _not_an_image(image)
+
+
+def shape_of(image: Any) -> tuple[int, int]:
+    """The shape (ny, nx) of an image of the user. No pixel of a file is read.
+
+    Raises ``DataError`` "bad-input" or "not-2d", and the errors of reading a header.
+    """
+    if isinstance(image, str | Path):
+        return read_summary(image, LIMITS).shape
+    if not (isinstance(image, Image | np.ndarray) or is_nddata(image)):
+        raise _not_an_image(image)
+    shape = np.shape(image.pixels if isinstance(image, Image) else _data(image))
+    if len(shape) != 2:
+        raise DataError("not-2d", f"expected an image with two axes; got {len(shape)}")
+    return shape[0], shape[1]
 
 
 def header_of(image: Any) -> Header:

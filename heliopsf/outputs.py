@@ -18,6 +18,7 @@ from heliopsf.inputs import is_map, is_nddata
 from heliopsf.psfs import Psf
 from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 from psfcore.deconvolve.cards import UsedPsf, deconvolution_cards, deconvolution_history
+from psfcore.deconvolve.region import BoxWork
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.deconvolve.whole import Assessed, Work
 from psfcore.errors import module_of_extra
@@ -47,7 +48,7 @@ class Deconvolution(Deconvolved):
     psf: Psf
     errors: ErrorPlanes | None
     warnings: dict[str, str]
-    work: Work = field(repr=False)
+    work: Work | BoxWork = field(repr=False)
 
     @property
     def mask(self) -> NDArray[np.bool_]:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from heliopsf.kept import kept_psf
-from heliopsf.machine import cores
 from heliopsf.progress import Told, told
 from psfcore.built.cache import sha256_of_file
 from psfcore.built.recipe import Recipe
@@ -23,6 +22,7 @@ from psfcore.psf import cumulative_curve
 from psfcore.psf_sampling import rebinned
 from psfcore.scatter.interpolation import Epoch, interpolated_psf
 from psfcore.scatter.utc_time import utc_time
+from workers.machine import cores
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,7 +6,6 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from heliopsf.machine import cores
 from heliopsf.progress import Stages, told_stages
 from heliopsf.psfs import LIMITS, Psf, build_psf
 from psfcore.errors import module_of_extra
@@ -19,6 +18,7 @@ from psfcore.psf import Kernel
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
 from psfcore.transit.folder import read_transit
 from psfcore.transit.transit import Transit
+from workers.machine import cores
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

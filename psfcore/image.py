@@ -60,11 +60,17 @@ class Image:
         if self.mask.shape != self.pixels.shape:
             raise DataError("mask-shape", f"expected a mask of {self.pixels.shape}; got {self.mask.shape}")
         bad = ~np.isfinite(self.pixels)
-        if bad.any() and (bad & ((self.mask & MaskBit.NONFINITE) == 0)).any():
+        if bad.any() and (bad & self.finite).any():
             raise DataError(
                 "unmasked-nonfinite",
                 "expected every NaN or infinite pixel to be masked; got at least one such pixel without a mask",
             )
+
+    @property
+    def finite(self) -> NDArray[np.bool_]:
+        """True for pixels that hold a number, [y, x]; some of them may be saturated."""
+        # The value is a plain int: numpy would turn the mask into int64 for a member of the class.
+        return (self.mask & MaskBit.NONFINITE.value) == 0
 
     @property
     def valid(self) -> NDArray[np.bool_]:

@@ -36,6 +36,7 @@ from service.http.bodies import BodyLimits
 from service.http.rates import AtOnce, Rates
 from service.http.state import State
 from service.operation import docs, health, metrics
+from service.pages import archive_runs as archive_run_pages
 from service.pages import assets, login, visitors
 from service.pages import bulk as bulk_pages
 from service.pages import image as image_page
@@ -148,6 +149,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         image_page,
         job_pages,
         product_pages,
+        archive_run_pages,
         bulk_pages,
         psf_listing,
         psf_comparison,

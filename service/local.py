@@ -17,6 +17,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from psfcore.built.cache import PsfCache
+from psfcore.deconvolve.memory import MIB, check_memory
 from psfcore.errors import DataError
 from psfcore.fits.cutout import cutout
 from psfcore.fits.header import FitsLimits, read_summary
@@ -36,21 +37,26 @@ from service.views.reports import ReportView
 from service.views.transits import TransitDetails
 from workers.cache_folder import psf_cache
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
+from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, ProductRow, PsfRow, ReportRow
 from workers.contract.kinds import JobRequest
 from workers.contract.phases import Phase
 from workers.contract.requests import PsfBuild
 from workers.contract.suggestions import explained
 from workers.files.intact import files_of
 from workers.files.store import Store, sha256_of
+from workers.intake import estimates
+from workers.intake.cost_model import COSTS
 from workers.intake.deprecated import details_now
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
+from workers.machine import free_bytes
 from workers.run import runner
 from workers.run.runner import Runner
 from workers.settings import Settings
 from workers.tasks.data.cached_psfs import CachedPsfs, recipes_in
 
+# The functions in Python read images of this size too. The memory is checked before an image is deconvolved.
+MOST_PIXELS = 2**26
 _Seen = dict[Path, tuple[int, int]]
 
 
@@ -245,12 +251,24 @@ class LocalService(Operations):
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
         """Add a job; ``wait`` runs it."""
         resolved = self._resolved(kind, parameters)
+        self._check_memory(kind, resolved[0])
         row, _ = self._catalogue.jobs.submit(kind, *resolved, DEFAULT_OWNER)
         if self._built is not None:
             self._recipes[row.id] = recipes_in(kind, resolved[0])
             for recipe in self._recipes[row.id]:
                 self._built.recall(recipe, whole=kind != "deconvolve")
         return JobView.of(row).model_dump(mode="json")
+
+    def _check_memory(self, kind: str, resolved: dict[str, Any]) -> None:
+        """Raise DataError "too-much-memory" if a deconvolution needs more than the free memory of this machine."""
+        if kind != "deconvolve":
+            return
+        needed = estimates.estimate(kind, resolved, self._catalogue, DEFAULT_OWNER, self._settings.threads)
+        image = self._catalogue.get(ImageRow, resolved["image_id"], DEFAULT_OWNER)
+        assert image is not None  # otherwise the request was refused
+        # This process already holds the libraries.
+        needed_bytes = MIB * (needed.memory_mib - COSTS.worker_mib)
+        check_memory(tuple(image.summary["shape"]), needed_bytes, free_bytes())
 
     def _resolved(self, kind: str, parameters: dict[str, Any]) -> tuple[dict[str, Any], str]:
         """The resolved parameters of a job, and the id of its result."""
@@ -375,6 +393,7 @@ def local_service(*, gap_effects: str = "", previews: bool = True) -> Iterator[L
     """
     with TemporaryDirectory(prefix="heliopsf-") as folder:
         settings = Settings.apart(Path(folder), gap_effects=gap_effects)
+        settings = settings.model_copy(update={"max_pixels": MOST_PIXELS})
         service = LocalService(settings, psf_cache(), previews=previews)
         jobs = logging.getLogger(runner.__name__)
         jobs.addFilter(_says_more)

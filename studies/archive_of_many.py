@@ -1,17 +1,20 @@
 """Run a bulk run over an archive of many small files, and measure the service.
 
-    python -m studies.archive_of_many [--images 50000] [--different 500] [--minutes 4] [--workers 1] [-o RESULT.json]
+    python -m studies.archive_of_many [--images 50000] [--different 500] [--minutes 4] [--workers 1] [--kill-early] [-o RESULT.json]
 
 The service runs with Redis, PostgreSQL and workers of one thread. The archive has ``--images`` files of 64 px in folders of
 500 files. ``--different`` of them have different contents; the others are hard links to them, so their products exist
 already when their turn comes. The study submits a bulk run, asks for its status, lists and report, pauses it, kills the
-server and all workers, and starts them again. It stops after ``--minutes``, even if images are left.
+server and all workers, and starts them again. With ``--kill-early``, they are also killed while files are listed. The study
+stops after ``--minutes``, even if images are left.
 
-Every request is timed from the client; a streamed answer is timed until its first bytes. The study also times requests
-to ``/healthz``, which reads no data: their time is what the machine itself adds. While the run is paused, it measures
-the CPU time that the server needs for a request, which does not depend on other work on the machine. The exit status is
-1 if a request takes longer than 200 ms plus the slowest one to ``/healthz``, if a request needs more than 200 ms of CPU
-time, if the memory of the server grows by more than 40 MiB, or if a finished image is processed again after the kill.
+Every request is timed from the client; a streamed answer is timed until its first bytes. Of each time, the study says
+how long the server and the database computed for it, and how long they waited for a processor because other programs
+used all of them (Linux counts both, ``/proc/PID/schedstat``); a request to ``/healthz``, which reads no data, shows the
+same. While the run is paused, the study measures the CPU time that the server needs for a request, which does not depend
+on other work on the machine. The exit status is 1 if a request takes longer than 200 ms although the server did not wait
+for a processor for the rest of the time, if a request needs more than 200 ms of CPU time, if the memory of the server
+grows by more than 40 MiB, if a finished image is processed again after a kill, or if a file is not listed exactly once.
 """
 
 from __future__ import annotations
@@ -24,9 +27,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -50,29 +54,80 @@ REQUESTS = 20  # requests over which the CPU time is averaged
 Answer = TypeVar("Answer")
 
 
-class Times:
-    """The times of requests in seconds, by name."""
+@dataclass(frozen=True)
+class Timed:
+    """A request. wall_s: its time. cpu_s, waited_s: time in which the server and its connections in the database
+    computed, and waited for a processor, meanwhile; both contain what they did for other requests."""
 
-    def __init__(self) -> None:
-        self.of: dict[str, list[float]] = defaultdict(list)
+    wall_s: float
+    cpu_s: float
+    waited_s: float
+
+    @property
+    def own_s(self) -> float:
+        """The time without that in which the server waited for a processor. It is too short if the server waited with
+        several threads at once."""
+        return max(0.0, self.wall_s - self.waited_s)
+
+
+class Times:
+    """The times of requests, by name."""
+
+    def __init__(self, stack: Stack) -> None:
+        self.of: dict[str, list[Timed]] = defaultdict(list)
+        self._stack = stack
 
     def of_request(self, name: str, ask: Callable[[], Answer]) -> Answer:
         """Time a request."""
+        cpu_s, waited_s = scheduled(self._stack)
         started = time.perf_counter()
         answer = ask()
-        self.of[name].append(time.perf_counter() - started)
+        wall_s = time.perf_counter() - started
+        cpu_after_s, waited_after_s = scheduled(self._stack)
+        # A thread of the server that has ended meanwhile is missing from the second sums.
+        spent = max(0.0, cpu_after_s - cpu_s), max(0.0, waited_after_s - waited_s)
+        self.of[name].append(Timed(wall_s, *spent))
         return answer
 
-    def slowest(self) -> tuple[str, float]:
-        """The slowest request, without the control."""
-        name = max((name for name in self.of if name != CONTROL), key=lambda name: max(self.of[name]))
-        return name, max(self.of[name])
+    def slowest(self, of: Callable[[Timed], float]) -> tuple[str, Timed]:
+        """The request with the largest value, without the control."""
+        found = {name: max(times, key=of) for name, times in self.of.items() if name != CONTROL}
+        return max(found.items(), key=lambda item: of(item[1]))
 
     def lines(self) -> Iterator[str]:
         """The times as a table."""
         for name, times in sorted(self.of.items()):
-            middle = statistics.median(times)
-            yield f"{name:<40} {len(times):5}  median {1e3 * middle:6.1f} ms  slowest {1e3 * max(times):6.1f} ms"
+            middle = statistics.median(one.wall_s for one in times)
+            slowest = max(times, key=lambda one: one.wall_s)
+            yield (
+                f"{name:<40} {len(times):5}  median {1e3 * middle:6.1f} ms  slowest {1e3 * slowest.wall_s:6.1f} ms, computing "
+                f"{1e3 * slowest.cpu_s:6.1f}, waiting for a processor {1e3 * slowest.waited_s:6.1f}; without that wait at most "
+                f"{1e3 * max(one.own_s for one in times):6.1f} ms"
+            )
+
+
+def scheduled(stack: Stack) -> tuple[float, float]:
+    """How long the server and its connections in the database have computed, and have waited for a processor, in seconds."""
+    assert stack.server is not None
+    cpu_ns = waited_ns = 0
+    for process in (stack.server.pid, *backends(psutil.Process(stack.server.pid))):
+        for thread in Path(f"/proc/{process}/task").glob("*/schedstat"):
+            try:
+                cpu, waited, _ = thread.read_text().split()
+            except (FileNotFoundError, ProcessLookupError):  # the thread has ended
+                continue
+            cpu_ns, waited_ns = cpu_ns + int(cpu), waited_ns + int(waited)
+    return cpu_ns / 1e9, waited_ns / 1e9
+
+
+def backends(server: psutil.Process) -> list[int]:
+    """The processes of PostgreSQL that work for the server. Their titles name the port of the client."""
+    ports = {f"({connection.laddr.port})" for connection in server.net_connections("tcp") if connection.raddr}
+    return [
+        one.pid
+        for one in psutil.process_iter(["name", "cmdline"])
+        if one.info["name"] == "postgres" and any(port in " ".join(one.info["cmdline"]) for port in ports)
+    ]
 
 
 def make_archive(folder: Path, images: int, different: int) -> None:
@@ -167,9 +222,24 @@ def first_bytes(client: Client, address: str) -> None:
         next(answer.iter_bytes())
 
 
+def ended(stack: Stack) -> dict[int, float]:
+    """When the images that are done ended, by their positions."""
+    return {row.position: row.ended_at for row in items(stack) if row.state == "done"}
+
+
+def kill_and_start(stack: Stack, workers: int) -> None:
+    """Kill the server and all workers, as a power failure does, and start them again."""
+    kill_everything(stack)
+    stack.start_server()
+    stack.workers.clear()
+    for _ in range(workers):
+        stack.start_worker()
+    warm_up(stack.client)
+
+
 def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) -> dict[str, Any]:
     """Run the study; returns its figures."""
-    times, client = Times(), stack.client
+    times, client = Times(stack), stack.client
     write_psf(folder / "psf.fits")
     psf_id = client.upload_psf(folder / "psf.fits")["id"]
     warm_up(client)
@@ -181,14 +251,23 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
     submit_s = time.perf_counter() - began
 
     def done() -> int:
-        found: int = client.bulk(bulk_id)["images"]["done"]
+        found: int = stack.client.bulk(bulk_id)["images"]["done"]
         return found
 
     with asking(client, bulk_id, times):
-        wait_for(lambda: client.bulk(bulk_id)["phase"] != "LISTING", "the files are listed", 1800.0)
-        listed_s = time.perf_counter() - began
         wait_for(lambda: done() > 0, "the first product", 600.0)
         first_s = time.perf_counter() - began
+        then_listed = client.bulk(bulk_id)["images"]["total"]
+    listed_at_kill, kept = 0, dict[int, float]()
+    if asked.kill_early:
+        kill_and_start(stack, asked.workers)
+        client = stack.client
+        now = client.bulk(bulk_id)
+        assert not now["listed"], "all files were listed before the kill: use more images"
+        listed_at_kill, kept = now["images"]["total"], ended(stack)
+    with asking(client, bulk_id, times):
+        wait_for(lambda: client.bulk(bulk_id)["listed"], "the files are listed", 1800.0)
+        listed_s = time.perf_counter() - began
         half_s = 30.0 * asked.minutes
         running = time.perf_counter()
         start = done()
@@ -202,18 +281,13 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
         wait_for(lambda: client.bulk(bulk_id)["images"]["at_work"] == 0, "the images at work are done")
     after_mib = memory_mib(stack)
     cpu = cpu_s(stack, bulk_id)
-    kept = {row.position: row.ended_at for row in items(stack) if row.state == "done"}
+    kept = ended(stack) | kept
     times.of_request("POST /v1/bulk/ID/resume", lambda: client.resume_bulk(bulk_id))
     wait_for(lambda: done() > len(kept), "the run goes on")
-    kept |= {row.position: row.ended_at for row in items(stack) if row.state == "done"}
-    kill_everything(stack)
-    stack.start_server()
-    stack.workers.clear()
-    for _ in range(asked.workers):
-        stack.start_worker()
+    kept = ended(stack) | kept
+    kill_and_start(stack, asked.workers)
     client = stack.client
     restarted = time.perf_counter()
-    warm_up(client)
     wait_for(lambda: stack.client.bulk(bulk_id)["images"]["done"] > len(kept) + 10, "it goes on", 300.0)
     goes_on_s = time.perf_counter() - restarted
     with asking(client, bulk_id, times):
@@ -240,13 +314,16 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
         times.of_request("POST /v1/bulk/ID/cancel", lambda: client.cancel_bulk(bulk_id))
     rows = items(stack)
     repeated = [row.position for row in rows if row.position in kept and row.ended_at != kept[row.position]]
+    sources = Counter(row.source for row in rows)
     images = end["images"]
     print("\n".join(times.lines()))
     print(
         "\n".join(f"{name:<40} CPU time of the server {1e3 * one_s:6.1f} ms" for name, one_s in cpu.items())
     )
-    name, slowest_s = times.slowest()
+    name, slowest = times.slowest(lambda one: one.wall_s)
+    own_name, own = times.slowest(lambda one: one.own_s)
     return {
+        "load": " ".join(f"{one:.1f}" for one in os.getloadavg()),
         "images": images["total"],
         "done": images["done"],
         "computed": images["done"] - images["reused"],
@@ -254,9 +331,18 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
         "submit_s": submit_s,
         "listed_s": listed_s,
         "first_product_s": first_s,
+        "listed_at_first_product": then_listed,
+        "listed_at_kill": listed_at_kill,
+        "listed_wrongly": sum(count - 1 for count in sources.values()) + abs(len(sources) - asked.images),
         "slowest_request": name,
-        "slowest_request_s": slowest_s,
-        "slowest_control_s": max(times.of[CONTROL]),
+        "slowest_request_s": slowest.wall_s,
+        "slowest_request_cpu_s": slowest.cpu_s,
+        "slowest_request_waited_s": slowest.waited_s,
+        "slowest_without_wait": own_name,
+        "slowest_without_wait_s": own.own_s,
+        "slowest_control_s": max(one.wall_s for one in times.of[CONTROL]),
+        "slower_than_200_ms": sum(one.wall_s > MOST_REQUEST_S for of in times.of.values() for one in of),
+        "requests_asked": sum(map(len, times.of.values())),
         "most_cpu_s": max(cpu.values()),
         "rows_per_s": rows_a_s,
         "goes_on_after_kill_s": goes_on_s,
@@ -267,21 +353,29 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
         "server_after_manifest_mib": manifest_mib,
         "manifest_rows": lines,
         "manifest_s": manifest_s,
-        "requests": {name: {"number": len(of), "slowest_s": max(of)} for name, of in times.of.items()},
+        "requests": {
+            name: {
+                "number": len(of),
+                "slowest_s": max(one.wall_s for one in of),
+                "slowest_without_wait_s": max(one.own_s for one in of),
+            }
+            for name, of in times.of.items()
+        },
     }
 
 
 def misses(found: dict[str, Any]) -> list[str]:
     """The bounds that the figures miss."""
-    most_s = MOST_REQUEST_S + found["slowest_control_s"]
     grown = max(found["server_after_mib"], found["server_after_manifest_mib"]) - found["server_before_mib"]
     missed = []
-    if found["slowest_request_s"] > most_s:
-        missed.append(f"{found['slowest_request']} took {1e3 * found['slowest_request_s']:.0f} ms")
+    if found["slowest_without_wait_s"] > MOST_REQUEST_S:
+        missed.append(f"{found['slowest_without_wait']} took {1e3 * found['slowest_without_wait_s']:.0f} ms")
     if found["most_cpu_s"] > MOST_REQUEST_S:
         missed.append(f"a request needs {1e3 * found['most_cpu_s']:.0f} ms of CPU time")
     if grown > MOST_MORE_MIB:
         missed.append(f"the memory of the server grew by {grown:.0f} MiB")
+    if found["listed_wrongly"]:
+        missed.append(f"{found['listed_wrongly']} files were not listed exactly once")
     if found["processed_again"]:
         missed.append(f"{found['processed_again']} finished images were processed again")
     return missed
@@ -295,6 +389,9 @@ def main() -> None:
     parser.add_argument("--different", type=int, default=500)
     parser.add_argument("--minutes", type=float, default=4.0)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument(
+        "--kill-early", action="store_true", help="kill everything also while files are listed"
+    )
     parser.add_argument("-o", "--output", type=Path)
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="heliopsf-archive-") as temporary:

@@ -1,13 +1,19 @@
-"""The memory and the cores that this process may use. A container may limit them to a part of the machine."""
+"""The memory and the cores that this process may use. A container may limit them to a part of the machine.
+
+This module needs no other module of ``workers``, so that the package ``heliopsf`` can import it alone.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 CGROUPS = Path("/sys/fs/cgroup")
 MEMBERSHIP = Path("/proc/self/cgroup")
+MEMINFO = Path("/proc/meminfo")
 
 
 def cores() -> int:
@@ -21,26 +27,68 @@ def memory_bytes(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP) -> int:
     cgroups: where the system shows the limits of cgroups. membership: the file that names the cgroups of this process.
     """
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return min([machine, *_limits(cgroups, membership)])
+    return min([machine, *(limited.limit for limited in _limits(cgroups, membership))])
 
 
-def _limits(cgroups: Path, membership: Path) -> Iterator[int]:
+def free_bytes(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP, meminfo: Path = MEMINFO) -> int:
+    """Memory that this process may use in addition to what it holds, bytes. Caches that the system can drop are free.
+
+    cgroups, membership: see ``memory_bytes``. meminfo: the file in which the system shows its free memory; without it,
+    all memory counts as free.
+    """
+    shown = re.search(r"^MemAvailable:\s*(\d+) kB$", _text(meminfo), re.MULTILINE)
+    machine = memory_bytes(cgroups, membership) if shown is None else 1024 * int(shown[1])
+    return max(0, min([machine, *(limited.free for limited in _limits(cgroups, membership))]))
+
+
+@dataclass(frozen=True)
+class _Version:
+    """The files of a version of cgroups: the limit, the memory in use, and the entry of memory.stat with the caches."""
+
+    limit: str
+    used: str
+    caches: str
+
+
+_V1 = _Version("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+_V2 = _Version("memory.max", "memory.current", "inactive_file")
+
+
+@dataclass(frozen=True)
+class _Limited:
+    """A cgroup with a memory limit, bytes."""
+
+    folder: Path
+    version: _Version
+    limit: int
+
+    @property
+    def free(self) -> int:
+        """The limit minus the memory in use; file caches that can be dropped are free."""
+        used = _text(self.folder / self.version.used).strip()
+        caches = re.search(
+            rf"^{self.version.caches} (\d+)$", _text(self.folder / "memory.stat"), re.MULTILINE
+        )
+        return self.limit - (int(used) if used.isdecimal() else 0) + (int(caches[1]) if caches else 0)
+
+
+def _limits(cgroups: Path, membership: Path) -> Iterator[_Limited]:
     """The memory limits of the cgroups of this process and of the cgroups above them, in both versions of cgroups."""
     for line in _text(membership).splitlines():
         number, controllers, path = line.split(":", 2)
         if number == "0":
-            top, file = cgroups, "memory.max"
+            top, version = cgroups, _V2
         elif "memory" in controllers.split(","):
-            top, file = cgroups / "memory", "memory.limit_in_bytes"
+            top, version = cgroups / "memory", _V1
         else:
             continue
         # Inside a container this may be a path of the host. The container then shows only the limits of its uppermost
         # folder.
         below = Path(path.lstrip("/"))
         for folder in (below, *below.parents):
-            limit = _text(top / folder / file).strip()
+            limit = _text(top / folder / version.limit).strip()
             if limit.isdecimal():  # the text is "max" without a limit
-                yield int(limit)
+                yield _Limited(top / folder, version, int(limit))
 
 
 def _text(file: Path) -> str:

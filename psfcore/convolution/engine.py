@@ -22,7 +22,7 @@ from __future__ import annotations
 import itertools
 import math
 import queue
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -31,8 +31,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
-from psfcore.convolution.fft_kernels import LANES, forward, good_length, inverse, make_plan
+from psfcore.convolution.fft_kernels import LANES, forward, inverse, make_plan
 from psfcore.convolution.lanes import join, scale, split, transpose, turn, turn_back
+from psfcore.convolution.lengths import good_length
 from psfcore.convolution.offsets import needed_kernel
 from psfcore.errors import DataError
 
@@ -132,15 +133,36 @@ class Engine:
         """Convert a field (ny, nx) to the engine's layout. Additional rows that complete the last block hold `padding`."""
         if field.shape != self.field_shape:
             raise DataError("field-shape", f"expected a field of {self.field_shape}; got {field.shape}")
+        return self.lanes_of(lambda rows: field[rows], padding=padding)
+
+    def lanes_of(self, rows_of: Callable[[slice], NDArray[np.floating]], *, padding: float = 0.0) -> Single:
+        """As ``to_lanes``, for a field that is computed in blocks of rows: `rows_of(rows)` returns these rows.
+
+        The whole field is never in memory.
+        """
         ny, nx = self.field_shape
-        padded = np.full((self.row_blocks, 2, LANES, nx), padding, np.float32)
-        padded.reshape(-1, nx)[:ny] = field
-        return _aligned_copy(padded.transpose(0, 3, 1, 2))
+        lanes = aligned(*self.lanes_shape)
+        block = np.empty((BLOCK_ROWS, nx), np.float32)
+        for n in range(self.row_blocks):
+            rows = slice(n * BLOCK_ROWS, min((n + 1) * BLOCK_ROWS, ny))
+            block[: rows.stop - rows.start] = rows_of(rows)
+            block[rows.stop - rows.start :] = padding
+            lanes[n] = block.reshape(2, LANES, nx).transpose(2, 0, 1)
+        return lanes
 
     def from_lanes(self, lanes: Single) -> Single:
         """Convert from the engine's layout to a field, shape (ny, nx)."""
+        field = np.empty(self.field_shape, np.float32)
+        for first, rows in self.row_blocks_of(lanes):
+            field[first : first + len(rows)] = rows
+        return field
+
+    def row_blocks_of(self, lanes: Single) -> Iterator[tuple[int, Single]]:
+        """The rows of a field in the engine's layout, in blocks: the number of the first row, and the rows [y, x]."""
         ny, nx = self.field_shape
-        return np.ascontiguousarray(lanes.transpose(0, 2, 3, 1).reshape(-1, nx)[:ny])
+        for n in range(self.row_blocks):
+            first = n * BLOCK_ROWS
+            yield first, lanes[n].transpose(1, 2, 0).reshape(BLOCK_ROWS, nx)[: ny - first]
 
     def rows_forward(self, lanes: Single) -> None:
         """Transform the rows of a field into the spectrum."""

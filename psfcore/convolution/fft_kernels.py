@@ -37,8 +37,6 @@ from numpy.typing import NDArray
 from psfcore.compiled import Addressed, compiled, compiled_at_address
 from psfcore.convolution.lanes import LANES, Memory, constant, parts
 
-LARGEST_LENGTH = 16384
-_ODD_FACTORS = (1, 3, 9)
 _HALF = np.float32(0.5)
 _HALF_ROOT = np.float32(np.sqrt(0.5))
 _HALF_ROOT_3 = np.float32(np.sqrt(0.75))
@@ -72,15 +70,6 @@ class Plan:
     def numbers(self) -> tuple[Any, ...]:
         """The arguments of `forward` and `inverse` after the buffer."""
         return self.length, self.passes, self.lengths, self.twiddles, self.offsets
-
-
-def good_length(at_least: int) -> int:
-    """The smallest supported length >= `at_least`. Supported are 2^a, 3 2^a and 9 2^a with a >= 4. Raises ValueError."""
-    candidates = [odd << a for odd in _ODD_FACTORS for a in range(4, 15) if odd << a <= LARGEST_LENGTH]
-    fitting = [length for length in candidates if length >= at_least]
-    if not fitting:
-        raise ValueError(f"expected a length of at most {LARGEST_LENGTH}; got {at_least}")
-    return min(fitting)
 
 
 @lru_cache(maxsize=16)

@@ -40,6 +40,10 @@ def deconvolution_cards(
         "DCNVBAND": (result.edge_band_px, "[px] width of band affected by DCNVEDGE"),
         "SWHELIO": (software_version(), "heliopsf version"),
     }
+    if result.of_box is not None:
+        cards["DCNVBOX"] = (str(result.of_box.box), "[px] box of the input, x0:x1,y0:y1 from 0")
+        cards["DCNVRIM"] = (result.of_box.rim_px, "[px] width of the rim that was also used")
+        cards["DCNVBERR"] = (result.of_box.error, "bound of the difference from whole image")
     if saturation is not None and saturation.found is not None and saturation.level is not None:
         cards["DCNVSATL"] = (saturation.level, "saturation level, in the unit of the image")
         cards["DCNVSATF"] = (saturation.found, "where the saturation level was found")
@@ -53,5 +57,16 @@ def deconvolution_history(psf: UsedPsf, result: Deconvolved, warnings: Mapping[s
     return [
         f"heliopsf {software_version()}: {result.method}, {result.steps_done} steps, "
         f"edges {result.edges}, PSF {psf.name} {psf.version} ({psf.status})",
+        *_of_box(result),
         *(f"WARNING ({code}): {message}" for code, message in warnings.items()),
+    ]
+
+
+def _of_box(result: Deconvolved) -> list[str]:
+    found = result.of_box
+    if found is None:
+        return []
+    return [
+        f"box {found.box} of the input alone, with a rim of {found.rim_px} px: differs from the same box of the whole image by "
+        f"at most {found.error:.3g} (estimated bound, in the unit of the image)"
     ]

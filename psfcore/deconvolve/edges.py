@@ -22,6 +22,7 @@ b is the mean over the four edges of the image.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.engine import BLOCK_ROWS
 from psfcore.errors import DataError
-from psfcore.image import Image, MaskBit
+from psfcore.image import Image
 from psfcore.psf import Psf
 
 Edges = Literal["zero", "symmetric", "extended"]
@@ -61,6 +62,13 @@ class Domain:
     edges: Edges
     margin_px: int
 
+    def release(self) -> None:
+        """Free the memory of `pixels` and `trusted` and `finite`, when the iteration holds what it needs of them."""
+        for name in ("pixels", "trusted", "finite"):
+            plane = getattr(self, name)
+            empty = np.broadcast_to(plane.dtype.type(0), plane.shape)  # one number, so that the shape is kept
+            object.__setattr__(self, name, empty)
+
     @property
     def shape(self) -> tuple[int, int]:
         """(ny, nx) of field and margin."""
@@ -77,9 +85,16 @@ class Domain:
         ny, nx = (part.stop - part.start for part in self.field)
         return ny + sought, nx + sought
 
-    def cut(self, plane: Plane) -> NDArray[np.float64]:
-        """Cut the field out of a plane, in the image's unit."""
-        return plane[self.field].astype(np.float64) * self.scale
+    def cut(self, blocks: Iterable[tuple[int, Plane]]) -> NDArray[np.float64]:
+        """Cut the field out of a plane, in the image's unit. blocks: the number of the first row, and rows of the plane."""
+        rows, columns = self.field
+        pixels = np.empty((rows.stop - rows.start, columns.stop - columns.start))
+        for first, block in blocks:
+            part = block[max(rows.start - first, 0) : max(rows.stop - first, 0), columns]
+            start = max(first - rows.start, 0)
+            pixels[start : start + len(part)] = part
+        pixels *= self.scale
+        return pixels
 
 
 def share_from_beyond(psf: Psf) -> NDArray[np.float64]:
@@ -136,14 +151,20 @@ def lay_out(image: Image, *, edges: Edges, margin_px: int) -> Domain:
             "all-masked",
             "expected at least one pixel that is not masked; all pixels are masked: check the mask",
         )
-    finite = (image.mask & MaskBit.NONFINITE) == 0
-    scale = float(np.abs(image.pixels[finite]).max())
+    finite = image.finite
+    scale = float(
+        max(
+            np.max(image.pixels, where=finite, initial=-np.inf),
+            -np.min(image.pixels, where=finite, initial=np.inf),
+        )
+    )
     if scale == 0:
         raise DataError(
             "no-signal", "expected at least one pixel other than zero; all are zero: use another image"
         )
     # Divide in float64: float32 cannot hold numbers such as 1e-300 and 1e300.
-    scaled = np.where(finite, image.pixels, 0.0) / scale
+    scaled = np.where(finite, image.pixels, 0.0)
+    scaled /= scale
     margin = 0 if edges == "zero" else margin_px
     ny, nx = scaled.shape
     trusted = np.pad(image.valid, margin, mode="symmetric")

@@ -17,7 +17,8 @@ from astropy.io.fits import Header
 
 from psfcore.compiled import is_kept
 from psfcore.convolution import engine
-from psfcore.convolution.fft_kernels import LARGEST_LENGTH, good_length, make_plan
+from psfcore.convolution.fft_kernels import make_plan
+from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.image import Image

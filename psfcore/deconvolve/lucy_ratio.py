@@ -50,7 +50,7 @@ def light_above_floor(problem: Problem) -> Single:
             "expected at least one trusted pixel above zero; got none: use another image or the method linear",
         )
     estimate = first_estimate(problem)
-    return np.maximum(estimate, np.float32(FLOOR_OF_MAXIMUM * float(estimate.max())))
+    return np.maximum(estimate, np.float32(FLOOR_OF_MAXIMUM * float(estimate.max())), out=estimate)
 
 
 class Ratio:
@@ -63,8 +63,12 @@ class Ratio:
         domain = problem.domain
         self.engine, self.judgement = problem.engine, problem.judgement
         self.floor = np.float32(FLOOR_OF_MAXIMUM * brightest)
-        light_or_agreed = np.where(domain.trusted, np.maximum(domain.pixels, 0), -np.float32(agreed))
-        self._light_or_agreed = self.engine.to_lanes(light_or_agreed)
+        of_masked = np.broadcast_to(np.float32(agreed), domain.shape)
+
+        def light_or_agreed(rows: slice) -> Single:
+            return np.where(domain.trusted[rows], np.maximum(domain.pixels[rows], 0), -of_masked[rows])
+
+        self._light_or_agreed = self.engine.lanes_of(light_or_agreed)
 
     def measure(self) -> None:
         """Compute H x, the chi2 of H x, and the ratio of Eq. (1)."""

@@ -20,7 +20,7 @@ from psfcore.deconvolve.edges import (
 )
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.deconvolve.stopping import Ended, Iteration, Judgement, Stop, check_steps, judgement, run
-from psfcore.image import Image, MaskBit
+from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.psf_sampling import check_compatible
 
@@ -42,7 +42,8 @@ class Problem:
     edge_band_px: int
 
     def solve(self, iteration: Iteration, *, steps: int, stop: Stop) -> Ended:
-        """Run a method's iteration until it stops."""
+        """Run a method's iteration until it stops. The planes of the domain are released before."""
+        self.domain.release()
         return run(
             iteration,
             self.judgement,
@@ -113,23 +114,28 @@ def solution(
     negatives_count: bool,
     noise_amplification: float | None = None,
 ) -> Deconvolved:
-    """Turn an estimate on the domain into the result for the image.
+    """Turn an estimate on the domain into the result for the image. estimate: a plane [y, x], or in the engine's layout.
 
     negatives_count: True if the method uses negative pixels unchanged; False if it counts them as 0.
     """
     image, domain = problem.image, problem.domain
-    pixels = domain.cut(estimate)
-    observed = image.pixels[image.valid]
-    flux_out = float(pixels[image.valid].sum())
-    pixels[(image.mask & MaskBit.NONFINITE) != 0] = np.nan
+    pixels = domain.cut([(0, estimate)] if estimate.ndim == 2 else problem.engine.row_blocks_of(estimate))
+    # The sums use no copies of planes: here most of the memory of a deconvolution is in use.
+    counted = image.valid
+    flux_out = float(pixels.sum(where=counted))
+    negative = image.pixels < 0
+    negative &= counted
+    if not negatives_count:
+        counted &= ~negative
+    pixels[~image.finite] = np.nan
     return Deconvolved(
         pixels=pixels,
         method=method,
         steps_done=ended.steps_done,
         stopped_because=ended.because,
-        flux_in=float((observed if negatives_count else np.maximum(observed, 0)).sum()),
+        flux_in=float(image.pixels.sum(where=counted)),
         flux_out=flux_out,
-        negative_pixels=int(np.count_nonzero(observed < 0)),
+        negative_pixels=int(np.count_nonzero(negative)),
         last_change=last_change,
         edges=domain.edges,
         margin_px=domain.margin_px,

@@ -7,7 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.edges import Edges
+
+
+@dataclass(frozen=True)
+class OfBox:
+    """How a box of an image was deconvolved alone (`psfcore.deconvolve.region`).
+
+    box: the box in the pixels of the whole image. rim_px: largest width of the rim around it. error: bound of the
+    difference from the deconvolution of the whole image, in the unit of the image; 0: there is no difference.
+    """
+
+    box: Box
+    rim_px: int
+    error: float
 
 
 @dataclass(frozen=True)
@@ -23,7 +37,8 @@ class Deconvolved:
     edge_band_px: width of the band along the edges in which the result depends on light from beyond the field.
     noise_amplification: rms noise of the estimate divided by the rms noise of the image, for uncorrelated noise; None if
     the method is not linear. chi2_per_pixel: chi2 of the fit divided by the number of judged pixels
-    (`psfcore.deconvolve.stopping`); None if the noise is not known.
+    (`psfcore.deconvolve.stopping`); None if the noise is not known. of_box: how the box was deconvolved, if the result is a
+    box of an image; None for a whole image.
     """
 
     pixels: NDArray[np.float64]
@@ -39,3 +54,4 @@ class Deconvolved:
     edge_band_px: int
     noise_amplification: float | None = None
     chi2_per_pixel: float | None = None
+    of_box: OfBox | None = None

@@ -66,7 +66,7 @@ def image_of(
     """
     unit, exposure_s = optional_text(header, "BUNIT"), optional_exposure_s(header)
     level = _saturation_level(header, unit, exposure_s, saturation_dn)
-    mask = np.where(np.isfinite(pixels), 0, int(MaskBit.NONFINITE)).astype(np.uint8)
+    mask = np.where(np.isfinite(pixels), np.uint8(0), np.uint8(MaskBit.NONFINITE))
     if level is not None:
         mask[pixels >= level] |= int(MaskBit.SATURATED)  # for NaN the comparison is False
     image = Image(pixels=pixels, mask=mask, header=header, unit=unit, exposure_s=exposure_s)
@@ -104,7 +104,7 @@ def _saturation_level(
 def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
     valid = image.pixels[image.valid]
     if valid.size == 0:
-        finite = (image.mask & MaskBit.NONFINITE) == 0
+        finite = image.finite
         if not finite.any():
             raise DataError(
                 "all-nan", "expected finite pixels; got only NaN, infinite or BLANK: use another image"

@@ -32,7 +32,7 @@ LOOK_FROM = 1.0  # a person should inspect images with this artefact score or a 
 class Counts(BaseModel):
     """Numbers of images by state."""
 
-    total: int = Field(description="images listed so far")
+    total: int = Field(description="images listed so far; more are added while `listed` is false")
     waiting: int
     at_work: int
     done: int
@@ -58,10 +58,13 @@ class BulkView(BaseModel):
     )
     context_id: str | None
     request: dict[str, Any] = Field(description="the request, without the ids of uploaded images")
+    listed: bool = Field(
+        description="whether all files are listed; false: the numbers of images and of waiting images are too small"
+    )
     images: Counts
     images_an_hour: float | None = Field(description="speed in the last hour; null: unknown")
     time_left_s: float | None = Field(
-        description="estimated time left; null: unknown, or the run is not running"
+        description="estimated time left; null: unknown, for example while files are listed, or the run is not running"
     )
     error: JobError | None = Field(description="the error that stopped the run; null: no error stopped it")
     results: str = Field(description="address of the manifest of the done images")
@@ -84,6 +87,7 @@ class BulkView(BaseModel):
             psf_id=row.psf_id,
             context_id=row.context_id,
             request=row.request,
+            listed=row.listed,
             images=Counts(
                 total=row.total,
                 waiting=max(0, left - pace.taken),
@@ -110,6 +114,7 @@ class BulkLine(BaseModel):
     phase: BulkPhase
     created_at: float
     ended_at: float | None
+    listed: bool = Field(description="whether all files are listed; false: `total` is too small")
     total: int
     done: int
     failed: int
@@ -123,6 +128,7 @@ class BulkLine(BaseModel):
             phase=BulkPhase(row.phase),
             created_at=row.created_at,
             ended_at=row.ended_at,
+            listed=row.listed,
             total=row.total,
             done=row.done,
             failed=row.failed,
@@ -175,6 +181,10 @@ class BulkEstimate(BaseModel):
     seconds: float = Field(description="expected time of the run with the workers of now")
     workers: int = Field(description="worker processes now; 1 if there are none")
     memory_mib: int = Field(description="memory that the largest examined image needs")
+    example_output: str | None = Field(
+        description="path of the product of an examined image in the output folder; null: there is no output folder, or the "
+        "path has the id of the product, which is not known before the run"
+    )
 
     @classmethod
     def of(cls, found: DryRun) -> BulkEstimate:
@@ -214,7 +224,8 @@ def estimate_bulk(
     },
 )
 def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shared) -> BulkView:
-    """Deconvolve many images in the same way. Workers list the files and deconvolve the images. All other jobs run first.
+    """Deconvolve many images in the same way. Workers list the files, and deconvolve images as soon as they are listed.
+    All other jobs run first.
 
     The PSF, or the context that pins a PSF for each image, is fixed when the run starts. An existing product is not made again.
     """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Response
@@ -16,7 +15,7 @@ from service.api.bulk import BulkId, find
 from service.http.callers import Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
-from workers.catalogue.bulk_progress import BulkProgress
+from workers.catalogue.bulk_progress import BATCH, BulkProgress
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.contract.bulk import ItemState
 
@@ -150,15 +149,16 @@ def _in_order(progress: BulkProgress, bulk_id: str, order: str, limit: int | Non
     left = limit
     after, behind = -1, None
     while left is None or left > 0:
+        size = BATCH if left is None else min(BATCH, left)
         if order == "worst":
-            batch = progress.worst(bulk_id, after=behind)
+            batch = progress.worst(bulk_id, after=behind, limit=size)
         else:
-            batch = progress.items(bulk_id, ItemState.DONE, after=after)
+            batch = progress.items(bulk_id, ItemState.DONE, after=after, limit=size)
         if not batch:
             return
         after = batch[-1].position
         behind = (float(batch[-1].score or 0.0), after)
-        yield [Result.of(row) for row in islice(batch, left)]
+        yield [Result.of(row) for row in batch]
         left = None if left is None else left - len(batch)
 
 

@@ -201,7 +201,7 @@ def list_bulks(most: int, server: str | None) -> None:
         click.echo("no bulk run yet; `heliopsf bulk submit` starts one")
     for row in rows:
         click.echo(
-            f"{short(row['id'])}  {row['phase']:<9}  {moment(row['created_at'])}  {row['done']} of {row['total']} done, "
+            f"{short(row['id'])}  {row['phase']:<9}  {moment(row['created_at'])}  {row['done']} of {_total(row, row['total'])} done, "
             f"{row['failed']} failed  {row['name']}".rstrip()
         )
 
@@ -344,6 +344,8 @@ def _estimated(found: dict[str, Any]) -> list[str]:
         f"examined: {found['examined']} of {found['images']} images; {found['refused_images']} would be refused"
         + (f", {found['existing']} products exist already" if found["existing"] else ""),
     ]
+    if found.get("example_output"):
+        lines.append(f"for example: {found['example_output']}")
     if not found["complete"]:
         lines.append(
             "the time of a dry run was not enough to find and examine all of them: the run may be larger"
@@ -357,7 +359,7 @@ def _estimated(found: dict[str, Any]) -> list[str]:
 def _said(found: dict[str, Any]) -> list[str]:
     images = found["images"]
     lines = [
-        f"{found['phase']}: {images['done']} of {images['total']} done"
+        f"{found['phase']}: {images['done']} of {_total(found, images['total'])} done"
         + (f" ({images['reused']} existed already)" if images["reused"] else "")
         + f", {images['failed']} failed, {images['at_work']} in progress, {images['waiting']} waiting"
     ]
@@ -368,6 +370,11 @@ def _said(found: dict[str, Any]) -> list[str]:
     if found["error"]:
         lines.append(f"stopped: {found['error']['message']}")
     return lines
+
+
+def _total(found: dict[str, Any], total: int) -> str:
+    """The number of images of a run, as far as it is known. An older service lists all files before it starts."""
+    return str(total) if found.get("listed", True) else f"at least {total}"
 
 
 def _end_with_status(found: dict[str, Any]) -> None:

@@ -8,6 +8,8 @@ from typing import Any
 
 import click
 
+from psfcore.deconvolve.box import Box
+from psfcore.errors import DataError
 from service.cli.connection import CONTEXT, LOCAL, PSF, SERVER, connection, named_psf, short
 from service.cli.options import (
     METHOD,
@@ -37,6 +39,16 @@ AGAIN = click.option(
 )
 
 
+def _region(context: click.Context, parameter: click.Parameter, text: str | None) -> str | None:
+    """The text of a region, if it has the right form."""
+    if text is not None:
+        try:
+            Box.parse(text)
+        except DataError as error:
+            raise click.BadParameter(error.message, context, parameter) from error
+    return text
+
+
 @click.command()
 @click.argument("images", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option(
@@ -57,6 +69,18 @@ AGAIN = click.option(
     "--edges",
     type=click.Choice(["zero", "symmetric", "extended"]),
     help="Assumed scene outside the image [default: depends on the method]",
+)
+@click.option(
+    "--region",
+    metavar="X0:X1,Y0:Y1",
+    callback=_region,
+    help="Deconvolve only this box, in pixels from 0 (X0 <= x < X1); the output is the box",
+)
+@click.option(
+    "--region-error",
+    type=click.FloatRange(0, 1, min_open=True),
+    metavar="SHARE",
+    help="Largest bound of the error of the region, as a share of its mean light; sets the rim [default: 0.05]",
 )
 @NOISE
 @SATURATION
@@ -85,6 +109,8 @@ def deconvolve(
     steps: int | None,
     stop: str | None,
     edges: str | None,
+    region: str | None,
+    region_error: float | None,
     noise: tuple[float, float] | None,
     saturation_dn: float | None,
     error_draws: int,
@@ -114,6 +140,8 @@ def deconvolve(
         "steps": steps,
         "stop": stop,
         "edges": edges,
+        "region": region,
+        "region_error": region_error,
         "other_channel": other_channel,
         "again": again,
         "overwrite": overwrite,
@@ -183,8 +211,20 @@ def _one(
     return [
         f"{output}: PSF {product['psf_version']}, product {short(product['id'])}",
         f"{details['steps_done']} steps ({details['stopped_because']}), edges {details['edges']}",
+        *_told_region(details),
         f"flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
         f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",
+    ]
+
+
+def _told_region(details: dict[str, Any]) -> list[str]:
+    """The line about the region that was deconvolved."""
+    found = details.get("region")  # products of earlier versions have no such detail
+    if found is None:
+        return []
+    return [
+        f"region {found['box']}, rim {found['rim_px']} px: differs from the same pixels of the whole image by at most "
+        f"{found['error']:.3g} (estimated bound, in the unit of the image)"
     ]
 
 

@@ -162,8 +162,13 @@ class BulkClient(ABC):
         try:
             for bulk in self.follow(f"/v1/bulk/{bulk_id}"):
                 images = bulk["images"]
-                if progress is not None and images["total"]:
-                    progress("images", images["done"] + images["failed"], images["total"])
+                ended, total = images["done"] + images["failed"], images["total"]
+                if progress is not None and not bulk.get("listed", True):
+                    progress(
+                        f"{ended} of at least {total} images", 0, 1
+                    )  # how many steps are left is unknown
+                elif progress is not None and total:
+                    progress("images", ended, total)
                 if bulk["phase"] not in ("LISTING", "RUNNING"):
                     break
         except KeyboardInterrupt as stop:

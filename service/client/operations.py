@@ -111,6 +111,8 @@ class Operations(ABC):
         context: str | None = None,
         other_channel: bool = False,
         again: bool = False,
+        region: str | None = None,
+        region_error: float | None = None,
         overwrite: bool = False,
         **method_parameters: Any,
     ) -> dict[str, Any]:
@@ -121,7 +123,8 @@ class Operations(ABC):
         realisations for an ERROR plane, 0 or at least 2. preview, changes: where to write the picture of the image
         before and after, and the picture of difference, ratio and histograms (PNG). other_channel: whether the PSF may be of
         another telescope, channel or filter than the image. again: deconvolve the file even if its header says that it is a
-        product or a PSF. ``details["warnings"]`` of the product says what may be wrong with it. method_parameters: for example
+        product or a PSF. region: deconvolve only this box, "x0:x1,y0:y1" in pixels from 0; region_error: largest bound of
+        its error, as a share of its mean light (default 0.05). ``details["warnings"]`` of the product says what may be wrong with it. method_parameters: for example
         ``steps=20``, ``stop="discrepancy"``, ``edges="zero"``.
         """
         check_outputs((output, preview, changes), inputs=(image,), overwrite=overwrite)
@@ -136,6 +139,8 @@ class Operations(ABC):
             context=context,
             other_channel=other_channel,
             again=again,
+            region=region,
+            region_error=region_error,
             **method_parameters,
         )
         job = self.submit("deconvolve", **wanted)
@@ -346,6 +351,8 @@ def deconvolution(
     context: str | None = None,
     other_channel: bool = False,
     again: bool = False,
+    region: str | None = None,
+    region_error: float | None = None,
     **method_parameters: Any,
 ) -> dict[str, Any]:
     """The parameters of a request to deconvolve an uploaded image, from the arguments of ``Operations.deconvolve``."""
@@ -359,6 +366,7 @@ def deconvolution(
         **({} if context is None else {"context": context}),
         **({"other_channel": True} if other_channel else {}),
         **({"again": True} if again else {}),
+        **_given({"region": region, "region_error": region_error}),
         **_noise(noise),
     }
 

@@ -32,7 +32,7 @@ from service.http.callers import Caller
 from service.http.paging import Cursor, following, number, place
 from service.http.problems import Problem
 from service.http.state import Shared, State
-from service.pages.parts import methods
+from service.pages.parts import archive, methods
 from service.pages.parts.forms import wrong_fields
 from service.pages.parts.sentences import of_error
 from service.pages.rendering import page, short
@@ -40,14 +40,10 @@ from service.pages.visitors import PageBulk, PageReading
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.bulk_progress import MOST_EXPLAINED
 from workers.catalogue.bulk_tables import BulkItemRow
-from workers.catalogue.psfs import PsfFilter
-from workers.catalogue.tables import PsfContextRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, BulkRequest, ItemState
 
 PER_PAGE, PER_SHEET = 20, 24
-MOST_CHOICES = 50  # PSFs and contexts that the form offers
 MOST_STARTED = 1000  # images of one run that is started from the form
-CHOICES = {"psf": "psf_id", "context": "context"}
 CHANGES = {"pause": pause_bulk, "resume": resume_bulk, "retry": retry_bulk, "cancel": cancel_bulk}
 # The phases in which each change is allowed. A retry also needs failed images.
 ALLOWED_IN = {
@@ -74,9 +70,9 @@ def bulk_list(request: Request, caller: PageReading, state: Shared, cursor: Curs
         first_page=cursor is None,
         images=len(without[:MOST_STARTED]),
         more=len(without) > MOST_STARTED,
-        psfs=state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_CHOICES),
-        contexts=state.catalogue.page(PsfContextRow, owner=caller.owner, limit=MOST_CHOICES),
-        methods=methods.choices(),
+        asked=archive.shown({}),
+        **archive.choices(caller, state),
+        **archive.folders(state.settings),
         may=Scope.BULK in caller.scopes,
     )
 
@@ -92,11 +88,7 @@ def start(
     steps: Annotated[str, Form()] = "",
 ) -> Response:
     """Start a run of the uploaded images that have no product, and show it. choice: ``psf:ID`` or ``context:ID``."""
-    kind, _, identity = choice.partition(":")
-    if kind not in CHOICES:
-        raise Problem(
-            422, "invalid-request", "expected a PSF or a context for the run: go back and choose one"
-        )
+    psf = archive.chosen_psf(choice)
     images = state.catalogue.bulks.progress.without_product(caller.owner, MOST_STARTED)
     if not images:
         raise Problem(
@@ -105,7 +97,7 @@ def start(
             "expected uploaded images without a product; each of your images has one: upload other images first",
         )
     parameters = {"method": methods.chosen({"method": method, "steps": steps})}
-    wanted = {CHOICES[kind]: identity, "images": list(images), "name": name, "parameters": parameters}
+    wanted = {**psf, "images": list(images), "name": name, "parameters": parameters}
     try:
         body = BulkRequest.model_validate(wanted)
     except ValidationError as error:

@@ -293,3 +293,83 @@ def test_progress_is_told_to_a_function_or_on_the_terminal(
 def test_the_number_of_threads_does_not_change_the_result(psf: heliopsf.Psf) -> None:
     one, two = (heliopsf.deconvolve(a_map(), psf, threads=threads).data for threads in (1, 2))
     np.testing.assert_array_equal(one, two)
+
+
+REGION = "32:64,32:64"
+
+
+def test_a_region_of_a_map_is_its_submap_deconvolved(psf: heliopsf.Psf) -> None:
+    image = a_map(datarms=3.0)
+    part = image.submap([32, 32] * u.pix, top_right=[63, 63] * u.pix)
+    whole = heliopsf.deconvolve(image, psf)
+    corners = (part.bottom_left_coord, part.top_right_coord)
+    for region in (REGION, np.s_[32:64, 32:64], corners):
+        result = heliopsf.deconvolve(image, psf, region=region, region_error=0.9)
+        assert type(result) is type(image) and result.data.shape == (32, 32)
+        assert result.wcs.wcs.compare(part.wcs.wcs)
+        assert result.meta["dcnvbox"] == REGION and "datarms" not in result.meta
+        assert result.meta["dcnvrim"] > 0
+        assert 0 < result.meta["dcnvberr"] < 0.9 * part.data.mean()
+        difference = np.abs(result.data - whole.data[32:64, 32:64])
+        assert difference.max() <= result.meta["dcnvberr"]
+
+
+def test_a_region_has_the_form_of_its_image(psf: heliopsf.Psf, tmp_path: Path) -> None:
+    a_map().save(tmp_path / "image.fits")
+    header = fits.Header({key.upper(): value for key, value in cards().items()})
+    options: dict[str, Any] = {"region": REGION, "region_error": 0.9, "other_channel": True}
+    wanted = heliopsf.deconvolve(tmp_path / "image.fits", psf, **options)
+    assert wanted.pixels.shape == wanted.quality.shape == wanted.image.pixels.shape == (32, 32)
+    assert wanted.image.header["CRPIX1"] == 64.5 - 32 and wanted.of_box.rim_px > 0
+    np.testing.assert_array_equal(wanted.image.pixels, pixels()[32:64, 32:64])
+    for image in (
+        NDData(pixels(), unit="DN", meta=cards()),
+        CCDData(pixels(), unit="adu", meta=header, wcs=WCS(header)),
+        pixels(),
+    ):
+        result = heliopsf.deconvolve(image, psf, **options)
+        assert type(result) is type(image)
+        found = result if isinstance(result, np.ndarray) else result.data
+        np.testing.assert_array_equal(found, wanted.pixels)
+        if isinstance(result, NDData):
+            assert {key.lower(): value for key, value in result.meta.items()}["crpix2"] == 48.5 - 32
+    several = heliopsf.deconvolve([pixels(1), pixels(2)], psf, **options)
+    assert [one.shape for one in several] == [(32, 32), (32, 32)]
+
+
+@pytest.mark.parametrize(
+    ("region", "code"),
+    [
+        ("1:2", "bad-region"),
+        ((1, 2), "bad-region"),
+        (np.s_[0:40:2, 0:40], "bad-region"),
+        (np.s_[0:40], "bad-region"),
+        ("0:20,80:97", "region-outside"),
+        (np.s_[0:10, 0:40], "region-too-small"),
+    ],
+)
+def test_a_region_of_another_form_is_refused(psf: heliopsf.Psf, region: Any, code: str) -> None:
+    for image in (pixels(), a_map()):
+        with pytest.raises(DataError) as refused:
+            heliopsf.deconvolve(image, psf, region=region)
+        assert refused.value.code == code
+
+
+def test_a_region_with_errors_is_refused(psf: heliopsf.Psf) -> None:
+    with pytest.raises(DataError, match="region-errors"):
+        heliopsf.deconvolve(pixels(), psf, region=REGION, error_draws=4, noise=(1.0, 1.0))
+
+
+def test_an_image_that_does_not_fit_into_the_memory_is_refused_before_it_is_read(
+    psf: heliopsf.Psf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a_map().save(tmp_path / "image.fits")
+    monkeypatch.setattr("heliopsf.images.free_bytes", lambda: 2**17)
+    read: list[Any] = []
+    monkeypatch.setattr("heliopsf.images.image_of", lambda *given, **more: read.append(given))
+    for image in (a_map(), pixels(), tmp_path / "image.fits"):
+        with pytest.raises(DataError) as refused:
+            heliopsf.deconvolve(image, psf)
+        assert refused.value.code == "too-much-memory"
+        assert "128 x 96 px" in refused.value.message and "free memory" in refused.value.message
+    assert not read

@@ -61,7 +61,10 @@ def test_the_functions_load_no_server() -> None:
     loaded = loaded_by("from heliopsf import deconvolve, build_psf, read_psf, fit_scatter, diagnose_gap")
     assert "psfcore.scatter.fit" in loaded
     assert loaded & {"fastapi", "sqlalchemy", "celery", "httpx", "service", "sunpy", "matplotlib"} == set()
-    assert {name for name in loaded if name.startswith("workers.")} == {"workers.cache_folder"}
+    assert {name for name in loaded if name.startswith("workers.")} == {
+        "workers.cache_folder",
+        "workers.machine",
+    }
 
 
 def test_the_core_needs_no_extra() -> None:

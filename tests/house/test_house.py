@@ -68,14 +68,16 @@ def test_imports_run_one_way(package: str, forbidden: tuple[str, ...]) -> None:
     assert wrong == []
 
 
-def test_what_people_import_stands_on_the_core_the_client_and_the_folder_of_the_cache_alone() -> None:
+def test_what_people_import_stands_on_the_core_the_client_the_folder_of_the_cache_and_the_machine_alone() -> (
+    None
+):
     libraries = {"astropy", "heliopsf", "matplotlib", "numpy", "psfcore"}
     wrong = [
         (path.name, name)
         for path in sources("heliopsf")
         for name in imports(path)
         if name.split(".")[0] not in libraries | sys.stdlib_module_names
-        and not name.startswith(("service.client", "workers.cache_folder"))
+        and not name.startswith(("service.client", "workers.cache_folder", "workers.machine"))
     ]
     assert wrong == []
 

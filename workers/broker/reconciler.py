@@ -32,7 +32,10 @@ def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
         log.info("job %s: destroyed at the time its client set", job_id)
     bulk_turns.keep_turns(catalogue, settings)
     submitted: list[str] = []
-    for job in catalogue.jobs.unsubmitted(settings.resubmit_s, limit=AT_ONCE):
+    idle = catalogue.jobs.nobody_works(settings.resubmit_s) and bool(
+        catalogue.census.workers(settings.lease_s)
+    )
+    for job in catalogue.jobs.unsubmitted(settings.resubmit_s, limit=AT_ONCE, idle=idle):
         if not queue.submit(app, job.id, job.queue):
             break
         submitted.append(job.id)

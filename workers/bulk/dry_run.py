@@ -59,7 +59,8 @@ class DryRun:
     images: images that were found. complete: False if the time was not enough to list all files and to examine the
     sample. examined, refused_images, existing: numbers of examined images, of those that would be refused, and of those
     whose product exists already (known for uploads only). output_bytes: size of all products, bytes. seconds: time of
-    the run. workers: worker processes now. memory_mib: memory of the largest examined image.
+    the run. workers: worker processes now. memory_mib: memory of the largest examined image. example_output: path of the
+    product of an examined image, if it is known before the run; a product's id is not known for a file.
     """
 
     images: int = 0
@@ -72,6 +73,7 @@ class DryRun:
     seconds: float = 0.0
     workers: int = 1
     memory_mib: int = 0
+    example_output: str | None = None
 
 
 class _OutOfTime(Exception):
@@ -119,6 +121,7 @@ def dry_run(
             continue
         found.existing += one.exists
         found.memory_mib = max(found.memory_mib, one.memory_mib)
+        found.example_output = found.example_output or one.output
         seconds, size_bytes = seconds + one.seconds, size_bytes + one.bytes
     scale = found.images / max(1, found.examined)
     found.seconds = round(scale * seconds / found.workers, 1)
@@ -132,6 +135,7 @@ class _Examined:
     bytes: int
     seconds: float
     memory_mib: int
+    output: str | None
 
 
 class _Asked:
@@ -155,11 +159,11 @@ class _Asked:
         """All images of the run. Raises ``_OutOfTime``, and the errors of listing."""
         for identity in self._uploads:
             yield Listed(identity, uploaded=True)
-        yield from found_files(self._request, self._settings, self._tick)
-
-    def _tick(self, _seen: int, _looked_at: int) -> None:
-        if self.late:
-            raise _OutOfTime
+        for step in found_files(self._request, self._settings):
+            if self.late:
+                raise _OutOfTime
+            if step.image is not None:
+                yield step.image
 
     def examined(self, image: Listed) -> _Examined:
         """The estimate of one image. Raises DataError if the run would refuse the image."""
@@ -176,19 +180,23 @@ class _Asked:
         needs = resolved.model_dump(mode="json") | {"image_shape": summary["shape"]}
         estimate = estimates.checked("deconvolve", needs, self._catalogue, self._owner, self._settings)
         exists = image.uploaded and self._exists(resolved)
-        if self._request.output is not None:
-            self._check_name(image, summary, resolved, self._request.output)
+        output, target = self._request.output, None
+        if output is not None:
+            target = self._named(image, summary, resolved, output)
+        if output is not None and not image.uploaded and "{product}" in (output.layout or "{product}"):
+            target = None  # the name has the id of the product, which depends on the bytes of the file
         return _Examined(
             exists,
             0 if exists else product_bytes(summary["shape"], resolved.error_draws),
             0.0 if exists else estimate["seconds"],
             estimate["memory_mib"],
+            None if target is None else archive_files.shown(target),
         )
 
-    def _check_name(
+    def _named(
         self, image: Listed, summary: dict[str, Any], resolved: ResolvedDeconvolve, output: Output
-    ) -> None:
-        """Raise DataError if the layout gives no name, or the name of another examined image."""
+    ) -> Path:
+        """The path of the product. Raises DataError if the layout gives no name, or the name of another examined image."""
         identity = product_identity(resolved)
         target = target_of(
             output,
@@ -206,6 +214,7 @@ class _Asked:
                 f"expected a name of its own for each product; got {archive_files.shown(target)}, which is also the name for "
                 f"{first}: use a layout with further fields, for example {{product}}",
             )
+        return target
 
     def _exists(self, resolved: ResolvedDeconvolve) -> bool:
         return self._catalogue.get(ProductRow, product_identity(resolved), self._owner) is not None

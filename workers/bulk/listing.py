@@ -1,12 +1,16 @@
-"""Lists the files that match the patterns of a bulk run, and adds them to the catalogue as its images."""
+"""Lists the files that match the patterns of a bulk run, and adds them to the catalogue as its images.
+
+A turn lists files in a thread of its own while it processes the images that are already listed. The transaction that
+adds images also stores how far the search has come, so that the next turn continues the search from there.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import islice
+import time
+from collections.abc import Callable
 
 from psfcore.errors import DataError
-from workers.bulk.matching import found_files
+from workers.bulk.matching import Place, found_files
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Listed
 from workers.catalogue.jobs import Lease
@@ -16,6 +20,9 @@ from workers.contract.phases import Fault, JobError
 from workers.tasks.context import Context
 
 LIST_AT_ONCE = 200
+ADD_EVERY_S = (
+    0.5  # images are added after this time even if they are fewer, so that the first ones are processed soon
+)
 NOT_LISTED = "not all files that the patterns match could be listed"  # a reason for Usage.no_room
 
 
@@ -24,19 +31,19 @@ def work_of(bulk: BulkRow) -> BulkWork:
     return BulkWork.model_validate(bulk.request)
 
 
-def list_files(context: Context, bulk: BulkRow, lease: Lease) -> bool:
-    """Add the files that the patterns of a bulk run match to its images. An error that concerns all files stops the run.
+def list_files(
+    context: Context, bulk: BulkRow, lease: Lease, added: Callable[[], None], stops: Callable[[], bool]
+) -> None:
+    """Add the files that the patterns of a bulk run match to its images, from the place where an earlier search ended.
 
-    Returns False if this turn has nothing more to do.
+    bulk: the row that ``Bulks.begin_listing`` returned. added: called after images were added. stops: whether the search
+    must end now; another turn then continues it. An error that concerns all files stops the run. Images that were added
+    before it stay.
     """
     bulks = context.catalogue.bulks
-    if not bulks.begin_listing(bulk.id, lease):
-        return False
     try:
-        listed = _listed(context, work_of(bulk))
-        while batch := list(islice(listed, LIST_AT_ONCE)):
-            if not bulks.add_listed(bulk.id, lease, batch, context.settings.quota_mib):
-                return False
+        if not _add_all(context, bulk, lease, added, stops):
+            return
         there = bulks.get(bulk.id)
         if there is not None and there.total == 0:
             raise DataError(
@@ -45,16 +52,48 @@ def list_files(context: Context, bulk: BulkRow, lease: Lease) -> bool:
             )
     except DataError as error:
         bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code=error.code, message=error.message))
-        return False
+        return
     except OverQuota as over:
         message = f"{over.usage.no_room(NOT_LISTED)}, then resume the run"
         bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code="quota-exceeded", message=message))
-        return False
-    return bulks.end_listing(bulk.id, lease)
+        return
+    bulks.end_listing(bulk.id, lease)
 
 
-def _listed(context: Context, request: BulkWork) -> Iterator[Listed]:
-    def tell(seen: int, looked_at: int) -> None:
-        context.report("listing", seen, max(looked_at, seen + 1))
+def _add_all(
+    context: Context, bulk: BulkRow, lease: Lease, added: Callable[[], None], stops: Callable[[], bool]
+) -> bool:
+    """Search and add images in batches. Returns whether the search came to its end. Raises DataError, OverQuota."""
+    bulks, request = context.catalogue.bulks, work_of(bulk)
+    place = None if bulk.listed_to is None else Place.of(bulk.listed_to)
+    several = place is not None and len(request.files) > 1
+    # A path that the catalogue cannot store is not known again: it may then fail twice, once for each pattern.
+    known = bulks.progress.sources(bulk.id) if several else frozenset[str]()
+    batch: list[Listed] = []
+    add_at = time.monotonic() + ADD_EVERY_S
 
-    return found_files(request, context.settings, tell)
+    def add() -> bool:
+        nonlocal add_at
+        images, add_at = tuple(batch), time.monotonic() + ADD_EVERY_S
+        batch.clear()
+        if place is None:
+            return True
+        if not bulks.add_listed(bulk.id, lease, images, place.stored(), context.settings.quota_mib):
+            return False
+        added()
+        return True
+
+    try:
+        for step in found_files(request, context.settings, place, known, bulk.total):
+            place = step.place
+            if step.image is not None:
+                batch.append(step.image)
+            stop = stops()
+            if (stop or len(batch) >= LIST_AT_ONCE or time.monotonic() >= add_at) and not add():
+                return False
+            if stop:
+                return False
+    except DataError:
+        add()
+        raise
+    return add()

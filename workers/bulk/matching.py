@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote, unquote_to_bytes
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
@@ -17,51 +20,71 @@ from workers.files import beneath
 from workers.settings import Settings
 
 MOST_IMAGES = 1_000_000
-TELL_EVERY_S = 1.0  # interval at which a search reports its progress, so that it can be stopped
 
 
-def found_files(request: BulkWork, settings: Settings, tell: Callable[[int, int], None]) -> Iterator[Listed]:
-    """The files that match the patterns of a request, each once even if several patterns match it.
+@dataclass(frozen=True)
+class Place:
+    """How far the search for the files of a run has come. pattern: number of the pattern. names: see ``archive.Looked``."""
 
-    A file that cannot be used comes with its error. tell(found, looked_at) is called for every file that was looked at, and
-    at least every ``TELL_EVERY_S`` while no file is found; if it raises an exception, the search ends. Raises DataError
-    "bad-path", "path-not-allowed", "unreadable-folder", "too-many-images".
+    pattern: int
+    names: archive_files.Place
+
+    def stored(self) -> dict[str, Any]:
+        """The place as JSON. Names may have bytes that are not UTF-8, which PostgreSQL refuses; they are written as %FF."""
+        return {"pattern": self.pattern, "names": [quote(os.fsencode(name), safe="") for name in self.names]}
+
+    @classmethod
+    def of(cls, stored: dict[str, Any]) -> Place:
+        """The place that was stored."""
+        names = tuple(os.fsdecode(unquote_to_bytes(name)) for name in stored["names"])
+        return cls(stored["pattern"], names)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the search, which looks at one folder or entry. image: the image that was found there, or None."""
+
+    place: Place
+    image: Listed | None = None
+
+
+def found_files(
+    request: BulkWork,
+    settings: Settings,
+    after: Place | None = None,
+    known: frozenset[str] = frozenset(),
+    listed: int = 0,
+) -> Iterator[Step]:
+    """Search the files that match the patterns of a request; each file is found once even if several patterns match it.
+
+    A file that cannot be used comes with its error. after: continue a search that ended after this place. known: paths
+    that it found, if there are several patterns. listed: number of images that are listed. Raises DataError "bad-path",
+    "path-not-allowed", "unreadable-folder", "too-many-images".
     """
     allowed = archive_files.roots(settings.bulk_roots)
     limits = FitsLimits(max_pixels=settings.max_pixels)
-    seen: set[Path] = set()
-    looked_at, told_at = 0, 0.0
-
-    def told() -> None:
-        nonlocal told_at
-        told_at = time.monotonic()
-        tell(len(seen), looked_at)
-
-    def tick() -> None:
-        """Report while a long search finds no files, so that the search can be stopped."""
-        if time.monotonic() - told_at >= TELL_EVERY_S:
-            told()
-
-    for files in request.files:
-        for found in archive_files.find(files.glob, allowed, tick):
-            looked_at += 1
-            told()
-            if found.path in seen:
-                continue
-            listed = _listed_one(allowed, limits, found, files.where)
-            if listed is None:
-                continue
-            seen.add(found.path)
-            if len(seen) > MOST_IMAGES:
+    seen = set(known)
+    first = 0 if after is None else after.pattern
+    for number, files in enumerate(request.files[first:], first):
+        names = after.names if after is not None and number == first else None
+        for looked in archive_files.find(files.glob, allowed, names):
+            path, image = str(looked.path), None
+            if (looked.matches or looked.error) and path not in seen:
+                image = _listed_one(allowed, limits, looked, files.where)
+            if image is not None:
+                listed += 1
+                if len(request.files) > 1:
+                    seen.add(path)
+            if listed > MOST_IMAGES:
                 raise DataError(
                     "too-many-images",
                     f"expected at most {MOST_IMAGES} images in a bulk run; the patterns match more: split the request",
                 )
-            yield listed
+            yield Step(Place(number, looked.place), image)
 
 
 def _listed_one(
-    allowed: Sequence[Path], limits: FitsLimits, found: archive_files.Found, where: dict[str, Condition]
+    allowed: Sequence[Path], limits: FitsLimits, found: archive_files.Looked, where: dict[str, Condition]
 ) -> Listed | None:
     """The found file as an image of the run, with an error if the file cannot be used; None if its header does not match."""
     failure = found.error

@@ -1,7 +1,8 @@
 """The task ``bulk``: one turn of a bulk run. A turn deconvolves images one after the other.
 
 While one image is computed, a second thread reads the next image and a third thread writes the product of the previous
-one. Only the main thread computes, with ``HELIOPSF_WORKER_THREADS`` threads.
+one. Only the main thread computes, with ``HELIOPSF_WORKER_THREADS`` threads. While files are being listed, one turn of
+the run lists them in a fourth thread, and all turns process the images that are already listed.
 
 A turn ends when no image is left, or when other jobs wait. A product that already exists is not made again, even if
 another job made it. An image that cannot be deconvolved is recorded as failed, with the reason; the run continues.
@@ -23,7 +24,8 @@ from workers.bulk.image import Outcome, Ready, compute_one, done_before, read_on
 from workers.bulk.listing import list_files, work_of
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Taken
-from workers.contract.bulk import BulkPhase, BulkWork
+from workers.catalogue.jobs import Lease
+from workers.contract.bulk import AT_WORK, BulkPhase, BulkWork
 from workers.contract.phases import Fault, JobError
 from workers.tasks.context import Context, TurnOver
 from workers.tasks.data.product import Made
@@ -31,6 +33,7 @@ from workers.tasks.stage_timer import STARTING
 
 TELL_EVERY_S = 1.0  # interval at which a turn reports its progress and checks whether it must stop
 BETWEEN = "between images"  # the stage between two images: the worker checks whether the run continues
+LISTING = "listing files"  # the stage of a turn that waits for images
 TURN_S = (
     60.0  # a turn ends after this time, so that other bulk runs get turns; an attempt may take much longer
 )
@@ -41,18 +44,13 @@ log = logging.getLogger(__name__)
 def bulk_turn(context: Context, parameters: Mapping[str, Any]) -> str:
     """Deconvolve images of a bulk run; returns the id of the run. Raises ``TurnOver`` if images are left but the turn must end."""
     bulk_id: str = parameters["bulk_id"]
-    assert context.lease is not None
-    while True:
-        bulk = context.catalogue.bulks.get(bulk_id)
-        if bulk is None or (bulk.phase == BulkPhase.LISTING and not list_files(context, bulk, context.lease)):
-            return bulk_id
-        if bulk.phase != BulkPhase.LISTING:
-            break
-    turn = _Turn(context, bulk)
-    try:
-        turn.run()
-    finally:
-        turn.close()
+    bulk = context.catalogue.bulks.get(bulk_id)
+    if bulk is not None and bulk.phase in AT_WORK:
+        turn = _Turn(context, bulk)
+        try:
+            turn.run()
+        finally:
+            turn.close()
     return bulk_id
 
 
@@ -76,6 +74,49 @@ class _Stopped(Exception):
     """The turn ends, so the image that was read ahead is given back."""
 
 
+class _Listing:
+    """The thread of a turn that lists files. lease: the lease of the turn.
+
+    The thread ends when all files are listed, and when the run or the turn stops.
+    """
+
+    def __init__(self, context: Context, bulk: BulkRow, lease: Lease, stops: threading.Event) -> None:
+        self._context, self._bulk, self._lease, self._stops = context, bulk, lease, stops
+        self._pool = ThreadPoolExecutor(1, "bulk-lister")
+        self._running: Future[None] | None = None
+        self._news = threading.Event()
+
+    def begin(self) -> bool:
+        """List files, if the run is LISTING and no other turn lists them. Returns whether this turn lists files now.
+
+        Raises the exception with which the thread ended.
+        """
+        if self._running is not None and not self._running.done():
+            return True
+        if self._running is not None:
+            self._running.result()
+        begun = self._context.catalogue.bulks.begin_listing(self._bulk.id, self._lease)
+        if begun is None:
+            return False
+        run = contextvars.copy_context().run
+        self._running = self._pool.submit(
+            run, list_files, self._context, begun, self._lease, self._news.set, self._stops.is_set
+        )
+        self._running.add_done_callback(lambda _: self._news.set())
+        return True
+
+    def wait(self) -> None:
+        """Wait until images were added or the thread ended, but for ``TELL_EVERY_S`` at most."""
+        self._news.wait(TELL_EVERY_S or 0.1)
+        self._news.clear()
+
+    def close(self) -> None:
+        """Wait for the thread. Raises the exception with which it ended."""
+        self._pool.shutdown()
+        if self._running is not None:
+            self._running.result()
+
+
 class _Turn:
     """The images of one turn: one is read, one is computed and one is written at the same time.
 
@@ -94,22 +135,44 @@ class _Turn:
         self._writing: _Writing | None = None
         self._made: set[str] = set()
         self._ends_at = time.monotonic() + TURN_S
+        assert context.lease is not None
+        self._listing = _Listing(self._beside, bulk, context.lease, self._stop)
 
     def run(self) -> None:
         """Process images until no image is left. Raises ``TurnOver`` if the turn must end before."""
         context = self._context
+        if self._bulk.phase == BulkPhase.LISTING:
+            self._listing.begin()
         while True:
             bulk = context.catalogue.bulks.get(self._bulk.id)
-            if bulk is None or bulk.phase != BulkPhase.RUNNING or _stopped_for_quota(context, bulk):
+            if bulk is None or bulk.phase not in AT_WORK or _stopped_for_quota(context, bulk):
                 return
             self._bulk = bulk
-            reading, self._ahead = self._ahead or self._read(), None
+            ahead, self._ahead = self._ahead, None
+            reading = ahead or self._read()
             taken = reading.taken.result()
-            if taken is None:
+            if taken is not None:
+                self._do(taken, reading.ready)
+            elif ahead is not None:
+                continue  # images may have been listed after this turn asked for one
+            elif bulk.phase == BulkPhase.LISTING and self._listing.begin():
+                self._wait_for_images()
+            elif bulk.phase == BulkPhase.RUNNING or not self._is_running():
                 return
-            self._do(taken, reading.ready)
             if time.monotonic() > self._ends_at or context.others_wait():
                 raise TurnOver
+
+    def _wait_for_images(self) -> None:
+        """Wait a moment until further images are listed. This wait does not count towards the time limit of a job."""
+        self._finish_writing()
+        error = self._context.guarded(lambda: self._context.report(LISTING, 0, 1))
+        assert error is None, error
+        self._listing.wait()
+
+    def _is_running(self) -> bool:
+        """Whether the listing ended a moment ago, so that images may have been added after this turn asked for one."""
+        bulk = self._context.catalogue.bulks.get(self._bulk.id)
+        return bulk is not None and bulk.phase == BulkPhase.RUNNING
 
     def close(self) -> None:
         """Give back the image that was read ahead, and wait until the last product is written."""
@@ -121,6 +184,7 @@ class _Turn:
         finally:
             self._reader.shutdown()
             self._writer.shutdown()
+            self._listing.close()
 
     def _give_back(self, reading: _Reading) -> None:
         error = reading.taken.exception()

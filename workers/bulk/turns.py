@@ -49,9 +49,10 @@ def cancel_turns(catalogue: Catalogue, bulk_id: str) -> None:
 
 
 def _wanted(bulk: BulkRow, processes: int) -> int:
+    left = bulk.total - bulk.done - bulk.failed
     if bulk.phase == BulkPhase.LISTING:
-        return 1
-    return min(bulk.total - bulk.done - bulk.failed, max(1, processes), MOST_TURNS)
+        left = max(1, left)  # one turn lists files, even if it has no image to process meanwhile
+    return min(left, max(1, processes), MOST_TURNS)
 
 
 def _forget(catalogue: Catalogue, turn: JobRow) -> None:

@@ -97,6 +97,14 @@ class BulkProgress:
         with self._database.reading() as session:
             return session.scalars(query.order_by(BulkItemRow.position).limit(limit)).all()
 
+    def sources(self, bulk_id: str) -> frozenset[str]:
+        """The paths of all files of a run."""
+        query = select(BulkItemRow.source).where(
+            BulkItemRow.bulk_id == bulk_id, BulkItemRow.uploaded.is_(False)
+        )
+        with self._database.reading() as session:
+            return frozenset(session.scalars(query.execution_options(yield_per=BATCH)))
+
     def reasons(self, bulk_id: str) -> list[Reason]:
         """The errors of the first ``MOST_EXPLAINED`` failed images, grouped by error code; the most frequent code
         first."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
-from sqlalchemy import ColumnElement, Delete, Update, delete, func, insert, select, update
+from sqlalchemy import ColumnElement, Delete, Update, case, delete, func, insert, null, select, update
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
@@ -108,10 +108,14 @@ class Bulks:
         return self._set(bulk_id, AT_WORK, phase=BulkPhase.PAUSED)
 
     def resume(self, bulk_id: str) -> bool:
-        """PAUSED, ERROR -> RUNNING, or LISTING if not all files of the run are listed."""
+        """PAUSED, ERROR -> RUNNING, or LISTING if not all files of the run are listed.
+
+        The listing continues where it ended. If it has found nothing, it starts again.
+        """
         now = {"running_since": time.time(), "error": None}
+        listed_to = case((BulkRow.total > 0, BulkRow.listed_to), else_=null())
         return self._set(bulk_id, STOPPED, BulkRow.listed, phase=BulkPhase.RUNNING, **now) or self._set(
-            bulk_id, STOPPED, BulkRow.listed.is_(False), phase=BulkPhase.LISTING, **now
+            bulk_id, STOPPED, BulkRow.listed.is_(False), phase=BulkPhase.LISTING, listed_to=listed_to, **now
         )
 
     def cancel(self, bulk_id: str) -> bool:
@@ -218,34 +222,49 @@ class Bulks:
 
     # Listing ------------------------------------------------------------------------------------------
 
-    def begin_listing(self, bulk_id: str, lease: Lease) -> bool:
-        """Begin to list the files under this lease. Files that a lost worker listed are deleted first.
+    def begin_listing(self, bulk_id: str, lease: Lease) -> BulkRow | None:
+        """Begin to list the files under this lease, or continue after the place up to which they are listed.
 
-        Returns False if the lease is lost or the run is not LISTING.
+        Returns the run, or None if the lease is lost, the run is not LISTING, or another worker lists the files now.
         """
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
             if bulk is None or bulk.phase != BulkPhase.LISTING or not _good(session, lease):
-                return False
-            files = delete(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.uploaded.is_(False))
-            bulk.lister, bulk.failed = lease.token, 0
-            removed = _changed(session, files)
-            bulk.total -= removed
-            add_bytes(session, bulk.owner, -ROW_BYTES * removed)
-            return True
+                return None
+            if bulk.lister not in (None, lease.token) and _is_lease(session, bulk.lister):
+                return None
+            bulk.lister = lease.token
+            if bulk.listed_to is None:
+                self._forget_files(session, bulk)
+            return bulk
+
+    def _forget_files(self, session: Session, bulk: BulkRow) -> None:
+        """Remove the files that a version without ``listed_to`` has listed. None of them was taken before all were listed."""
+        files = delete(BulkItemRow).where(BulkItemRow.bulk_id == bulk.id, BulkItemRow.uploaded.is_(False))
+        told = files.returning(BulkItemRow.state).execution_options(synchronize_session=False)
+        states = session.scalars(told).all()
+        bulk.total -= len(states)
+        bulk.failed -= sum(state == ItemState.FAILED for state in states)
+        add_bytes(session, bulk.owner, -ROW_BYTES * len(states))
 
     def add_listed(
-        self, bulk_id: str, lease: Lease, images: Sequence[Listed], quota_mib: int | None = None
+        self,
+        bulk_id: str,
+        lease: Lease,
+        images: Sequence[Listed],
+        listed_to: Mapping[str, Any],
+        quota_mib: int | None = None,
     ) -> bool:
         """Add images to a run. Returns False if another lease now lists the files, or if the run is not LISTING.
 
-        quota_mib: as for ``create``.
+        listed_to: the place up to which the files are then listed. quota_mib: as for ``create``.
         """
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
             if bulk is None or bulk.phase != BulkPhase.LISTING or bulk.lister != lease.token:
                 return False
             bulk.failed += sum(image.error is not None for image in images)
+            bulk.listed_to = dict(listed_to)
             added = _add(session, bulk_id, bulk.total, images)
             bulk.total += added
             add_held(session, bulk.owner, ROW_BYTES * added, quota_mib)
@@ -268,13 +287,13 @@ class Bulks:
     def take(self, bulk_id: str, lease: Lease, max_attempts: int) -> Taken | None:
         """Take an image whose worker was lost, or else the next waiting image.
 
-        Returns None if no image is left, the run is not RUNNING, or the lease is lost. An image that was taken
-        ``max_attempts`` times becomes a failed image.
+        Returns None if no image is left, the run is not LISTING or RUNNING, or the lease is lost. An image that was
+        taken ``max_attempts`` times becomes a failed image.
         """
         while True:
             with self._database.writing.begin() as session:
-                running = select(BulkRow.phase).where(BulkRow.id == bulk_id)
-                if session.scalar(running) != BulkPhase.RUNNING or not _good(session, lease):
+                phase = session.scalar(select(BulkRow.phase).where(BulkRow.id == bulk_id))
+                if phase not in AT_WORK or not _good(session, lease):
                     return None
                 item = session.scalars(_left(bulk_id)).first() or session.scalars(_waiting(bulk_id)).first()
                 if item is None:
@@ -379,6 +398,12 @@ def _good(session: Session, lease: Lease) -> bool:
         JobRow.id == lease.job_id, JobRow.lease == lease.token, JobRow.phase == Phase.EXECUTING
     )
     return session.scalar(held) is not None
+
+
+def _is_lease(session: Session, token: str | None) -> bool:
+    """Whether a job holds the lease with this token."""
+    held = select(JobRow.id).where(JobRow.lease == token, JobRow.phase == Phase.EXECUTING)
+    return session.scalars(held.limit(1)).first() is not None
 
 
 def _holding(taken: Taken) -> Iterator[ColumnElement[bool]]:

@@ -298,18 +298,27 @@ class Jobs:
             taken = session.execute(back.returning(JobRow.id, JobRow.phase))
             return [job_id for job_id, phase in taken if phase == Phase.QUEUED]
 
-    def unsubmitted(self, resubmit_s: float, limit: int = 1000) -> list[Waiting]:
+    def nobody_works(self, for_s: float) -> bool:
+        """Whether no job has started, or has sent a heartbeat, in the last ``for_s`` seconds."""
+        recent = JobRow.heartbeat_at > self._database.now - for_s
+        query = select(JobRow.id).where(JobRow.phase.in_([*Phase]), recent)
+        with self._database.reading() as session:
+            return session.scalars(query.limit(1)).first() is None
+
+    def unsubmitted(self, resubmit_s: float, limit: int = 1000, *, idle: bool = False) -> list[Waiting]:
         """Queued jobs that the broker never received or seems to have lost; sorted by queue, then oldest first.
 
         A job seems lost when it has waited for ``resubmit_s`` since its submission. This waiting time doubles with each
-        submission, so that the jobs of a long queue are not submitted again and again.
+        submission, so that the jobs of a long queue are not submitted again and again. idle: there are workers, and they
+        do nothing; then the waiting time does not double, because a message that the broker still had would be taken.
         """
         waits = {number: resubmit_s * 2 ** (number - 1) for number in range(2, 9)}
-        wait_s = case(
+        growing_s = case(
             (JobRow.submissions <= 1, resubmit_s),
             *((JobRow.submissions == number, wait) for number, wait in waits.items()),
             else_=resubmit_s * 2**8,
         )
+        wait_s = literal(resubmit_s) if idle else growing_s
         now = self._database.now
         # If a submission lies in the future, the database's clock was set back after it.
         ahead = JobRow.submitted_at > now + resubmit_s

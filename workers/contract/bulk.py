@@ -34,8 +34,8 @@ TEXT = r"^[^\x00-\x1f\x7f]+$"
 class BulkPhase(StrEnum):
     """Phases of a bulk run."""
 
-    LISTING = "LISTING"  # the files are being listed
-    RUNNING = "RUNNING"
+    LISTING = "LISTING"  # files are being listed, and images that are listed are processed
+    RUNNING = "RUNNING"  # all files are listed
     PAUSED = "PAUSED"
     COMPLETED = "COMPLETED"  # every image is done or failed
     CANCELLED = "CANCELLED"

@@ -67,6 +67,8 @@ def product_identity(request: ResolvedDeconvolve) -> str:
     excluded = {"psf_recipe", "psf_interpolation", "context_id", "again"} | (
         {"picked_for"} if request.picked_for is None else set()
     )
+    if request.region is None:
+        excluded |= {"region", "region_error"}
     if not request.other_channel:
         excluded.add("other_channel")
     hashed = request.model_dump(mode="json", exclude=excluded)

@@ -11,6 +11,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from psfcore.built.recipe import BUILD_VERSION
+from psfcore.deconvolve.box import BOX, LARGEST_ERROR, region_without_discrepancy, region_without_errors
 from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise_figures import NoiseFigures
@@ -134,6 +135,28 @@ class Deconvolve(Treatment):
         False, description="also draw the difference, the ratio and the histogram of the changes"
     )
 
+    region: str | None = Field(
+        None,
+        pattern=BOX,
+        description="deconvolve only this box of the image, `x0:x1,y0:y1` in pixels counted from 0 (x0 <= x < x1); null: the whole "
+        "image. Not with `error_draws` or `stop` = `discrepancy`",
+    )
+    region_error: float = Field(
+        LARGEST_ERROR,
+        gt=0,
+        le=1,
+        description="largest bound of the difference between the region and the same pixels of the whole deconvolved image, as a share "
+        "of the mean light of the region; the rim around the region is made as wide as this needs",
+    )
+
+    @model_validator(mode="after")
+    def _whole_for_errors(self) -> Deconvolve:
+        if self.region is not None and self.error_draws:
+            raise ValueError(region_without_errors(self.error_draws).message)
+        if self.region is not None and self.method.stop == "discrepancy":
+            raise ValueError(region_without_discrepancy().message)
+        return self
+
     @model_validator(mode="after")
     def _one_choice(self) -> Deconvolve:
         if self.psf_id is not None and self.context is not None:
@@ -214,7 +237,7 @@ class GapDiagnose(Parameters):
     """Diagnose the gap between an uploaded transit and the model that was fitted to it. The report says how large the gap is,
     where in the data it appears, and which effects explain it."""
 
-    algorithm_version: ClassVar[int] = 9
+    algorithm_version: ClassVar[int] = 10
     transit_id: TransitId
     psf_id: Identity | None = Field(
         None,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from psfcore.deconvolve.box import LARGEST_ERROR
 from psfcore.noise_figures import NoiseFigures
 from workers.contract.methods import Method, Parameters
 from workers.contract.requests import (
@@ -36,6 +37,8 @@ class ResolvedDeconvolve(Parameters):
     saturation_dn: float | None = None
     error_draws: int = 0
     changes_picture: bool = False
+    region: str | None = None
+    region_error: float = LARGEST_ERROR
     other_channel: bool = False
     again: bool = False
 

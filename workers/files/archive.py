@@ -11,7 +11,7 @@ import errno
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
@@ -26,13 +26,21 @@ _MAGIC = re.compile(r"[*?\[]")
 _FITS_ENDING = re.compile(r"\.(fits|fit|fts)(\.gz)?$", re.IGNORECASE)
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._-]+")
 _CHUNK = 2**20
+Place = tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Found:
-    """A file that a pattern matches; or an entry of a folder that could not be inspected, together with the error."""
+class Looked:
+    """A folder or an entry of a folder at which a search looked.
+
+    place: the names of the folders below the fixed part of the pattern, and then the name of the entry; for a folder
+    that is now read, the last name is empty. matches: whether the entry is a file that the pattern matches. error: the
+    error if the entry could not be inspected.
+    """
 
     path: Path
+    place: Place
+    matches: bool = False
     error: DataError | None = None
 
 
@@ -66,16 +74,15 @@ def check_glob(glob: str, allowed: Sequence[Path]) -> None:
     check_under(folder, allowed)
 
 
-def find(glob: str, allowed: Sequence[Path], tick: Callable[[], None] = lambda: None) -> Iterator[Found]:
-    """Find the files that a pattern matches. Each file is yielded once.
+def find(glob: str, allowed: Sequence[Path], after: Place | None = None) -> Iterator[Looked]:
+    """Find the files that a pattern matches, and yield every folder and entry at which the search looks, each once.
 
-    The files of a folder are sorted by name; the files of its subfolders follow. Links that lead out of the allowed
-    folders are not followed. A matching entry that cannot be inspected is yielded with the error. ``tick`` is called for
-    every folder and entry; if it raises an exception, the search ends.
-    Raises DataError "bad-path", "path-not-allowed", "unreadable-folder".
+    The entries of a folder are sorted by name; those of its subfolders follow. Links that lead out of the allowed
+    folders are not followed. after: continue a search that ended after this place; what was added or removed before it
+    since then is not noticed. Raises DataError "bad-path", "path-not-allowed", "unreadable-folder".
     """
     folder, parts = _split(glob)
-    return _walk(check_under(folder, allowed), parts, allowed, tick)
+    return _walk(check_under(folder, allowed), parts, allowed, after)
 
 
 def matches(path: Path, where: dict[str, Condition], limits: FitsLimits) -> bool:
@@ -139,52 +146,65 @@ def _split(glob: str) -> tuple[Path, tuple[str, ...]]:
 
 
 def _walk(
-    top: Path, parts: tuple[str, ...], allowed: Sequence[Path], tick: Callable[[], None]
-) -> Iterator[Found]:
+    top: Path, parts: tuple[str, ...], allowed: Sequence[Path], after: Place | None
+) -> Iterator[Looked]:
     """Read each folder only once, and compare its entries with all parts of the pattern that can match at this depth.
 
     Several ** in a pattern therefore cost no additional time.
     """
-    left = [(top, frozenset({0}))]
+    left = [(top, Place(), frozenset({0}))]
     while left:
-        folder, places = left.pop()
-        tick()
-        places |= {place + 1 for place in places if parts[place] == ANY_FOLDERS}  # ** also matches no folder
-        below: list[tuple[Path, frozenset[int]]] = []
+        folder, names, indices = left.pop()
+        if _is_after((*names, ""), after):
+            yield Looked(folder, (*names, ""))
+        indices |= {
+            index + 1 for index in indices if parts[index] == ANY_FOLDERS
+        }  # ** also matches no folder
+        below: list[tuple[Path, Place, frozenset[int]]] = []
         for entry in _entries(folder):
-            tick()
-            path = Path(entry.path)
+            path, place = Path(entry.path), (*names, entry.name)
+            meant, further, error = False, frozenset[int](), None
             try:
-                meant, further = _meant(entry, parts, places, allowed)
-            except OSError as error:
+                meant, further = _meant(entry, parts, indices, allowed)
+            except OSError as failed:
                 message = (
-                    f"expected a file or folder that can be inspected; the system says: {reason_of(error)}"
+                    f"expected a file or folder that can be inspected; the system says: {reason_of(failed)}"
                 )
-                yield Found(path, DataError("unreadable-file", message))
-                continue
-            if meant:
-                yield Found(path)
-            if further:
-                below.append((path, further))
+                error = DataError("unreadable-file", message)
+            if _is_after(place, after):
+                yield Looked(path, place, meant, error)
+            if further and _leads_after(place, after):
+                below.append((path, place, further))
         left += reversed(below)
 
 
+def _is_after(place: Place, after: Place | None) -> bool:
+    """Whether a search looks at a place later than at ``after``: folders come in the order of their names, and the
+    entries of a folder come before those of its subfolders."""
+    return after is None or (place[:-1], place[-1]) > (after[:-1], after[-1])
+
+
+def _leads_after(folder: Place, after: Place | None) -> bool:
+    """Whether the places in a folder and below it are after ``after``, or some of them are."""
+    return after is None or folder >= after[:-1] or folder == after[: len(folder)]
+
+
 def _meant(
-    entry: os.DirEntry[str], parts: tuple[str, ...], places: frozenset[int], allowed: Sequence[Path]
+    entry: os.DirEntry[str], parts: tuple[str, ...], indices: frozenset[int], allowed: Sequence[Path]
 ) -> tuple[bool, frozenset[int]]:
     """Whether an entry is a matching file; and the parts of the pattern that may match entries inside it.
 
     The second result is empty if the entry is not a folder. Raises OSError if the entry cannot be inspected.
     """
-    further = {place for place in places if parts[place] == ANY_FOLDERS}
+    further = {index for index in indices if parts[index] == ANY_FOLDERS}
     if further and (entry.name.startswith(".") or not entry.is_dir(follow_symlinks=False)):
         further.clear()
-    named = {n for n in places if parts[n] != ANY_FOLDERS and _named(entry.name, parts[n])}
+    named = {n for n in indices if parts[n] != ANY_FOLDERS and _named(entry.name, parts[n])}
     if not named or not any(_resolved(Path(entry.path)).is_relative_to(root) for root in allowed):
         return False, frozenset(further)
     last = len(parts) - 1
     if named != {last} and entry.is_dir():
-        further |= {place + 1 for place in named - {last}}
+        further |= {index + 1 for index in named - {last}}
     return last in named and entry.is_file(), frozenset(further)
 
 

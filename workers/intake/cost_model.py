@@ -33,7 +33,7 @@ class Linear(_Frozen):
 
 
 class Deconvolution(_Frozen):
-    """Time and memory of a deconvolution. The plane is the image with its margins.
+    """Time of a deconvolution. The plane is the image with its margins. `psfcore.deconvolve.memory` has the memory.
 
     step_ns: for each method, the time of one step for one pixel of the plane, ns.
     """
@@ -41,16 +41,9 @@ class Deconvolution(_Frozen):
     base_s: float
     image_ns: float
     step_ns: dict[str, float]
-    margin_share: dict[
-        str, float
-    ]  # default margin divided by half the width of the PSF, measured with the PSF of HRI_EUV
     psf_draws: (
         int  # number of deconvolutions with other PSFs, for the errors of a fitted PSF: two per parameter
     )
-    plane_bytes: float
-    image_bytes: float
-    errors_bytes: float  # further memory per pixel of the image, if errors are estimated
-    psf_bytes: float
 
 
 class Build(_Frozen):

@@ -20,6 +20,8 @@ from statistics import median
 from typing import Any
 from weakref import WeakKeyDictionary
 
+from psfcore.deconvolve.box import EXPECTED_RIM_PX, Box
+from psfcore.deconvolve.memory import MIB, Asked, deconvolution_bytes, of_method
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import workload
@@ -31,7 +33,10 @@ from workers.contract.requests import PsfBuild
 from workers.intake.cost_model import COSTS
 from workers.settings import Settings
 
-MIB = 2**20
+ASSESSED_BYTES = (
+    100.0  # for each pixel of an image: to measure the changes, and to draw the pictures of a product
+)
+READ_BYTES = 25.0  # for each pixel of the image beyond the region that is deconvolved
 BYTES_A_PIXEL = 4.0  # assumed for the files of a transit, because only their length is known here
 
 FEWEST_JOBS, MOST_JOBS = (
@@ -138,32 +143,28 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
         recipe = parameters["psf_recipe"]
         built_s, built_mib = _build(recipe, _mask_px(recipe, catalogue, owner))
         psf_shape = (recipe["size"], recipe["size"])
-    method = parameters["method"]
-    margin = 2 * _margin_px(method, (ny, nx), max(psf_shape))
-    plane = (ny + margin) * (nx + margin)
-    draws = parameters["error_draws"]
+    method, draws = parameters["method"], parameters["error_draws"]
+    whole_px = ny * nx
+    if parameters.get("region") is not None:
+        ny, nx = Box.parse(parameters["region"]).wider(EXPECTED_RIM_PX, (ny, nx)).shape
+    asked = Asked(
+        method["name"],
+        (ny, nx),
+        (psf_shape[0], psf_shape[1]),
+        edges=method["edges"],
+        margin_px=method["margin_px"],
+        draws=draws,
+    )
+    plane = math.prod(asked.plane)
     interpolated = parameters.get("psf_interpolation") is not None
     fitted = interpolated or (psf is not None and "fit" in psf.details)
     runs = 1 + draws + (cost.psf_draws if draws and fitted else 0)
     cpu_s = built_s + cost.base_s + cost.image_ns * 1e-9 * ny * nx
-    cpu_s += runs * method["steps"] * _of_method(cost.step_ns, method) * 1e-9 * plane
-    image_bytes = cost.image_bytes + (cost.errors_bytes if draws else 0.0)
-    working = cost.plane_bytes * plane + image_bytes * ny * nx + cost.psf_bytes * math.prod(psf_shape)
-    return cpu_s, max(built_mib, working / MIB)
-
-
-def _margin_px(method: Mapping[str, Any], field: tuple[int, int], psf_px: int) -> int:
-    if method["edges"] == "zero":
-        return 0
-    if method["margin_px"] is not None:
-        return int(method["margin_px"])
-    share = _of_method(COSTS.kinds.deconvolve.margin_share, method)
-    return int(min(share * psf_px / 2, min(field) / 2))
-
-
-def _of_method(figures: Mapping[str, float], method: Mapping[str, Any]) -> float:
-    """The figure of a method; the largest figure of all methods if this method has not been measured yet."""
-    return figures.get(method["name"], max(figures.values()))
+    cpu_s += runs * method["steps"] * of_method(cost.step_ns, method["name"]) * 1e-9 * plane
+    return cpu_s, max(
+        built_mib,
+        (deconvolution_bytes(asked) + ASSESSED_BYTES * ny * nx + READ_BYTES * (whole_px - ny * nx)) / MIB,
+    )
 
 
 def _mask_px(recipe: Mapping[str, Any], catalogue: Catalogue, owner: str) -> int:

@@ -6,6 +6,7 @@ import uuid
 from dataclasses import dataclass
 from typing import Any
 
+from psfcore.deconvolve.box import Box
 from psfcore.errors import DataError
 from psfcore.fits.header import IMAGE, check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
@@ -145,6 +146,8 @@ def resolved_deconvolution(
     # The summaries of images that were uploaded by earlier versions lack "content"; the worker checks the header itself.
     if not wanted.again:
         check_not_deconvolved(header.get("content", IMAGE))
+    if wanted.region is not None:
+        Box.parse(wanted.region).checked((header["shape"][0], header["shape"][1]))
     resolved = ResolvedDeconvolve(
         **_psf_for(catalogue, header, wanted, owner), **wanted.model_dump(exclude={"psf_id", "context"})
     )

@@ -9,7 +9,9 @@ from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.region import BoxWork, box_work
 from psfcore.deconvolve.whole import Work, input_warnings
 from psfcore.errors import DataError
 from psfcore.fits.gain import no_noise_figures
@@ -171,11 +173,14 @@ def make(
     """Deconvolve an image and measure the changes. ``preview``: also draw the preview picture."""
     inputs = Inputs(context, request, psf_row, image)
     asked = _Asked(inputs)
-    work = asked.work
+    work: Work | BoxWork = asked.work
     warnings = asked.warnings()
-    if request.error_draws and work.conditions.noise is None:
+    if request.error_draws and asked.work.conditions.noise is None:
         raise no_noise_figures()
     context.times.begin("deconvolving")
+    if request.region is not None:
+        work = box_work(asked.work, Box.parse(request.region), largest_error=request.region_error)
+        inputs = replace(inputs, image=work.image)
     result = work.run(progress=asked.progress("deconvolving"))
     errors = work.errors(result, request.error_draws, possible_psfs=asked.possible_psfs, begin=asked.begin)
     context.report("saving", 0, 1)

@@ -58,7 +58,7 @@ def deconvolve(
     ended = problem.solve(iteration, steps=steps, stop=stop)
     return solution(
         problem,
-        problem.engine.from_lanes(iteration.x),
+        iteration.x,
         ended,
         method=METHOD,
         last_change=iteration.change,

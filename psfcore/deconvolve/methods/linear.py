@@ -57,7 +57,7 @@ def deconvolve(
     g = np.conj(sample.values) / np.maximum(np.abs(sample.values) ** 2, LEAST_TRANSFER**2)
     return solution(
         problem,
-        problem.engine.from_lanes(iteration.x),
+        iteration.x,
         ended,
         method=METHOD,
         last_change=iteration.change,

@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import Any
 
 import psfcore.deconvolve.methods
+from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.errors import DataError
 
@@ -37,6 +38,19 @@ def method_names() -> list[str]:
 def may_be_negative(name: str) -> bool:
     """Whether results of a method may be negative: its module then has the constant MAY_BE_NEGATIVE = True."""
     return getattr(_module(name.replace("-", "_")), "MAY_BE_NEGATIVE", False)
+
+
+def keeps_flux(name: str) -> bool:
+    """Whether the steps of a method conserve the flux of the plane, and so compensate for light that leaves it: its
+    module then has the constant KEEPS_FLUX = True."""
+    return getattr(_module(name.replace("-", "_")), "KEEPS_FLUX", False)
+
+
+def defaults_of(name: str) -> tuple[Edges, float]:
+    """The constants EDGES and MARGIN_SHARE of a method. Raises DataError "unknown-method"."""
+    method_named(name)
+    module = _module(name.replace("-", "_"))
+    return module.EDGES, module.MARGIN_SHARE
 
 
 def _files() -> list[str]:

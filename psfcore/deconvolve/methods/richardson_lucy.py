@@ -46,6 +46,7 @@ from psfcore.psf import Psf
 METHOD = "richardson-lucy"
 EDGES: Edges = "symmetric"
 MARGIN_SHARE = 0.05
+KEEPS_FLUX = True
 _SUMS: Any = {"contract", "reassoc"}
 _SUMMED = 16 * LANES
 
@@ -65,7 +66,7 @@ def deconvolve(
     ended = problem.solve(iteration, steps=steps, stop=stop)
     return solution(
         problem,
-        problem.engine.from_lanes(iteration.x),
+        iteration.x,
         ended,
         method=METHOD,
         last_change=iteration.change,
@@ -86,11 +87,13 @@ class _RichardsonLucy(Iteration):
 
     def __init__(self, problem: Problem) -> None:
         estimate = light_above_floor(problem)
+        brightest = float(estimate.max())
         self._engine = problem.engine
-        self._ratio = Ratio(problem, agreed(problem), float(estimate.max()))
+        self.x = problem.engine.to_lanes(estimate)
+        del estimate  # makes room for the planes of the ratio
+        self._ratio = Ratio(problem, agreed(problem), brightest)
         self._dark = self._ratio.floor * np.float32(DARK_OF_FLOOR)
         self._moved, self._total = np.zeros((2, problem.engine.row_blocks))
-        self.x = problem.engine.to_lanes(estimate)
         self._engine.rows_forward(self.x)
 
     def measure(self) -> None:
@@ -109,11 +112,11 @@ class _RichardsonLucy(Iteration):
         return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
 
 
-def agreed(problem: Problem) -> Single:
+def agreed(problem: Problem) -> Single | float:
     """Compute 1 / s of Eq. (1) on the domain. If all pixels are trusted, 1 / s is not needed, and the result is 1."""
-    ones = np.ones(problem.domain.shape, dtype=np.float32)
     if problem.domain.trusted.all():
-        return ones
+        return 1.0
+    ones = np.ones(problem.domain.shape, dtype=np.float32)
     return np.asarray(1 / np.maximum(problem.engine.adjoint(ones), np.finfo(np.float32).eps))
 
 

@@ -33,6 +33,7 @@ from psfcore.psf import Psf
 METHOD = "richardson-lucy-accelerated"
 EDGES: Edges = "symmetric"
 MARGIN_SHARE = 0.05
+KEEPS_FLUX = True
 # Biggs & Andrews require an acceleration below 1.
 _MOST_ACCELERATION = 0.999
 
@@ -58,7 +59,7 @@ def deconvolve(
     ended = problem.solve(iteration, steps=steps, stop=stop)
     return solution(
         problem,
-        problem.engine.from_lanes(iteration.prediction),
+        iteration.prediction,
         ended,
         method=METHOD,
         last_change=iteration.change,

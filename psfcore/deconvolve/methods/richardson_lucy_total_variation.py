@@ -40,6 +40,7 @@ from psfcore.psf import Psf
 METHOD = "richardson-lucy-total-variation"
 EDGES: Edges = "symmetric"
 MARGIN_SHARE = 0.05
+KEEPS_FLUX = True
 SOFTENING = 0.1
 # One step multiplies a small difference by 1 - 8 k / SOFTENING. The steps converge if 8 k / SOFTENING is below 2.
 MOST_SMOOTHING = 0.02

@@ -128,14 +128,20 @@ def _pixels_of(points: Points, header: fits.Header) -> Points:
     return found
 
 
-def _cut(hdu: Any, columns: slice, rows: slice) -> Any:
-    header = hdu.header.copy()
+def moved_header(whole: fits.Header, columns: slice, rows: slice) -> fits.Header:
+    """The header of these columns and rows of an image. Their pixels keep their places on the sky."""
+    header = whole.copy()
     for key in _DROPPED:
         header.remove(key, ignore_missing=True, remove_all=True)
     for card in list(header.cards):
         moved = _MOVED.fullmatch(card.keyword)
         if moved is not None and isinstance(card.value, (int, float)):
             header[card.keyword] = card.value - (columns if moved[1] == "1" else rows).start
+    return header
+
+
+def _cut(hdu: Any, columns: slice, rows: slice) -> Any:
+    header = moved_header(hdu.header, columns, rows)
     pixels = np.asarray(hdu.section[rows, columns])
     make = fits.PrimaryHDU if isinstance(hdu, fits.PrimaryHDU) else fits.ImageHDU
     return make(pixels, header)

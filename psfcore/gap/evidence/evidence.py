@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.gap.effect import Change, Effect
-from psfcore.gap.evidence.cells import DiscCells, disc_cells
+from psfcore.gap.evidence.cells import DiscCells, cells_of, disc_cells
 from psfcore.gap.evidence.unocculted_blocks import (
     UnoccultedBlocks,
     UnoccultedEquations,
@@ -72,6 +72,15 @@ class Evidence:
     image_info: tuple[ImageInfo, ...]
     untestable: dict[str, str]
     numbers: dict[int, int] = field(default_factory=dict)
+
+    def columns_of(self, effect: str) -> dict[str, int]:
+        """The column of each parameter of an effect, by the parameter's name.
+
+        An effect that is fitted for each pointing may have fewer or more columns than parameters.
+        """
+        (found,) = (one for one in self.effects if one.name == effect)
+        names = (parameter.name for parameter in found.parameters)
+        return dict(zip(names, self.columns[effect], strict=False))
 
     def numbers_of(self, columns: Sequence[int]) -> int:
         """The number of values that were measured in the unocculted field to compute the changes of these columns."""
@@ -193,6 +202,49 @@ def disc_with_jacobian(view: View, n: int, changes: Sequence[Change]) -> DiscCel
         some = np.array([np.ravel(one) for one in itertools.islice(fields, AT_ONCE)], dtype=flat.dtype)
         jacobian[rows[first : first + AT_ONCE]] = some @ flat.T
     return replace(cells, jacobian=jacobian)
+
+
+def residuals_at(
+    view: View,
+    evidence: Evidence,
+    columns: Sequence[int] = (),
+    changes: Sequence[Change] = (),
+    progress: Progress = lambda stage, step, steps: None,
+) -> Evidence:
+    """The evidence of another fit to the same transit: its residuals, with the Jacobian of `evidence`.
+
+    The Jacobian takes most of the time of `gather`, and hardly differs between two fits. view: of the other fit. columns:
+    the columns after the base that are kept; changes: the changes that belong to them, for discs whose cells have moved.
+    The result has no effects. Discs that `evidence` lacks are left out.
+    """
+    kept = [*evidence.base, *columns]
+    part = set(view.solution.part)
+    unocculted = unocculted_blocks(view, len(kept), progress)
+    unocculted.errors[:] = evidence.unocculted.errors[kept]
+    return replace(
+        evidence,
+        effects=(),
+        columns={},
+        numbers={},
+        untestable={},
+        discs=tuple(_disc_at(view, disc, kept, changes) for disc in evidence.discs if disc.index in part),
+        unocculted=unocculted,
+    )
+
+
+def _disc_at(view: View, disc: DiscCells, kept: Sequence[int], changes: Sequence[Change]) -> DiscCells:
+    other = view.solution
+    place = other.sky.found[disc.index].place
+    cells = cells_of(other.sky.dark[disc.index], place.x_px, place.y_px)
+    if cells.pixels.size != disc.pixels.size:  # its outermost dark pixels moved
+        return disc_with_jacobian(view, disc.index, changes)
+    residual, expected = other.residual(disc.index)
+    return replace(
+        disc,
+        residual=cells.weights @ residual,
+        expected=cells.weights @ expected,
+        jacobian=disc.jacobian[list(kept)],
+    )
 
 
 class _Distance:

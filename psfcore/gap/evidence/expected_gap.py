@@ -15,12 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psfcore.gap.evidence.cells import DiscCells, cells_of
-from psfcore.gap.evidence.evidence import Evidence, disc_with_jacobian
+from psfcore.gap.evidence.evidence import Evidence, residuals_at
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.evidence.unocculted_blocks import unocculted_blocks
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Progress, Solution, invert
+from psfcore.scatter.inversion import Progress, invert
 from psfcore.transit.transit import Transit
 
 
@@ -77,7 +75,7 @@ def expected_gap(
         threads=solution.threads,
         progress=say,
     )
-    model = LinearModel(_at(again, evidence, say), floor)
+    model = LinearModel(residuals_at(View(again), evidence, progress=say), floor)
     left = model.left(model.base)
     cells = max(sum(one.size for one in left) - len(model.base.columns), 1)
     unocculted = model.evidence.all_unocculted
@@ -87,35 +85,4 @@ def expected_gap(
         unocculted_scale=unocculted.chi2 / unocculted.freedom,
         scale_error=float(np.sqrt(2 / cells)),
         residual_pct=float(np.sqrt(np.mean(np.square(residual)))),
-    )
-
-
-def _at(again: Solution, evidence: Evidence, progress: Progress) -> Evidence:
-    """The evidence of the fit to the simulated images, without effects."""
-    base = list(evidence.base)
-    part = set(again.part)
-    view = View(again)
-    return replace(
-        evidence,
-        effects=(),
-        columns={},
-        numbers={},
-        untestable={},
-        discs=tuple(_disc_at(view, disc, base) for disc in evidence.discs if disc.index in part),
-        unocculted=unocculted_blocks(view, len(base), progress),
-    )
-
-
-def _disc_at(view: View, disc: DiscCells, base: list[int]) -> DiscCells:
-    again = view.solution
-    place = again.sky.found[disc.index].place
-    cells = cells_of(again.sky.dark[disc.index], place.x_px, place.y_px)
-    if cells.pixels.size != disc.pixels.size:  # its outermost dark pixels moved
-        return disc_with_jacobian(view, disc.index, ())
-    residual, expected = again.residual(disc.index)
-    return replace(
-        disc,
-        residual=cells.weights @ residual,
-        expected=cells.weights @ expected,
-        jacobian=disc.jacobian[base],
     )

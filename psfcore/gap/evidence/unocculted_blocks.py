@@ -66,7 +66,12 @@ class UnoccultedBlocks:
 
     def with_flickering_blocks(self) -> UnoccultedBlocks:
         """The same blocks, with the variance of flickering blocks raised to their observed variance."""
-        variance = self.variance.copy()
+        return replace(self, variance=self.variance * self.flicker)
+
+    @cached_property
+    def flicker(self) -> Matrix:
+        """The observed variance of each flickering block, divided by the usual variance; 1 for the other blocks: (images, blocks)."""
+        excess = np.ones_like(self.variance)
         gains = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
         steady = self.levels / (1 + gains[:, None])
         for pointing in np.unique(self.pointing):
@@ -81,8 +86,8 @@ class UnoccultedBlocks:
             usual = max(float(np.median(spread[used])), 1.0)
             # The variance of faint blocks is not changed: they show how the detector changes faint signals.
             bright = used & (mean > float(np.median(mean[used])))
-            variance[here] *= np.where(bright & (spread > FLICKERING * usual), spread / usual, 1.0)
-        return replace(self, variance=variance)
+            excess[here] = np.where(bright & (spread > FLICKERING * usual), spread / usual, 1.0)
+        return excess
 
     @cached_property
     def gain_width(self) -> float:
@@ -214,6 +219,16 @@ def blocks(plane: NDArray[np.floating]) -> Vector:
     rows, columns = (n // edge for n in plane.shape)
     cut = plane[: rows * edge, : columns * edge]
     return np.asarray(cut.reshape(rows, edge, columns, edge).mean(axis=(1, 3), dtype=np.float64).ravel())
+
+
+def spread_blocks(values: Vector, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """A plane [y, x] of this shape with the value of each block in its pixels (the reverse of `blocks`); 0 in incomplete blocks."""
+    edge = block_px(shape)
+    rows, columns = (n // edge for n in shape)
+    plane = np.zeros(shape, np.float32)
+    each = values.reshape(rows, columns)
+    plane[: rows * edge, : columns * edge] = np.repeat(np.repeat(each, edge, axis=0), edge, axis=1)
+    return plane
 
 
 def not_compared(solution: Solution, n: int) -> NDArray[np.bool_]:

@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from psfcore.gap.effect import Change, Effect, EffectParameter
-from psfcore.gap.evidence.unocculted_blocks import blocks, not_compared
+from psfcore.gap.evidence.unocculted_blocks import spread_blocks, unocculted_blocks
 from psfcore.gap.view import Field, View
 
 # Decay levels of two losses; their sum approximates a loss with any decay level in between.
@@ -158,40 +157,30 @@ def _filled(view: View) -> Sequence[Change]:
 
 
 def _flicker(view: View) -> Change:
-    """The change of the Sun in the pixels that some image of a pointing fills. Such pixels are bright, and bright pixels often flicker.
+    """The change of the Sun in the flickering blocks of the unocculted field. Pixels that are filled are bright, and bright pixels
+    often flicker, also those that are not filled.
 
-    The change is measured in the images that show these pixels: the difference from their mean.
+    The change is measured in the images: the difference from the mean of the pointing.
     """
-    frames = view.solution.transit.frames
-    nothing = np.zeros(view.solution.transit.shape, np.float32)
-    filled: dict[int, NDArray[np.bool_]] = {}
-    for frame in frames:
-        if frame.filled is not None and frame.filled.any():
-            filled[frame.pointing] = filled.get(frame.pointing, nothing > 0) | frame.filled
-    shown: dict[
-        int, NDArray[np.bool_]
-    ] = {}  # by image: the pixels that are filled elsewhere and visible here
-    scale: dict[int, np.float32] = {}  # by image: its brightness
-    mean: dict[int, Field] = {}  # by pointing
-    numbers = 0
-    for pointing, bright in filled.items():
-        total, count = nothing.astype(np.float64), nothing.astype(np.int32)
-        seen = np.zeros(blocks(nothing).shape, np.int64)
-        for n in (n for n, frame in enumerate(frames) if frame.pointing == pointing):
-            out = not_compared(view.solution, n)
-            shown[n] = bright & ~out
-            usual = view.pointing_means[n][~out].sum(dtype=np.float64)
-            scale[n] = np.float32(view.unocculted[n][~out].sum(dtype=np.float64) / max(usual, 1e-9))
-            total[shown[n]] += view.unocculted[n][shown[n]] / scale[n]
-            count += shown[n]
-            seen += (blocks(bright.astype(np.float64)) > 0) & (blocks(out.astype(np.float64)) == 0)
-        mean[pointing] = np.asarray(total / np.maximum(count, 1), np.float32)
-        numbers += int(np.maximum(seen - 1, 0).sum())  # the mean over the images is a part of the scene
+    compared = unocculted_blocks(view, 0, lambda stage, step, steps: None)
+    flickers = (compared.flicker > 1) & compared.free
+    shape = view.solution.transit.shape
+    nothing = np.zeros(shape, np.float32)
+    scale, mean, numbers = np.ones(len(flickers)), np.zeros_like(compared.levels), 0
+    for pointing in np.unique(compared.pointing):
+        here = compared.pointing == pointing
+        usual = np.where(compared.free[here], compared.means[here], 0.0).sum(axis=1)
+        scale[here] = np.where(compared.free[here], compared.levels[here], 0.0).sum(axis=1) / np.maximum(
+            usual, 1e-9
+        )
+        images = flickers[here].sum(axis=0)
+        steady = np.where(flickers[here], compared.levels[here] / scale[here][:, None], 0.0)
+        mean[here] = steady.sum(axis=0) / np.maximum(images, 1)
+        numbers += int(np.maximum(images - 1, 0).sum())  # the mean over the images is a part of the scene
 
     def change(n: int) -> Field:
-        if n not in shown:
-            return nothing
-        return np.where(shown[n], view.unocculted[n] / scale[n] - mean[frames[n].pointing], np.float32(0))
+        differing = np.where(flickers[n], compared.levels[n] / scale[n] - mean[n], 0.0)
+        return spread_blocks(differing, shape) if differing.any() else nothing
 
     return Change(lambda n, images: change(n), disc=False, numbers=numbers)
 

@@ -1,14 +1,17 @@
 """A full refit: fit the PSF again to images from which the change by an effect was subtracted.
 
 Each round computes the change of the images by the effect, from the current scene and PSF. It subtracts this change from
-the images and fits the PSF again. Then it computes the change again at this fit, and fits what remains of the effect together with
-the PSF. The rounds are Gauss-Newton steps. Two or three rounds converge, and the result is then more than a first-order
-approximation. A round is rejected if it leaves clearly more chi2 than an earlier round.
+the images and fits the PSF again. Then it fits what remains of the effect together with the PSF. Two or three rounds
+converge, and the result is then more than a first-order approximation. A round is rejected if it leaves clearly more chi2 than an
+earlier round.
+
+The rounds use the Jacobian of the linear model from before the refit, because a new Jacobian takes most of the time of a round. The
+residuals are those of the current round, so the rounds converge to images without the effect all the same. After the
+last round, the Jacobian is computed once at the refit, and the remaining part is fitted with it.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +21,7 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, left_chi2
-from psfcore.gap.evidence.evidence import Evidence, gather
+from psfcore.gap.evidence.evidence import Evidence, gather, residuals_at
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution, invert
@@ -39,7 +42,7 @@ class Corrected:
 
     values: value, error and unit of each parameter of the effects; the value is summed over all rounds. subtracted: the
     amounts of the parameters that were subtracted from the images in the last round, by effect. model: the linear model
-    at the refit. rounds: number of rounds made.
+    at the refit. beside: the same with further effects, if they were asked for. rounds: number of rounds made.
     """
 
     effects: tuple[Effect, ...]
@@ -49,6 +52,7 @@ class Corrected:
     values: dict[str, tuple[float, float, str]]
     subtracted: dict[str, tuple[float, ...]]
     rounds: int
+    beside: LinearModel | None = None
 
     @property
     def label(self) -> str:
@@ -91,25 +95,26 @@ def add_to_model(
     found: EffectFit,
     model: LinearModel,
     *,
+    beside: Sequence[Effect] = (),
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Corrected:
-    """Fit the PSF and effects together, starting from the linear fit `found`.
+    """Fit the PSF and effects together, starting from the linear fit `found` in the linear model `model`.
 
-    view: the view of the solution, if it exists already. Raises the errors of `invert` if the first round fails, DataError
-    "effect-unseen" if the images do not constrain the effects, and "bad-effects" if an added effect fails.
+    beside: further effects, which are not fitted; `Corrected.beside` contains them. view: the view of the solution, if it
+    exists already. Raises the errors of `invert` if the first round fails, DataError "effect-unseen" if the images do not constrain the
+    effects, and "bad-effects" if an added effect fails.
     """
     transit = solution.transit
     # An effect that searches for a position keeps the position that it found first.
     view = view or View(solution)
     held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
-    names, theta = list(found.values), np.array([value for value, _, _ in found.values.values()])
-    units = [unit for _, _, unit in found.values.values()]
+    theta = np.array([value for value, _, _ in found.values.values()])
     in_images = _in_images(held, view)
     base = len(model.evidence.base)
     here, start = view, _stepped(solution, found.step.values[:base])
     least = np.inf
-    taken: Corrected | None = None
+    taken: _Round | None = None
     for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
         try:
             if in_images.any():
@@ -118,18 +123,18 @@ def add_to_model(
                 near = start is not None
                 fit = invert(images, shape, start=start, near=near, threads=threads, progress=progress)
                 here = View(fit)
-            seen = _fit_remaining(here, held, theta, in_images, model, progress)
+            seen = _fit_remaining(_with_old_jacobian(model, here, held), held, theta, in_images)
         except DataError:
             if taken is None:
                 raise
             break  # the step was too long: the fit failed, or the images no longer constrain the effect
-        gone = np.where(in_images, theta, 0.0)
-        steps, theta, start = seen.theta - theta, seen.theta, seen.start
+        gone = theta
+        steps, theta = seen.theta - theta, seen.theta
+        start = _stepped(here.solution, seen.left.step.values[:base])
         # A parameter that must be positive is dropped if its fitted value is not positive.
         acts = ~(_positive(held) & (theta <= 0))
         if not acts.all() and rounds < ROUNDS:
             held = _those_that_act(held, acts)
-            names, units = (list(itertools.compress(some, acts)) for some in (names, units))
             theta, in_images = theta[acts], in_images[acts]
             taken, least = None, np.inf
             continue
@@ -139,22 +144,78 @@ def add_to_model(
         ):  # the effect is too strong for first-order steps
             break
         least = min(least, left_over)
-        taken = Corrected(
-            effects=tuple(held),
-            solution=here.solution,
-            evidence=seen.model.evidence,
-            model=seen.model,
-            values={
-                name: (float(value), float(sigma), unit)
-                for name, value, sigma, unit in zip(names, theta, seen.sigma, units, strict=True)
-            },
-            subtracted=_by_effect(held, gone),
-            rounds=rounds,
-        )
+        taken = _Round(here, gone, rounds)
         if float(np.sqrt(np.mean((steps / np.maximum(seen.sigma, 1e-300)) ** 2))) < SETTLED:
             break
     assert taken is not None
-    return taken
+    return _corrected(taken, held, beside, in_images, model, progress)
+
+
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """An accepted round. theta: the parameters that were subtracted from the images. rounds: its number, from 1."""
+
+    view: View
+    theta: Vector
+    rounds: int
+
+
+def _corrected(
+    taken: _Round,
+    held: Sequence[Effect],
+    beside: Sequence[Effect],
+    in_images: NDArray[np.bool_],
+    model: LinearModel,
+    progress: Progress,
+) -> Corrected:
+    """The refit after its last round, with the Jacobian computed there."""
+    evidence = gather(taken.view.solution, (*held, *beside), view=taken.view, progress=progress)
+    evidence = _with_noise_of(model.evidence, evidence)
+    own = replace(model, evidence=_of_effects(evidence, [effect.name for effect in held]))
+    seen = _fit_remaining(own, held, taken.theta, in_images)
+    fitted = zip(seen.left.values.items(), seen.theta, strict=True)
+    return Corrected(
+        effects=tuple(held),
+        solution=taken.view.solution,
+        evidence=own.evidence,
+        model=own,
+        values={name: (float(value), sigma, unit) for (name, (_, sigma, unit)), value in fitted},
+        subtracted=_by_effect(held, np.where(in_images, taken.theta, 0.0)),
+        rounds=taken.rounds,
+        beside=replace(model, evidence=evidence) if beside else None,
+    )
+
+
+def _with_old_jacobian(model: LinearModel, view: View, held: Sequence[Effect]) -> LinearModel:
+    """The linear model of another fit: its residuals, with the Jacobian and the noise of `model`."""
+    before = model.evidence
+    base, kept = len(before.base), list[int]()
+    columns: dict[str, tuple[int, ...]] = {}
+    for effect in held:
+        at = before.columns_of(effect.name)
+        own = [at[parameter.name] for parameter in effect.parameters if parameter.name in at]
+        columns[effect.name] = tuple(range(base + len(kept), base + len(kept) + len(own)))
+        kept += own
+    changes = [change for effect in held for change in effect.changes(view)]
+    evidence = residuals_at(view, before, kept, changes)
+    numbers = {base + k: before.numbers[c] for k, c in enumerate(kept) if c in before.numbers}
+    evidence = replace(evidence, effects=tuple(held), columns=columns, numbers=numbers)
+    return replace(model, evidence=_with_noise_of(before, evidence))
+
+
+def _of_effects(evidence: Evidence, names: Sequence[str]) -> Evidence:
+    """The evidence with these effects only, whose columns must come first."""
+    columns = {name: here for name, here in evidence.columns.items() if name in names}
+    size = max((c + 1 for here in columns.values() for c in here), default=len(evidence.base))
+    return replace(
+        evidence,
+        effects=tuple(effect for effect in evidence.effects if effect.name in columns),
+        columns=columns,
+        untestable={name: why for name, why in evidence.untestable.items() if name in names},
+        numbers={column: number for column, number in evidence.numbers.items() if column < size},
+        discs=tuple(replace(disc, jacobian=disc.jacobian[:size]) for disc in evidence.discs),
+        unocculted=replace(evidence.unocculted, errors=evidence.unocculted.errors[:size]),
+    )
 
 
 def _by_effect(effects: Sequence[Effect], values: Vector) -> dict[str, tuple[float, ...]]:
@@ -172,14 +233,12 @@ class _Remaining:
     """A fit to images from which a part of the effects was subtracted.
 
     model: the linear model at this fit. left: the linear fit of the remaining part of the effects. theta: the
-    parameters: the subtracted part plus the remaining part. start: the coordinates of the PSF for the next round, as
-    in `_stepped`.
+    parameters: the subtracted part plus the remaining part.
     """
 
     model: LinearModel
     left: EffectFit
     theta: Vector
-    start: Vector | None
 
     @property
     def sigma(self) -> Vector:
@@ -188,20 +247,14 @@ class _Remaining:
 
 
 def _fit_remaining(
-    view: View,
-    held: Sequence[Effect],
-    out: Vector,
-    in_images: NDArray[np.bool_],
-    model: LinearModel,
-    progress: Progress,
+    model: LinearModel, held: Sequence[Effect], out: Vector, in_images: NDArray[np.bool_]
 ) -> _Remaining:
     """Fit the effects to images from which these effects were already subtracted.
 
-    out: the current parameters. in_images: for each parameter, whether its change was subtracted from the images.
+    model: the linear model of these images. out: the current parameters. in_images: for each parameter, whether its
+    change was subtracted from the images.
     """
-    evidence = _with_noise_of(model.evidence, gather(view.solution, held, view=view, progress=progress))
-    again = replace(model, evidence=evidence)
-    left = fit_effects(again, evidence.effects, any_sign=True)
+    left = fit_effects(model, model.evidence.effects, any_sign=True)
     found = np.array([value for value, _, _ in left.values.values()])
     if found.size != out.size:
         raise DataError(
@@ -209,12 +262,11 @@ def _fit_remaining(
             f"expected the images to constrain all {out.size} parameters of {label_of([e.name for e in held])} after this effect "
             f"was subtracted; the images constrain {found.size} of them: they may not contain this effect",
         )
-    base = len(evidence.base)
+    base = len(model.evidence.base)
     out_already = np.concatenate([np.zeros(base), np.where(in_images, out, 0.0)])
-    found -= again.pull_of_prior(left.step, out_already)[base:]
+    found -= model.pull_of_prior(left.step, out_already)[base:]
     # For a subtracted parameter the fit gives only the remainder; for the other parameters it gives the full value.
-    theta = np.where(in_images, out + found, found)
-    return _Remaining(again, left, theta, _stepped(view.solution, left.step.values[:base]))
+    return _Remaining(model, left, np.where(in_images, out + found, found))
 
 
 def _stepped(current: Solution, step: Vector) -> Vector | None:
@@ -254,23 +306,6 @@ def _those_that_act(effects: Sequence[Effect], acts: NDArray[np.bool_]) -> list[
             )
         out.append(_with_part(effect, part))
     return out
-
-
-def with_library(
-    added: Corrected,
-    library: Sequence[Effect],
-    model: LinearModel,
-    *,
-    progress: Progress = lambda stage, step, steps: None,
-) -> LinearModel:
-    """The linear model at a full refit, with all effects of a library. Only the PSF is always fitted.
-
-    Raises DataError "bad-effects" if an added effect fails.
-    """
-    names = {effect.name for effect in added.effects}
-    others = [effect for effect in library if effect.name not in names]
-    evidence = gather(added.solution, (*added.effects, *others), progress=progress)
-    return replace(model, evidence=_with_noise_of(model.evidence, evidence))
 
 
 def hold(effect: Effect, view: View) -> Effect:

@@ -12,7 +12,7 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of
 from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.verdict.correction import Corrected, add_to_model, with_library
+from psfcore.gap.verdict.correction import Corrected, add_to_model
 from psfcore.gap.verdict.posterior import Names, at_refit
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress
@@ -38,9 +38,7 @@ class Refits:
         if made is None:
             return None
         effects = self._model.evidence.effects
-        model = made.model
-        if len(names) == 1:  # the pairs with this effect are weighed at the same refit
-            model = with_library(made, effects, self._model, progress=self._say(f"effects beside {names[0]}"))
+        model = made.model if made.beside is None else made.beside
         moved = made.solution.inversion.coordinates - self._view.solution.inversion.coordinates
         return at_refit(model, self._model, names, made.subtracted, moved, effects)
 
@@ -84,6 +82,9 @@ class Refits:
     def _fit(self, names: Names) -> Corrected | None:
         if names not in self._made:
             chosen = [effect for effect in self._model.evidence.effects if effect.name in names]
+            # The pairs with a single effect are weighed at its refit.
+            alone = len(names) == 1
+            beside = [effect for effect in self._model.evidence.effects if alone and effect not in chosen]
             label = label_of(names)
             try:
                 self._made[names] = add_to_model(
@@ -91,6 +92,7 @@ class Refits:
                     chosen,
                     self._start(chosen),
                     self._model,
+                    beside=beside,
                     view=self._view,
                     progress=self._say(f"full refit with {label}"),
                 )

@@ -74,12 +74,9 @@ def _parameters_of(
 ) -> list[tuple[int, int, float]]:
     """For each parameter of the effects of a refit: its column at the refit, its column before, and the amount that the
     refit subtracted from the images."""
-    first = {effect.name: effect for effect in before.effects}
     found: list[tuple[int, int, float]] = []
     for effect in after.effects:
-        columns = dict(
-            zip((p.name for p in first[effect.name].parameters), before.columns[effect.name], strict=False)
-        )
+        columns = before.columns_of(effect.name)
         own = [p.name for p in effect.parameters]
         values = taken.get(effect.name, (0.0,) * len(own))
         found += (

@@ -18,8 +18,15 @@ _THINGS = {
     "no-such-transit": "transit",
 }
 # The labels in the forms, for fields whose label differs from their name.
-_FIELDS = {"error_draws": "Noise realisations", "psf_id": "PSF", "image_id": "Image"}
-_FIELD = re.compile(r"(?:^|(?<=; ))(?:[a-z_-]+\.)*([a-z_]+): ")
+_FIELDS = {
+    "error_draws": "Noise realisations",
+    "psf_id": "PSF",
+    "image_id": "Image",
+    "glob": "Files",
+    "folder": "Output folder",
+    "layout": "Names of the files",
+}
+_FIELD = re.compile(r"(?:^|(?<=; ))(?:[a-z0-9_-]+\.)*([a-z_]+): ")
 _NO_FIELDS: Mapping[str, Any] = {}
 # Parts of a message that only a command or a program needs, such as "(--again, in a request again = true)".
 _FOR_PROGRAMS = re.compile(

@@ -22,7 +22,8 @@ function show(place, run) {
   const flawed = run.phase === "COMPLETED" && failed > 0;
   phase.className = `phase ${flawed ? "flawed" : run.phase}`;
   tell("phase", flawed ? `COMPLETED, ${failed} of ${total} failed` : run.phase);
-  for (const [name, count] of Object.entries(run.images)) tell(name, String(count));
+  const counts = { ...run.images, total: run.listed ? total : `at least ${total}` };
+  for (const [name, count] of Object.entries(counts)) tell(name, String(count));
   const pace = place === one || AT_WORK.includes(run.phase) ? run.images_an_hour : null;
   const unknown = place === one ? "unknown" : "";
   tell("pace", pace === null ? unknown : `${Number(pace.toPrecision(3))} images an hour`);
@@ -45,7 +46,8 @@ function showOne(run) {
   const part = (name) => one.querySelector(`[data-part="${name}"]`);
   const { total, done, failed } = run.images;
   part("bar").max = total || 1;
-  part("bar").value = done + failed;
+  if (run.listed) part("bar").value = done + failed;
+  else part("bar").removeAttribute("value"); // how much is left is not known
   part("error").hidden = run.error === null;
   part("error").textContent = run.error === null ? "" : sentence(run.error.message);
   part("ended").textContent = moment(run.ended_at);

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import BLOCK_ROWS, Engine, Scratch
-from psfcore.convolution.fft_kernels import LANES, forward, good_length, inverse, make_plan
+from psfcore.convolution.fft_kernels import LANES, forward, inverse, make_plan
+from psfcore.convolution.lengths import good_length
 from psfcore.errors import DataError
 
 LENGTHS = [16, 32, 48, 64, 96, 128, 144, 192, 256, 288, 384, 512, 576, 768, 1024, 1152, 2048, 3072, 4096]

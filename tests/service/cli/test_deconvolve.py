@@ -144,3 +144,47 @@ def test_a_bulk_run_with_failures_ends_with_status_1(
     assert run("bulk", "status", "b" * 32, "--wait").exit_code == status
     assert run("bulk", "submit", "/x/*.fits", "--psf", "a" * 64, "--wait").exit_code == status
     assert run("bulk", "status", "b" * 32).exit_code == 0
+
+
+def test_a_region_becomes_a_product_with_its_coordinates(folder: Path) -> None:
+    image = folder / "in" / "0.fits"
+    for key in ("CRPIX1", "CRPIX2"):
+        fits.setval(image, key, value=30.5)
+    nx = fits.getdata(image).shape[1]
+    region = ("--region", f"8:{nx - 8},16:48", "--region-error", 0.9)
+    done = run("deconvolve", image, "-o", folder / "box.fits", *region, *options(folder))
+    assert done.exit_code == 0, done.output
+    assert f"region 8:{nx - 8},16:48, rim " in done.output and "by at most" in done.output
+    product = fits.open(folder / "box.fits")
+    assert product[0].data.shape == product["QUALITY"].data.shape == (32, nx - 16)
+    before, after = fits.getheader(image), product[0].header
+    assert [after[key] - before[key] for key in ("CRPIX1", "CRPIX2")] == [-8, -16]
+    assert after["DCNVBOX"] == f"8:{nx - 8},16:48"
+    assert "differs from the same box" in "".join(after["HISTORY"])
+    whole = run("deconvolve", image, "-o", folder / "whole.fits", *options(folder))
+    assert whole.exit_code == 0, whole.output
+    difference = abs(fits.getdata(folder / "whole.fits")[16:48, 8 : nx - 8] - product[0].data)
+    assert difference.max() <= after["DCNVBERR"] + 1e-4 * abs(product[0].data).max()
+
+
+@pytest.mark.parametrize(
+    ("region", "said"),
+    [("8:40", "expected a region as x0:x1,y0:y1"), ("0:9999,0:40", "the size of the image")],
+)
+def test_a_wrong_region_is_refused(folder: Path, region: str, said: str) -> None:
+    image, out = folder / "in" / "0.fits", folder / "out.fits"
+    refused = run("deconvolve", image, "-o", out, "--region", region, *options(folder))
+    assert refused.exit_code != 0 and said in refused.output
+    assert not out.exists()
+
+
+def test_an_image_that_does_not_fit_into_the_memory_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.local.free_bytes", lambda: 2**20)
+    image, out = folder / "in" / "0.fits", folder / "out.fits"
+    refused = run("deconvolve", image, "-o", out, *options(folder))
+    assert refused.exit_code == 1 and not out.exists()
+    assert "free memory, 1 MiB" in refused.output and "use a machine with more memory" in refused.output
+    several = run("deconvolve", folder / "in", "-o", f"{folder}/out/", *options(folder))
+    assert several.exit_code == 1 and several.output.count("free memory, 1 MiB") == 2

@@ -90,6 +90,32 @@ def test_the_wait_of_a_job_that_is_submitted_over_and_over_doubles_and_ends_grow
                 values = {"submissions": submissions, "submitted_at": time.time() - ago_s}
                 connection.execute(update(JobRow).values(**values))
             assert bool(catalogue.jobs.unsubmitted(10.0)) is due, values
+            assert bool(catalogue.jobs.unsubmitted(10.0, idle=True)) is (ago_s > 10.0), values
+
+
+def test_a_job_whose_message_is_lost_does_not_wait_long_for_workers_that_do_nothing(tmp_path: Path) -> None:
+    """It was submitted nine times while the queue was long. Then the broker lost the last message."""
+    settings = Settings(data_dir=tmp_path / "data", broker_url="filesystem://", resubmit_s=10.0)
+    app, catalogue = queue.make_app(settings), Catalogue(settings.catalogue_url)
+    catalogue.upgrade()
+    lost, _ = catalogue.jobs.submit("psf-build", {}, "lost", "o")
+    other, _ = catalogue.jobs.submit("psf-build", {}, "other", "o")
+
+    def submitted(worked_ago_s: float, phase: str = "COMPLETED") -> int:
+        """How many jobs are submitted if a worker last worked on the other job so long ago."""
+        now = time.time()
+        with catalogue._engine.begin() as connection:
+            waits = {"submissions": 9, "submitted_at": now - 15.0}
+            connection.execute(update(JobRow).where(JobRow.id == lost.id).values(**waits))
+            works = {"phase": phase, "heartbeat_at": now - worked_ago_s}
+            connection.execute(update(JobRow).where(JobRow.id == other.id).values(**works))
+        return reconcile(catalogue, app, settings)
+
+    assert submitted(12.0) == 0, "there is no worker"
+    catalogue.census.announce("w", time.time(), "1")
+    assert submitted(1.0, "EXECUTING") == submitted(8.0) == 0, "a worker may take the message soon"
+    assert submitted(12.0) == 1
+    catalogue.close()
 
 
 def test_the_folder_s_messages_come_in_our_order(tmp_path: Path) -> None:

@@ -25,12 +25,13 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import ROW_BYTES, counted_bytes
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow
-from workers.contract.bulk import DELETABLE, BulkPhase, BulkWork, ItemState
+from workers.contract.bulk import DELETABLE, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError
 from workers.files.store import Store
 from workers.settings import Settings
 from workers.tasks.context import Context
 
+B, C = ({"pattern": 0, "names": [name]} for name in "bc")  # places up to which files are listed
 BAD = JobError(fault=Fault.USER, code="bad", message="a bad image")
 DONE: dict[str, Any] = {
     "image_sha256": "a" * 64, "psf_id": "b" * 64, "product_id": "c" * 64, "kept": True, "output": None,
@@ -212,6 +213,13 @@ def used(catalogue: Catalogue) -> int:
     """What the owner's files and rows count now; a recount agrees."""
     assert catalogue.owners.recount() == []
     return catalogue.owners.usage("o", 0).used_bytes
+
+
+def turn_bytes(catalogue: Catalogue, lease: Lease) -> int:
+    """What the job of a turn counts."""
+    job = catalogue.jobs.get(lease.job_id)
+    assert job is not None
+    return counted_bytes(job)
 
 
 def images_of(catalogue: Catalogue, bulk_id: str) -> int:
@@ -397,22 +405,63 @@ def test_a_request_whose_identical_run_ends_meanwhile_makes_a_new_run(
     check_counts(catalogue, second)
 
 
-def test_a_second_worker_lists_files_from_the_start(catalogue: Catalogue) -> None:
+def test_a_second_worker_continues_the_listing_of_a_lost_one(catalogue: Catalogue) -> None:
     bulk_id, lost = made(catalogue, 1, listed=False), turn(catalogue)
-    bulks = catalogue.bulks
-    assert bulks.take(bulk_id, lost, 3) is None, "nothing is done before all is listed"
-    assert bulks.begin_listing(bulk_id, lost)
-    assert bulks.add_listed(bulk_id, lost, [Listed("/a", False), Listed("/b", False, BAD)])
+    bulks, before = catalogue.bulks, used(catalogue)
+    begun = bulks.begin_listing(bulk_id, lost)
+    assert begun is not None and begun.listed_to is None
+    assert bulks.begin_listing(bulk_id, turn(catalogue)) is None, "another worker lists now"
+    assert bulks.add_listed(bulk_id, lost, [Listed("/a", False), Listed("/b", False, BAD)], B)
     catalogue.jobs.give_up_silent(-1.0, 99)
-    assert not bulks.begin_listing(bulk_id, lost)
+    assert bulks.begin_listing(bulk_id, lost) is None
     other = turn(catalogue)
-    assert bulks.begin_listing(bulk_id, other)
-    assert not bulks.add_listed(bulk_id, lost, [Listed("/z", False)]), "the lost one adds nothing more"
-    assert bulks.add_listed(bulk_id, other, [Listed("/a", False), Listed("/b", False, BAD)])
+    begun = bulks.begin_listing(bulk_id, other)
+    assert begun is not None and (begun.listed_to, begun.total) == (B, 3)
+    assert not bulks.add_listed(bulk_id, lost, [Listed("/z", False)], C), "the lost one adds nothing more"
+    assert bulks.add_listed(bulk_id, other, [Listed("/c", False)], C)
     check_counts(catalogue, bulk_id)
     assert not bulks.end_listing(bulk_id, lost) and bulks.end_listing(bulk_id, other)
-    assert [one.source[-2:] for one in all_taken(catalogue, bulk_id, other)] == ["00", "/a"]
+    assert [one.source[-2:] for one in all_taken(catalogue, bulk_id, other)] == ["00", "/a", "/c"]
     assert row(catalogue, bulk_id).failed == 1
+    assert used(catalogue) == before + 3 * ROW_BYTES + 2 * turn_bytes(catalogue, other)
+
+
+def test_images_are_taken_while_others_are_listed_and_the_run_ends_after_all(catalogue: Catalogue) -> None:
+    bulk_id, lister, other = made(catalogue, 0, listed=False), turn(catalogue), turn(catalogue)
+    bulks = catalogue.bulks
+    assert bulks.begin_listing(bulk_id, lister) is not None and bulks.take(bulk_id, other, 3) is None
+    assert bulks.add_listed(bulk_id, lister, [Listed("/a", False)], B)
+    first = bulks.take(bulk_id, other, 3)
+    assert first is not None and first.source == "/a" and done(catalogue, first)
+    assert row(catalogue, bulk_id).phase == "LISTING", (
+        "all listed images are done, but not all images are listed"
+    )
+    assert bulks.add_listed(bulk_id, lister, [Listed("/b", False, BAD), Listed("/c", False)], C)
+    (second,) = all_taken(catalogue, bulk_id, lister)
+    assert (second.source, second.position) == ("/c", 2) and bulks.fail(second, BAD)
+    assert bulks.retry(bulk_id) == 2 and row(catalogue, bulk_id).phase == "LISTING"
+    again = list(all_taken(catalogue, bulk_id, other))
+    assert [one.source for one in again] == ["/b", "/c"] and all(done(catalogue, one) for one in again)
+    assert bulks.end_listing(bulk_id, lister)
+    ended = row(catalogue, bulk_id)
+    assert (ended.phase, ended.total, ended.done, ended.failed) == ("COMPLETED", 3, 3, 0)
+    check_counts(catalogue, bulk_id)
+
+
+def test_files_that_an_older_version_listed_are_listed_again(catalogue: Catalogue) -> None:
+    """It stored no place, and took no file before all were listed."""
+    bulk_id, lost = made(catalogue, 2, listed=False), turn(catalogue)
+    bulks, before = catalogue.bulks, used(catalogue)
+    assert bulks.begin_listing(bulk_id, lost) is not None
+    assert bulks.add_listed(bulk_id, lost, [Listed("/a", False), Listed("/b", False, BAD)], B)
+    with catalogue._engine.begin() as connection:
+        connection.execute(update(BulkRow).where(BulkRow.id == bulk_id).values(listed_to=None))
+    begun = bulks.begin_listing(bulk_id, lost)
+    assert begun is not None and (begun.total, begun.failed) == (2, 0)
+    check_counts(catalogue, bulk_id)
+    assert used(catalogue) == before
+    assert bulks.add_listed(bulk_id, lost, [Listed("/a", False)], B) and bulks.end_listing(bulk_id, lost)
+    assert [one.position for one in all_taken(catalogue, bulk_id, lost)] == [0, 1, 2]
 
 
 def test_files_whose_paths_cannot_be_stored_are_failed_images(
@@ -431,10 +480,13 @@ def test_files_whose_paths_cannot_be_stored_are_failed_images(
         settings=settings.model_copy(update={"bulk_roots": str(root)}), report=lambda *_: None,
     )  # fmt: skip
     bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
-    assert catalogue.bulks.begin_listing(bulk_id, lease)
-    files = [{"glob": f"{root}/**/*.fits", "where": {"NAXIS": 2}}]
-    listed = list(listing._listed(context, BulkWork.model_validate({"files": files})))
-    assert catalogue.bulks.add_listed(bulk_id, lease, listed) and catalogue.bulks.end_listing(bulk_id, lease)
+    request = {"files": [{"glob": f"{root}/**/*.fits", "where": {"NAXIS": 2}}]}
+    with catalogue._engine.begin() as connection:
+        connection.execute(update(BulkRow).where(BulkRow.id == bulk_id).values(request=request))
+    begun = catalogue.bulks.begin_listing(bulk_id, lease)
+    assert begun is not None
+    listing.list_files(context, begun, lease, lambda: None, lambda: False)
+    assert row(catalogue, bulk_id).phase == BulkPhase.RUNNING
     (taken,) = all_taken(catalogue, bulk_id, lease)
     assert taken.source == str(root / "a.fits")
     failed = {
@@ -461,9 +513,12 @@ def test_files_whose_paths_cannot_be_stored_are_failed_images(
 def test_a_run_paused_while_listing_resumes_listing(catalogue: Catalogue) -> None:
     bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
     bulks = catalogue.bulks
-    assert bulks.begin_listing(bulk_id, lease) and bulks.pause(bulk_id)
-    assert not bulks.add_listed(bulk_id, lease, [Listed("/a", False)])
+    assert bulks.begin_listing(bulk_id, lease) and bulks.add_listed(bulk_id, lease, [Listed("/a", False)], B)
+    assert bulks.pause(bulk_id) and not bulks.add_listed(bulk_id, lease, [Listed("/b", False)], C)
+    assert bulks.take(bulk_id, lease, 3) is None
     assert bulks.resume(bulk_id) and row(catalogue, bulk_id).phase == BulkPhase.LISTING
+    begun = bulks.begin_listing(bulk_id, lease)
+    assert begun is not None and begun.listed_to == B and begun.total == 1
 
 
 def test_images_are_sorted_by_artefact_score_over_pages(catalogue: Catalogue) -> None:
@@ -607,7 +662,10 @@ def test_every_query_of_a_run_uses_an_index(catalogue: Catalogue) -> None:
     first, second = bulks.take(bulk_id, lease, 3), bulks.take(bulk_id, lease, 3)
     assert first is not None and second is not None
     bulk = row(catalogue, bulk_id)
+    other = made(catalogue, 0, key="listing", listed=False)
     with statements(catalogue) as sent:
+        assert bulks.begin_listing(other, lease) and bulks.begin_listing(other, lease) and bulks.cancel(other)
+        bulks.progress.sources(other)
         third = bulks.take(bulk_id, lease, 3)
         assert (
             third is not None and done(catalogue, first) and bulks.fail(second, BAD) and bulks.release(third)

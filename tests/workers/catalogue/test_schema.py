@@ -59,8 +59,9 @@ OLD_ROWS = {
     },
 }  # fmt: skip
 
-# Without these, the tables are those of revision 0017.
-UNDO_0018 = ("DROP TABLE series_changes", "ALTER TABLE psf_pins DROP COLUMN interpolated")
+# Without these, the tables are those of revision 0018, and then those of 0017.
+UNDO_0019 = ("ALTER TABLE bulks DROP COLUMN listed_to",)
+UNDO_0018 = (*UNDO_0019, "DROP TABLE series_changes", "ALTER TABLE psf_pins DROP COLUMN interpolated")
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

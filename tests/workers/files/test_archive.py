@@ -34,9 +34,9 @@ def archive(tmp_path: Path) -> Path:
 
 
 def found(archive: Path, glob: str) -> list[str]:
-    files = list(archive_files.find(f"{archive}/{glob}", [archive]))
-    assert all(file.error is None for file in files)
-    return [str(file.path.relative_to(archive)) for file in files]
+    looked = list(archive_files.find(f"{archive}/{glob}", [archive]))
+    assert all(one.error is None for one in looked)
+    return [str(one.path.relative_to(archive)) for one in looked if one.matches]
 
 
 @pytest.mark.parametrize(
@@ -91,24 +91,65 @@ def test_each_folder_is_read_once_with_several_double_stars(
         return real(folder)
 
     monkeypatch.setattr(archive_files.os, "scandir", counted)
-    ticks: list[None] = []
-    files = list(archive_files.find(f"{root}{pattern}", [root], lambda: ticks.append(None)))
-    assert [file.path for file in files] == [deep / "x.fits"]
+    steps = list(archive_files.find(f"{root}{pattern}", [root]))
+    assert [step.path for step in steps if step.matches] == [deep / "x.fits"]
     assert sorted(looked) == sorted({root, deep, *(one for one in deep.parents if root in one.parents)})
-    assert len(ticks) == 13 + 13, "for each folder and each entry"
+    assert len(steps) == 13 + 13, "for each folder and each entry"
 
 
-def test_a_walk_that_finds_nothing_ticks_and_can_be_stopped(archive: Path) -> None:
-    ticks: list[None] = []
+def test_a_search_that_finds_nothing_can_be_stopped_at_each_folder_before_it_is_read(
+    archive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = archive_files.find(f"{archive}/**/*.none", [archive])
+    with monkeypatch.context() as patched:
+        patched.setattr(archive_files.os, "scandir", lambda folder: pytest.fail(f"{folder} was read"))
+        first = next(search)
+    assert (first.path, first.place, first.matches) == (archive, ("",), False)
 
-    def tick() -> None:
-        ticks.append(None)
-        if len(ticks) == 3:
-            raise InterruptedError
 
-    with pytest.raises(InterruptedError):
-        list(archive_files.find(f"{archive}/**/*.none", [archive], tick))
-    assert len(ticks) == 3
+@pytest.mark.parametrize("glob", ["**/*.fits", "**/2*/**/*.fits", "*/*/*.fits", "**/*", "2022/**"])
+def test_a_search_continues_after_every_place_where_it_can_stop(archive: Path, glob: str) -> None:
+    """Files between folders by name, names with bytes before "/", and a folder that begins with another's name."""
+    for name in (
+        "2022/03!/d.fits",
+        "2022/03.fits",
+        "2022/03/z/e.fits",
+        "2022-b/f.fits",
+        "z.fits",
+        "2022/zz/g.fits",
+    ):
+        (archive / name).parent.mkdir(exist_ok=True, parents=True)
+        (archive / name).write_bytes(b"x")
+    (archive / "2022" / os.fsdecode(b"\xff.fits")).write_bytes(b"x")
+    whole = list(archive_files.find(f"{archive}/{glob}", [archive]))
+    assert len({step.place for step in whole}) == len(whole)
+    for number, step in enumerate(whole):
+        rest = list(archive_files.find(f"{archive}/{glob}", [archive], step.place))
+        assert rest == whole[number + 1 :], step.place
+
+
+def test_a_search_that_continues_does_not_read_folders_that_it_has_finished(
+    archive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[str] = []
+    real = os.scandir
+    monkeypatch.setattr(
+        archive_files.os, "scandir", lambda folder: looked.append(str(folder)) or real(folder)
+    )
+    after = ("2022", "03", "b.fits")
+    rest = [one.path.name for one in archive_files.find(f"{archive}/**/*.fits", [archive], after)]
+    assert rest == ["b.txt"]
+    assert looked == [str(archive), str(archive / "2022"), str(archive / "2022" / "03")], "not 2021"
+
+
+def test_a_place_stays_valid_when_files_are_removed_and_added(archive: Path) -> None:
+    after = ("2022", "03", "b.fits")
+    (archive / "2022" / "03" / "b.fits").unlink()
+    for name in ("2021/before.fits", "2022/03/c.fits", "2023/later.fits"):
+        (archive / name).parent.mkdir(exist_ok=True)
+        (archive / name).write_bytes(b"x")
+    rest = list(archive_files.find(f"{archive}/**/*.fits", [archive], after))
+    assert [one.path.name for one in rest if one.matches] == ["c.fits", "later.fits"]
 
 
 @pytest.mark.parametrize("glob", ["*.fits", "**/*.fits", "*/*.fits"])
@@ -116,7 +157,7 @@ def test_a_circular_link_is_yielded_with_its_error_and_the_walk_continues(archiv
     for name in ("loop.fits", "2021/loop.fits"):
         (archive / name).symlink_to(archive / name)
     (archive / "z.fits").write_bytes(b"x")
-    files = list(archive_files.find(f"{archive}/{glob}", [archive]))
+    files = [one for one in archive_files.find(f"{archive}/{glob}", [archive]) if one.matches or one.error]
     wrong = [file for file in files if file.error is not None]
     assert wrong and all(file.path.name == "loop.fits" for file in wrong)
     for file in wrong:

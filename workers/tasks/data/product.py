@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from psfcore.deconvolve.assess.changes import Changes
 from psfcore.deconvolve.assess.quality import MEANINGS
 from psfcore.deconvolve.cards import UsedPsf, deconvolution_cards, deconvolution_history
-from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.result import Deconvolved, OfBox
 from psfcore.drawing.thumbnail import write_thumbnail
 from psfcore.drawing.units import unit_label
 from psfcore.fits.header import optional_text
@@ -222,6 +222,7 @@ def details_of(
         "edge_band_px": result.edge_band_px,
         "noise_amplification": result.noise_amplification if errors is None else errors.amplification,
         "chi2_per_pixel": result.chi2_per_pixel,
+        "region": None if result.of_box is None else _region(result.of_box),
         "flux_change_pct": 100 * (result.flux_out / result.flux_in - 1),
         "bright_change_pct": _change_pct(before[bright], after[bright]),
         "dark_change_pct": _change_pct(before[dark], after[dark]),
@@ -234,6 +235,11 @@ def details_of(
         "changes": found.as_json(),
     }
     return details
+
+
+def _region(found: OfBox) -> dict[str, Any]:
+    """The region that was deconvolved alone, the rim around it, and the bound of the error in the unit of the image."""
+    return {"box": str(found.box), "rim_px": found.rim_px, "error": found.error}
 
 
 def _saturation(image: Image) -> dict[str, Any] | None:

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import fit_effects
-from psfcore.gap.evidence.evidence import gather
+from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.search import displaced
 from psfcore.gap.library.optics import (
@@ -57,6 +57,38 @@ def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch:
     assert value == pytest.approx(1.0, abs=4 * sigma)
     assert added.parameters("dark_offset") == {"offset": (value, sigma)}
     assert added.subtracted["dark_offset"] == pytest.approx((1.0,), abs=4 * sigma)
+
+
+def test_a_refit_of_several_rounds_computes_the_jacobian_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plane of light; the model at the refit is that of a new linear model of the images without this plane."""
+    plane = effect("intensity_gradient")
+    x = np.indices(clean().shape)[1] / clean().shape[1] - 0.5
+    frames = tuple(
+        replace(frame, pixels=(frame.pixels + 4.0 + 8.0 * x).astype(np.float32)) for frame in clean().frames
+    )
+    found = invert(replace(clean(), frames=frames))
+    model = LinearModel(gather(found, [plane]), FLOOR)
+    gathered: list[Evidence] = []
+
+    def counted(*given: Any, **named: Any) -> Evidence:
+        gathered.append(gather(*given, **named))
+        return gathered[-1]
+
+    monkeypatch.setattr(correction, "gather", counted)
+    monkeypatch.setattr(correction, "SETTLED", 0.0)
+    offset = effect("dark_offset")
+    added = add_to_model(found, [plane], fit_effects(model, [plane]), model, beside=[offset])
+    assert added.rounds > 1 and len(gathered) == 1
+    for name, true in (("level", 4.0), ("slope_x", 8.0), ("slope_y", 0.0)):
+        value, sigma, _ = added.values[name]
+        assert value == pytest.approx(true, abs=4 * sigma)
+    assert added.beside is not None
+    assert [e.name for e in added.beside.evidence.effects] == ["intensity_gradient", "dark_offset"]
+    alone = gather(added.solution, added.effects)
+    assert added.evidence.columns == alone.columns and added.evidence.size == alone.size
+    for made, again in zip(added.evidence.discs, alone.discs, strict=True):
+        assert made.residual == pytest.approx(again.residual)
+        assert made.jacobian == pytest.approx(again.jacobian)
 
 
 def test_a_refit_gives_the_parameters_of_each_effect() -> None:

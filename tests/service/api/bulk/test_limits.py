@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,9 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from tests.conftest import write_image
 from tests.service.conftest import upload, work_through_bulks
-from workers.bulk import matching
 from workers.bulk import task as bulk_task
 from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
-from workers.files import archive as archive_files
 from workers.files.store import Store
 from workers.intake import estimates
 from workers.run import attempt, runner
@@ -114,41 +111,6 @@ def test_an_image_that_takes_too_long_fails_but_a_turn_may_last_longer(
         (failed,) = api.get(f"/v1/bulk/{bulk['id']}/failures").json()["items"]
         assert (failed["source"], failed["error"]["code"]) == (ids[2], "took-too-long")
         assert failed["error"]["fault"] == "user" and "30 s" in failed["error"]["message"]
-
-
-def test_a_listing_that_takes_too_long_is_stopped_even_if_it_finds_no_file(
-    settings: Settings, tmp_path: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    archive = tmp_path / "archive"
-    for number in range(20):
-        (archive / f"{number:02}").mkdir(parents=True)
-    limited = settings.model_copy(update={"max_job_s": 30.0, "bulk_roots": str(archive)})
-    clock = _Clock()
-    monkeypatch.setattr(attempt, "time", clock)
-    monkeypatch.setattr(matching, "TELL_EVERY_S", 0.0)
-    looked: list[Any] = []
-    real = os.scandir
-
-    def slow(folder: Any) -> Any:
-        looked.append(folder)
-        clock.ahead_s += 20.0
-        return real(folder)
-
-    with TestClient(create_app(limited)) as api:
-        psf_id = upload(api, psf_file, "/v1/psfs")
-        files = [{"glob": f"{archive}/**/*.none"}]
-        bulk = api.post("/v1/bulk", json={"files": files, "psf_id": psf_id, "parameters": FEW}).json()
-        catalogue = Catalogue(limited.catalogue_url)
-        keep_turns(catalogue, limited)
-        (turn,) = catalogue.jobs.of_kind("bulk")
-        with monkeypatch.context() as patched:
-            patched.setattr(archive_files.os, "scandir", slow)
-            Runner(limited, catalogue, Store(limited.data_dir)).run(turn.id)
-        keep_turns(catalogue, limited)
-        catalogue.close()
-        stopped = api.get(f"/v1/bulk/{bulk['id']}").json()
-        assert (stopped["phase"], stopped["error"]["code"]) == ("ERROR", "took-too-long")
-        assert len(looked) == 2
 
 
 class _Clock:

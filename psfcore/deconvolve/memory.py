@@ -1,0 +1,133 @@
+"""The memory that a deconvolution needs, from the sizes of image and PSF, before anything is read.
+
+    bytes = plane_bytes P + transform_bytes L + image_bytes I + psf_bytes K        Eq. (1)
+
+`python -m benchmarks.growth memory` measures both sides of Eq. (1). The size of the margin follows from the PSF, which may not
+exist yet; the shares of MARGIN_SHARE were measured with the PSF of HRI_EUV, which scatters much light. This module
+imports no numerical libraries, because the web process uses it too.
+
+| symbol | name | unit |
+|---|---|---|
+| I | pixels of the image | px |
+| P | pixels of the plane: image and margins | px |
+| L | pixels of the transforms: the plane, padded for the reach of the PSF | px |
+| K | pixels of the PSF | px |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+from psfcore.convolution.lengths import LARGEST_LENGTH, good_length
+from psfcore.errors import DataError
+
+# Default margin divided by half the width of the PSF. It is at most half the width of the image.
+MARGIN_SHARE = {
+    "richardson-lucy": 0.08,
+    "richardson-lucy-accelerated": 0.08,
+    "richardson-lucy-extended": 0.56,
+    "richardson-lucy-total-variation": 0.08,
+    "basic-iterative": 0.28,
+    "linear": 0.28,
+}
+# plane_bytes and transform_bytes of each method. At its end, a linear method also computes its noise amplification from the
+# transfer function.
+WORKING_BYTES = {
+    "richardson-lucy": (8.0, 8.0),
+    "richardson-lucy-accelerated": (24.0, 8.0),
+    "richardson-lucy-extended": (26.0, 8.0),
+    "richardson-lucy-total-variation": (20.0, 8.0),
+    "basic-iterative": (12.0, 18.0),
+    "linear": (12.0, 19.0),
+}
+IMAGE_BYTES = 20.0  # the image and the result in float64, the mask, and a comparison of both
+ERRORS_BYTES = 240.0  # further bytes for each pixel of the image, if errors are estimated
+PSF_BYTES = 8.0
+MIB = 2**20
+
+Shape = tuple[int, int]
+Figure = TypeVar("Figure", float, tuple[float, float])
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A deconvolution: the method, the shapes (ny, nx) of image and PSF, and the options that determine its memory.
+
+    edges, margin_px: None: the default of the method. draws: number of noise realisations.
+    """
+
+    method: str
+    image: Shape
+    psf: Shape
+    edges: str | None = None
+    margin_px: int | None = None
+    draws: int = 0
+
+    @property
+    def margin(self) -> int:
+        """Expected width of the margin, px."""
+        if self.edges == "zero":
+            return 0
+        if self.margin_px is not None:
+            return self.margin_px
+        share = of_method(MARGIN_SHARE, self.method)
+        return int(min(share * max(self.psf) / 2, min(self.image) / 2))
+
+    @property
+    def plane(self) -> Shape:
+        """Shape of the plane: image and margins."""
+        ny, nx = self.image
+        return ny + 2 * self.margin, nx + 2 * self.margin
+
+    @property
+    def transform(self) -> Shape:
+        """Lengths of the transforms: the plane, and the light that crosses its edge must not wrap into the image."""
+        extended = self.edges == "extended" or (self.edges is None and self.method.endswith("-extended"))
+        sought = self.margin if extended else 0
+        ny, nx = (
+            max(side, size + sought + min(psf // 2, size + sought - 1))
+            for side, size, psf in zip(self.plane, self.image, self.psf, strict=True)
+        )
+        return _length(ny), _length(nx)
+
+
+def deconvolution_bytes(asked: Asked) -> float:
+    """Eq. (1): the memory of a deconvolution, with its image, its PSF and its result, in bytes."""
+    image_bytes = IMAGE_BYTES + (ERRORS_BYTES if asked.draws else 0.0)
+    plane_bytes, transform_bytes = of_method(WORKING_BYTES, asked.method)
+    return (
+        plane_bytes * math.prod(asked.plane)
+        + transform_bytes * math.prod(asked.transform)
+        + image_bytes * math.prod(asked.image)
+        + PSF_BYTES * math.prod(asked.psf)
+    )
+
+
+def check_memory(image: Shape, needed_bytes: float, free_bytes: int) -> None:
+    """Raise DataError "too-much-memory" if the deconvolution of an image of this shape needs more than the free memory.
+
+    The system would end the process otherwise, without a message.
+    """
+    if needed_bytes <= free_bytes:
+        return
+    ny, nx = image
+    raise DataError(
+        "too-much-memory",
+        f"expected a deconvolution that fits into the free memory, {free_bytes / MIB:.0f} MiB; an image of {nx} x {ny} px "
+        f"needs about {needed_bytes / MIB:.0f} MiB: deconvolve a part of the image "
+        "(--region, in Python region=), end other programs, or use a machine with more memory",
+        {"needed_mib": round(needed_bytes / MIB), "free_mib": round(free_bytes / MIB)},
+    )
+
+
+def of_method(figures: Mapping[str, Figure], method: str) -> Figure:
+    """The figure of a method; the largest figure of all methods if this method has not been measured yet."""
+    return figures.get(method, max(figures.values()))
+
+
+def _length(at_least: int) -> int:
+    # A longer transform is refused when the deconvolution begins.
+    return good_length(at_least) if at_least <= LARGEST_LENGTH else at_least

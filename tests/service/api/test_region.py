@@ -1,0 +1,80 @@
+"""A request for a region of an image."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from astropy.io import fits
+from fastapi.testclient import TestClient
+from httpx import Response
+
+from tests.service.conftest import upload
+
+DEFAULT = {"method": {"name": "linear"}}
+
+
+def ask(api: TestClient, image_id: str, psf_id: str, **more: Any) -> Response:
+    parameters = {"image_id": image_id, "psf_id": psf_id, **DEFAULT, **more}
+    return api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
+
+
+def test_the_product_of_a_region_is_the_box(
+    api: TestClient, run_jobs: Callable[[], None], image_file: Path, psf_file: Path
+) -> None:
+    fits.setval(image_file, "CRPIX1", value=1.5)
+    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    whole = ask(api, image_id, psf_id).json()
+    assert ask(api, image_id, psf_id, region_error=0.5).json()["id"] == whole["id"], (
+        "without a region it means nothing"
+    )
+    job = ask(api, image_id, psf_id, region="10:50,20:60", region_error=0.9).json()
+    assert job["id"] != whole["id"]
+    run_jobs()
+    product, of_whole = (
+        api.get(api.get(f"/v1/jobs/{one['id']}").json()["result"]).json() for one in (job, whole)
+    )
+    told = product["details"]["region"]
+    assert told["box"] == "10:50,20:60" and told["rim_px"] > 0 and told["error"] > 0
+    assert of_whole["details"]["region"] is None
+    found, expected = (fits.open(io.BytesIO(api.get(one["file"]).content))[0] for one in (product, of_whole))
+    assert found.data.shape == (40, 40) and found.header["DCNVBERR"] == told["error"]
+    assert found.header["CRPIX1"] == 1.5 - 10
+    assert abs(found.data - expected.data[20:60, 10:50]).max() <= told["error"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "code", "said"),
+    [
+        ({"region": "10-50,20-60"}, "invalid-request", "region"),
+        ({"region": "0:5000,0:50"}, "region-outside", "the size of the image"),
+        ({"region": "0:40,0:8"}, "region-too-small", "16 px"),
+        ({"region": "0:40,0:40", "error_draws": 4}, "invalid-request", "error_draws 0 with a region"),
+        (
+            {"region": "0:40,0:40", "method": {"name": "linear", "stop": "discrepancy"}},
+            "invalid-request",
+            "stopping rule fixed",
+        ),
+        ({"region": "0:40,0:40", "region_error": 0}, "invalid-request", "region_error"),
+    ],
+)
+def test_a_region_that_cannot_be_is_refused(
+    api: TestClient, image_file: Path, psf_file: Path, asked: dict[str, Any], code: str, said: str
+) -> None:
+    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    answer = ask(api, image_id, psf_id, **asked)
+    assert answer.status_code == 422 and answer.json()["type"] == f"urn:heliopsf:{code}"
+    assert said in answer.json()["detail"]
+
+
+def test_a_region_needs_less_time_and_memory(api: TestClient, image_file: Path, psf_file: Path) -> None:
+    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    asked = {"image_id": image_id, "psf_id": psf_id, "method": {"name": "linear", "steps": 2}}
+    whole, part = (
+        api.post("/v1/estimates", json={"kind": "deconvolve", "parameters": asked | more}).json()["estimate"]
+        for more in ({}, {"region": "0:16,0:16"})
+    )
+    assert part["memory_mib"] <= whole["memory_mib"] and part["seconds"] <= whole["seconds"]

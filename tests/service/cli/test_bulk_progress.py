@@ -1,0 +1,60 @@
+"""What the commands of bulk runs say while files are still being listed, and about a dry run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from service.cli.bulk import _estimated, _said
+from service.client.http import Client
+
+
+def described(phase: str, total: int, *, listed: bool | None) -> dict[str, Any]:
+    """The description of a bulk run. listed None: one of a service that has no such field."""
+    images = {"total": total, "waiting": total - 3, "at_work": 0, "done": 3, "reused": 0, "failed": 0}
+    more = {} if listed is None else {"listed": listed}
+    return {
+        "id": "a" * 32, "phase": phase, "images": images | {"to_look_at": 0}, "images_an_hour": None,
+        "time_left_s": None, "error": None, **more,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("listed", "said"), [(False, "3 of at least 400 done"), (True, "3 of 400 done"), (None, "3 of 400 done")]
+)
+def test_a_number_of_images_that_may_grow_is_a_lower_limit(listed: bool | None, said: str) -> None:
+    assert _said(described("PAUSED", 400, listed=listed)) == [
+        f"PAUSED: {said}, 0 failed, 0 in progress, 397 waiting"
+    ]
+
+
+def test_the_progress_of_a_run_that_lists_files_has_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No time left can be computed from the number of images that are listed so far."""
+    client, told = Client("http://testserver"), []
+    runs = [
+        described("LISTING", 0, listed=False) | {"images": {"total": 0, "done": 0, "failed": 0}},
+        described("LISTING", 400, listed=False),
+        described("RUNNING", 500, listed=True),
+        described("COMPLETED", 500, listed=True),
+    ]
+    monkeypatch.setattr(client, "follow", lambda address: iter(runs))
+    client.wait_for_bulk("a" * 32, progress=lambda *step: told.append(step))
+    client.close()
+    assert told == [
+        ("0 of at least 0 images", 0, 1),
+        ("3 of at least 400 images", 0, 1),
+        ("images", 3, 500),
+        ("images", 3, 500),
+    ]
+
+
+def test_a_dry_run_names_the_path_of_a_product() -> None:
+    found = {
+        "images": 4, "complete": True, "examined": 4, "refused_images": 0, "refused": [], "existing": 0,
+        "output_bytes": 2**20, "seconds": 8.0, "workers": 1, "memory_mib": 100,
+    }  # fmt: skip
+    path = "/out/SOLO/2021/03/01/a.fits"
+    assert f"for example: {path}" in _estimated(found | {"example_output": path})
+    for nothing in ({"example_output": None}, {}):  # an older service does not send it
+        assert not any("for example" in line for line in _estimated(found | nothing))
