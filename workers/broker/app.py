@@ -21,6 +21,9 @@ from workers.settings import Settings
 
 RUN_JOB = "heliopsf.run_job"
 ASSIST = "heliopsf.assist"
+PROCESS_START_S = (
+    120.0  # on a busy machine; Celery's default of 4 s would end every new process again and again
+)
 AWAY = (OperationalError, KombuError, RedisError, OSError)
 log = logging.getLogger(__name__)
 
@@ -39,6 +42,8 @@ def make_app(settings: Settings) -> Celery:
         # If a process has ended, Celery waits for the result of its job before the new process gets a job.
         # This wait is short, because our jobs have no results in Celery.
         worker_lost_wait=0.1,
+        # A new process loads numba and other libraries before it reports to its parent, which ends it otherwise.
+        worker_proc_alive_timeout=PROCESS_START_S,
         task_queues=[BrokerQueue(broker_name(queue), routing_key=broker_name(queue)) for queue in Queue],
         task_default_queue=broker_name(Queue.INTERACTIVE),
         broker_connection_retry_on_startup=True,
