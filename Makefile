@@ -42,6 +42,8 @@ bench: $(DEV)
 	$(BIN)/python -m benchmarks.cross_validation
 	$(BIN)/python -m benchmarks.bulk --images 24
 	$(BIN)/python -m benchmarks.viewer
+	$(BIN)/python -m benchmarks.accelerated
+	$(BIN)/python -m benchmarks.growth --quick
 
 # Other programs in their own environment, timed in turn with heliopsf on the same data. The second command writes
 # docs/aia.md, the PSFs of AIA beside those of aiapy, if there is an image (level 1 at 171 angstrom). The third one adds

@@ -1,0 +1,1 @@
+"""How time and memory grow; see `benchmarks.growth.__main__`."""
