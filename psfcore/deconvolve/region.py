@@ -40,14 +40,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.assess.changes import measure_changes
-from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 from psfcore.deconvolve.assess.quality import QualityBit, quality_plane
 from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.deconvolve.conditions import Progress
@@ -61,6 +59,10 @@ from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf
 from psfcore.psf_sampling import check_compatible, rebinned_kernel
+
+if TYPE_CHECKING:
+    from psfcore.convolution.convolver import Convolver
+    from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 
 AMPLIFICATION = 2.0
 ROUNDING = 1e-5  # rounding error of a deconvolution in float32, as a share of the brightest pixel
@@ -261,7 +263,7 @@ class _FarLight:
         margin = margin_px // self.factor
         plane = np.pad(coarse, margin, mode="symmetric")
         field = tuple(slice(margin, margin + n) for n in coarse.shape)
-        convolver = Convolver(self._kernel, plane.shape, threads=self._threads)
+        convolver = self._convolver(plane.shape)
         kept = 1 / _compensation(convolver, plane.shape) if self._keeps_flux else np.ones(plane.shape)
         scene = plane
         for _ in range(_ITERATIONS):
@@ -269,11 +271,17 @@ class _FarLight:
         self._kept = kept[field]
         self._scene, self._light = scene[field], convolver.apply(scene)[field]
 
+    def _convolver(self, shape: tuple[int, int]) -> Convolver:
+        # A deconvolution of a whole image does not load SciPy.
+        from psfcore.convolution.convolver import Convolver
+
+        return Convolver(self._kernel, shape, threads=self._threads)
+
     def beyond(self, rim: Box, box: Box) -> _Light:
         """The light from beyond a rim."""
         k = self.factor
         here = slice(rim.y0 // k, -(-rim.y1 // k)), slice(rim.x0 // k, -(-rim.x1 // k))
-        convolver = Convolver(self._kernel, self._scene[here].shape, threads=self._threads)
+        convolver = self._convolver(self._scene[here].shape)
         light = np.maximum(self._light[here] - convolver.apply(self._scene[here]), 0)  # Eq. (1)
         kept, shares = self._kept[here], np.ones(light.shape)
         if self._keeps_flux:
