@@ -149,10 +149,10 @@ def test_the_wheel_holds_the_packages_and_their_files_and_stays_small(wheel: Pat
         assert name in names
     kept = {f"{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "service" / "pages").rglob("*.html")}
     assert kept and kept <= names
-    # The wheel is code and texts. Compressed, in kB: Python code 1146 (psfcore 621, service 278, workers 229, heliopsf 18), sample image
-    # 109, web pages 92, data 16, metadata 34, and 86 for the names of its 644 files. Only a second wheel for the service
-    # would bring it below 1 MB.
-    assert wheel.stat().st_size < 1.5e6
+    # The wheel is code and texts. Compressed, in kB: Python code 1172 (psfcore 636, service 282, workers 233, heliopsf 21), sample image
+    # 109, web pages 94, data 16, metadata 35, and 87 for the names of its 655 files. Only a second wheel for the service
+    # would bring it below 1 MB. The limit was 1.5 MB before the vector kernels, regions and the listing of archives (32 kB).
+    assert wheel.stat().st_size < 1.6e6
 
 
 @pytest.mark.slow
