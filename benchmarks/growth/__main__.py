@@ -2,11 +2,12 @@
 
     python -m benchmarks.growth [NAME ...] [--most N] [--quick] [--write]
     python -m benchmarks.growth memory
+    python -m benchmarks.growth figures
 
 NAME: image, psf, steps, transit, catalogue or workers; default: all, about ten minutes on two cores. --quick measures
 fewer and smaller points. --most leaves out the points above N. --write replaces the measured numbers in docs/growth/measured.json and their figures; without
 it, the numbers are only printed. Exponents are fitted to the three largest points. memory: the peak of every method
-at 2048 and 4096 px beside its estimate.
+at 2048 and 4096 px beside its estimate. figures: draw the figures again from the table.
 
 Times are the shortest of several runs. They are also printed as ratios to 1 F (see benchmarks/deconvolution.py), which is
 measured before every axis: other work on the machine slows both.
@@ -90,7 +91,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("names", nargs="*", choices=[*AXES, "memory", []], metavar="NAME")
+    parser.add_argument("names", nargs="*", choices=[*AXES, "memory", "figures", []], metavar="NAME")
     parser.add_argument("--most", type=float, default=math.inf, metavar="N")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--write", action="store_true")
@@ -99,6 +100,10 @@ def main() -> None:
         memory()
         return
     table = json.loads(TABLE.read_text("utf-8")) if TABLE.exists() else {}
+    if asked.names == ["figures"]:
+        for name, axis in table.items():
+            draw(FOLDER / f"{name}.svg", axis, axis["machine"])
+        return
     for name in asked.names or AXES:
         table[name] = measured(name, asked.quick, asked.most) | {"machine": machine()}
         if asked.write:

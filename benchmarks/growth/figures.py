@@ -37,14 +37,16 @@ def figure_of(axis: dict[str, Any], machine: str) -> Figure:
         values = [point[key] for point in points]
         power = exponent(n, values)
         axes.loglog(n, values, "o-", color=colour)
+        # At least a decade, so that a quantity that hardly grows is shown as such.
+        spread = max(10**0.5 / (max(values) / min(values)) ** 0.5, 1.3)
+        axes.set_ylim(min(values) / spread, max(values) * spread)
         axes.set_ylabel(f"{label} ~ n^{power:.2f}", color=colour)
         axes.tick_params(axis="y", which="both", labelcolor=colour)
     left.set_xticks(n, [f"{value:g}" for value in n])
     left.minorticks_off()
     left.set_xlabel(f"n: {axis['label']}")
-    left.set_title(axis["what"], fontsize="medium")
+    left.set_title(f"{axis['what']}\n{machine}", fontsize="small")
     left.grid(alpha=0.3)
-    figure.text(0.99, 0.005, machine, ha="right", va="bottom", fontsize=5, color="#666666")
     return figure
 
 
