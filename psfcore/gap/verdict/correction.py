@@ -144,18 +144,22 @@ def add_to_model(
         ):  # the effect is too strong for first-order steps
             break
         least = min(least, left_over)
-        taken = _Round(here, gone, rounds)
+        taken = _Round(here.solution, gone, rounds)
         if float(np.sqrt(np.mean((steps / np.maximum(seen.sigma, 1e-300)) ** 2))) < SETTLED:
             break
     assert taken is not None
+    del here  # its planes, before those of another view are made
     return _corrected(taken, held, beside, in_images, model, progress)
 
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """An accepted round. theta: the parameters that were subtracted from the images. rounds: its number, from 1."""
+    """An accepted round. theta: the parameters that were subtracted from the images. rounds: its number, from 1.
 
-    view: View
+    A view keeps many planes for each image, so the round keeps only the solution.
+    """
+
+    solution: Solution
     theta: Vector
     rounds: int
 
@@ -169,14 +173,14 @@ def _corrected(
     progress: Progress,
 ) -> Corrected:
     """The refit after its last round, with the Jacobian computed there."""
-    evidence = gather(taken.view.solution, (*held, *beside), view=taken.view, progress=progress)
+    evidence = gather(taken.solution, (*held, *beside), progress=progress)
     evidence = _with_noise_of(model.evidence, evidence)
     own = replace(model, evidence=_of_effects(evidence, [effect.name for effect in held]))
     seen = _fit_remaining(own, held, taken.theta, in_images)
     fitted = zip(seen.left.values.items(), seen.theta, strict=True)
     return Corrected(
         effects=tuple(held),
-        solution=taken.view.solution,
+        solution=taken.solution,
         evidence=own.evidence,
         model=own,
         values={name: (float(value), sigma, unit) for (name, (_, sigma, unit)), value in fitted},
