@@ -591,15 +591,19 @@ def test_a_turn_lets_others_go_first_after_each_image(
     keep_turns(catalogue, settings)
     (turn,) = catalogue.jobs.of_kind("bulk")
     waiting, _ = catalogue.jobs.submit("psf-build", {"instrument": "hri_euv"}, "k", "somebody")
+    turns = 0
     for done in (1, 2):
-        runner.run(turn.id)
+        while seen(api, bulk)["images"]["done"] < done:
+            runner.run(turn.id)
+            turns += 1
+            row = catalogue.jobs.get(turn.id)
+            assert row is not None and (row.phase, row.attempt, row.lease) == ("QUEUED", 0, None)
+            assert again == [(turn.id, Queue.BULK)] * turns and row.submitted_at is not None
         assert seen(api, bulk)["images"]["done"] == done
-        row = catalogue.jobs.get(turn.id)
-        assert row is not None and (row.phase, row.attempt, row.lease) == ("QUEUED", 0, None)
-        assert again == [(turn.id, Queue.BULK)] * done and row.submitted_at is not None
+    assert turns <= 3  # the first turn may end as soon as it has listed files
     catalogue.jobs.cancel(waiting.id)
     runner.run(turn.id)
-    assert seen(api, bulk)["images"]["done"] == 5 and len(again) == 2
+    assert seen(api, bulk)["images"]["done"] == 5 and len(again) == turns
 
 
 def test_images_of_another_channel_fail_alone_unless_the_request_says_so(
