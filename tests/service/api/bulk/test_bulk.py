@@ -505,10 +505,11 @@ def test_a_link_made_after_the_listing_is_not_followed(
     write_image(tmp_path / "secret.fits")
 
     def swapped(*arguments: Any) -> Any:
-        if path.is_file() and not path.is_symlink():
+        taken = real(*arguments)
+        if taken is not None and not path.is_symlink():
             path.unlink()
             os.symlink(tmp_path / "secret.fits", path)
-        return real(*arguments)
+        return taken
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(
