@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
@@ -15,6 +17,7 @@ from service.pages.parts.forms import Sent, fields
 from service.pages.parts.sentences import of_error, of_problem
 from service.pages.rendering import page
 from service.pages.visitors import PageBulk
+from workers.contract.bulk import BulkRequest
 
 MOST_REFUSED = 20  # refused images that the page shows
 OF_FIELDS = (404, 409, 422)  # statuses of problems that the person can solve in the form
@@ -36,23 +39,29 @@ async def start(request: Request, response: Response, caller: PageBulk, state: S
 
 
 def _started(request: Request, response: Response, form: Sent, caller: Caller, state: State) -> Response:
-    try:
-        made = submit_bulk(archive.wanted(form), response, caller, state)
-    except Problem as problem:
-        if problem.status not in OF_FIELDS:
-            raise
-        return _page(request, form, caller, state, problem=problem)
-    return RedirectResponse(f"/bulk/{made.id}", 303)
+    def submitted(wanted: BulkRequest) -> Response:
+        return RedirectResponse(f"/bulk/{submit_bulk(wanted, response, caller, state).id}", 303)
+
+    return _answered(request, form, caller, state, submitted)
 
 
 def _checked(request: Request, form: Sent, caller: Caller, state: State) -> Response:
+    def estimated(wanted: BulkRequest) -> Response:
+        return _page(request, form, caller, state, found=estimate_bulk(wanted, caller, state))
+
+    return _answered(request, form, caller, state, estimated)
+
+
+def _answered(
+    request: Request, form: Sent, caller: Caller, state: State, answer: Callable[[BulkRequest], Response]
+) -> Response:
+    """The answer to the request of the form; if the form is refused, the form with the reason."""
     try:
-        found = estimate_bulk(archive.wanted(form), caller, state)
+        return answer(archive.wanted(form))
     except Problem as problem:
         if problem.status not in OF_FIELDS:
             raise
         return _page(request, form, caller, state, problem=problem)
-    return _page(request, form, caller, state, found=found)
 
 
 def _page(
