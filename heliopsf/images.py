@@ -199,6 +199,8 @@ def _deconvolved(
     engines: EngineCache,
     parameters: Mapping[str, Any],
 ) -> Deconvolution:
+    if box is not None and error_draws:
+        raise region_without_errors(error_draws)
     given = None if psf is None else _given(psf)
     shape = shape_of(image)
     asked = Asked(
@@ -236,8 +238,6 @@ def _deconvolved(
     )
     work: Work | BoxWork = whole
     if box is not None:
-        if error_draws:
-            raise region_without_errors(error_draws)
         work = box_work(whole, box, largest_error=region_error)
         # The width of the rim is known only now.
         asked = replace(asked, image=work.rim.shape)
