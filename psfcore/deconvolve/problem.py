@@ -18,7 +18,7 @@ from psfcore.deconvolve.edges import (
     margin_for,
     share_from_beyond,
 )
-from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.result import Deconvolved, fluxes
 from psfcore.deconvolve.stopping import Ended, Iteration, Judgement, Stop, check_steps, judgement, run
 from psfcore.image import Image
 from psfcore.psf import Psf
@@ -116,26 +116,20 @@ def solution(
 ) -> Deconvolved:
     """Turn an estimate on the domain into the result for the image. estimate: a plane [y, x], or in the engine's layout.
 
-    negatives_count: True if the method uses negative pixels unchanged; False if it counts them as 0.
+    negatives_count: as in `fluxes`.
     """
     image, domain = problem.image, problem.domain
     pixels = domain.cut([(0, estimate)] if estimate.ndim == 2 else problem.engine.row_blocks_of(estimate))
-    # The sums use no copies of planes: here most of the memory of a deconvolution is in use.
-    counted = image.valid
-    flux_out = float(pixels.sum(where=counted))
-    negative = image.pixels < 0
-    negative &= counted
-    if not negatives_count:
-        counted &= ~negative
+    flux_in, flux_out, negative_pixels = fluxes(image, pixels, negatives_count=negatives_count)
     pixels[~image.finite] = np.nan
     return Deconvolved(
         pixels=pixels,
         method=method,
         steps_done=ended.steps_done,
         stopped_because=ended.because,
-        flux_in=float(image.pixels.sum(where=counted)),
+        flux_in=flux_in,
         flux_out=flux_out,
-        negative_pixels=int(np.count_nonzero(negative)),
+        negative_pixels=negative_pixels,
         last_change=last_change,
         edges=domain.edges,
         margin_px=domain.margin_px,

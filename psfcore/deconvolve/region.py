@@ -51,7 +51,7 @@ from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_discrepanc
 from psfcore.deconvolve.conditions import Progress
 from psfcore.deconvolve.edges import Edges, margin_for, share_from_beyond
 from psfcore.deconvolve.methods.registry import defaults_of, keeps_flux, may_be_negative
-from psfcore.deconvolve.result import Deconvolved, OfBox
+from psfcore.deconvolve.result import Deconvolved, OfBox, fluxes
 from psfcore.deconvolve.whole import Assessed, Work
 from psfcore.errors import DataError
 from psfcore.fits.viewing.regions import moved_header
@@ -105,15 +105,15 @@ class BoxWork:
         """Deconvolve box and rim, and cut out the box. Flux and negative pixels are those of the box."""
         found = self.work.run(progress=progress)
         pixels = np.ascontiguousarray(found.pixels[self.box.inside(self.rim).slices])
-        valid = self.image.valid
-        negative = valid & (self.image.pixels < 0)
-        counted = valid if may_be_negative(self.work.method) else valid & ~negative
+        flux_in, flux_out, negative_pixels = fluxes(
+            self.image, pixels, negatives_count=may_be_negative(self.work.method)
+        )
         return replace(
             found,
             pixels=pixels,
-            flux_in=float(self.image.pixels.sum(where=counted)),
-            flux_out=float(pixels.sum(where=valid)),
-            negative_pixels=int(np.count_nonzero(negative)),
+            flux_in=flux_in,
+            flux_out=flux_out,
+            negative_pixels=negative_pixels,
             edges=self.edges,
             of_box=OfBox(self.box, self.rim_px, self.error),
         )

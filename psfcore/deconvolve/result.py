@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.edges import Edges
+from psfcore.image import Image
 
 
 @dataclass(frozen=True)
@@ -55,3 +56,18 @@ class Deconvolved:
     noise_amplification: float | None = None
     chi2_per_pixel: float | None = None
     of_box: OfBox | None = None
+
+
+def fluxes(image: Image, pixels: NDArray[np.float64], *, negatives_count: bool) -> tuple[float, float, int]:
+    """`flux_in`, `flux_out` and `negative_pixels` of a `Deconvolved` with these pixels.
+
+    negatives_count: True if the method uses negative pixels unchanged; False if it counts them as 0.
+    """
+    # The sums use no copies of planes: here most of the memory of a deconvolution is in use.
+    counted = image.valid
+    flux_out = float(pixels.sum(where=counted))
+    negative = image.pixels < 0
+    negative &= counted
+    if not negatives_count:
+        counted &= ~negative
+    return float(image.pixels.sum(where=counted)), flux_out, int(np.count_nonzero(negative))
