@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fastapi.testclient import TestClient
@@ -19,6 +21,14 @@ from workers.contract.phases import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
+
+
+@pytest.fixture
+def one_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Set the clock of the rates to the fifth second of a minute: in the next minute a caller may ask again."""
+    ahead = 5 - time.time() % 60
+    clock = SimpleNamespace(time=lambda: time.time() + ahead)
+    monkeypatch.setattr("limits.storage.memory.time", clock)
 
 
 @pytest.fixture(scope="package", autouse=True)

@@ -150,6 +150,7 @@ def test_an_owner_makes_a_bounded_number(service: Keyed) -> None:
     made(ann)
 
 
+@pytest.mark.usefixtures("one_minute")
 def test_keys_count_as_submissions(settings: Settings) -> None:
     with keyed(settings, submissions_per_minute=2) as service:
         ann = service.client("ann")

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import uvicorn
@@ -128,14 +127,6 @@ def test_the_files_of_pages_are_served_under_any_name(api: TestClient) -> None:
 
 
 # Rates ----------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def one_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock that counts go by, at the fifth second of a minute: over the end of one a caller may ask once more."""
-    ahead = 5 - time.time() % 60
-    clock = SimpleNamespace(time=lambda: time.time() + ahead)
-    monkeypatch.setattr("limits.storage.memory.time", clock)
 
 
 @pytest.mark.usefixtures("one_minute")

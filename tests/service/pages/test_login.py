@@ -120,6 +120,7 @@ def test_answers_that_caches_may_keep_depend_on_the_cookie(service: Keyed, psf_f
         assert "Cookie" in answer.headers["Vary"].split(", ")
 
 
+@pytest.mark.usefixtures("one_minute")
 def test_both_count_against_the_same_limit(settings: Settings) -> None:
     with keyed(settings, reads_per_minute=40) as service:
         key = service.key("ann")
@@ -228,6 +229,7 @@ def test_a_page_without_a_session_leads_to_the_login_and_back(service: Keyed) ->
 NO_KEY = "This is not a key. Copy the whole key; it begins with hpsf_."
 
 
+@pytest.mark.usefixtures("one_minute")
 def test_a_wrong_key_is_refused_with_the_reason_and_counted(settings: Settings) -> None:
     with keyed(settings, reads_per_minute=3) as service:
         expired = service.key("ann", lasts_s=-1)
@@ -241,6 +243,7 @@ def test_a_wrong_key_is_refused_with_the_reason_and_counted(settings: Settings) 
         assert browser(service, service.key("ann")).cookies, "a good key is still accepted"
 
 
+@pytest.mark.usefixtures("one_minute")
 def test_logins_count_as_submissions_of_their_key(settings: Settings) -> None:
     with keyed(settings, submissions_per_minute=2) as service:
         data = {"key": service.key("ann")}

@@ -189,6 +189,7 @@ def test_forms_without_files_may_be_multipart_and_are_bounded(api: TestClient) -
     assert many.status_code == 400 and "at most 64 fields" in many.text
 
 
+@pytest.mark.usefixtures("one_minute")
 def test_a_file_needs_the_scope_and_counts_for_its_owner(settings: Settings, image_file: Path) -> None:
     files = {"f": ("sun.fits", image_file.read_bytes())}
     fields: dict[str, str | list[str]] = dict(IMAGE)
