@@ -61,7 +61,8 @@ class Evidence:
 
     effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns that
     every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every image,
-    used or not. untestable: the reasons why effects cannot be tested, by name. numbers: `Change.numbers` by column.
+    used or not. untestable: the reasons why effects cannot be tested, by name. longest_step: `Parameter.largest_step` of each
+    coordinate of the PSF. numbers: `Change.numbers` by column.
     """
 
     effects: tuple[Effect, ...]
@@ -71,6 +72,7 @@ class Evidence:
     unocculted: UnoccultedBlocks
     image_info: tuple[ImageInfo, ...]
     untestable: dict[str, str]
+    longest_step: Vector
     numbers: dict[int, int] = field(default_factory=dict)
 
     def columns_of(self, effect: str) -> dict[str, int]:
@@ -162,6 +164,7 @@ def gather(
             )
         ),
         untestable=untestable,
+        longest_step=np.array([parameter.largest_step for parameter in solution.inversion.shape.parameters]),
         numbers={len(base) + k: change.numbers for k, change in enumerate(changes) if change.numbers},
     )
     return _testable(found)

@@ -1,7 +1,7 @@
 """The settled posterior: the linear model is replaced by full refits where it is not exact enough.
 
-A plausible hypothesis is refitted if an error of its template (`likelihood.USUAL_ERROR`) would be visible in the
-data. The most probable hypothesis comes first. Before several effects are refitted together, the most probable of them is
+A plausible hypothesis is refitted if an error of its template (`likelihood.USUAL_ERROR`), or the curvature of the PSF
+(`likelihood.CURVATURE`), would be visible in the data. The most probable hypothesis comes first. Before several effects are refitted together, the most probable of them is
 refitted alone, for two reasons: this refit also gives the evidence of all pairs with this effect; and a strong effect
 that is not linear can make a pair look more probable than the effect alone. The refits end when no plausible hypothesis needs a
 refit, or after MOST_REFITS refits.
@@ -24,7 +24,7 @@ from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior, kind_of, posterior
 
 MOST_REFITS = 3  # for example, an effect alone, a pair that contains it, and a rival
-VISIBLE = 9.0  # a template error is visible if it adds this much to chi2
+VISIBLE = 9.0  # an error of the first order is visible if it adds this much to chi2
 PLAUSIBLE = 0.02
 LEADING = 0.5
 
@@ -102,7 +102,7 @@ def _to_refit(found: Posterior, done: set[Names]) -> Names | None:
     for names, share in found.probabilities().items():
         if share < PLAUSIBLE:
             return None
-        if names in done or found.visible_error.get(names, 0.0) <= VISIBLE:
+        if names in (NONE, UNKNOWN) or names in done or found.visible_error.get(names, 0.0) <= VISIBLE:
             continue
         alone = [(name,) for name in names]
         if len(alone) > 1 and not done.intersection(alone):

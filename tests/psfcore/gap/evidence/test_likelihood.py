@@ -151,12 +151,32 @@ def test_what_an_error_of_the_first_template_explains_is_credited_less_to_a_seco
 
     def credit(model: LinearModel, error: float) -> float:
         likelihood = Likelihood(model)
-        alone, both = (likelihood._weigh(some, 1.0, {}, error) for some in ([offset], [offset, smear]))
+        alone, both = (likelihood._weigh(some, 1.0, {}, error)[0] for some in ([offset], [offset, smear]))
         return both.log_evidence - alone.log_evidence
 
     largest = TEMPLATE_ERRORS[-1]
     assert credit(weak, largest) == pytest.approx(credit(weak, 0.0), abs=1)
     assert 5 < credit(strong, largest) < credit(strong, 0.0) - 3
+
+
+def test_a_long_step_of_the_psf_is_not_linear(evidence: Evidence) -> None:
+    """The curvature of the PSF grows with the fourth power of the step: with its relative error and its change."""
+    longest = float(evidence.longest_step[0])
+    disc_change = np.concatenate([disc.jacobian[evidence.base[0]] for disc in evidence.discs])
+    assert disc_change.any()
+
+    def visible(steps: float) -> float:
+        discs = tuple(
+            replace(disc, residual=steps * longest * disc.jacobian[evidence.base[0]])
+            for disc in evidence.discs
+        )
+        plain = with_residuals(evidence, {})
+        return Likelihood(replace(plain, evidence=replace(plain.evidence, discs=discs))).weigh([]).visible_error
+
+    short, long = visible(0.1), visible(1.0)
+    assert 0 < short < long
+    assert long / short == pytest.approx(1e4, rel=0.01)
+    assert Likelihood(with_residuals(evidence, {})).weigh([]).visible_error == 0
 
 
 def test_the_template_error_leaves_out_what_a_change_of_the_psf_absorbs(evidence: Evidence) -> None:
