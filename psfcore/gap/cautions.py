@@ -59,3 +59,16 @@ def cautions_of(solution: Solution, noise: MeasuredNoise | None, evidence: Evide
             "All images have the same exposure time: an error of every readout (in DN) and an error of the rate (in DN/s) look the same."
         )
     return tuple(out)
+
+
+def caution_of_closure(label: str, gap_pct: float, error_pct: float) -> tuple[str, ...]:
+    """A sentence if the closure by some effects says little, because their parameters are too uncertain without the held-out images.
+
+    label: the effects. gap_pct: the gap in held-out images, %. error_pct: the error of their prediction, %, rms.
+    """
+    if error_pct <= gap_pct:
+        return ()
+    return (
+        f"The closure by {label} says little: without the held-out images, its parameters are so uncertain that they predict the "
+        f"discs of these images only to {error_pct:.1f} %, and the gap is {gap_pct:.1f} %. More images, or longer exposures, would help.",
+    )

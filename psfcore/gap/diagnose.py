@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfcore.errors import DataError
-from psfcore.gap.cautions import cautions_of
+from psfcore.gap.cautions import caution_of_closure, cautions_of
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects
 from psfcore.gap.evidence.evidence import Evidence, gather
@@ -200,6 +200,10 @@ def diagnose_solution(
     rms = gap(before, rng) if before is not None else nothing
     gone = found.verdict in ("attributed", "tie") and after is not None
     explained = best.step if best is not None and found.answer else None
+    cautions = [*cautions_of(solution, noise, model.evidence), *refits.failures]
+    if gone and best is not None and after is not None:
+        error_pct = float(np.sqrt(np.mean(after.noise_pct**2)))
+        cautions += caution_of_closure(best.label, rms.value, error_pct)
     return Diagnosis(
         judgement=found,
         calibration=calibration,
@@ -221,7 +225,7 @@ def diagnose_solution(
         corrected=corrected,
         residual=before,
         residual_after=after if gone else None,
-        cautions=(*cautions_of(solution, noise, model.evidence), *refits.failures),
+        cautions=tuple(cautions),
     )
 
 

@@ -174,7 +174,9 @@ class Likelihood:
             found += [self._weigh(effects, trials, out, error) for error in TEMPLATE_ERRORS[1:]]
         evidence = float(logsumexp([one.log_evidence for one, _ in found])) - math.log(len(found))
         best, of_psf = max(found, key=lambda one: one[0].log_evidence)
-        visible = self._visible_error(best.columns, best.values, USUAL_ERROR) + self._visible_curvature(of_psf)
+        visible = self._visible_error(best.columns, best.values, USUAL_ERROR) + self._visible_curvature(
+            of_psf
+        )
         return replace(best, log_evidence=evidence, visible_error=visible)
 
     def _weigh(

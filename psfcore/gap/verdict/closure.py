@@ -23,6 +23,8 @@ example.
 The intervals are meant to contain the closure that the true cause would reach, not only our estimate. They combine four
 errors: a bootstrap over the images; the error of the noise scale in nu, which one simulation determines; the part of
 chi2_after that comes from errors of the effect's parameters; and a relative error FORM_ERROR of the effect's template.
+The part that comes from the parameters is drawn, fold by fold, from the covariance of the fit: its mean is the second term of
+nu, but a single direction with a large error often makes it several times as large.
 """
 
 from __future__ import annotations
@@ -69,7 +71,8 @@ class HeldOut:
     chi2, unocculted_chi2: chi2 of the cells, and of the blocks of the unocculted field. expected, unocculted_expected: the
     values of the two chi2 without a gap. residual_pct: the mean of the disc, simulated minus observed, divided by the
     observed mean. noise_pct: the error of this residual, including the error of the fit. deviance: Eq. (4) of each fold; the
-    key is the tuple of its held-out images.
+    key is the tuple of its held-out images. spread: for each fold, the parts of chi2 that independent errors of its fit add on
+    average, in the discs and in discs and blocks together.
     """
 
     images: tuple[int, ...]
@@ -80,9 +83,10 @@ class HeldOut:
     residual_pct: Vector
     noise_pct: Vector
     deviance: Mapping[tuple[int, ...], float] = field(default_factory=dict)
+    spread: Mapping[tuple[int, ...], tuple[Vector, Vector]] = field(default_factory=dict)
 
     def of(self, images: Sequence[int]) -> HeldOut:
-        """The results for these images only. The deviance is left out, because it belongs to folds."""
+        """The results for these images only. Deviance and spread are left out, because they belong to folds."""
         at = {image: k for k, image in enumerate(self.images)}
         here = [at[image] for image in images]
         return HeldOut(
@@ -123,6 +127,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
     rows: list[tuple[float, ...]] = []
     images: list[int] = []
     deviance: dict[tuple[int, ...], float] = {}
+    spread: dict[tuple[int, ...], tuple[Vector, Vector]] = {}
     base = len(evidence.base)
     free = base + len(set(columns) - model.of_fields)  # a prior constrains the parameters of a random field
     unocculted_noise = math.sqrt(model.unocculted_scale)
@@ -165,19 +170,41 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
             )
         residuals, jacobians = (np.concatenate(parts, axis=-1) for parts in zip(*everything, strict=True))
         deviance[tuple(held)] = _deviance(residuals, jacobians, step.covariance)
+        in_discs = np.concatenate([jacobian for _, jacobian in everything[::2]], axis=-1)
+        spread[tuple(held)] = _spread(in_discs, step.covariance), _spread(jacobians, step.covariance)
     if not rows:
         return None
     chi2, expected, unocculted_chi2, unocculted_expected, residual, noise_pct = np.array(rows).T
     return HeldOut(
-        tuple(images), chi2, expected, unocculted_chi2, unocculted_expected, residual, noise_pct, deviance
+        tuple(images),
+        chi2,
+        expected,
+        unocculted_chi2,
+        unocculted_expected,
+        residual,
+        noise_pct,
+        deviance,
+        spread,
     )
+
+
+def _along_errors(jacobian: Vector, covariance: Vector) -> Vector:
+    """The change (parameters, n) by one standard deviation of each independent error of the parameters."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T) @ jacobian)
+
+
+def _spread(jacobian: Vector, covariance: Vector) -> Vector:
+    """The eigenvalues of J Cov J^T (parameters,): the chi2 that errors of the parameters add is the sum of these times
+    squares of standard normal variables. jacobian: (parameters, n)."""
+    along = _along_errors(jacobian, covariance)
+    return np.maximum(np.linalg.eigvalsh(along @ along.T), 0.0)
 
 
 def _deviance(left: Vector, jacobian: Vector, covariance: Vector) -> float:
     """Eq. (4). left: residuals (n,) in units of the noise. jacobian: (parameters, n). covariance: of the parameters."""
-    values, vectors = np.linalg.eigh(covariance)
-    along = (np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T) @ jacobian
-    inner = np.eye(values.size) + along @ along.T
+    along = _along_errors(jacobian, covariance)
+    inner = np.eye(along.shape[0]) + along @ along.T
     projected = along @ left
     return float(left @ left - projected @ np.linalg.solve(inner, projected) + np.linalg.slogdet(inner)[1])
 
@@ -200,11 +227,13 @@ def closure(
     both = _in_both(before, after)
     if both is None:
         return None
+    spread = list(after.spread.values())
     before, after = both
     chi2_before, chi2_after, nu, nu_after = before.chi2, after.chi2, before.expected, after.expected
     shown = float((before.unocculted_chi2 - before.unocculted_expected).sum())
     fallen = float((before.unocculted_chi2 - after.unocculted_chi2).sum())
-    if shown > (chi2_before - nu).sum() and fallen > shown / 2:
+    with_blocks = bool(shown > (chi2_before - nu).sum() and fallen > shown / 2)
+    if with_blocks:
         chi2_before, chi2_after = chi2_before + before.unocculted_chi2, chi2_after + after.unocculted_chi2
         nu, nu_after = nu + before.unocculted_expected, nu_after + after.unocculted_expected
     total = float((chi2_before - nu).sum())
@@ -217,8 +246,11 @@ def closure(
     if use.sum() < RESAMPLES // 2:
         return None
     seen = chi2_after[chosen].sum(axis=1) / scale
+    of_errors = np.concatenate([fold[with_blocks] for fold in spread] or [np.zeros(0)])
+    drawn = rng.standard_normal((RESAMPLES, of_errors.size)) ** 2 @ of_errors - of_errors.sum()
     resampled, without_errors = (
-        1 - (seen - expected[chosen].sum(axis=1))[use] / totals[use] for expected in (nu, nu_after)
+        1 - (seen - expected[chosen].sum(axis=1) - more)[use] / totals[use]
+        for expected, more in ((nu, 0.0), (nu_after, drawn))
     )
     value = 1 - float((chi2_after - nu).sum()) / total
     low, high = np.percentile(resampled, INTERVAL)

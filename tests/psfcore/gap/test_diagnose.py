@@ -11,6 +11,7 @@ import pytest
 
 from psfcore.blind.effects.scene import patches
 from psfcore.errors import DataError
+from psfcore.gap.cautions import caution_of_closure
 from psfcore.gap.diagnose import Diagnosis, diagnose, diagnose_solution
 from psfcore.gap.evidence.measured_noise import measured_noise
 from psfcore.gap.library.registry import LIBRARY
@@ -228,6 +229,12 @@ def test_the_noise_of_the_images_is_measured(clean: Transit) -> None:
 
 
 @pytest.mark.slow
+def test_a_closure_whose_prediction_is_less_exact_than_the_gap_has_a_caution() -> None:
+    (caution,) = caution_of_closure("ghost", gap_pct=6.4, error_pct=6.8)
+    assert "closure by ghost says little" in caution and "6.8 %" in caution and "6.4 %" in caution
+    assert caution_of_closure("ghost", gap_pct=6.4, error_pct=2.0) == ()
+
+
 def test_cautions_tell_what_one_pointing_and_few_images_cannot_show(clean: Transit) -> None:
     one = replace(clean, frames=tuple(f for f in clean.frames if f.pointing == 2))
     found = verdict(one)

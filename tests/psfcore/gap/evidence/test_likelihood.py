@@ -171,7 +171,9 @@ def test_a_long_step_of_the_psf_is_not_linear(evidence: Evidence) -> None:
             for disc in evidence.discs
         )
         plain = with_residuals(evidence, {})
-        return Likelihood(replace(plain, evidence=replace(plain.evidence, discs=discs))).weigh([]).visible_error
+        return (
+            Likelihood(replace(plain, evidence=replace(plain.evidence, discs=discs))).weigh([]).visible_error
+        )
 
     short, long = visible(0.1), visible(1.0)
     assert 0 < short < long

@@ -14,6 +14,7 @@ from psfcore.gap.verdict.closure import (
     FORM_ERROR,
     HeldOut,
     _deviance,
+    _spread,
     closure,
     fall,
     gap,
@@ -52,6 +53,16 @@ def test_closure_and_gap_by_hand() -> None:
     assert closure(held_out([9.0] * 4, [0.0] * 4), after, rng) is None
 
 
+def test_the_spread_is_the_chi2_that_errors_of_the_parameters_add() -> None:
+    rng = np.random.default_rng(3)
+    root = rng.standard_normal((3, 3))
+    covariance, jacobian = root @ root.T, rng.standard_normal((3, 40))
+    spread = _spread(jacobian, covariance)
+    assert spread.sum() == pytest.approx(np.trace(jacobian.T @ covariance @ jacobian))
+    drawn = rng.multivariate_normal(np.zeros(3), covariance, 20_000) @ jacobian
+    assert np.var(np.sum(drawn**2, axis=1)) == pytest.approx(2 * np.sum(spread**2), rel=0.1)
+
+
 def test_the_interval_of_closure_contains_its_known_errors() -> None:
     ones = np.ones(6)
 
@@ -70,6 +81,11 @@ def test_the_interval_of_closure_contains_its_known_errors() -> None:
     # Of the remaining 20, 15 come from errors of the parameters.
     unsure = closure(before, held_out(30.0, 25.0), np.random.default_rng(1))
     assert unsure is not None and (unsure.value, unsure.high) == pytest.approx((0.80, 0.95 + FORM_ERROR**2))
+    # If all of it comes from one direction, it is often more than its mean: up to 3.8 times.
+    one_direction = {tuple(range(6)): (np.array([30.0]), np.array([30.0]))}  # the sum over six images is 30
+    drawn = closure(before, replace(held_out(40.0, 15.0), spread=one_direction), np.random.default_rng(1))
+    assert drawn is not None and drawn.value == pytest.approx(0.70)
+    assert drawn.high == pytest.approx(0.70 + 3.84 * 30 / 600 + FORM_ERROR**2, abs=0.02)
     # A noise scale with an error of 20 % widens the interval on both sides.
     wide = closure(before, after, np.random.default_rng(1), 0.2)
     assert (
