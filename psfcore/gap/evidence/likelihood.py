@@ -58,8 +58,8 @@ Planes = NDArray[np.float64]
 TEMPLATE_ERRORS = (0.0, 0.03)
 USUAL_ERROR = TEMPLATE_ERRORS[1]
 # What remains of the change by the PSF after a step of one `largest_step` of a coordinate, relative to its first order, if the PSF is
-# fitted again: 0.004 to 0.014 for three power laws, and in proportion to the step.
-CURVATURE = 0.012
+# fitted again: 0.004 to 0.014 for three power laws, in proportion to the step, but at most 0.04 after four such steps.
+CURVATURE, MOST_CURVATURE = 0.012, 0.05
 UNSEEN = 0.5  # if the largest template error adds less than this to chi2, its width does not matter
 CORRELATED = 0.5
 MEASURED = 2.0
@@ -404,7 +404,7 @@ class Likelihood:
             return 0.0
         too_long = float((np.abs(step) / self._evidence.longest_step).max())
         change = self._jacobian[:, :, self._base] @ step
-        return (CURVATURE * too_long) ** 2 * float(np.sum((self._white @ change[..., None]) ** 2))
+        return min(CURVATURE * too_long, MOST_CURVATURE) ** 2 * float(np.sum((self._white @ change[..., None]) ** 2))
 
     def _net(self, change: Matrix) -> Matrix:
         """The part of a change of the discs (discs, cells) that a change of the PSF cannot absorb."""
