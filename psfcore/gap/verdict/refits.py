@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -31,16 +32,23 @@ class Refits:
         self._made: dict[Names, Corrected | None] = {}
         self.failures: list[str] = []
 
-    def weighed(self, names: Names) -> Mapping[Names, Weighed] | None:
+    def weighed(self, names: Names, most_visible: float = math.inf) -> Mapping[Names, Weighed] | None:
         """The evidence of hypotheses, computed at the refit of `names` (`posterior.at_refit`); None if the refit
-        failed."""
+        failed. Empty if it did not settle: the error of its first order, `Weighed.visible_error`, is larger than most_visible."""
         made = self._fit(names)
         if made is None:
             return None
         effects = self._model.evidence.effects
         model = made.model if made.beside is None else made.beside
         moved = made.solution.inversion.coordinates - self._view.solution.inversion.coordinates
-        return at_refit(model, self._model, names, made.subtracted, moved, effects)
+        found = at_refit(model, self._model, names, made.subtracted, moved, effects)
+        if found[names].visible_error > most_visible:
+            self.failures.append(
+                f"The full refit with {label_of(names)} in the model did not settle; the linear model was used instead."
+            )
+            self._made[names] = None
+            return {}
+        return found
 
     @property
     def made(self) -> tuple[Corrected, ...]:

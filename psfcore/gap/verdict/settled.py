@@ -10,7 +10,8 @@ The report names the effects of a hypothesis that is more probable than all othe
 linear model is exact enough, and if this refit fails, the hypothesis is excluded. If it succeeds, the evidence of the linear
 model stays: the evidence of a refit scatters by a few units, and the other hypotheses have no refit.
 
-If the refit of a pair fails, the triples with this pair are excluded too.
+If the refit of a pair fails, the triples with this pair are excluded too. A refit that did not settle counts for nothing: the
+evidence of the linear model stays.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ PLAUSIBLE = 0.02
 LEADING = 0.5
 
 # A function that makes a full refit of a hypothesis. It returns the evidence of this hypothesis, and of the other
-# hypotheses that the refit also tests; None if the refit failed.
-Refit = Callable[[Names], "Mapping[Names, Weighed] | None"]
+# hypotheses that the refit also tests; None if the refit failed; nothing if the error of the first order is still larger than the
+# number that it gets.
+Refit = Callable[[Names, float], "Mapping[Names, Weighed] | None"]
 
 
 def settled_posterior(model: LinearModel, refit: Refit | None) -> tuple[Posterior, tuple[Names, ...]]:
@@ -51,11 +53,11 @@ def settled_posterior(model: LinearModel, refit: Refit | None) -> tuple[Posterio
         if chosen is None:
             break
         done.add(chosen)
-        real = refit(chosen)
+        real = refit(chosen, max(VISIBLE, found.visible_error.get(chosen, 0.0)))
         if real is None:  # the images do not contain the effects as the linear fit states them
             failed.append(chosen)
             found = _without_failed(found, chosen)
-        elif inexact is not None:
+        elif real and inexact is not None:
             # The refit of a hypothesis itself is more exact than its evidence at the refit of another one.
             new = {names: weighed for names, weighed in real.items() if names == chosen or names not in done}
             found = _without_stale(found, chosen, done, new).with_evidence(new, effects)

@@ -68,6 +68,15 @@ def test_how_far_a_refit_departs_from_first_order_is_measured_where_noise_does_n
     assert 0 < made.departures[OFFSET] < 0.5
 
 
+def test_a_refit_whose_first_order_is_not_exact_enough_counts_for_nothing() -> None:
+    refits = Refits(View(found().solution), found().model)
+    assert refits.weighed(OFFSET, most_visible=-1.0) == {}
+    assert refits.made == () and refits.of([OFFSET]) == ()
+    assert refits.failures == [
+        "The full refit with dark_offset in the model did not settle; the linear model was used instead."
+    ]
+
+
 def test_a_failed_refit_is_named_once_and_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[list[str]] = []
 

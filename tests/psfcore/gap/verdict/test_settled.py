@@ -48,7 +48,7 @@ class Refitted:
     def __init__(self, evidence: Mapping[Names, Mapping[Names, float]]) -> None:
         self.evidence, self.asked = evidence, list[Names]()
 
-    def __call__(self, names: Names) -> Mapping[Names, Weighed] | None:
+    def __call__(self, names: Names, most_visible: float) -> Mapping[Names, Weighed] | None:
         self.asked.append(names)
         found = self.evidence.get(names)
         return None if found is None else {one: weighed(log) for one, log in found.items()}
@@ -69,14 +69,14 @@ def test_a_strong_effect_is_refitted_and_the_evidence_of_the_refit_counts(eviden
 
 
 def test_a_hypothesis_whose_refit_fails_is_left_out(evidence: Evidence) -> None:
-    found, failed = settled_posterior(strong_offset(evidence), lambda names: None)
+    found, failed = settled_posterior(strong_offset(evidence), lambda names, most_visible: None)
     assert failed[0] == OFFSET
     assert not set(failed) & set(found.probabilities())
     assert sum(without_idle(found.probabilities()).values()) == pytest.approx(1.0)
 
 
 def test_a_weak_effect_needs_no_refit(evidence: Evidence) -> None:
-    def refit(names: Names) -> Mapping[Names, Weighed]:
+    def refit(names: Names, most_visible: float) -> Mapping[Names, Weighed]:
         raise AssertionError(f"{names} was refitted")
 
     settled_posterior(replace(with_residuals(evidence, {}, noise=0.5), scale_error=0.1), refit)
@@ -100,7 +100,7 @@ def test_before_a_pair_the_more_probable_of_its_effects_is_refitted_alone(start:
 def test_a_second_strong_effect_leads_to_the_refit_of_the_pair(start: Start) -> None:
     start({NONE: 0.0, A: 30.0, B: 35.0, AB: 40.0})
 
-    def refit(names: Names) -> Mapping[Names, Weighed]:
+    def refit(names: Names, most_visible: float) -> Mapping[Names, Weighed]:
         asked.append(names)
         # At the refit of b the pair is still better; the error of the template of a is visible there.
         return {B: weighed(35.0), AB: weighed(55.0, 2 * VISIBLE)} if names == B else {AB: weighed(50.0)}
@@ -162,6 +162,19 @@ def test_an_improbable_effect_and_an_invisible_error_need_no_refit(
     refit = Refitted({})
     settled_posterior(MODEL, refit)
     assert refit.asked == []
+
+
+def test_a_refit_that_did_not_settle_counts_for_nothing(start: Start) -> None:
+    start({NONE: 0.0, A: 30.0, B: 20.0}, 3 * VISIBLE)
+    bounds: list[float] = []
+
+    def refit(names: Names, most_visible: float) -> Mapping[Names, Weighed]:
+        bounds.append(most_visible)
+        return {}
+
+    found, failed = settled_posterior(MODEL, refit)
+    assert failed == () and next(iter(found.probabilities())) == A
+    assert bounds == [3 * VISIBLE], "not made again"
 
 
 def test_a_leading_effect_keeps_its_evidence_if_its_refit_succeeds(start: Start) -> None:
