@@ -404,7 +404,9 @@ class Likelihood:
             return 0.0
         too_long = float((np.abs(step) / self._evidence.longest_step).max())
         change = self._jacobian[:, :, self._base] @ step
-        return min(CURVATURE * too_long, MOST_CURVATURE) ** 2 * float(np.sum((self._white @ change[..., None]) ** 2))
+        return min(CURVATURE * too_long, MOST_CURVATURE) ** 2 * float(
+            np.sum((self._white @ change[..., None]) ** 2)
+        )
 
     def _net(self, change: Matrix) -> Matrix:
         """The part of a change of the discs (discs, cells) that a change of the PSF cannot absorb."""
