@@ -43,9 +43,9 @@ from psfcore.transit.blocks import Fold, folds
 Vector = NDArray[np.float64]
 
 RESAMPLES = 1000
-# Relative error of an effect's template; the square of this error is a fraction of chi2. In a blind set, 0.1 was exceeded in half of
-# the cases with a strong effect, by at most 0.05.
-FORM_ERROR = 0.15
+# Relative error of an effect's template; chi2_after contains its square times the chi2 of the gap. In a blind set of 80 cases (seed 36),
+# ghosts and persistence that the library describes differently had up to 0.34; an interval with 0.15 contained the truth in 8 of 11.
+FORM_ERROR = 0.35
 INTERVAL = (5.0, 95.0)
 # A normal variable is below this number of standard deviations with a probability of 95 %.
 HIDDEN_SIGMA = 1.645
@@ -255,8 +255,8 @@ def closure(
     value = 1 - float((chi2_after - nu).sum()) / total
     low, high = np.percentile(resampled, INTERVAL)
     high = max(high, np.percentile(without_errors, INTERVAL[1]))
-    # No effect can close more than the whole gap.
-    return Interval(value, float(low) - FORM_ERROR**2, max(value, min(float(high), 1.0)) + FORM_ERROR**2)
+    # An error of the template only lowers the closure. No effect can close more than the whole gap.
+    return Interval(value, float(low), max(value, min(float(high) + FORM_ERROR**2, 1.0)))
 
 
 def fall(before: HeldOut, after: HeldOut) -> float:
