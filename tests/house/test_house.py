@@ -8,11 +8,13 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pytest
 import yaml
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 from service.openapi import description
@@ -297,6 +299,19 @@ def test_the_image_is_installed_from_pins_with_hashes() -> None:
     installs = re.findall(r"pip install (.+)", (HERE / "Dockerfile").read_text())
     assert len(installs) == 2 and "--require-hashes" in installs[0]
     assert "--no-deps" in installs[1] and "--no-build-isolation" in installs[1]
+
+
+def test_every_installed_pin_runs_on_the_oldest_python() -> None:
+    """Debian 12 has Python 3.11.2. If one pin needs a newer one, pip searches for a solution for a very long time."""
+    (oldest,) = SpecifierSet(
+        tomllib.loads((HERE / "pyproject.toml").read_text())["project"]["requires-python"]
+    )
+    refused = {
+        found.name: found.metadata["Requires-Python"]
+        for found in distributions()
+        if not SpecifierSet(found.metadata.get("Requires-Python", "")).contains(f"{oldest.version}.0")
+    }
+    assert refused == {}, "pin an older version in constraints.txt"
 
 
 def test_the_page_of_settings_is_made_from_the_settings_class() -> None:
