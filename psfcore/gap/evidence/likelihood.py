@@ -147,6 +147,7 @@ class Likelihood:
         self._white = np.linalg.inv(np.linalg.cholesky(self._covariance))
         base = (self._white @ self._jacobian[:, :, self._base]).reshape(-1, len(self._base))
         self._to_base = np.linalg.pinv(base)
+        self._normal_of_base = base.T @ base
         self._blocks = list(_pointings(model, errors))
         self._log_det = (0.0, 0.0)  # of discs and blocks without any effect
         self._parts((), np.zeros(len(self._base)), np.zeros(0), 0.0)
@@ -400,13 +401,8 @@ class Likelihood:
 
     def _visible_curvature(self, step: Vector) -> float:
         """The chi2 of the discs that a step of the coordinates of the PSF adds, because they change the discs not only linearly."""
-        if not step.any():
-            return 0.0
         too_long = float((np.abs(step) / self._evidence.longest_step).max())
-        change = self._jacobian[:, :, self._base] @ step
-        return min(CURVATURE * too_long, MOST_CURVATURE) ** 2 * float(
-            np.sum((self._white @ change[..., None]) ** 2)
-        )
+        return min(CURVATURE * too_long, MOST_CURVATURE) ** 2 * float(step @ self._normal_of_base @ step)
 
     def _net(self, change: Matrix) -> Matrix:
         """The part of a change of the discs (discs, cells) that a change of the PSF cannot absorb."""

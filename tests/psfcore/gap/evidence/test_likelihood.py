@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from psfcore.gap.evidence import likelihood as likelihoods
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import TEMPLATE_ERRORS, Likelihood
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from tests.psfcore.gap.linear_models import with_residuals
 
 EXACT = 1e-4  # relative error of the noise scale: so small that the likelihood is Gaussian
@@ -157,6 +159,38 @@ def test_what_an_error_of_the_first_template_explains_is_credited_less_to_a_seco
     largest = TEMPLATE_ERRORS[-1]
     assert credit(weak, largest) == pytest.approx(credit(weak, 0.0), abs=1)
     assert 5 < credit(strong, largest) < credit(strong, 0.0) - 3
+
+
+@pytest.mark.parametrize(
+    "values", [{}, {"b_px": 3.0, "c": 2.3, "total": 0.3}, {"b_px": 9.0, "c": 2.8, "total": 0.5}]
+)
+def test_the_curvature_is_that_of_the_scatter_kernel(values: dict[str, float]) -> None:
+    """The light in rings around a disc, after a step of a coordinate, minus its first order and what the PSF absorbs."""
+    shape, size = SOFTENED_POWER_LAW, 257
+    at = shape.coordinates(values)
+    r = np.hypot(*np.mgrid[-128:129, -128:129])
+    bounds = (15, 20, 30, 45, 70, 100, 180)
+
+    def light(step: np.ndarray) -> np.ndarray:
+        kernel = shape.kernel(at + step, size)
+        return np.array([kernel[(r >= low) & (r < high)].sum() for low, high in itertools.pairwise(bounds)])
+
+    start, unit = light(np.zeros(at.size)), np.eye(at.size)
+    slopes = np.array([(light(1e-3 * one) - light(-1e-3 * one)) / 2e-3 for one in unit]) / start
+    absorbed = slopes.T @ np.linalg.pinv(slopes.T)
+
+    def curvature(step: np.ndarray) -> float:
+        linear = step @ slopes
+        rest = light(step) / start - 1 - linear
+        return float(np.linalg.norm(rest - absorbed @ rest) / np.linalg.norm(linear))
+
+    steps = [
+        sign * parameter.largest_step * one
+        for parameter, one in zip(shape.parameters, unit, strict=True)
+        for sign in (-1, 1)
+    ]
+    assert pytest.approx(max(curvature(step) for step in steps), rel=0.25) == likelihoods.CURVATURE
+    assert max(curvature(4 * step) for step in steps) < likelihoods.MOST_CURVATURE
 
 
 def test_a_long_step_of_the_psf_is_not_linear(evidence: Evidence) -> None:

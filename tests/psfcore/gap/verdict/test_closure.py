@@ -13,6 +13,7 @@ from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.verdict.closure import (
     FORM_ERROR,
     HeldOut,
+    _along_errors,
     _deviance,
     _spread,
     closure,
@@ -57,7 +58,7 @@ def test_the_spread_is_the_chi2_that_errors_of_the_parameters_add() -> None:
     rng = np.random.default_rng(3)
     root = rng.standard_normal((3, 3))
     covariance, jacobian = root @ root.T, rng.standard_normal((3, 40))
-    spread = _spread(jacobian, covariance)
+    spread = _spread(_along_errors(jacobian, covariance))
     assert spread.sum() == pytest.approx(np.trace(jacobian.T @ covariance @ jacobian))
     drawn = rng.multivariate_normal(np.zeros(3), covariance, 20_000) @ jacobian
     assert np.var(np.sum(drawn**2, axis=1)) == pytest.approx(2 * np.sum(spread**2), rel=0.1)
@@ -107,8 +108,8 @@ def test_deviance_is_the_log_likelihood_of_a_fold() -> None:
     covariance = root @ root.T
     spread = np.eye(7) + jacobian.T @ covariance @ jacobian
     expected = -2 * multivariate_normal(cov=spread).logpdf(left) - 7 * np.log(2 * np.pi)
-    assert _deviance(left, jacobian, covariance) == pytest.approx(expected)
-    assert _deviance(left, jacobian[:0], covariance[:0, :0]) == pytest.approx(left @ left)
+    assert _deviance(left, _along_errors(jacobian, covariance)) == pytest.approx(expected)
+    assert _deviance(left, _along_errors(jacobian[:0], covariance[:0, :0])) == pytest.approx(left @ left)
 
 
 def test_a_decrease_of_deviance_uses_the_common_folds() -> None:
