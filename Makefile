@@ -32,29 +32,19 @@ test: $(DEV)
 test-full: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests
 
+# Each figure beside its goal and the stored one; needs half an hour and no other program on the machine.
 bench: $(DEV)
-	$(BIN)/python -m benchmarks.start_up
-	$(BIN)/python -m benchmarks.quick_calls
-	$(BIN)/python -m benchmarks.deconvolution
-	$(BIN)/python -m benchmarks.roofline
-	$(BIN)/python -m benchmarks.ring_sums --quick
-	$(BIN)/python -m benchmarks.fit
-	$(BIN)/python -m benchmarks.cross_validation
-	$(BIN)/python -m benchmarks.bulk --images 24
-	$(BIN)/python -m benchmarks.viewer
-	$(BIN)/python -m benchmarks.accelerated
-	$(BIN)/python -m benchmarks.growth --quick
+	$(BIN)/python -m benchmarks
 
-# Other programs in their own environment, timed in turn with heliopsf on the same data. The second command writes
-# docs/aia.md, the PSFs of AIA beside those of aiapy, if there is an image (level 1 at 171 angstrom). The third one adds
-# the times of a 4096 px image to this page.
+# Other packages, each in its own environment, timed in turn with heliopsf on the same data: the table of docs/speed.md. The
+# third command writes docs/aia.md, the PSFs of AIA beside those of aiapy, if there is an image (level 1 at 171 angstrom). The
+# last one adds the times of a 4096 px image to this page.
 AIA_IMAGE ?= $(or $(HELIOPSF_SHARED),../shared)/data/real/aia/aia_171_cutout_20130310.fits
 bench-peers: $(DEV)
-	test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
-	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt numpy scipy 'scikit-image>=0.24' 'aiapy>=0.9' 'jax>=0.4'
-	$(BIN)/python -m benchmarks.peers .venv-peers/bin/python
-	$(BIN)/python -m benchmarks.aia .venv-peers/bin/python "$(AIA_IMAGE)" docs/aia.md
-	$(BIN)/python -m benchmarks.aia_loop .venv-peers/bin/python --rounds 3 --page docs/aia.md
+	$(BIN)/python -m benchmarks.race.environments
+	$(BIN)/python -m benchmarks.race.peers --page docs/speed.md
+	$(BIN)/python -m benchmarks.race.aia .venv-peers/aiapy/bin/python "$(AIA_IMAGE)" docs/aia.md
+	$(BIN)/python -m benchmarks.race.aia_loop --rounds 3 --page docs/aia.md
 
 # Runs jobs while workers, Redis, PostgreSQL and the service are killed at random. Needs Redis and PostgreSQL.
 chaos: $(DEV)

@@ -14,7 +14,7 @@ of each result beside the true scene.
 
 Times are processor times of all threads, which other work on the machine changes less than it changes the duration. They
 are ratios to 20 plain steps in the same run (shortest of three runs in turn), and to the processor time of 1 F (see
-benchmarks/deconvolution.py). The PSF is prepared and the kernels are compiled before.
+benchmarks/timing.py). The PSF is prepared and the kernels are compiled before.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 import heliopsf
-from benchmarks.deconvolution import THREADS
+from benchmarks.timing import THREADS
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions, EngineCache
 from psfcore.deconvolve.methods.registry import method_named, method_names

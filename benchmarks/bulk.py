@@ -29,6 +29,7 @@ from typing import Any
 
 from astropy.io import fits
 
+from benchmarks.figures import tell
 from psfcore.build import build_psf
 from psfcore.deconvolve.assess.contact_sheet import treat
 from psfcore.deconvolve.conditions import Conditions, EngineCache
@@ -42,6 +43,7 @@ from tests.whole.stack import Missing, Stack, wait_for
 from tests.whole.test_bulk import items, kill_everything
 
 LIMITS = FitsLimits(max_pixels=2**24)
+OVERHEAD = {1: "bulk, one worker: overhead", 2: "bulk, two workers: overhead"}
 MARK = b"BENCH   =              1000000"
 
 
@@ -120,8 +122,8 @@ def cpu_s(stack: Stack) -> float:
     return sum(one.user + one.system for one in times)
 
 
-def worked_through(folder: Path, workers: int, archive: Path, psf: Path, steps: int) -> float:
-    """Images per second that the service deconvolves."""
+def worked_through(folder: Path, workers: int, archive: Path, psf: Path, steps: int) -> tuple[float, float]:
+    """Images per second that the service deconvolves, and the overhead divided by the kernel time."""
     with running(folder, workers, archive) as stack:
         bulk = submit(stack, archive, psf, steps)
         wait_for(lambda: stack.client.bulk(bulk["id"])["images"]["done"] >= workers, "some are done", 3600.0)
@@ -136,7 +138,7 @@ def worked_through(folder: Path, workers: int, archive: Path, psf: Path, steps: 
         f"overhead {100 * overhead(rows):.1f} % of the kernel time; CPU time {of_one_s:.2f} s per image",
         flush=True,
     )
-    return found
+    return found, overhead(rows)
 
 
 def bare(archive: Path, psf: Path, steps: int, processes: int, images: int) -> float:
@@ -225,10 +227,15 @@ def main() -> None:
             f"plain processes: {1 / alone:.2f} s per image; two processes are {together / alone:.2f} times as fast as one",
             flush=True,
         )
-        one, two = (
-            worked_through(folder / f"by-{workers}", workers, archive, psf, asked.steps) for workers in (1, 2)
-        )
+        found = {
+            workers: worked_through(folder / f"by-{workers}", workers, archive, psf, asked.steps)
+            for workers in (1, 2)
+        }
+        (one, _), (two, _) = found.values()
+        for workers, (_, share) in found.items():
+            tell(OVERHEAD[workers], 100 * share)
         print(f"two workers are {two / one:.2f} times as fast as one", flush=True)
+        tell("bulk: gain of two workers / of two plain processes", 100 * (two / one) / (together / alone))
         for path in sorted(archive.iterdir())[max(12, asked.images // 4) :]:
             path.unlink()
         killed(folder / "killed", archive, psf, asked.steps)

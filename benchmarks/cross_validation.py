@@ -5,7 +5,7 @@
 It uses 30 simulated images of 512 px. Shared scheme: 100 folds in this process. Exact scheme: ten folds by two worker
 processes of one thread each, with Redis and PostgreSQL. If this machine lacks them, the two worker processes of a local
 service compute the folds. With Redis and PostgreSQL, the exact scheme runs a second time, and one of the two workers is
-killed half-way. Times are printed as ratios to 1 F (see benchmarks/deconvolution.py). The time of 100 exact folds is
+killed half-way. Times are printed as ratios to 1 F (see benchmarks/timing.py). The time of 100 exact folds is
 extrapolated from the ten; --full runs all of them.
 """
 
@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.deconvolution import THREADS, reference
+from benchmarks.timing import THREADS, reference
 from psfcore.fits.header import FitsLimits
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.validation.bands import bands

@@ -1,26 +1,24 @@
 """Times of deconvolution and PSF builds, in units of a reference transform; part of `make bench`.
 
-The unit 1 F is the time of one 4096 x 4096 float32 rfft2 + irfft2 by SciPy with two workers, measured in the same run.
-Other work on the machine slows both equally, so ratios are more reliable than seconds.
+benchmarks/timing.py defines the unit 1 F.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import scipy.fft
 
-from benchmarks import fft_libraries
-from benchmarks.peers import peak_gib
+from benchmarks.figures import tell
+from benchmarks.race import fft_libraries
+from benchmarks.timing import THREADS, peak_gib, reference, seconds
 from psfcore.build import build_psf
 from psfcore.deconvolve.conditions import Conditions, EngineCache
 from psfcore.deconvolve.methods.registry import method_named
@@ -30,32 +28,17 @@ from psfcore.diffraction.pupil import entrance_pupil
 from psfcore.drawing.plots import preview_png
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_image
-from psfcore.instruments.model import load_instrument
+from psfcore.instruments.model import Instrument, load_instrument
 from psfcore.psf import Psf
 from psfcore.simulate.observe import demo_image
 from tests.whole import stack as stacks
 
-THREADS = os.cpu_count() or 1
-
-
-def seconds(work: Callable[[], object], repeats: int = 1) -> float:
-    """Shortest time of several runs, in s."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
-def reference() -> float:
-    """1 F, in s."""
-    field = np.random.default_rng(0).random((4096, 4096), dtype=np.float32)
-
-    def pair() -> None:
-        scipy.fft.irfft2(scipy.fft.rfft2(field, workers=2), s=field.shape, workers=2)
-
-    return seconds(pair, 5)
+ASYMMETRIC = "build 2048, no symmetry"
+FIGURES = {
+    "build 2048": "PSF of HRI_EUV, 2048 px",
+    ASYMMETRIC: "PSF with a mount without symmetry, 2048 px",
+}
+TURN_DEG = 7.0
 
 
 def row(what: str, took_s: float, f_s: float, note: str = "") -> None:
@@ -98,10 +81,18 @@ def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, fold
         row(f"  the same request again, {name}", again, f_s)
 
 
+def turned_mount(instrument: Instrument) -> Instrument:
+    """The instrument with a mount that has no symmetry: its bars turned by TURN_DEG, which no mirror maps to itself."""
+    mount = instrument.mount
+    assert mount is not None
+    rays = tuple(replace(rays, count=5, first_angle_deg=TURN_DEG) for rays in mount.rays)
+    return replace(instrument, mount=replace(mount, rays=rays))
+
+
 def builds(f_s: float) -> None:
     """Time PSF builds, and compare the far field with a plain transform of the padded pupil; each in a separate
     process."""
-    for what in ("build 2048", "build 4096", "far field 1024", "plain padded transform 1024"):
+    for what in ("build 2048", ASYMMETRIC, "build 4096", "far field 1024", "plain padded transform 1024"):
         answer = subprocess.run(
             [sys.executable, "-m", "benchmarks.deconvolution", what],
             capture_output=True,
@@ -113,13 +104,18 @@ def builds(f_s: float) -> None:
             f"{'hri_euv, ' + what:<52} {measured['seconds']:8.2f} s {measured['seconds'] / f_s:8.1f} F   "
             f"peak {measured['peak_gib']:.2f} GiB"
         )
+        if what in FIGURES:
+            tell(FIGURES[what], measured["seconds"], f_s)
 
 
 def one_build(what: str) -> None:
     """Print one line of `builds`, as JSON."""
     instrument = load_instrument("hri_euv")
     if what.startswith("build"):
-        took = seconds(lambda: build_psf(instrument, size=int(what.split()[1]), threads=THREADS))
+        if what == ASYMMETRIC:
+            instrument = turned_mount(instrument)
+        build_psf(instrument, size=256, threads=THREADS)  # compiles
+        took = seconds(lambda: build_psf(instrument, size=int(what.split()[1].rstrip(",")), threads=THREADS))
     elif what.startswith("far field"):
         optics = {
             "wavelength_angstrom": instrument.wavelength_angstrom,

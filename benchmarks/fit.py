@@ -2,7 +2,7 @@
 
     python -m benchmarks.fit [--full] [--folder DIR]
 
-By default it fits 30 images of 512 px and prints the time as a ratio to 1 F (see benchmarks/deconvolution.py). It also
+By default it fits 30 images of 512 px and prints the time as a ratio to 1 F (see benchmarks/timing.py). It also
 fits nine images of 256 px with both solvers. The reference solver uses SciPy transforms in float64 and all images in
 every round. For each set of parameters it reconstructs every scene anew, with thirty steps of Richardson's iteration.
 It computes the derivatives by finite differences of the whole model. --full also fits 126 images of 2048 px and prints
@@ -21,8 +21,8 @@ from tempfile import gettempdir
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.deconvolution import THREADS, reference
-from benchmarks.peers import peak_gib
+from benchmarks.figures import tell
+from benchmarks.timing import THREADS, peak_gib, reference
 from psfcore.convolution.convolver import Convolver
 from psfcore.fits.header import FitsLimits
 from psfcore.psf import cumulative_curve
@@ -120,8 +120,8 @@ def full_size(folder: Path, f_s: float) -> None:
         check=True,
     )
     took, gib, sentence = told.stdout.strip().split("\n")
-    print(f"fit of 126 images of 2048 px: {float(took):.0f} s = {float(took) / f_s:.0f} F, {gib} GiB")
-    print(f"  {sentence}", flush=True)
+    tell("fit of 126 images of 2048 px", float(took), f_s)
+    print(f"  {gib} GiB; {sentence}", flush=True)
 
 
 def one(folder: Path) -> None:

@@ -1,6 +1,6 @@
 """Compare the times of calls for which a person waits with their goals; part of `make bench`.
 
-Times and goals are ratios to 1 F (see benchmarks/deconvolution.py), so that they hold on another machine too. Each goal
+Times and goals are ratios to 1 F (see benchmarks/timing.py), so that they hold on another machine too. Each goal
 is about twice the ratio measured when it was set.
 """
 
@@ -12,7 +12,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.deconvolution import reference, seconds
+from benchmarks.figures import tell
+from benchmarks.timing import reference, seconds
 from psfcore.diffraction.design_study import design_study
 from psfcore.diffraction.mesh_series import rotated_mesh_kernel
 from psfcore.drawing.plots import preview_png
@@ -29,24 +30,21 @@ ENTRANCE_MESH = {
 }
 
 
-def calls(folder: Path) -> dict[str, tuple[Callable[[], object], float]]:
-    """The timed calls by name, each with its goal in units of F."""
+def calls(folder: Path) -> dict[str, Callable[[], object]]:
+    """The timed calls by name."""
     hri = load_instrument("hri_euv")
     plane = np.random.default_rng(0).random((2048, 2048)) * 1000
     pitches_um = [300.0 + 300 * step for step in range(8)]
     return {
-        "preview of an image of 2048 px": (
-            lambda: preview_png(plane, plane * 1.1, folder / "preview.png", title="timed", unit="DN/s"),
-            4.0,
+        "preview, 2048 px": lambda: preview_png(
+            plane, plane * 1.1, folder / "preview.png", title="timed", unit="DN/s"
         ),
-        "orders of a rotated mesh, 2048 px": (
-            lambda: rotated_mesh_kernel(**ENTRANCE_MESH, angle_deg=45.0, size=2048),  # type: ignore[arg-type]
-            6.0,
+        "orders of a rotated mesh, 2048 px": lambda: rotated_mesh_kernel(
+            **ENTRANCE_MESH,  # type: ignore[arg-type]
+            angle_deg=45.0,
+            size=2048,
         ),
-        "design study of 32 meshes": (
-            lambda: design_study(hri, pitches_um, [20, 30, 40, 50]),
-            15.0,
-        ),
+        "design study of 32 meshes": lambda: design_study(hri, pitches_um, [20, 30, 40, 50]),
     }
 
 
@@ -54,11 +52,9 @@ def main() -> None:
     f_s = reference()
     print(f"1 F = {f_s:.3f} s; shortest of {REPEATS} runs, after one that compiles")
     with TemporaryDirectory(prefix="heliopsf-quick-") as folder:
-        for what, (call, goal_f) in calls(Path(folder)).items():
+        for what, call in calls(Path(folder)).items():
             call()
-            took_s = seconds(call, REPEATS)
-            note = "" if took_s <= goal_f * f_s else "  slower than its goal"
-            print(f"{what:<40} {took_s:6.2f} s {took_s / f_s:6.1f} F (goal {goal_f:.0f} F){note}", flush=True)
+            tell(what, seconds(call, REPEATS) / f_s)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 The sums are computed about 51,660 target pixels: the 410 pixels nearest to each of 126 positions of the occulter along
 a transit, in images of 2048 px. Sums are over the 50 published shells, over the same shells divided into 12 sectors,
-and over fine shells. 1 F is defined in `benchmarks.deconvolution`. Two of the methods, the plain look-up and one
+and over fine shells. 1 F is defined in `benchmarks.timing`. Two of the methods, the plain look-up and one
 convolution for each shell, are too slow for all targets. They are timed on a part of the targets, and the times are
 scaled to all targets. On that part, their sums are compared with those of the third method, the running sums.
 """
@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.deconvolution import THREADS, reference, seconds
+from benchmarks.timing import THREADS, reference, seconds
 from psfcore.scatter.as_published.ring_sums import segment_sums
 from psfcore.scatter.as_published.segments import Segments, fine_shells, shells_as_published
 from tests.psfcore.scatter.as_published.ring_sum_references import segment_sums_fft, segment_sums_plain

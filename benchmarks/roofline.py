@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -29,7 +28,8 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.io.fits import Header
 
-from benchmarks.deconvolution import reference, seconds
+from benchmarks.figures import tell
+from benchmarks.timing import THREADS, reference, seconds
 from psfcore.build import build_psf
 from psfcore.convolution.fft_kernels import LANES
 from psfcore.deconvolve.conditions import Conditions, EngineCache
@@ -40,7 +40,6 @@ from psfcore.deconvolve.problem import pose
 from psfcore.image import Image
 from psfcore.instruments.model import load_instrument
 
-THREADS = os.cpu_count() or 1
 COPIED_FLOATS = 2**26
 MATRIX = 2048
 REPEATS = 7
@@ -127,9 +126,10 @@ def main() -> None:
         )
     whole_s = seconds(lambda: method(image, psf, conditions, steps=STEPS), 3)
     print(
-        f"{STEPS} steps: {whole_s:.2f} s = {whole_s / f_s:.1f} F; their stages {STEPS * times.sum():.2f} s, "
-        f"the floors {STEPS * floors.sum():.2f} s"
+        f"{STEPS} steps: {whole_s:.2f} s; their stages {STEPS * times.sum():.2f} s, the floors {STEPS * floors.sum():.2f} s"
     )
+    if size == 2048:
+        tell("20 steps, 2048 px", whole_s, f_s)
 
 
 if __name__ == "__main__":

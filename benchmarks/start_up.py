@@ -1,6 +1,6 @@
 """Compare the times to import the packages and to start the command with their goals; part of `make bench`.
 
-For each case, the processor time (user and system) is printed, and its ratio to the start of a bare Python interpreter.
+For each case, the processor time (user and system) is printed, and that of a bare Python interpreter.
 The cases run in turn, several times, and the minimum of each is used, because another program on the machine can only
 make a run slower. The first run of each case is not counted: it reads the files from disk and compiles the modules, as
 after an installation.
@@ -14,15 +14,14 @@ import subprocess
 import sys
 from tempfile import TemporaryDirectory
 
+from benchmarks.figures import tell
+from benchmarks.timing import reference
+
 RUNS = 7
 BARE = "pass"
-# The code of each case, and its goal in seconds on an idle machine.
-GOALS_S = {
-    "import heliopsf": 0.3,
-    "import service.app": 1.5,
-    "heliopsf --version": 0.4,
-}
 CODE = {
+    "import heliopsf": "import heliopsf",
+    "import service.app": "import service.app",
     "heliopsf --version": "from service.cli.main import main; main(['--version'])",
 }
 
@@ -54,13 +53,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=RUNS, help="timed runs of each")
     runs = parser.parse_args().runs
-    best = minima([BARE, *(CODE.get(what, what) for what in GOALS_S)], runs)
+    best = minima([BARE, *CODE.values()], runs)
     print(f"a bare Python interpreter starts in {best[BARE]:.3f} s of processor time; minimum of {runs} runs")
-    for what, goal_s in GOALS_S.items():
-        took_s = best[CODE.get(what, what)]
-        print(
-            f"{what:<20} {took_s:6.2f} s (goal {goal_s:.1f} s) {took_s / best[BARE]:7.1f} x a bare interpreter"
-        )
+    f_s = reference()
+    for what, code in CODE.items():
+        tell(what, best[code], f_s)
 
 
 if __name__ == "__main__":

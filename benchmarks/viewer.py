@@ -28,13 +28,13 @@ from typing import Any
 import psutil
 from playwright.sync_api import Page, sync_playwright
 
+from benchmarks.figures import tell
+from benchmarks.timing import reference
 from tests.service.pages.browser.conftest import CANDIDATES, SOFTWARE_GL, VARIABLE
 from tests.service.pages.browser.products import made
 from tests.whole import stack as stacks
 
 BLINKS = 20
-GOALS_S = {"first sight, 2048 px": 1.0, "all pixels, 2048 px": 3.0, "a blink": 0.05}
-GOAL_MB = 300
 FIRST = "first page after start"
 TIME_OF = "(name) => performance.getEntriesByName(name)[0]?.startTime ?? null"
 BLINK_MS = """async () => {
@@ -80,6 +80,7 @@ def main() -> None:
         raise SystemExit(
             f"expected Chromium on this machine; found none: install it, or set {VARIABLE} to the path of its program"
         )
+    f_s = reference()
     with TemporaryDirectory(prefix="heliopsf-viewer-") as folder, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=list(SOFTWARE_GL))
         large: dict[str, Any] = {"viewport": {"width": 1280, "height": 900}}
@@ -102,8 +103,7 @@ def main() -> None:
             blinks = [page.evaluate(BLINK_MS) / 1000 for _ in range(BLINKS)]
             times["a blink"] = statistics.median(blinks)
             for what, took_s in times.items():
-                note = "" if took_s <= GOALS_S[what] else "  slower than its goal"
-                print(f"{what:<24} {took_s:6.3f} s (goal {GOALS_S[what]:g} s){note}", flush=True)
+                tell(f"viewer: {what}", took_s, f_s)
             print(f"{'the slowest blink':<24} {max(blinks):6.3f} s of {BLINKS}", flush=True)
             page.close()
             product = made(site, subfolder(folder, "4096"), (4096, 4096))
@@ -114,9 +114,7 @@ def main() -> None:
             for key in ("1", "ArrowRight", "ArrowUp", "ArrowLeft", "-", "b", "b", "f", "1"):
                 page.keyboard.press(key)
                 page.wait_for_timeout(600)
-            tab_mb = own_mb("renderer")
-            note = "" if tab_mb <= GOAL_MB else "  more than its goal"
-            print(f"memory of a tab, 4096 px {tab_mb:6.0f} MB (goal {GOAL_MB} MB){note}")
+            tell("viewer: memory of a tab, 4096 px", own_mb("renderer"))
             print(f"memory of the graphics process {own_mb('gpu-process'):.0f} MB")
         browser.close()
 

@@ -9,7 +9,7 @@ fewer and smaller points. --most leaves out the points above N. --write replaces
 it, the numbers are only printed. Exponents are fitted to the three largest points. memory: the peak of every method
 at 2048 and 4096 px beside its estimate. figures: draw the figures again from the table.
 
-Times are the shortest of several runs. They are also printed as ratios to 1 F (see benchmarks/deconvolution.py), which is
+Times are the shortest of several runs. They are also printed as ratios to 1 F (see benchmarks/timing.py), which is
 measured before every axis: other work on the machine slows both.
 """
 
@@ -19,15 +19,15 @@ import argparse
 import json
 import math
 import os
-import platform
 import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.deconvolution import THREADS, reference
+from benchmarks.figures import kind_of_machine
 from benchmarks.growth.axes import AXES, _deconvolved
 from benchmarks.growth.figures import draw, exponent
+from benchmarks.timing import reference
 from psfcore.deconvolve.methods.registry import method_names
 
 FOLDER = Path(__file__).parents[2] / "docs" / "growth"
@@ -64,10 +64,8 @@ def measured(name: str, quick: bool, most: float) -> dict[str, Any]:
 
 def machine() -> str:
     """The machine and the date, for the figures."""
-    names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
-    model = names[0].partition(":")[2].strip() if names else platform.processor()
     load = os.getloadavg()[2]
-    return f"{model}, {THREADS} cores, {time.strftime('%Y-%m-%d')}, load {load:.0f} in the last 15 minutes"
+    return f"{kind_of_machine()}, {time.strftime('%Y-%m-%d')}, load {load:.0f} in the last 15 minutes"
 
 
 def memory() -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from benchmarks.figures import tell
 from psfcore.deconvolve.memory import Asked, deconvolution_bytes
 from workers.machine import free_bytes
 
@@ -53,7 +54,11 @@ def _one(**case: Any) -> dict[str, Any]:
 def _deconvolved(n: float, **case: Any) -> Point:
     found = _one(**case)
     besides = (found["peak_bytes"] - found["output_bytes"]) / found["padded_px"]
-    more = {"bytes_a_padded_px": besides, "estimate_mib": found["estimate_bytes"] / 2**20}
+    more = {
+        "bytes_a_padded_px": besides,
+        "estimate_mib": found["estimate_bytes"] / 2**20,
+        "process_gib": found["process_bytes"] / 2**30,
+    }
     return Point(n, found["seconds"], found["peak_bytes"] / 2**20, more)
 
 
@@ -68,7 +73,11 @@ def image_size(quick: bool, most: float) -> Iterator[Point]:
         if needed > free_bytes():
             print(f"left out: {size} px need {needed / 2**20:.0f} MiB, more than the free memory")
             continue
-        yield _deconvolved(size, size=size, repeats=3 if size < 4096 else 1)
+        point = _deconvolved(size, size=size, repeats=3 if size < 4096 else 1)
+        if size == 2048:
+            tell("memory for a pixel of the padded plane, 2048 px", point.more["bytes_a_padded_px"])
+            tell("20 steps, 2048 px: memory of the process", point.more["process_gib"])
+        yield point
 
 
 def psf_size(quick: bool, most: float) -> Iterator[Point]:
@@ -122,7 +131,7 @@ def workers(quick: bool, most: float) -> Iterator[Point]:
         folder = Path(temporary)
         psf = make_archive(folder, images, BULK_PX)
         for number in _upto(most, (1, 2)):
-            pace = worked_through(folder / f"by-{number}", number, folder / "archive", psf, BULK_STEPS)
+            pace, _ = worked_through(folder / f"by-{number}", number, folder / "archive", psf, BULK_STEPS)
             yield Point(number, 1 / pace, None, {"images_an_hour": 3600 * pace})
 
 

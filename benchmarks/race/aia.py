@@ -38,7 +38,7 @@ EDGE_PX = 64  # this many pixels at each edge of the image are not compared
 NEAR_PX = 6  # exp(-4.5 * 6^2) is below the smallest double
 ARM_ORDERS = (*range(4, 10), *range(12, 21))  # the light of orders 10, 11 and 21 is almost zero
 BOUNDS = {"angle": 0.1, "spacing": 0.1, "light": 0.3}
-REPOSITORY = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[2]
 
 Kernel = NDArray[np.float64]
 
@@ -129,7 +129,7 @@ def run_peer(folder: Path) -> None:
     import aiapy.psf
     import astropy.units as u
 
-    from benchmarks.peers import aia_map
+    from benchmarks.race.peers import aia_map
 
     calculate: Callable[..., Any] = getattr(aiapy.psf, "calculate_psf", None) or aiapy.psf.psf
     meshes = aiapy.psf.filter_mesh_parameters()

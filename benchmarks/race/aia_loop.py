@@ -1,8 +1,8 @@
 """Time twenty Richardson-Lucy steps of a 4096 x 4096 px image of AIA; part of `make bench-peers`.
 
-    python -m benchmarks.aia_loop INTERPRETER [--rounds N] [--page FILE]
+    python -m benchmarks.race.aia_loop [--rounds N] [--page FILE]
 
-INTERPRETER has the packages aiapy and jax. Three loops run in turn, each in a process of its own:
+Three loops run in turn, each in a process and an environment of its own (`benchmarks.race.environments`):
 
 - heliopsf, with the edges "zero": the convolution is linear, on a plane that is larger than the image;
 - aiapy's function `aiapy.psf.deconvolve`, which uses NumPy without a GPU;
@@ -29,7 +29,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.peers import REPOSITORY, aia_map, peak_gib, reference_s
+from benchmarks.race.environments import REPOSITORY, python_of
+from benchmarks.race.peers import aia_map
+from benchmarks.timing import peak_gib, reference
 
 SIZE_PX, STEPS = 4096, 20
 RADIUS_PX = 1600  # of the Sun
@@ -45,7 +47,7 @@ SHOWN = {
 HEADING = "## Time and memory of a whole image"
 SECTION = """{heading}
 
-`python -m benchmarks.aia_loop`: a simulated image of the whole Sun, {size} x {size} px, and a PSF of the same size, {steps} Richardson-Lucy
+`python -m benchmarks.race.aia_loop`: a simulated image of the whole Sun, {size} x {size} px, and a PSF of the same size, {steps} Richardson-Lucy
 steps on {cores} cores. The loops run in turn; rounds: {rounds}. A time is the minimum, and a ratio is the median of the rounds. 1 F
 is the time of one Fourier transform of this size and its inverse (`rfft2` and `irfft2` of SciPy, float32, two workers), measured before each run: here {f}.
 The times contain the transform of the PSF, but not the compilation of the loops. The deviation is the largest one of a pixel within the
@@ -118,6 +120,7 @@ def jax_loop(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
 
 _COMPILED: Any = None
 LOOPS = {HELIOPSF: heliopsf, AIAPY: aiapy, JAX_32: jax_loop, JAX_64: jax_loop}
+ENVIRONMENTS = {HELIOPSF: "", AIAPY: "aiapy", JAX_32: "jax", JAX_64: "jax"}
 
 
 def run_one(name: str, folder: Path) -> None:
@@ -139,11 +142,11 @@ def deviation(result: np.ndarray, reference: np.ndarray) -> float:
     return float((np.abs(result[INNER] - own) / np.maximum(own, own.mean())).max())
 
 
-def measured_once(name: str, python: str, folder: Path) -> dict[str, float]:
+def measured_once(name: str, folder: Path) -> dict[str, float]:
     """One run: its time in s and in F, its peak memory, and its deviation from heliopsf. 1 F is measured just before."""
-    f_s = reference_s()
+    f_s = reference()
     done = subprocess.run(
-        [python, str(Path(__file__).resolve()), "--one", name, str(folder)],
+        [python_of(ENVIRONMENTS[name]), "-m", "benchmarks.race.aia_loop", "--one", name, str(folder)],
         stdout=subprocess.PIPE,
         text=True,
         check=True,
@@ -186,7 +189,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("peer", help="interpreter that has aiapy and jax")
     parser.add_argument("--rounds", type=int, default=1, help="runs of each loop, in turn")
     parser.add_argument("--page", type=Path, help="page whose last section is replaced by the result")
     arguments = parser.parse_args()
@@ -197,8 +199,7 @@ def main() -> None:
             np.save(folder / f"{label}.npy", array)
         for _ in range(arguments.rounds):
             for name in LOOPS:
-                python = sys.executable if name == HELIOPSF else arguments.peer
-                runs[name].append(measured_once(name, python, folder))
+                runs[name].append(measured_once(name, folder))
                 print(name, runs[name][-1], flush=True)
     text = section(runs, arguments.rounds)
     print(text)

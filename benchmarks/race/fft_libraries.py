@@ -63,7 +63,7 @@ def compare(image: Single, psf: Single, folder: Path, f_s: float) -> None:
 
 
 def _in_a_process(name: str, folder: Path) -> float:
-    command = [sys.executable, "-m", "benchmarks.fft_libraries", name, str(folder)]
+    command = [sys.executable, "-m", "benchmarks.race.fft_libraries", name, str(folder)]
     answer = subprocess.run(command, capture_output=True, text=True, check=True)
     return float(answer.stdout.splitlines()[-1])
 

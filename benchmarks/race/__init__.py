@@ -1,0 +1,1 @@
+"""heliopsf beside other packages; `make bench-peers` runs these benchmarks."""

@@ -1,0 +1,60 @@
+"""The unit of time of the benchmarks, the shortest time of several runs, and the peak memory of a process.
+
+The unit 1 F is the time of one 4096 x 4096 float32 rfft2 + irfft2 by SciPy with two workers, measured in the same run.
+Other work on the machine slows this and the benchmark equally, so ratios are more reliable than seconds.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+THREADS = os.cpu_count() or 1
+
+
+def seconds(work: Callable[[], object], repeats: int = 1) -> float:
+    """Shortest time of several runs, in s."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def reference() -> float:
+    """1 F, in s."""
+    import scipy.fft
+
+    field = np.random.default_rng(0).random((4096, 4096), dtype=np.float32)
+    return seconds(
+        lambda: scipy.fft.irfft2(scipy.fft.rfft2(field, workers=2), s=field.shape, workers=2), repeats=5
+    )
+
+
+def peak_gib() -> float:
+    """Largest resident size of this process, in GiB. (getrusage would include the parent's memory at the fork.)"""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 2**20
+
+
+def measured_process(command: Sequence[str], environment: Mapping[str, str]) -> tuple[float, float]:
+    """Run a command; its wall time, s, and its largest resident memory, GiB. Raises SystemExit if it fails."""
+    start = time.perf_counter()
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment, text=True
+    )
+    assert process.stdout is not None
+    said = process.stdout.read()
+    _, status, usage = os.wait4(process.pid, 0)  # the memory of this process only
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(
+            f"expected {' '.join(command)} to succeed; it ended with {process.returncode}: {said}"
+        )
+    return time.perf_counter() - start, usage.ru_maxrss / 2**20
