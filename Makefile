@@ -32,7 +32,7 @@ test: $(DEV)
 test-full: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests
 
-# Each figure beside its goal and the stored one; needs half an hour and no other program on the machine.
+# Each figure beside its goal and the stored one; needs an hour and no other program on the machine.
 bench: $(DEV)
 	$(BIN)/python -m benchmarks
 

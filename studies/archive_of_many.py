@@ -57,11 +57,13 @@ Answer = TypeVar("Answer")
 @dataclass(frozen=True)
 class Timed:
     """A request. wall_s: its time. cpu_s, waited_s: time in which the server and its connections in the database
-    computed, and waited for a processor, meanwhile; both contain what they did for other requests."""
+    computed, and waited for a processor, meanwhile; both contain what they did for other requests. since_start_s: when it
+    began, after the last start of the server."""
 
     wall_s: float
     cpu_s: float
     waited_s: float
+    since_start_s: float
 
     @property
     def own_s(self) -> float:
@@ -86,7 +88,9 @@ class Times:
         cpu_after_s, waited_after_s = scheduled(self._stack)
         # A thread of the server that has ended meanwhile is missing from the second sums.
         spent = max(0.0, cpu_after_s - cpu_s), max(0.0, waited_after_s - waited_s)
-        self.of[name].append(Timed(wall_s, *spent))
+        assert self._stack.server is not None
+        since_start_s = time.time() - wall_s - psutil.Process(self._stack.server.pid).create_time()
+        self.of[name].append(Timed(wall_s, *spent, since_start_s))
         return answer
 
     def slowest(self, of: Callable[[Timed], float]) -> tuple[str, Timed]:
@@ -102,7 +106,8 @@ class Times:
             yield (
                 f"{name:<40} {len(times):5}  median {1e3 * middle:6.1f} ms  slowest {1e3 * slowest.wall_s:6.1f} ms, computing "
                 f"{1e3 * slowest.cpu_s:6.1f}, waiting for a processor {1e3 * slowest.waited_s:6.1f}; without that wait at most "
-                f"{1e3 * max(one.own_s for one in times):6.1f} ms"
+                f"{1e3 * max(one.own_s for one in times):6.1f} ms; the slowest began {slowest.since_start_s:.0f} s after the start of "
+                "the server"
             )
 
 
@@ -338,6 +343,7 @@ def study(folder: Path, stack: Stack, archive: Path, asked: argparse.Namespace) 
         "slowest_request_s": slowest.wall_s,
         "slowest_request_cpu_s": slowest.cpu_s,
         "slowest_request_waited_s": slowest.waited_s,
+        "slowest_request_since_start_s": slowest.since_start_s,
         "slowest_without_wait": own_name,
         "slowest_without_wait_s": own.own_s,
         "slowest_control_s": max(one.wall_s for one in times.of[CONTROL]),
