@@ -83,7 +83,7 @@ def http_round_trip(image: Path, psf: Psf, in_process_s: float, f_s: float, fold
 
 
 def turned_mount(instrument: Instrument) -> Instrument:
-    """The instrument with a mount that has no symmetry: its bars turned by TURN_DEG, which no mirror maps to itself."""
+    """The instrument with a mount that has no symmetry: five bars, turned by an angle that no mirror maps to itself."""
     mount = instrument.mount
     assert mount is not None
     rays = tuple(replace(rays, count=5, first_angle_deg=TURN_DEG) for rays in mount.rays)
