@@ -45,7 +45,7 @@ from workers.settings import Settings
 
 LIMITS = FitsLimits(max_pixels=2**24)
 OVERHEAD = {1: "bulk, one worker: overhead", 2: "bulk, two workers: overhead"}
-# The settings that an installation has. The tests shorten these intervals, which costs a tenth of a core.
+# The settings that an installation has. The tests shorten these intervals, which takes processor time from the images.
 USUAL = {
     f"HELIOPSF_{name.upper()}": str(Settings.model_fields[name].default)
     for name in ("resubmit_s", "lease_s", "heartbeat_s", "reconcile_s")

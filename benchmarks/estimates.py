@@ -21,6 +21,7 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from benchmarks.timing import memory_bytes
 from psfcore.deconvolve.methods.registry import method_names
 
 # psf: edge length of a PSF with little scattered light, or "hri" for the PSF of HRI_EUV, which scatters the most light.
@@ -116,7 +117,7 @@ def measure(case: dict[str, Any], folder: Path) -> None:
         said = estimates.estimate(kind, job["parameters"], service._catalogue, DEFAULT_OWNER, threads=1)
         started = time.process_time()
         service.wait(job)
-        took_s, peak = time.process_time() - started, peak_mib()
+        took_s, peak = time.process_time() - started, memory_bytes("VmHWM") / 2**20
         service.close()
     record = {
         "kind": kind,
@@ -200,14 +201,6 @@ def transit(case: dict[str, Any], folder: Path) -> Path:
 
 
 CLI = [sys.executable, "-m", "service.cli"]
-
-
-def peak_mib() -> float:
-    """The peak memory of this process, MiB."""
-    line = next(
-        line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")
-    )
-    return int(line.split()[1]) / 1024
 
 
 if __name__ == "__main__":

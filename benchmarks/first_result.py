@@ -18,7 +18,7 @@ from psfcore.instruments.model import load_instrument
 from psfcore.simulate.observe import demo_image
 
 ROUNDS, SIZE_PX = 3, 2048
-COMMAND = (sys.executable, "-c", "from service.cli.main import main; main()", "deconvolve")
+COMMAND = (sys.executable, "-m", "service.cli", "deconvolve")
 
 
 def one_round(image: Path, folder: Path) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from benchmarks.timing import measured_process, reference
 from psfcore.blind.case_set import SetPlan, make_set
 
 PLAN = SetPlan(cases=1, seed=7, size_px=512, images=30, only=("ghost",), left_pct=(10.0,))
-COMMAND = (sys.executable, "-c", "from service.cli.main import main; main()", "gap")
+COMMAND = (sys.executable, "-m", "service.cli", "gap")
 
 
 def diagnosed(folder: Path) -> None:

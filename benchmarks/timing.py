@@ -37,10 +37,15 @@ def reference() -> float:
     )
 
 
+def memory_bytes(name: str) -> int:
+    """The memory of this process that Linux counts under this name, for example VmHWM (peak) or VmRSS (now), in bytes."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * int(next(line for line in lines if line.startswith(name)).split()[1])
+
+
 def peak_gib() -> float:
     """Largest resident size of this process, in GiB. (getrusage would include the parent's memory at the fork.)"""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 2**20
+    return memory_bytes("VmHWM") / 2**30
 
 
 def measured_process(command: Sequence[str], environment: Mapping[str, str]) -> tuple[float, float]:

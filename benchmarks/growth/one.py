@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import heliopsf
-from benchmarks.timing import THREADS, seconds
+from benchmarks.timing import THREADS, memory_bytes, seconds
 from psfcore.central_part import central_part
 from psfcore.deconvolve.memory import Asked, deconvolution_bytes
 from psfcore.scatter.fit import fit_transit
@@ -41,10 +41,10 @@ def deconvolution(case: dict[str, Any]) -> dict[str, Any]:
 
     deconvolve(pixels[:256, :256].copy(), 2)
     gc.collect()
-    before = _memory("VmRSS")
+    before = memory_bytes("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
     took = [seconds(lambda: deconvolve(pixels, steps))]
-    highest = _memory("VmHWM")
+    highest = memory_bytes("VmHWM")
     peak = highest - before
     took += [seconds(lambda: deconvolve(pixels, steps)) for _ in range(case.get("repeats", 1) - 1)]
     given = 8 * (pixels.size + psf.kernel.size)
@@ -66,16 +66,10 @@ def fit(case: dict[str, Any]) -> dict[str, Any]:
         default_plan(case["images"], size), truth, diffraction(2 * size), 1, threads=THREADS
     ).transit
     gc.collect()
-    before = _memory("VmRSS")
+    before = memory_bytes("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")
     took = seconds(lambda: fit_transit(transit, threads=THREADS))
-    return {"seconds": took, "peak_bytes": _memory("VmHWM") - before}
-
-
-def _memory(name: str) -> int:
-    """A line of the memory of this process, in bytes."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * int(next(line for line in lines if line.startswith(name)).split()[1])
+    return {"seconds": took, "peak_bytes": memory_bytes("VmHWM") - before}
 
 
 if __name__ == "__main__":

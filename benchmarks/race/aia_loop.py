@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.race.environments import REPOSITORY, python_of
-from benchmarks.race.peers import aia_map
+from benchmarks.race.peers import aia_map, heliopsf
 from benchmarks.timing import peak_gib, reference
 
 SIZE_PX, STEPS = 4096, 20
@@ -74,18 +74,6 @@ def data() -> tuple[np.ndarray, np.ndarray]:
     image *= 1 / (1 + np.exp((radius - RADIUS_PX) / 40))
     image += 1
     return image, (psf / psf.sum(dtype=float)).astype(np.float32)
-
-
-def heliopsf(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
-    from astropy.io.fits import Header
-
-    from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
-    from psfcore.image import Image
-    from psfcore.psf import Psf
-
-    observed = Image(image.astype(float), np.zeros(image.shape, np.uint8), Header(), "DN", 1.0)
-    kernel = Psf(psf.astype(float), "bench", "1", None, "draft", None, None)
-    return richardson_lucy(observed, kernel, steps=steps, threads=os.cpu_count() or 1).pixels
 
 
 def aiapy(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:

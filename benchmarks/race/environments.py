@@ -13,7 +13,7 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[2]
 FOLDER = REPOSITORY / ".venv-peers"
-# The CPU build of PyTorch is the version that package indexes offer without the libraries of a GPU; any version works here.
+# PyTorch is pinned because a new release would be a download of gigabytes; any version works.
 REQUIREMENTS: dict[str, tuple[str, ...]] = {
     "scipy": ("scipy",),
     "pyfftw": ("pyfftw>=0.14",),

@@ -10,7 +10,6 @@ process; the shortest of three times is printed.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -20,6 +19,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.race import peers
+from benchmarks.timing import THREADS
 from psfcore.convolution.lengths import good_length
 from psfcore.convolution.offsets import needed_kernel
 
@@ -28,7 +29,6 @@ IMAGE_PX = 2048
 ROUNDS = 3
 AGREEMENT = 1e-5  # largest difference allowed, relative to the brightest pixel
 LIBRARIES = ("heliopsf", "scipy.fft", "ducc0")
-THREADS = os.cpu_count() or 1
 _FLOOR_OF_MAXIMUM = 2.0**-23
 _DARK_OF_FLOOR = 1e-6
 
@@ -70,15 +70,7 @@ def _in_a_process(name: str, folder: Path) -> float:
 
 def heliopsf(image: Single, psf: Single) -> Single:
     """The loop of heliopsf, from the preparation of the PSF to the result."""
-    from astropy.io.fits import Header
-
-    from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
-    from psfcore.image import Image
-    from psfcore.psf import Psf
-
-    observed = Image(image.astype(float), np.zeros(image.shape, np.uint8), Header(), "DN/s", 1.0)
-    kernel = Psf(psf.astype(float), "bench", "1", None, "draft")
-    return richardson_lucy(observed, kernel, steps=STEPS, threads=THREADS).pixels.astype(np.float32)
+    return peers.heliopsf(image, psf, STEPS).astype(np.float32)
 
 
 def scipy_fft(image: Single, psf: Single) -> Single:
