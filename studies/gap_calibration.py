@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -23,7 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from numpy.typing import NDArray
+from scipy.optimize import minimize, minimize_scalar
 
 from heliopsf.psfs import LIMITS
 from psfcore.blind.case_set import BlindSet, SetPlan, make_set
@@ -36,7 +38,7 @@ from psfcore.gap.evidence.measured_noise import measured_noise
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict import calibration
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration, true_share
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior, without_idle
+from psfcore.gap.verdict.posterior import NONE, PRIOR, UNKNOWN, Kind, Names, Posterior, kind_of, without_idle
 from psfcore.gap.verdict.refits import Refits
 from psfcore.gap.verdict.settled import settled_posterior
 from psfcore.gap.view import View
@@ -47,6 +49,7 @@ from psfcore.whole_files import write_whole
 
 KINDS = ("clean", "single", "pair", "unknown")
 TEMPERATURES = (0.5, 10.0)
+LEAST_SHARE = 1e-5  # a true cause that is less probable counts as if it had this probability
 HOLDS_FOR = (
     "The coverage holds for transits like these: 18 images of 256 px in three pointings, with no effect, with one or two effects of the "
     "library, or with one effect that is not in the library. Each effect leaves a residual of 0.5 to 30 % in the discs after "
@@ -67,13 +70,17 @@ class Case:
     log_weights: dict[Names, float]
     departures: tuple[float, ...] = ()
 
-    def shares(self, temperature: float) -> dict[Names, float]:
-        """The probability of every hypothesis."""
-        return without_idle(Posterior(self.log_weights, {}, {}).probabilities(temperature))
+    def shares(self, temperature: float, prior: Mapping[Kind, float] = PRIOR) -> dict[Names, float]:
+        """The probability of every hypothesis. prior: other prior probabilities of the kinds than those of the weights."""
+        weights = {
+            names: weight + math.log(prior[kind_of(names)] / PRIOR[kind_of(names)])
+            for names, weight in self.log_weights.items()
+        }
+        return without_idle(Posterior(weights, {}, {}).probabilities(temperature))
 
-    def true_share(self, temperature: float) -> float:
+    def true_share(self, temperature: float, prior: Mapping[Kind, float] = PRIOR) -> float:
         """The probability of the true cause."""
-        shares = self.shares(temperature)
+        shares = self.shares(temperature, prior)
         if self.true in (NONE, UNKNOWN):
             return shares.get(self.true, 0.0)
         return true_share(shares, self.true)
@@ -105,11 +112,29 @@ def calibrated(cases: Sequence[Case], about: Mapping[str, Any]) -> Calibration:
 
     def loss(log_temperature: float) -> float:
         shares = [case.true_share(float(np.exp(log_temperature))) for case in cases]
-        return -float(np.mean(np.log(np.maximum(shares, 1e-12))))
+        return -float(np.mean(np.log(np.maximum(shares, LEAST_SHARE))))
 
     low, high = np.log(TEMPERATURES)
     temperature = round(float(np.exp(minimize_scalar(loss, bounds=(low, high), method="bounded").x)), 2)
     return Calibration(temperature, tuple(sorted(case.true_share(temperature) for case in cases)), about)
+
+
+def best_prior(cases: Sequence[Case], temperature: float) -> dict[Kind, float]:
+    """The prior probabilities of the kinds whose mean logarithm of the probability of the true cause is largest.
+
+    Only those of one effect and of an unknown cause are fitted; the ratios of the others stay.
+    """
+
+    def prior(factors: NDArray[np.float64]) -> dict[Kind, float]:
+        single, unknown = np.exp(factors)
+        scaled = dict(PRIOR) | {"single": PRIOR["single"] * single, "unknown": PRIOR["unknown"] * unknown}
+        return {kind: float(share / sum(scaled.values())) for kind, share in scaled.items()}
+
+    def loss(factors: NDArray[np.float64]) -> float:
+        shares = [case.true_share(temperature, prior(factors)) for case in cases]
+        return -float(np.mean(np.log(np.maximum(shares, LEAST_SHARE))))
+
+    return prior(minimize(loss, np.zeros(2), method="Powell", options={"xtol": 0.02, "ftol": 1e-4}).x)
 
 
 def table(cases: Sequence[Case], coverage: float = COVERAGE) -> list[str]:
@@ -198,6 +223,11 @@ def main() -> None:
     made = calibrated(cases, about)
     print(f"{len(cases)} cases, temperature {made.temperature:g}, threshold {made.threshold():.3g}")
     print("\n".join(table(cases)))
+    best = best_prior(cases, made.temperature)
+    print(
+        "best prior: "
+        + ", ".join(f"{kind} {share:.2f} ({PRIOR[kind]:g} used)" for kind, share in best.items())
+    )
     departures = [one for case in cases for one in case.departures]
     if departures:
         print(

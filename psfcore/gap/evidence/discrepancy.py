@@ -31,9 +31,7 @@ from psfcore.gap.evidence.patterns import in_disc
 Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
-LIKELY = (
-    0.02  # likely relative size of a coefficient; the likelihood also tries a tenth and ten times this size
-)
+LIKELY = 0.02  # likely relative size of a coefficient; the likelihood also tries ten times this size
 DEGREE = 3
 DETECTOR = ("x", "y")
 OF_DISCS = (*DETECTOR, "time", "intensity", "exposure", "pointing", "radius", "azimuth")

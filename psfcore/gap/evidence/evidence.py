@@ -62,7 +62,7 @@ class Evidence:
     effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns that
     every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every image,
     used or not. untestable: the reasons why effects cannot be tested, by name. longest_step: `Parameter.largest_step` of each
-    coordinate of the PSF. numbers: `Change.numbers` by column.
+    coordinate of the PSF. numbers: `Change.numbers` by column. templates: `Effect.distinguished` by effect.
     """
 
     effects: tuple[Effect, ...]
@@ -74,6 +74,7 @@ class Evidence:
     untestable: dict[str, str]
     longest_step: Vector
     numbers: dict[int, int] = field(default_factory=dict)
+    templates: dict[str, float] = field(default_factory=dict)
 
     def columns_of(self, effect: str) -> dict[str, int]:
         """The column of each parameter of an effect, by the parameter's name.
@@ -166,6 +167,11 @@ def gather(
         untestable=untestable,
         longest_step=np.array([parameter.largest_step for parameter in solution.inversion.shape.parameters]),
         numbers={len(base) + k: change.numbers for k, change in enumerate(changes) if change.numbers},
+        templates={
+            effect.name: effect.distinguished(view) if effect.distinguished else float(effect.trials)
+            for effect in library
+            if effect.name in columns
+        },
     )
     return _testable(found)
 

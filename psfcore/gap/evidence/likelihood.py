@@ -30,7 +30,7 @@ have the same factor, because the field can be stronger than is likely:
 
 N is the normal matrix of the strengths with the PSF free (its Schur complement). The integral is computed in the
 Laplace approximation. Parameters that cannot be negative follow `evidence.one_sided`. If a template was chosen among many,
-the logarithm of their number is subtracted from ln E. For each number that was measured in the blocks to build a template,
+the logarithm of the number that the data distinguish is subtracted from ln E. For each number that was measured in the blocks to build a template,
 MEASURED is added to the chi2 of the blocks: noise alone lowers this chi2 by 1 for each number, and
 the likely size of the number is unknown.
 """
@@ -63,7 +63,9 @@ CURVATURE, MOST_CURVATURE = 0.012, 0.05
 UNSEEN = 0.5  # if the largest template error adds less than this to chi2, its width does not matter
 CORRELATED = 0.5
 MEASURED = 2.0
-SCALES = (0.1, 1.0, 10.0)
+# An effect of a tenth of its likely size often changes nothing that the data show. It is then as probable as "no effect", whatever the
+# data: with a further scale of 0.1, answer sets of the same coverage have 2.8 members instead of 2.4 (144 simulated cases).
+SCALES = (1.0, 10.0)
 ROUNDS = 3  # the template error depends on the fitted strengths
 SETTLED = 0.01
 SMALLEST_SCALE = 0.2
@@ -157,22 +159,22 @@ class Likelihood:
         self,
         effects: Sequence[Sequence[int]],
         *,
-        trials: float = 1.0,
+        templates: float = 1.0,
         subtracted: Sequence[float] = (),
         exact: bool = False,
     ) -> Weighed:
         """Weigh the hypothesis that some effects act. effects: the columns of each effect.
 
-        trials: the number of templates among which the templates of the effects were chosen. subtracted: the amounts
-        that a full refit subtracted from the images, by column; the fitted values are then the remaining amounts.
+        templates: the number of templates among which those of the effects were chosen (`search.distinguished`).
+        subtracted: the amounts that a full refit subtracted from the images, by column; the fitted values are then the remaining amounts.
         exact: whether the columns have no template error.
         """
         out = dict(zip((c for g in effects for c in g), subtracted, strict=True)) if len(subtracted) else {}
-        found = [self._weigh(effects, trials, out, 0.0)]
+        found = [self._weigh(effects, templates, out, 0.0)]
         first, _ = found[0]
         whole = first.values + np.array([out.get(c, 0.0) for c in first.columns])
         if not exact and self._visible_error(first.columns, whole, TEMPLATE_ERRORS[-1]) > UNSEEN:
-            found += [self._weigh(effects, trials, out, error) for error in TEMPLATE_ERRORS[1:]]
+            found += [self._weigh(effects, templates, out, error) for error in TEMPLATE_ERRORS[1:]]
         evidence = float(logsumexp([one.log_evidence for one, _ in found])) - math.log(len(found))
         best, of_psf = max(found, key=lambda one: one[0].log_evidence)
         visible = self._visible_error(best.columns, best.values, USUAL_ERROR) + self._visible_curvature(
@@ -181,7 +183,7 @@ class Likelihood:
         return replace(best, log_evidence=evidence, visible_error=visible)
 
     def _weigh(
-        self, effects: Sequence[Sequence[int]], trials: float, out: Mapping[int, float], error: float
+        self, effects: Sequence[Sequence[int]], templates: float, out: Mapping[int, float], error: float
     ) -> tuple[Weighed, Vector]:
         """As `weigh`, for one width of the template error, and the step of the PSF. The result has no visible_error.
 
@@ -219,7 +221,7 @@ class Likelihood:
             parts = self._parts(groups, theta, taken, error, at_zero)
         amounts = np.array([out.get(c, 0.0) for c in at_zero])
         weighed = self._weighed(parts, theta, scales, columns, taken, at_zero, amounts, effects)
-        weighed = replace(weighed, log_evidence=weighed.log_evidence - math.log(trials))
+        weighed = replace(weighed, log_evidence=weighed.log_evidence - math.log(templates))
         return weighed, theta[: len(self._base)]
 
     def normal(self, columns: Sequence[int]) -> Matrix:

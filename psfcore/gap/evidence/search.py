@@ -90,29 +90,29 @@ class PlaceSearch:
             np.concatenate([responses, in_cells]), np.concatenate([residual, self._near.residual])
         )
 
-    def kernel(self, kernels: Sequence[Plane]) -> int:
-        """The index of the change of the PSF that explains most of the residuals, Eq. (2) and (3).
+    def kernels(self, kernels: Sequence[Plane]) -> Vector:
+        """The gain, Eq. (2), of each change of the PSF: (kernels,).
 
         kernels: changes of the PSF [y, x], with the centre at n // 2. The search uses the means of the discs and, for light
-        that moves near a disc, also its cells.
+        that moves near a disc, also its cells, Eq. (3).
         """
         cells = np.array([self._near.of_kernel(kernel) for kernel in kernels]).T
-        return self._best(self._to_displacements, kernels, cells)
+        return self._gains_of(self._to_displacements, kernels, cells)
 
-    def wide_kernel(self, kernels: Sequence[Plane]) -> int:
-        """As `kernel`, for smooth changes of the PSF that may reach across the field. It uses only the means of the discs, not their cells, and coarse pixels."""
-        return self._best(self._to_far, [coarse_kernel(kernel, STEP_PX) for kernel in kernels])
+    def wide_kernels(self, kernels: Sequence[Plane]) -> Vector:
+        """As `kernels`, for smooth changes of the PSF that may reach across the field. It uses only the means of the discs, not their cells, and coarse pixels."""
+        return self._gains_of(self._to_far, [coarse_kernel(kernel, STEP_PX) for kernel in kernels])
 
-    def _best(
+    def _gains_of(
         self, to_displacements: NDArray[np.floating], kernels: Sequence[Plane], cells: Plane | None = None
-    ) -> int:
+    ) -> Vector:
         size, dtype = to_displacements.shape[1], to_displacements.dtype
         of_discs = [
             np.einsum("nyx,yx->n", to_displacements, crop_or_pad(kernel, size).astype(dtype))
             for kernel in kernels
         ]
         means = np.array(of_discs, dtype=np.float64).T / self._sigma[:, None]
-        return int(np.argmax(self._gain(means, cells)))
+        return self._gain(means, cells)
 
     @cached_property
     def copy(self) -> tuple[float, int, int]:
@@ -121,25 +121,38 @@ class PlaceSearch:
         A copy is displaced by at least NEAREST_RADII times the radius of the disc. The search uses a coarse grid with one blur,
         then a fine grid around the best displacement with several blurs.
         """
-        dx, dy = self._coarse_displacement(COARSE_BLUR_PX)
+        dx, dy = self._coarse_displacement
         best = (-1.0, COARSE_BLUR_PX, dx, dy)
         for blur_px in BLURS_PX:
             gain, at_x, at_y = self._fine_displacement(blur_px, dx, dy)
             best = max(best, (gain, blur_px, at_x, at_y))
         return best[1:]
 
-    def _coarse_displacement(self, blur_px: float) -> tuple[int, int]:
+    @property
+    def copies(self) -> Vector:
+        """The gain, Eq. (2), of each displacement of the coarse grid that a copy may have."""
+        return self._coarse_gains[self._coarse_gains >= 0]
+
+    @cached_property
+    def _coarse_gains(self) -> Plane:
+        """The gain of each displacement of the coarse grid [y, x]; -1 if the displacement is too short."""
         rows, columns = (2 * n - 1 for n in next(iter(self._planes.values())).shape)
 
         def response(n: int, q: Plane) -> Plane:
-            copy = _binned(gaussian_filter(self._expected[n], blur_px), STEP_PX)
+            copy = _binned(gaussian_filter(self._expected[n], COARSE_BLUR_PX), STEP_PX)
             return linear_convolve(q, copy[::-1, ::-1], (rows, columns))
 
         dy, dx = (_displacements(n) for n in (rows, columns))
         gain = self._gains(response)
         gain[np.hypot(dy[:, None], dx[None, :]) < self._nearest_px] = -1.0
-        at = int(np.argmax(gain))
-        return int(dx[at % columns]), int(dy[at // columns])
+        return gain
+
+    @property
+    def _coarse_displacement(self) -> tuple[int, int]:
+        """The displacement (x, y) of the coarse grid with the largest gain."""
+        row, column = np.unravel_index(np.argmax(self._coarse_gains), self._coarse_gains.shape)
+        dy, dx = (_displacements(n) for n in self._coarse_gains.shape)
+        return int(dx[column]), int(dy[row])
 
     def _fine_displacement(self, blur_px: float, dx: int, dy: int) -> tuple[float, int, int]:
         """The best gain and its displacement (x, y), among displacements within one coarse step of (dx, dy).
@@ -181,6 +194,19 @@ class PlaceSearch:
         size, along = (flat**2).sum(axis=0), left.residual @ flat
         seen = size > max(least * float(size.max()), UNSEEN)
         return np.asarray(np.where(seen & (along > 0), along**2 / np.where(seen, size, 1.0), 0.0))
+
+
+def distinguished(gains: Vector) -> float:
+    """The effective number of templates that the data distinguish, from the gain of each of them (templates,).
+
+    A search uses the template with the largest gain. The evidence is the mean over all templates, of which each is a priori
+    equally probable. The evidence of the best one must therefore be divided by
+
+        M / sum over templates of exp((gain - largest gain) / 2)                        Eq. (4)
+
+    This is M if the data exclude all other templates, and 1 if all M templates explain the data equally well.
+    """
+    return float(gains.size / np.sum(np.exp((gains - gains.max()) / 2)))
 
 
 class _Unabsorbed:

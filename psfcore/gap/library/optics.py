@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from scipy.ndimage import affine_transform, gaussian_filter, rotate
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.gap.effect import Change, Effect, EffectParameter
-from psfcore.gap.evidence.search import KERNEL_REACH_PX, displaced, place_search
+from psfcore.gap.evidence.search import KERNEL_REACH_PX, displaced, distinguished, place_search
 from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.optics import Blur
@@ -38,6 +39,31 @@ BLURS = (
 BETWEEN = 6  # number of parts into which the interval between the neighbours of the best step is divided
 SPLINE = 3  # order of the interpolation; a linear interpolation (order 1) would blur a rotated pattern
 AMOUNT = SOFTENED_POWER_LAW.names.index("total")  # the coordinate of the total scatter
+
+
+@dataclass(frozen=True)
+class _Sought:
+    """The result of a search among templates: the best one, and how many the data distinguish (`search.distinguished`)."""
+
+    best: Any
+    distinguished: float
+
+
+Search = Callable[[View], _Sought]
+
+
+def _once(name: str, search: Search) -> Search:
+    """The same search, which runs once for each view."""
+
+    def kept(view: View) -> _Sought:
+        results = view.kept.setdefault(_Sought, {})
+        if name not in results:
+            results[name] = search(view)
+        found = results[name]
+        assert isinstance(found, _Sought)
+        return found
+
+    return kept
 
 
 def by_psf(view: View, blur: Blur, weight: Field | None = None) -> Change:
@@ -70,9 +96,10 @@ def _blur(view: View, kernel: Kernel) -> Blur:
     return Blur(kernel, view.solution.transit.shape, threads=view.solution.threads)
 
 
-def _ghost(view: View) -> Sequence[Change]:
+def _ghost(view: View) -> _Sought:
     """A blurred, displaced copy of the image. A search over the field finds the displacement that explains the discs best."""
-    return _copy(*place_search(view).copy)
+    search = place_search(view)
+    return _Sought(search.copy, distinguished(search.copies))
 
 
 def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
@@ -82,27 +109,49 @@ def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
     return [Change(change, unocculted=False)]
 
 
-def _held(name: str, changes: Callable[[View], Sequence[Change]]) -> Effect:
-    """The effect of this name, without its search. changes: the changes for the result of the search, which stays
-    fixed."""
-    sought = next(effect for effect in EFFECTS if effect.name == name)
-    return replace(sought, changes=changes, held=None)
+def _searching(
+    effect: Effect,
+    search: Search,
+    changes: Callable[[View, Any], Sequence[Change]],
+    cause: Callable[[Any], str] = lambda best: "",
+) -> Effect:
+    """The effect with a search among templates. changes(view, best): the changes by a template. cause(best): its description, which
+    follows the cause of the effect if the template is held."""
+    search = _once(effect.name, search)
 
+    def held(view: View) -> Effect:
+        found = search(view)
+        return replace(
+            effect,
+            cause=effect.cause[:-1] + cause(found.best) + ".",
+            changes=lambda view: changes(view, found.best),
+            distinguished=lambda view: found.distinguished,
+        )
 
-def _held_ghost(view: View) -> Effect:
-    blur_px, dx, dy = place_search(view).copy
-    ghost = _held("ghost", lambda view: _copy(blur_px, dx, dy))
     return replace(
-        ghost, cause=f"{ghost.cause[:-1]}: displaced by ({dx}, {dy}) px, blurred by {blur_px:g} px."
+        effect,
+        changes=lambda view: changes(view, search(view).best),
+        distinguished=lambda view: search(view).distinguished,
+        held=held,
     )
+
+
+def _sought_later(view: View) -> Sequence[Change]:
+    """No changes; `_searching` replaces them."""
+    return ()
+
+
+def _as_ghost(view: View, copy: tuple[float, int, int]) -> Sequence[Change]:
+    return _copy(*copy)
+
+
+def _where_copied(copy: tuple[float, int, int]) -> str:
+    blur_px, dx, dy = copy
+    return f": displaced by ({dx}, {dy}) px, blurred by {blur_px:g} px"
 
 
 def _anisotropic(view: View) -> Sequence[Change]:
     return [by_psf(view, blur) for blur in shape_slopes(view, "stretched", (3, 4))]
-
-
-def _halo(view: View) -> Sequence[Change]:
-    return _as_halo(view, _best_halo(view))
 
 
 def _exponential(scale_px: float) -> Halo:
@@ -129,15 +178,11 @@ def _as_halo(view: View, halo: Halo) -> Sequence[Change]:
     return [by_psf(view, _blur(view, total.diffracted(halo(total.size) - scatter)))]
 
 
-def _best_halo(view: View) -> Halo:
+def _halo(view: View) -> _Sought:
     """The halo that explains most of the residuals."""
     size = view.solution.total.size
-    return HALOS[place_search(view).wide_kernel([halo(size) for halo in HALOS])]
-
-
-def _held_halo(view: View) -> Effect:
-    halo = _best_halo(view)
-    return _held("wide_halo", lambda view: _as_halo(view, halo))
+    gains = place_search(view).wide_kernels([halo(size) for halo in HALOS])
+    return _Sought(HALOS[int(np.argmax(gains))], distinguished(gains))
 
 
 def _field_dependent(view: View) -> Sequence[Change]:
@@ -148,20 +193,17 @@ def _field_dependent(view: View) -> Sequence[Change]:
     return [by_psf(view, slope, (where / share).astype(np.float32)) for where in (x, y, x * x + y * y)]
 
 
-def _core_blur(view: View) -> Sequence[Change]:
-    return blur_as(view, *_best_blur(view))
-
-
 def blur_as(view: View, width_px: float, steps: Steps) -> Sequence[Change]:
     """The change of the images by a blur of width `width_px`, divided by the variance of the blur, width_px^2."""
     change = (_blurred(view.kernel, width_px, steps) - view.kernel) / width_px**2
     return [by_psf(view, _blur(view, change))]
 
 
-def _best_blur(view: View) -> tuple[float, Steps]:
+def _core_blur(view: View) -> _Sought:
     """The width (px) and the directions of the blur that explains most of the residuals."""
     near = crop_or_pad(view.kernel, 2 * KERNEL_REACH_PX + 1)
-    return BLURS[place_search(view).kernel([_blurred(near, *blur) - near for blur in BLURS])]
+    gains = place_search(view).kernels([_blurred(near, *blur) - near for blur in BLURS])
+    return _Sought(BLURS[int(np.argmax(gains))], distinguished(gains))
 
 
 def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
@@ -173,11 +215,6 @@ def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
     walk = sum((np.cos(2 * np.pi * (y * fy + x * fx)) - 1) / (y * y + x * x) for y, x in steps)
     transfer = np.exp(width_px**2 * walk)
     return np.asarray(np.fft.irfft2(np.fft.rfft2(kernel) * transfer, s=kernel.shape))
-
-
-def _held_blur(view: View) -> Effect:
-    blur = _best_blur(view)
-    return _held("core_blur", lambda view: blur_as(view, *blur))
 
 
 def _mesh(view: View, changed: Kernel) -> list[Change]:
@@ -207,7 +244,7 @@ def _stretched(pattern: Kernel, percent: float) -> Kernel:
     )
 
 
-def _best_amount(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> float:
+def _amount(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> _Sought:
     """The amount of change of the diffraction PSF that explains most of the residuals.
 
     A search is needed because the mesh orders move by more than their width. form(pattern, amount): the changed pattern.
@@ -215,11 +252,13 @@ def _best_amount(view: View, form: Callable[[Kernel, float], Kernel], steps: Seq
     """
     search, pattern = place_search(view), _near(_odd(view))
     tried = sorted(sign * step for step in steps for sign in (-1, 1))
-    best = search.kernel([form(pattern, amount) - pattern for amount in tried])
+    gains = search.kernels([form(pattern, amount) - pattern for amount in tried])
+    best = int(np.argmax(gains))
     low, high = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
     between = [low + (high - low) * k / BETWEEN for k in range(1, BETWEEN)]
     between = [amount for amount in between if abs(amount) >= min(steps)]
-    return between[search.kernel([form(pattern, amount) - pattern for amount in between])]
+    nearer = search.kernels([form(pattern, amount) - pattern for amount in between])
+    return _Sought(between[int(np.argmax(nearer))], distinguished(gains))
 
 
 def _near(pattern: Kernel) -> Kernel:
@@ -236,22 +275,11 @@ def _changed_mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: f
 
 def _mesh_effect(name: str, form: Callable[[Kernel, float], Kernel], steps: Sequence[float],
                  parameter: EffectParameter, cause: str, axes: tuple[str, ...]) -> Effect:  # fmt: skip
-    def held(view: View) -> Effect:
-        amount = _best_amount(view, form, steps)
-        return replace(effect, changes=lambda view: _changed_mesh(view, form, amount), held=None)
-
-    effect = Effect(
-        name,
-        "optics",
-        (parameter,),
-        cause,
-        "the diffraction arms of a flare",
-        axes,
-        lambda view: _changed_mesh(view, form, _best_amount(view, form, steps)),
-        trials=2 * len(steps),
-        held=held,
-    )
-    return effect
+    return _searching(
+        Effect(name, "optics", (parameter,), cause, "the diffraction arms of a flare", axes, _sought_later, trials=2 * len(steps)),
+        lambda view: _amount(view, form, steps),
+        lambda view, amount: _changed_mesh(view, form, amount),
+    )  # fmt: skip
 
 
 def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
@@ -259,9 +287,11 @@ def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectPar
 
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect("ghost", "optics", (_p("share", "", 0.02, True),), "A reflection adds a displaced, defocused copy of the image.",
-           "images of a bright source at several positions in the field", ("detector_x", "detector_y", "intensity"), _ghost,
-           trials=GHOST_TRIALS, held=_held_ghost),
+    _searching(
+        Effect("ghost", "optics", (_p("share", "", 0.02, True),), "A reflection adds a displaced, defocused copy of the image.",
+               "images of a bright source at several positions in the field", ("detector_x", "detector_y", "intensity"), _sought_later,
+               trials=GHOST_TRIALS),
+        _ghost, _as_ghost, _where_copied),
     Effect("anisotropic_scatter", "optics", (_p("p", "", 0.1), _p("q", "", 0.1)),
            "Scatter reaches farther along one direction. p and q are ln(1 + stretch) times the cosine and the sine of twice the angle of this direction.",
            "a transit along a second track that crosses the first", ("azimuth_in_disc", "detector_x", "detector_y"),
@@ -270,12 +300,15 @@ EFFECTS: tuple[Effect, ...] = (
            (_p("x", "/field", 0.1), _p("y", "/field", 0.1), _p("outwards", "/field2", 0.2)),
            "The total scatter varies across the detector, linearly or from its centre outwards.", "a transit across another part of the detector",
            ("detector_x", "detector_y"), _field_dependent, not_a_power_law),
-    Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "The scatter has a second, wide component.",
-           "an eclipse, or a transit of a larger occulter", ("scattering_distance", "pointing", "intensity"), _halo,
-           trials=len(HALOS), held=_held_halo),
-    Effect("core_blur", "optics", (_p("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",
-           "an image of a sharp limb or of a point source", ("radius_in_disc", "azimuth_in_disc"), _core_blur, trials=len(BLURS),
-           held=_held_blur),
+    _searching(
+        Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "The scatter has a second, wide component.",
+               "an eclipse, or a transit of a larger occulter", ("scattering_distance", "pointing", "intensity"), _sought_later,
+               trials=len(HALOS)),
+        _halo, _as_halo),
+    _searching(
+        Effect("core_blur", "optics", (_p("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",
+               "an image of a sharp limb or of a point source", ("radius_in_disc", "azimuth_in_disc"), _sought_later, trials=len(BLURS)),
+        _core_blur, lambda view, blur: blur_as(view, *blur)),
     _mesh_effect("mesh_rotation", _turned, ANGLES_DEG, _p("angle", "deg", 3.0),
                  "The meshes are rotated relative to the detector.", ("azimuth_in_disc", "detector_x", "detector_y")),
     _mesh_effect("mesh_pitch", _stretched, PITCHES_PCT, _p("stretch", "%", 3.0),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names
-from studies.gap_calibration import KINDS, TEMPERATURES, Case, calibrated, required, table
+from psfcore.gap.verdict.posterior import NONE, PRIOR, UNKNOWN, Kind, Names
+from studies.gap_calibration import KINDS, TEMPERATURES, Case, best_prior, calibrated, required, table
 
 A, B, AB = ("a",), ("b",), ("a", "b")
 
@@ -18,14 +19,14 @@ def case_of(number: int, kind: str, true: Names, shares: dict[Names, float]) -> 
     return Case(number, kind, true, {names: math.log(share) for names, share in shares.items()})
 
 
-def drawn_cases(count: int, temperature: float) -> list[Case]:
-    """Cases whose weights are too sure: the truth is drawn from their probabilities at this temperature."""
+def drawn_cases(count: int, temperature: float, prior: Mapping[Kind, float] = PRIOR) -> list[Case]:
+    """Cases whose weights are too sure: the truth is drawn from their probabilities at this temperature, and with this prior."""
     rng = np.random.default_rng(5)
     cases = []
     for number in range(count):
         logs = dict(zip((NONE, UNKNOWN, A, B), (4 * rng.normal(size=4)).tolist(), strict=True))
         case = Case(number, "clean", NONE, logs)
-        shares = case.shares(temperature)
+        shares = case.shares(temperature, prior)
         true = list(shares)[int(rng.choice(len(shares), p=list(shares.values())))]
         kind = {NONE: "clean", UNKNOWN: "unknown"}.get(true, "single")
         cases.append(Case(number, kind, true, logs))
@@ -100,3 +101,14 @@ def test_the_table_has_coverage_and_size_of_every_kind() -> None:
     assert 1.0 <= size <= 4.0 and 0.0 < alone < held
     larger = {row.split()[0]: row for row in table(cases, 0.5)[1:]}
     assert float(larger["all"].split()[-2]) < size
+
+
+def test_the_best_prior_is_the_one_from_which_the_truths_were_drawn() -> None:
+    drawn_with = dict(PRIOR) | {"single": 4.0 * PRIOR["single"], "unknown": 0.4 * PRIOR["unknown"]}
+    found = best_prior(drawn_cases(400, 1.0, drawn_with), 1.0)
+    assert sum(found.values()) == pytest.approx(1.0)
+    for kind in ("single", "unknown"):
+        wanted = drawn_with[kind] / drawn_with["none"]
+        assert found[kind] / found["none"] == pytest.approx(wanted, rel=0.5), (
+            "a quarter is the scatter of 400 draws"
+        )

@@ -13,7 +13,7 @@ from psfcore.convolution.convolver import correlations
 from psfcore.gap.evidence.cells import cells_of, sensitivities, whitening
 from psfcore.gap.evidence.near_discs import NearDiscs, cut
 from psfcore.gap.evidence.search import displaced, place_search
-from psfcore.gap.library.optics import _best_blur, _blurred
+from psfcore.gap.library.optics import _blurred, _core_blur
 from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.inversion import invert
@@ -108,7 +108,7 @@ def test_the_direction_of_a_directional_blur_is_found() -> None:
         )
         for f in clean().frames
     )
-    width, steps = _best_blur(View(invert(replace(clean(), frames=blurred))))
+    width, steps = _core_blur(View(invert(replace(clean(), frames=blurred)))).best
     assert steps == LINE and width <= 1.5
 
 

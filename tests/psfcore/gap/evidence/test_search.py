@@ -20,6 +20,7 @@ from psfcore.gap.evidence.search import (
     _along_copy,
     coarse_kernel,
     displaced,
+    distinguished,
     place_search,
 )
 from psfcore.gap.library.optics import (
@@ -29,9 +30,9 @@ from psfcore.gap.library.optics import (
     DIRECTIONS,
     HALOS,
     Halo,
-    _best_amount,
-    _best_halo,
+    _amount,
     _blurred,
+    _halo,
     _turned,
 )
 from psfcore.gap.view import View
@@ -99,7 +100,9 @@ def test_a_turned_mesh_is_found_at_its_angle() -> None:
     turned = np.maximum(rotate(cross(), 12.0, reshape=False, order=1), 0.0)
     transit = simulate(plan, TRUTH, turned / turned.sum(), seed=4).transit
     view = View(invert(replace(transit, diffraction=cross())))
-    assert _best_amount(view, _turned, ANGLES_DEG) == pytest.approx(12.0, abs=2.0)
+    found = _amount(view, _turned, ANGLES_DEG)
+    assert found.best == pytest.approx(12.0, abs=2.0)
+    assert 1 <= found.distinguished <= 2 * len(ANGLES_DEG)
 
 
 def test_the_coarse_sum_predicts_the_effect_of_a_wide_psf_change_on_the_discs() -> None:
@@ -134,8 +137,14 @@ def test_a_wide_halo_is_found_at_about_its_width() -> None:
     wide = np.exp(-np.hypot(x, y) / 30.0)
     transit = simulate(plan, TRUTH, 0.8 * kernel + 0.2 * wide / wide.sum(), seed=4).transit
     found = invert(replace(transit, diffraction=kernel))
-    halo = _best_halo(View(found))
-    assert halo in HALOS[2:6]
+    view = View(found)
+    assert _halo(view).best in HALOS[2:6]
+    halo = effect("wide_halo")
+    assert halo.distinguished is not None and halo.held is not None
+    held = halo.held(view).distinguished
+    assert held is not None and held(View(solution())) == halo.distinguished(view), (
+        "of the search, not of the refit"
+    )
     library = [effect("wide_halo"), effect("dark_offset")]
     model = LinearModel(gather(found, library), FLOOR)
     share, sigma, _ = fit_effects(model, library[:1]).values["share"]
@@ -169,6 +178,16 @@ def test_a_changing_sun_shows_only_in_the_unocculted_field(share: float, seen: b
     assert (fit.p_value < 1e-6) == seen
     # The change is linear in time, so the uneven part is left out.
     assert set(fit.values) == ({"rms"} if seen else set())
+
+
+@pytest.mark.parametrize(
+    ("gains", "wanted"),
+    [([3.0, 3.0, 3.0], 1.0), ([80.0, 0.0, 0.0, 0.0], 4.0), ([80.0, 80.0, 0.0, 0.0], 2.0), ([7.0], 1.0)],
+)
+def test_templates_that_explain_the_data_equally_well_are_not_distinguished(
+    gains: list[float], wanted: float
+) -> None:
+    assert distinguished(np.array(gains)) == pytest.approx(wanted)
 
 
 def test_a_copy_is_found_at_its_place() -> None:
