@@ -129,13 +129,8 @@ class PlaceSearch:
         return best[1:]
 
     @property
-    def copies(self) -> Vector:
-        """The gain, Eq. (2), of each displacement of the coarse grid that a copy may have."""
-        return self._coarse_gains[self._coarse_gains >= 0]
-
-    @cached_property
-    def _coarse_gains(self) -> Plane:
-        """The gain of each displacement of the coarse grid [y, x]; -1 if the displacement is too short."""
+    def _coarse_displacement(self) -> tuple[int, int]:
+        """The displacement (x, y) of the coarse grid with the largest gain."""
         rows, columns = (2 * n - 1 for n in next(iter(self._planes.values())).shape)
 
         def response(n: int, q: Plane) -> Plane:
@@ -145,13 +140,7 @@ class PlaceSearch:
         dy, dx = (_displacements(n) for n in (rows, columns))
         gain = self._gains(response)
         gain[np.hypot(dy[:, None], dx[None, :]) < self._nearest_px] = -1.0
-        return gain
-
-    @property
-    def _coarse_displacement(self) -> tuple[int, int]:
-        """The displacement (x, y) of the coarse grid with the largest gain."""
-        row, column = np.unravel_index(np.argmax(self._coarse_gains), self._coarse_gains.shape)
-        dy, dx = (_displacements(n) for n in self._coarse_gains.shape)
+        row, column = np.unravel_index(np.argmax(gain), gain.shape)
         return int(dx[column]), int(dy[row])
 
     def _fine_displacement(self, blur_px: float, dx: int, dy: int) -> tuple[float, int, int]:

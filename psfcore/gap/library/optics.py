@@ -98,8 +98,8 @@ def _blur(view: View, kernel: Kernel) -> Blur:
 
 def _ghost(view: View) -> _Sought:
     """A blurred, displaced copy of the image. A search over the field finds the displacement that explains the discs best."""
-    search = place_search(view)
-    return _Sought(search.copy, distinguished(search.copies))
+    # The coarse grid of the search uses the means of the discs only. How many displacements the cells distinguish is not known, so all count.
+    return _Sought(place_search(view).copy, GHOST_TRIALS)
 
 
 def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:

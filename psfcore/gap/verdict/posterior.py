@@ -39,12 +39,12 @@ UNKNOWN: Names = ("unknown",)  # no effect may have this name
 KINDS: tuple[Kind, ...] = ("none", "single", "pair", "triple", "unknown")
 # Prior probabilities of the kinds. Those of one effect and of an unknown cause maximise the mean logarithm of the probability of the true
 # cause in 144 simulated cases (`studies.gap_calibration` computes them). With 0.4 for one effect and 0.15 for an
-# unknown cause, answer sets of the same coverage have 5.0 members instead of 2.4.
+# unknown cause, answer sets of the same coverage have 3.4 members instead of 2.2.
 PRIOR: Mapping[Kind, float] = {"none": 0.28, "single": 0.15, "pair": 0.08, "triple": 0.01, "unknown": 0.48}
 
 # The data do not show a further effect if it makes a hypothesis less probable by this factor. The priors alone make a pair 0.06 times
 # as probable as one of its effects. With the factor 1, pairs that are nearly as probable as one of their effects are not in the
-# answer set; to cover 0.9 of the causes anyway, the sets must be larger: 8.0 members instead of 5.8 (144 simulated cases).
+# answer set; to cover 0.9 of the causes anyway, the sets must be larger: 3.7 members instead of 2.2 (144 simulated cases).
 IDLE = 0.2
 
 

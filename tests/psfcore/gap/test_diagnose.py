@@ -261,8 +261,8 @@ def test_an_empty_library_is_refused(clean: Transit) -> None:
 
 
 def test_a_larger_coverage_gives_a_larger_set_and_one_without_enough_cases_is_refused() -> None:
-    """The probabilities of the true causes of 39 simulated cases, spread evenly."""
-    calibration = Calibration(1.0, tuple(np.linspace(1e-4, 0.9, 39)), {})
+    """The probabilities of the true causes of 39 simulated cases; their logarithms are spread evenly."""
+    calibration = Calibration(1.0, tuple(np.geomspace(1e-4, 0.9, 39)), {})
     solution = invert(small_gaps.clean())
     found = {}
     with small_gaps.QUICK:
