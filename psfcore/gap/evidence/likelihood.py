@@ -30,9 +30,9 @@ have the same factor, because the field can be stronger than is likely:
 
 N is the normal matrix of the strengths with the PSF free (its Schur complement). The integral is computed in the
 Laplace approximation. Parameters that cannot be negative follow `evidence.one_sided`. If a template was chosen among many,
-the logarithm of the number that the data distinguish is subtracted from ln E. For each number that was measured in the blocks to build a template,
-MEASURED is added to the chi2 of the blocks: noise alone lowers this chi2 by 1 for each number, and
-the likely size of the number is unknown.
+the logarithm of the number that the data distinguish (`search.distinguished`) is subtracted from ln E. For each number that was
+measured in the blocks to build a template, MEASURED is added to the chi2 of the blocks: noise alone lowers this chi2 by 1 for
+each number, and the likely size of the number is unknown.
 """
 
 from __future__ import annotations
