@@ -29,6 +29,9 @@ from workers.settings import Settings
 
 log = logging.getLogger(__name__)
 
+# Clients such as httpx reuse an idle connection for up to 5 s. A server that closes it at the same moment resets the request.
+IDLE_CONNECTION_S = 15
+
 
 def serve(
     settings: Settings, host: str, port: int, announce: Callable[[str], None], *, verbose: bool = False
@@ -50,6 +53,7 @@ def serve(
                 log_level="warning",
                 access_log=False,
                 server_header=False,
+                timeout_keep_alive=IDLE_CONNECTION_S,
                 timeout_graceful_shutdown=ceil(settings.stop_s),
                 http=bounded(ConnectionLimits.of(settings)),
                 ws="none",

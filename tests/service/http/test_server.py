@@ -7,13 +7,17 @@ import gc
 import socket
 import threading
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
+import httpx
 import pytest
 import uvicorn
 from fastapi import FastAPI
 
 from service import server
 from tests.whole.stack import wait_for
+from workers.settings import Settings
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
@@ -49,6 +53,27 @@ def test_a_port_that_is_in_use_is_refused() -> None:
         listener.listen()
         with pytest.raises(OSError, match="in use"):
             server.listening("127.0.0.1", listener.getsockname()[1])
+
+
+class Configured(Exception):
+    """Raised in place of a start. settings: those of uvicorn."""
+
+    def __init__(self, settings: dict[str, Any]) -> None:
+        self.settings = settings
+
+
+def test_an_idle_connection_stays_open_longer_than_clients_use_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def config(_: FastAPI, **settings: Any) -> None:
+        raise Configured(settings)
+
+    monkeypatch.setattr(server.uvicorn, "Config", config)
+    monkeypatch.setattr(server.logs, "configure", lambda settings, *, verbose: None)
+    with pytest.raises(Configured) as raised:
+        server.serve(Settings(data_dir=tmp_path), "127.0.0.1", 0, lambda address: None)
+    used_for_s = httpx.Limits().keepalive_expiry
+    assert used_for_s is not None and raised.value.settings["timeout_keep_alive"] > 2 * used_for_s
 
 
 @pytest.fixture
