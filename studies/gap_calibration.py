@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -111,8 +111,7 @@ def calibrated(cases: Sequence[Case], about: Mapping[str, Any]) -> Calibration:
     share is 0."""
 
     def loss(log_temperature: float) -> float:
-        shares = [case.true_share(float(np.exp(log_temperature))) for case in cases]
-        return -float(np.mean(np.log(np.maximum(shares, LEAST_SHARE))))
+        return _loss(case.true_share(float(np.exp(log_temperature))) for case in cases)
 
     low, high = np.log(TEMPERATURES)
     temperature = round(float(np.exp(minimize_scalar(loss, bounds=(low, high), method="bounded").x)), 2)
@@ -131,10 +130,15 @@ def best_prior(cases: Sequence[Case], temperature: float) -> dict[Kind, float]:
         return {kind: float(share / sum(scaled.values())) for kind, share in scaled.items()}
 
     def loss(factors: NDArray[np.float64]) -> float:
-        shares = [case.true_share(temperature, prior(factors)) for case in cases]
-        return -float(np.mean(np.log(np.maximum(shares, LEAST_SHARE))))
+        other = prior(factors)
+        return _loss(case.true_share(temperature, other) for case in cases)
 
     return prior(minimize(loss, np.zeros(2), method="Powell", options={"xtol": 0.02, "ftol": 1e-4}).x)
+
+
+def _loss(true_shares: Iterable[float]) -> float:
+    """Minus the mean logarithm of the probabilities of the true causes."""
+    return -float(np.mean(np.log(np.maximum(list(true_shares), LEAST_SHARE))))
 
 
 def table(cases: Sequence[Case], coverage: float = COVERAGE) -> list[str]:

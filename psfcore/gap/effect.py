@@ -60,7 +60,7 @@ class Effect:
     changes(view): one change for each parameter. An effect that is fitted for each pointing may return fewer or more
     changes than it has parameters. In this case, changes and parameters are paired in order. A change or parameter
     without a partner is not fitted. why_not(view): the reason why these data cannot show the effect; None if they can.
-    trials: the approximate number of positions or templates among which the effect searches; it raises the p-value.
+    trials: the approximate number of positions or templates among which the effect searches; it raises the p-value and the detection limit.
     distinguished(view): how many of these the data distinguish (`search.distinguished`; None: all of them); a larger number
     lowers the evidence. held(view): for an effect that searches for a position or a template, the same effect with the result of
     the search fixed. field: whether the parameters describe a random field, in which each parameter is about as large

@@ -141,10 +141,6 @@ def _sought_later(view: View) -> Sequence[Change]:
     return ()
 
 
-def _as_ghost(view: View, copy: tuple[float, int, int]) -> Sequence[Change]:
-    return _copy(*copy)
-
-
 def _where_copied(copy: tuple[float, int, int]) -> str:
     blur_px, dx, dy = copy
     return f": displaced by ({dx}, {dy}) px, blurred by {blur_px:g} px"
@@ -291,7 +287,7 @@ EFFECTS: tuple[Effect, ...] = (
         Effect("ghost", "optics", (_p("share", "", 0.02, True),), "A reflection adds a displaced, defocused copy of the image.",
                "images of a bright source at several positions in the field", ("detector_x", "detector_y", "intensity"), _sought_later,
                trials=GHOST_TRIALS),
-        _ghost, _as_ghost, _where_copied),
+        _ghost, lambda view, copy: _copy(*copy), _where_copied),
     Effect("anisotropic_scatter", "optics", (_p("p", "", 0.1), _p("q", "", 0.1)),
            "Scatter reaches farther along one direction. p and q are ln(1 + stretch) times the cosine and the sine of twice the angle of this direction.",
            "a transit along a second track that crosses the first", ("azimuth_in_disc", "detector_x", "detector_y"),
