@@ -54,7 +54,7 @@ chaos: $(DEV)
 # Measures the gap diagnosis on cases whose effect is withheld. Takes hours; resumes where it was stopped.
 blind: $(RUN)
 	OMP_NUM_THREADS=1 $(BIN)/heliopsf gap blind --cases 204 --size 256 --images 18 -o heliopsf-blind
-	OMP_NUM_THREADS=1 $(BIN)/heliopsf gap blind --cases 12 --seed 2 --size 512 --images 30 -o heliopsf-blind-512
+	OMP_NUM_THREADS=1 $(BIN)/heliopsf gap blind --cases 24 --seed 2 --size 512 --images 30 -o heliopsf-blind-512
 
 lint: $(DEV)
 	$(BIN)/ruff check .

@@ -20,6 +20,7 @@ import numpy as np
 
 from heliopsf.psfs import LIMITS
 from psfcore.blind.score_table import wilson
+from psfcore.errors import DataError
 from psfcore.gap.diagnose import linear_model_of
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.linear_model import LinearModel
@@ -70,7 +71,8 @@ class Settings:
 
 
 def case_of(number: int, asked: Settings) -> Case:
-    """Make and diagnose a case. strength is None if no strength of the effect would be found."""
+    """Make and diagnose a case. strength is None if no strength of the effect would be found, or if the images with it cannot be
+    fitted."""
     name = EFFECTS[number % len(EFFECTS)]
     transit = clean(number, asked)
     view = View(invert(transit))
@@ -81,7 +83,12 @@ def case_of(number: int, asked: Settings) -> Case:
     leading = _limits(model, asked, name)[0]
     if leading.found_90 is None:
         return Case(name, leading.name, None, False, None, "no strength would be found")
-    view = View(invert(with_effect(transit, view, effect, leading)))
+    try:
+        solution = invert(with_effect(transit, view, effect, leading))
+    except DataError as error:
+        # A limit of many times the likely size can be stronger than any image allows: a halo of 70 % hides the occulter.
+        return Case(name, leading.name, None, False, None, f"{leading.found_90:.3g}: {error.code}")
+    view = View(solution)
     model, _ = linear_model_of(view, LIBRARY)
     found, _ = settled_posterior(model, Refits(view, model).weighed)
     shares = without_idle(found.probabilities(asked.temperature))

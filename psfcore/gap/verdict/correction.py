@@ -23,6 +23,7 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, left_chi2
 from psfcore.gap.evidence.evidence import Evidence, gather, residuals_at
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.unused_memory import return_unused_memory
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import Progress, Solution, invert
 from psfcore.transit.transit import Transit
@@ -123,6 +124,7 @@ def add_to_model(
                 near = start is not None
                 fit = invert(images, shape, start=start, near=near, threads=threads, progress=progress)
                 here = View(fit)
+                return_unused_memory()  # the planes of the view before
             seen = _fit_remaining(_with_old_jacobian(model, here, held), held, theta, in_images)
         except DataError:
             if taken is None:
@@ -149,6 +151,7 @@ def add_to_model(
             break
     assert taken is not None
     del here  # its planes, before those of another view are made
+    return_unused_memory()
     return _corrected(taken, held, beside, in_images, model, progress)
 
 

@@ -13,6 +13,7 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of
 from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
+from psfcore.gap.unused_memory import return_unused_memory
 from psfcore.gap.verdict.correction import Corrected, add_to_model
 from psfcore.gap.verdict.posterior import Names, at_refit
 from psfcore.gap.view import View
@@ -107,6 +108,7 @@ class Refits:
             except DataError as error:  # the fit may fail if the subtracted effect is not in the images
                 self.failures.append(f"The full refit with {label} in the model failed: {error}")
                 self._made[names] = None
+            return_unused_memory()
         return self._made[names]
 
     def _start(self, effects: Sequence[Effect]) -> EffectFit:
