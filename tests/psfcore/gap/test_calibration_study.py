@@ -109,4 +109,5 @@ def test_the_best_prior_is_the_one_from_which_the_truths_were_drawn() -> None:
     assert sum(found.values()) == pytest.approx(1.0)
     for kind in ("single", "unknown"):
         wanted = drawn_with[kind] / drawn_with["none"]
+        # Three times the scatter: with eight other seeds, the ratios of 400 draws scatter by 14 and 17 %.
         assert found[kind] / found["none"] == pytest.approx(wanted, rel=0.5)
