@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,6 +66,13 @@ LONGEST_FIRST = (
 _CACHE = TemporaryDirectory(prefix="heliopsf-tests-")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that shows whether a test depends on the order of the tests."""
+    parser.addoption(
+        "--shuffle", type=int, metavar="SEED", help="run files, and the tests of a file, in random order"
+    )
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Have xdist keep our order of files: its own begins with those of the most tests.
 
@@ -82,15 +90,21 @@ def _own_cache(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Put the longest files first; refuse tests of one id: of these, side by side, one alone is run and nobody sees it."""
     twice = [name for name, count in Counter(item.nodeid for item in items).items() if count > 1]
     if twice:
         raise pytest.UsageError(
             f"expected an id of its own for each test; got several of {', '.join(twice[:5])}"
         )
-    rank = {REPOSITORY / "tests" / name: place for place, name in enumerate(LONGEST_FIRST)}
-    items.sort(key=lambda item: rank.get(item.path, len(rank)))
+    seed = config.getoption("--shuffle")
+    if seed is None:
+        rank = {REPOSITORY / "tests" / name: place for place, name in enumerate(LONGEST_FIRST)}
+        items.sort(key=lambda item: rank.get(item.path, len(rank)))
+    else:
+        generator = random.Random(seed)
+        place = {path: generator.random() for path in dict.fromkeys(item.path for item in items)}
+        items.sort(key=lambda item: (place[item.path], generator.random()))
 
 
 # An instrument so small that its PSF is built in a second.
