@@ -13,6 +13,7 @@ from service.local import LocalService
 from tests.blank_figures import blank_unless_told
 from tests.tables import copied_tables
 from tests.whole.stack import Missing, postgres_database
+from tests.workers.databases import change
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import Base
 from workers.settings import Settings
@@ -56,23 +57,16 @@ def postgres_tables() -> Iterator[str]:
         yield catalogue_url
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+@pytest.fixture
 def catalogue(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalogue]:
-    """A catalogue without rows."""
-    if request.param == "sqlite":
-        catalogue = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
-    else:
-        catalogue = Catalogue(request.getfixturevalue("postgres_tables"))
+    """A catalogue without rows, in SQLite; the mark ``BOTH`` runs a test on PostgreSQL too."""
+    postgresql = getattr(request, "param", "sqlite") == "postgresql"
+    url = request.getfixturevalue("postgres_tables") if postgresql else f"sqlite:///{tmp_path / 'c.sqlite'}"
+    catalogue = Catalogue(url)
     catalogue.upgrade()
     yield catalogue
-    if request.param == "postgresql":
-        _delete_all_rows(catalogue)
-    catalogue.close()
-
-
-def _delete_all_rows(catalogue: Catalogue) -> None:
-    with catalogue._engine.begin() as connection:
+    if postgresql:
         # A transaction that a test left open would let this wait for ever.
-        connection.execute(text("SET LOCAL lock_timeout = '10s'"))
-        for table in reversed(Base.metadata.sorted_tables):
-            connection.execute(table.delete())
+        tables = reversed(Base.metadata.sorted_tables)
+        change(catalogue, text("SET LOCAL lock_timeout = '10s'"), *(table.delete() for table in tables))
+    catalogue.close()

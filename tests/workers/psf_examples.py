@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Callable
 from typing import Any
 
+import pytest
+
+from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ProductRow, PsfRow
@@ -92,3 +96,20 @@ def deprecate(catalogue: Catalogue, name: str, successor: str | None = None) -> 
 def years(start: int | None, end: int | None) -> Validity:
     """From the first of January of a year to that of another."""
     return Validity.of(*(None if year is None else f"{year}-01-01" for year in (start, end)))
+
+
+def header_of(date: str | None, **cards: Any) -> dict[str, Any]:
+    """What the upload of an image of HRI_EUV is kept with, as far as a PSF is found by it."""
+    known = {
+        "instrument": "hri_euv", "telescop": None, "instrume": "EUI", "detector": "HRI_EUV", "wavelnth": 174.0,
+        "gain_mode": None, "date_obs": date, "cards": {"DETECTOR": "HRI_EUV", "WAVELNTH": 174.0},
+    }  # fmt: skip
+    return known | cards
+
+
+def refused(code: str, change: Callable[[], object]) -> str:
+    """The message of the DataError with this code that a call raises."""
+    with pytest.raises(DataError) as caught:
+        change()
+    assert caught.value.code == code, caught.value.message
+    return caught.value.message

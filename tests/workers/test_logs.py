@@ -1,20 +1,15 @@
-"""Which messages are written: those that clients can cause once in a while, requests only if wanted, upgrades in one line."""
+"""Which messages are written: those that clients can cause once in a while, requests only if wanted."""
 
 from __future__ import annotations
 
 import io
 import logging
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from sqlalchemy import text
 
 from service.http import observation
-from tests.tables import RUN_REVISIONS
 from workers import logs
-from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.schema import Schema
 from workers.settings import Settings
 
 
@@ -58,25 +53,35 @@ class Terminal(io.StringIO):
         self.isatty = lambda: terminal  # type: ignore[method-assign]
 
 
-@pytest.mark.parametrize(
-    ("terminal", "asked", "verbose", "shown"),
-    [
-        (True, None, False, False),
-        (True, None, True, True),
-        (True, "text", False, True),
-        (True, "json", False, True),
-        (False, None, False, True),
-    ],
+# Whether standard error is a terminal, the setting of the format, --verbose, and whether requests are shown.
+SHOWN = (
+    (True, None, False, False),
+    (True, None, True, True),
+    (True, "text", False, True),
+    (True, "json", False, True),
+    (False, None, False, True),
 )
-def test_requests_are_shown_on_a_terminal_only_if_wanted(
-    monkeypatch: pytest.MonkeyPatch, terminal: bool, asked: str | None, verbose: bool, shown: bool
-) -> None:
-    root, stream = logging.getLogger(), Terminal(terminal=terminal)
+
+
+def test_requests_are_shown_on_a_terminal_only_if_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    for terminal, log_format, verbose, shown in SHOWN:
+        with monkeypatch.context() as patched:
+            text = written(patched, Terminal(terminal=terminal), log_format, verbose)
+        requests = [f"GET /{status}" in text for status in (200, 404, 500)]
+        assert requests == [shown, shown, True], (terminal, log_format, verbose)
+        assert "job 1: submitted" in text and "Running upgrade" not in text
+
+
+def written(
+    monkeypatch: pytest.MonkeyPatch, stream: io.StringIO, log_format: str | None, verbose: bool
+) -> str:
+    """What some messages write to this stream."""
+    root = logging.getLogger()
     monkeypatch.setattr(root, "handlers", [])  # the test runner's own come back afterwards
     monkeypatch.setattr("sys.__stderr__", stream)
     level = root.level
     try:
-        logs.configure(Settings.model_validate({"log_format": asked}), verbose=verbose)
+        logs.configure(Settings.model_validate({"log_format": log_format}), verbose=verbose)
         for status in (200, 404, 500):
             fields = {"fields": {"status": status}}
             logging.getLogger(observation.__name__).info("GET /%d", status, extra=fields)
@@ -85,28 +90,4 @@ def test_requests_are_shown_on_a_terminal_only_if_wanted(
     finally:
         root.setLevel(level)
         logging.captureWarnings(False)
-    said = stream.getvalue()
-    assert [f"GET /{status}" in said for status in (200, 404, 500)] == [shown, shown, True]
-    assert "job 1: submitted" in said and "Running upgrade" not in said
-
-
-def test_an_upgrade_of_the_database_is_one_line(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Schema, "upgrade", RUN_REVISIONS)  # other tests get a copy of ready tables
-    caplog.set_level(logging.INFO, "workers.catalogue.schema")
-    catalogue = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
-    catalogue.upgrade()
-    wanted = catalogue.schema.status().wanted
-    assert caplog.messages == [f"database: created, revision {wanted}"]
-    with catalogue._engine.begin() as connection:
-        # The tables of revision 0016; revision 0017 changes only counts.
-        connection.execute(text("DROP TABLE series_changes"))
-        connection.execute(text("ALTER TABLE psf_pins DROP COLUMN interpolated"))
-        connection.execute(text("ALTER TABLE bulks DROP COLUMN listed_to"))
-        connection.execute(text("UPDATE alembic_version SET version_num = '0016'"))
-    caplog.clear()
-    catalogue.upgrade()
-    catalogue.upgrade()
-    catalogue.close()
-    assert caplog.messages == [f"database: upgraded from 0016 to {wanted}"]
+    return stream.getvalue()

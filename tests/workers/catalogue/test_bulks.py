@@ -1,4 +1,4 @@
-"""Bulk runs and their images as rows: taken, lost, done, paused, retried; consistent counts; fifty thousand images."""
+"""Bulk runs and their images as rows: taken, lost, done, paused, retried, deleted; consistent counts."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import func, select, update
+from sqlalchemy import event, func, select, update
 
 from psfcore.errors import DataError
 from tests.conftest import write_image
 from tests.whole.many_rows import plan, statements
+from tests.workers.databases import BOTH, change, database, rows
+from tests.workers.psf_examples import product
 from workers.bulk import listing, matching
 from workers.catalogue import bulk_progress
 from workers.catalogue import bulks as bulk_rows
@@ -24,7 +26,7 @@ from workers.catalogue.bulks import Listed, Taken, new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import ROW_BYTES, counted_bytes
-from workers.catalogue.tables import ImageRow, JobRow, ProductRow
+from workers.catalogue.tables import ImageRow
 from workers.contract.bulk import DELETABLE, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError
 from workers.files.store import Store
@@ -62,6 +64,12 @@ def row(catalogue: Catalogue, bulk_id: str) -> BulkRow:
     return found
 
 
+def one_taken(catalogue: Catalogue, bulk_id: str, lease: Lease) -> Taken:
+    taken = catalogue.bulks.take(bulk_id, lease, 3)
+    assert taken is not None
+    return taken
+
+
 def done(catalogue: Catalogue, taken: Taken, *, reused: bool = False, **values: Any) -> bool:
     return catalogue.bulks.finish(taken, reused=reused, **{**DONE, **values})
 
@@ -73,12 +81,9 @@ def all_taken(catalogue: Catalogue, bulk_id: str, lease: Lease) -> Iterator[Take
 
 def check_counts(catalogue: Catalogue, bulk_id: str) -> None:
     """The counts of the run equal those of its images."""
-    query = select(BulkItemRow.state, func.count()).where(BulkItemRow.bulk_id == bulk_id)
-    with catalogue._engine.connect() as connection:
-        states = dict(connection.execute(query.group_by(BulkItemRow.state)).all())  # type: ignore[arg-type]
+    states = rows(catalogue, select(BulkItemRow.state).where(BulkItemRow.bulk_id == bulk_id))
     bulk = row(catalogue, bulk_id)
-    assert bulk.total == sum(states.values())
-    assert (bulk.done, bulk.failed) == (states.get("done", 0), states.get("failed", 0))
+    assert (bulk.total, bulk.done, bulk.failed) == (len(states), states.count("done"), states.count("failed"))
 
 
 def test_images_are_taken_in_order_and_the_last_one_ends_the_bulk(catalogue: Catalogue) -> None:
@@ -87,6 +92,7 @@ def test_images_are_taken_in_order_and_the_last_one_ends_the_bulk(catalogue: Cat
     assert [one.position for one in taken] == [0, 1, 2]
     assert catalogue.bulks.progress.pace(row(catalogue, bulk_id)).taken == 3
     assert done(catalogue, taken[0]) and done(catalogue, taken[1], reused=True)
+    assert not done(catalogue, taken[0]) and not catalogue.bulks.fail(taken[0], BAD), "it counts once"
     assert row(catalogue, bulk_id).phase == BulkPhase.RUNNING
     assert catalogue.bulks.fail(taken[2], BAD)
     ended = row(catalogue, bulk_id)
@@ -95,118 +101,73 @@ def test_images_are_taken_in_order_and_the_last_one_ends_the_bulk(catalogue: Cat
     check_counts(catalogue, bulk_id)
 
 
-def test_an_image_done_twice_counts_once(catalogue: Catalogue) -> None:
-    bulk_id, lease = made(catalogue, 2), turn(catalogue)
-    taken = catalogue.bulks.take(bulk_id, lease, 3)
-    assert taken is not None
-    assert [done(catalogue, taken), done(catalogue, taken), catalogue.bulks.fail(taken, BAD)] == [
-        True,
-        False,
-        False,
-    ]
-    assert row(catalogue, bulk_id).done == 1
-    check_counts(catalogue, bulk_id)
-
-
+@BOTH
 def test_many_workers_take_each_image_once(catalogue: Catalogue) -> None:
-    bulk_id = made(catalogue, 60)
+    bulk_id = made(catalogue, 30)
     leases = [turn(catalogue) for _ in range(6)]
 
     def work(lease: Lease) -> list[int]:
-        found = []
+        positions = []
         for taken in all_taken(catalogue, bulk_id, lease):
-            found.append(taken.position)
+            positions.append(taken.position)
             assert done(catalogue, taken)
-        return found
+        return positions
 
     with ThreadPoolExecutor(6) as pool:
-        found = [position for positions in pool.map(work, leases) for position in positions]
-    assert sorted(found) == list(range(60))
+        positions = [position for part in pool.map(work, leases) for position in part]
+    assert sorted(positions) == list(range(30))
     assert row(catalogue, bulk_id).phase == BulkPhase.COMPLETED
     check_counts(catalogue, bulk_id)
 
 
-def test_an_image_of_a_lost_worker_is_taken_by_another_and_its_result_counts(catalogue: Catalogue) -> None:
-    bulk_id, lost = made(catalogue, 1), turn(catalogue)
-    first = catalogue.bulks.take(bulk_id, lost, 3)
-    other = turn(catalogue)
-    assert first is not None
-    assert catalogue.bulks.take(bulk_id, other, 3) is None, "it is held"
+@BOTH
+def test_an_image_of_a_lost_worker_is_taken_by_another_and_fails_with_the_third(catalogue: Catalogue) -> None:
+    bulk_id, lost = made(catalogue, 3), turn(catalogue)
+    first, other = one_taken(catalogue, bulk_id, lost), turn(catalogue)
+    assert [one.position for one in all_taken(catalogue, bulk_id, other)] == [1, 2], "the first one is held"
     catalogue.jobs.give_up_silent(-1.0, 99)  # every worker was silent for longer than that
     other = turn(catalogue)
-    second = catalogue.bulks.take(bulk_id, other, 3)
-    assert second is not None and second.position == 0
+    second = one_taken(catalogue, bulk_id, other)
+    assert second.position == 0
     assert not done(catalogue, first, score=9.0), "the lost one comes back too late"
     assert catalogue.bulks.take(bulk_id, lost, 3) is None, "and gets nothing more"
     assert done(catalogue, second)
     (item,) = catalogue.bulks.progress.items(bulk_id, ItemState.DONE)
     assert (item.attempts, item.score) == (2, 0.5)
-
-
-def test_an_image_whose_workers_are_lost_fails(catalogue: Catalogue) -> None:
-    bulk_id = made(catalogue, 2)
-    for _ in range(3):
-        taken = catalogue.bulks.take(bulk_id, turn(catalogue), 3)
-        assert taken is not None and taken.position == 0
+    for _ in range(2):
+        assert one_taken(catalogue, bulk_id, turn(catalogue)).position == 1
         catalogue.jobs.give_up_silent(-1.0, 99)
-    taken = catalogue.bulks.take(bulk_id, turn(catalogue), 3)
-    assert taken is not None and taken.position == 1, "the others go on"
+    last = one_taken(catalogue, bulk_id, turn(catalogue))
+    assert last.position == 2, "the others go on"
     (item,) = catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)
     assert item.error is not None and item.error["code"] == "worker-lost" and item.attempts == 3
-    assert done(catalogue, taken)
+    assert done(catalogue, last)
     assert row(catalogue, bulk_id).phase == BulkPhase.COMPLETED
     check_counts(catalogue, bulk_id)
 
 
-def test_a_released_image_is_as_if_it_had_not_been_taken(catalogue: Catalogue) -> None:
-    bulk_id, lease = made(catalogue, 1), turn(catalogue)
-    for _ in range(5):
-        taken = catalogue.bulks.take(bulk_id, lease, 3)
-        assert taken is not None and catalogue.bulks.release(taken)
-    assert not catalogue.bulks.release(taken)
-
-
-def test_paused_resumed_cancelled(catalogue: Catalogue) -> None:
+def test_released_paused_resumed_cancelled(catalogue: Catalogue) -> None:
     bulk_id, lease = made(catalogue, 2), turn(catalogue)
-    taken = catalogue.bulks.take(bulk_id, lease, 3)
-    assert taken is not None and catalogue.bulks.pause(bulk_id)
+    for _ in range(5):
+        taken = one_taken(catalogue, bulk_id, lease)
+        assert catalogue.bulks.release(taken), "as if it had not been taken"
+    assert not catalogue.bulks.release(taken)
+    taken = one_taken(catalogue, bulk_id, lease)
+    assert catalogue.bulks.pause(bulk_id)
     assert not catalogue.bulks.pause(bulk_id) and catalogue.bulks.at_work() == []
     assert catalogue.bulks.take(bulk_id, lease, 3) is None
     assert done(catalogue, taken), "what is at work is let end"
     assert catalogue.bulks.resume(bulk_id) and not catalogue.bulks.resume(bulk_id)
-    taken = catalogue.bulks.take(bulk_id, lease, 3)
-    assert taken is not None and catalogue.bulks.cancel(bulk_id)
+    one_taken(catalogue, bulk_id, lease)
+    assert catalogue.bulks.cancel(bulk_id)
     assert not catalogue.bulks.cancel(bulk_id) and not catalogue.bulks.resume(bulk_id)
     assert catalogue.bulks.take(bulk_id, lease, 3) is None
     assert catalogue.bulks.retry(bulk_id) is None
     assert row(catalogue, bulk_id).phase == BulkPhase.CANCELLED
-
-
-def test_the_last_image_ends_a_bulk_that_is_paused(catalogue: Catalogue) -> None:
-    bulk_id, lease = made(catalogue, 1), turn(catalogue)
-    taken = catalogue.bulks.take(bulk_id, lease, 3)
-    assert taken is not None and catalogue.bulks.pause(bulk_id) and done(catalogue, taken)
-    assert row(catalogue, bulk_id).phase == BulkPhase.COMPLETED
-
-
-def test_retry_queues_only_failed_images(catalogue: Catalogue) -> None:
-    bulk_id, lease = made(catalogue, 3), turn(catalogue)
-    first, second, third = all_taken(catalogue, bulk_id, lease)
-    done(catalogue, first), catalogue.bulks.fail(second, BAD), catalogue.bulks.fail(third, BAD)
-    assert catalogue.bulks.retry(bulk_id) == 2
-    again = row(catalogue, bulk_id)
-    assert (again.phase, again.done, again.failed, again.ended_at) == (BulkPhase.RUNNING, 1, 0, None)
-    assert [one.position for one in all_taken(catalogue, bulk_id, lease)] == [1, 2]
-    assert catalogue.bulks.retry(bulk_id) == 0
-    check_counts(catalogue, bulk_id)
-
-
-def test_an_identical_request_finds_only_an_open_run(catalogue: Catalogue) -> None:
-    first = made(catalogue, 2)
-    assert made(catalogue, 2) == first and made(catalogue, 2, key="other") != first
-    assert row(catalogue, first).total == 2
-    catalogue.bulks.cancel(first)
-    assert made(catalogue, 2) != first
+    last = made(catalogue, 1)
+    taken = one_taken(catalogue, last, lease)
+    assert catalogue.bulks.pause(last) and done(catalogue, taken)
+    assert row(catalogue, last).phase == BulkPhase.COMPLETED, "the last image ends a run that is paused"
 
 
 def used(catalogue: Catalogue) -> int:
@@ -224,8 +185,7 @@ def turn_bytes(catalogue: Catalogue, lease: Lease) -> int:
 
 def images_of(catalogue: Catalogue, bulk_id: str) -> int:
     query = select(func.count()).select_from(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id)
-    with catalogue._engine.connect() as connection:
-        return connection.scalar(query) or 0
+    return int(rows(catalogue, query)[0])
 
 
 def in_phase(catalogue: Catalogue, bulk_id: str, phase: BulkPhase) -> None:
@@ -244,60 +204,56 @@ def in_phase(catalogue: Catalogue, bulk_id: str, phase: BulkPhase) -> None:
     assert row(catalogue, bulk_id).phase == phase
 
 
-@pytest.mark.parametrize("phase", sorted(DELETABLE))
 def test_a_deleted_run_gives_all_its_bytes_back_and_leaves_other_runs(
-    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, phase: BulkPhase
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bulk_rows, "BATCH", 2)
     other = made(catalogue, 3, key="other")
     before = used(catalogue)
-    bulk_id = made(catalogue, 3)
-    in_phase(catalogue, bulk_id, phase)
-    for job in catalogue.jobs.of_kind("bulk"):
-        catalogue.uws.destroy(job.id)  # turns are jobs, which count by themselves
-    assert used(catalogue) == before + counted_bytes(row(catalogue, bulk_id)) > before + 4 * ROW_BYTES
-    assert catalogue.bulks.delete(bulk_id)
-    assert catalogue.bulks.get(bulk_id) is None and images_of(catalogue, bulk_id) == 0
-    assert used(catalogue) == before
-    assert images_of(catalogue, other) == row(catalogue, other).total == 3
-    assert not catalogue.bulks.delete(bulk_id), "it is deleted once"
-    assert made(catalogue, 3) != bulk_id, "the same request makes a new run"
+    for phase in sorted(DELETABLE):
+        bulk_id = made(catalogue, 3)
+        in_phase(catalogue, bulk_id, phase)
+        for job in catalogue.jobs.of_kind("bulk"):
+            catalogue.uws.destroy(job.id)  # turns are jobs, which count by themselves
+        assert used(catalogue) == before + counted_bytes(row(catalogue, bulk_id)) > before + 4 * ROW_BYTES
+        assert catalogue.bulks.delete(bulk_id), phase
+        assert catalogue.bulks.get(bulk_id) is None and images_of(catalogue, bulk_id) == 0
+        assert used(catalogue) == before
+        assert images_of(catalogue, other) == row(catalogue, other).total == 3
+        assert not catalogue.bulks.delete(bulk_id), "it is deleted once"
+    for listed in (True, False):
+        bulk_id = made(catalogue, 2, key=f"{listed}", listed=listed)
+        there = used(catalogue), row(catalogue, bulk_id).phase
+        assert not catalogue.bulks.delete(bulk_id), "a run at work is not deleted"
+        assert (used(catalogue), row(catalogue, bulk_id).phase) == there
+        assert images_of(catalogue, bulk_id) == 2
 
 
-@pytest.mark.parametrize("listed", [True, False], ids=["running", "listing"])
-def test_a_run_at_work_is_not_deleted(catalogue: Catalogue, listed: bool) -> None:
-    bulk_id = made(catalogue, 2, listed=listed)
-    before = used(catalogue), row(catalogue, bulk_id).phase
-    assert not catalogue.bulks.delete(bulk_id)
-    assert (used(catalogue), row(catalogue, bulk_id).phase) == before
-    assert images_of(catalogue, bulk_id) == 2
-
-
-def test_a_deletion_that_was_interrupted_leaves_a_cancelled_run_that_can_be_deleted(
+def test_each_transaction_deletes_a_batch_and_an_interrupted_deletion_leaves_a_cancelled_run(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bulk_rows, "BATCH", 1)
+    monkeypatch.setattr(bulk_rows, "BATCH", 2)
     before = used(catalogue)
-    bulk_id, lease = made(catalogue, 4), turn(catalogue)
+    bulk_id, lease = made(catalogue, 7), turn(catalogue)
     first, second, *_ = all_taken(catalogue, bulk_id, lease)
     done(catalogue, first, reused=True), catalogue.bulks.fail(second, BAD), catalogue.bulks.pause(bulk_id)
-    with_turn, real, calls = used(catalogue) - counted_bytes(row(catalogue, bulk_id)), bulk_rows._changed, []
+    with_turn, deleted = used(catalogue) - counted_bytes(row(catalogue, bulk_id)), []
 
-    def killed(*statement: Any) -> int:
-        calls.append(statement)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return real(*statement)
+    @event.listens_for(database(catalogue).engine, "after_cursor_execute")
+    def killed_in_the_third(*given: Any) -> None:
+        if given[2].startswith("DELETE FROM bulk_items"):
+            deleted.append(given[2])
+            if len(deleted) == 3:
+                raise ZeroDivisionError
 
-    monkeypatch.setattr(bulk_rows, "_changed", killed)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(ZeroDivisionError):
         catalogue.bulks.delete(bulk_id)
     left = row(catalogue, bulk_id)
-    assert (left.phase, left.total, left.done, left.reused, left.failed) == ("CANCELLED", 2, 0, 0, 0)
+    assert (left.phase, left.total, left.done, left.reused, left.failed) == ("CANCELLED", 3, 0, 0, 0)
     check_counts(catalogue, bulk_id)
     assert used(catalogue) == with_turn + counted_bytes(left)
     assert not catalogue.bulks.resume(bulk_id) and catalogue.bulks.retry(bulk_id) is None
-    assert catalogue.bulks.delete(bulk_id)
+    assert catalogue.bulks.delete(bulk_id) and len(deleted) == 5
     catalogue.uws.destroy(lease.job_id)
     assert used(catalogue) == before
 
@@ -306,47 +262,31 @@ def test_a_worker_whose_run_is_deleted_records_nothing(catalogue: Catalogue) -> 
     bulk_id, lease = made(catalogue, 3), turn(catalogue)
     first, second, third = all_taken(catalogue, bulk_id, lease)
     assert catalogue.bulks.pause(bulk_id) and catalogue.bulks.delete(bulk_id)
-    told = done(catalogue, first), catalogue.bulks.fail(second, BAD), catalogue.bulks.release(third)
-    assert told == (False, False, False)
-    assert catalogue.bulks.take(bulk_id, lease, 3) is None
+    assert not done(catalogue, first) and not catalogue.bulks.fail(second, BAD)
+    assert not catalogue.bulks.release(third) and catalogue.bulks.take(bulk_id, lease, 3) is None
     assert not catalogue.bulks.stop_with(bulk_id, BAD)
     assert images_of(catalogue, bulk_id) == 0
 
 
+@BOTH
 def test_deletions_and_workers_at_the_same_moment_do_not_block_each_other(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three requests delete a paused run while workers record the images that they had taken."""
     monkeypatch.setattr(bulk_rows, "BATCH", 7)
     before = used(catalogue)
-    bulk_id, lease = made(catalogue, 60), turn(catalogue)
+    bulk_id, lease = made(catalogue, 30), turn(catalogue)
     taken = list(all_taken(catalogue, bulk_id, lease))[::-1]
     assert catalogue.bulks.pause(bulk_id)
     with ThreadPoolExecutor(8) as pool:
         recorded = [pool.submit(done, catalogue, one) for one in taken]
         deleted = [pool.submit(catalogue.bulks.delete, bulk_id) for _ in range(3)]
         assert any(one.result() for one in deleted)
-        assert [one.result() for one in recorded].count(True) <= 60
+        for one in recorded:
+            one.result()
     assert catalogue.bulks.get(bulk_id) is None and images_of(catalogue, bulk_id) == 0
     catalogue.uws.destroy(lease.job_id)
     assert used(catalogue) == before
-
-
-def test_each_transaction_deletes_a_batch_of_images(
-    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bulk_id, left = made(catalogue, 2 * bulk_progress.BATCH + 1), []
-    catalogue.bulks.cancel(bulk_id)
-    real = catalogue.bulks._delete_batch
-
-    def counted(*asked: str) -> bool:
-        more = real(*asked)
-        left.append(images_of(catalogue, bulk_id))
-        return more
-
-    monkeypatch.setattr(catalogue.bulks, "_delete_batch", counted)
-    assert catalogue.bulks.delete(bulk_id)
-    assert left == [bulk_progress.BATCH + 1, 1, 0, 0]
 
 
 def with_a_failure(catalogue: Catalogue) -> str:
@@ -357,54 +297,53 @@ def with_a_failure(catalogue: Catalogue) -> str:
     return bulk_id
 
 
-def ends_unseen(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, bulk_id: str) -> None:
-    """A bulk ends just before the next look for an open one."""
-    database = catalogue.bulks._database
-    real = database.reading
-
-    def reading() -> Any:
-        catalogue.bulks.cancel(bulk_id)
-        return real()
-
-    monkeypatch.setattr(database, "reading", reading)
-
-
-def test_retry_is_refused_while_an_identical_run_is_open(catalogue: Catalogue) -> None:
+def test_retry_queues_only_failed_images_and_is_refused_while_an_identical_run_is_open(
+    catalogue: Catalogue,
+) -> None:
     ended = with_a_failure(catalogue)
     other = made(catalogue, 2)
     assert other != ended
-    for change, phase in ((catalogue.bulks.pause, "PAUSED"), (catalogue.bulks.resume, "RUNNING")):
-        assert change(other)
+    for act, phase in ((catalogue.bulks.pause, "PAUSED"), (catalogue.bulks.resume, "RUNNING")):
+        assert act(other)
         with pytest.raises(DataError, match=f"run {other} is {phase}") as refused:
             catalogue.bulks.retry(ended)
         assert refused.value.code == "equal-bulk-open"
         now = row(catalogue, ended)
         assert (now.phase, now.failed) == ("COMPLETED", 1), "nothing of it has changed"
         check_counts(catalogue, ended)
+    assert made(catalogue, 2) == other and made(catalogue, 2, key="other") != other
+    assert row(catalogue, other).total == 2
     catalogue.bulks.cancel(other)
-    assert catalogue.bulks.retry(ended) == 1 and row(catalogue, ended).phase == "RUNNING"
+    assert catalogue.bulks.retry(ended) == 1
+    again = row(catalogue, ended)
+    assert (again.phase, again.done, again.failed, again.ended_at) == (BulkPhase.RUNNING, 1, 0, None)
+    assert [one.position for one in all_taken(catalogue, ended, turn(catalogue))] == [1]
+    assert catalogue.bulks.retry(ended) == 0
     check_counts(catalogue, ended)
 
 
-def test_retry_succeeds_if_the_identical_run_ends_meanwhile(
+def test_an_identical_run_that_ends_meanwhile_hinders_neither_a_retry_nor_a_new_run(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ended = with_a_failure(catalogue)
-    ends_unseen(catalogue, monkeypatch, made(catalogue, 2))
-    assert catalogue.bulks.retry(ended) == 1
+    ended, there = with_a_failure(catalogue), made(catalogue, 2)
+    real = database(catalogue).reading
+    ends = [there]  # just before the next look for an open run
+
+    def reading() -> Any:
+        catalogue.bulks.cancel(ends[-1])
+        return real()
+
+    with monkeypatch.context() as patched:
+        patched.setattr(database(catalogue), "reading", reading)
+        assert catalogue.bulks.retry(ended) == 1
     assert row(catalogue, ended).phase == "RUNNING"
-
-
-def test_a_request_whose_identical_run_ends_meanwhile_makes_a_new_run(
-    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first = made(catalogue, 2)
-    ends_unseen(catalogue, monkeypatch, first)
+    ends.append(ended)
+    monkeypatch.setattr(database(catalogue), "reading", reading)
     second = made(catalogue, 3)
-    assert second != first and row(catalogue, second).total == 3
-    check_counts(catalogue, second)
+    assert second not in (ended, there) and row(catalogue, second).total == 3
 
 
+@BOTH
 def test_a_second_worker_continues_the_listing_of_a_lost_one(catalogue: Catalogue) -> None:
     bulk_id, lost = made(catalogue, 1, listed=False), turn(catalogue)
     bulks, before = catalogue.bulks, used(catalogue)
@@ -431,11 +370,14 @@ def test_images_are_taken_while_others_are_listed_and_the_run_ends_after_all(cat
     bulks = catalogue.bulks
     assert bulks.begin_listing(bulk_id, lister) is not None and bulks.take(bulk_id, other, 3) is None
     assert bulks.add_listed(bulk_id, lister, [Listed("/a", False)], B)
-    first = bulks.take(bulk_id, other, 3)
-    assert first is not None and first.source == "/a" and done(catalogue, first)
-    assert row(catalogue, bulk_id).phase == "LISTING", (
-        "all listed images are done, but not all images are listed"
-    )
+    assert bulks.pause(bulk_id) and not bulks.add_listed(bulk_id, lister, [Listed("/b", False)], C)
+    assert bulks.take(bulk_id, lister, 3) is None
+    assert bulks.resume(bulk_id) and row(catalogue, bulk_id).phase == BulkPhase.LISTING
+    begun = bulks.begin_listing(bulk_id, lister)
+    assert begun is not None and begun.listed_to == B and begun.total == 1
+    first = one_taken(catalogue, bulk_id, other)
+    assert first.source == "/a" and done(catalogue, first)
+    assert row(catalogue, bulk_id).phase == "LISTING", "all listed images are done, but not all are listed"
     assert bulks.add_listed(bulk_id, lister, [Listed("/b", False, BAD), Listed("/c", False)], C)
     (second,) = all_taken(catalogue, bulk_id, lister)
     assert (second.source, second.position) == ("/c", 2) and bulks.fail(second, BAD)
@@ -446,22 +388,6 @@ def test_images_are_taken_while_others_are_listed_and_the_run_ends_after_all(cat
     ended = row(catalogue, bulk_id)
     assert (ended.phase, ended.total, ended.done, ended.failed) == ("COMPLETED", 3, 3, 0)
     check_counts(catalogue, bulk_id)
-
-
-def test_files_that_an_older_version_listed_are_listed_again(catalogue: Catalogue) -> None:
-    """It stored no place, and took no file before all were listed."""
-    bulk_id, lost = made(catalogue, 2, listed=False), turn(catalogue)
-    bulks, before = catalogue.bulks, used(catalogue)
-    assert bulks.begin_listing(bulk_id, lost) is not None
-    assert bulks.add_listed(bulk_id, lost, [Listed("/a", False), Listed("/b", False, BAD)], B)
-    with catalogue._engine.begin() as connection:
-        connection.execute(update(BulkRow).where(BulkRow.id == bulk_id).values(listed_to=None))
-    begun = bulks.begin_listing(bulk_id, lost)
-    assert begun is not None and (begun.total, begun.failed) == (2, 0)
-    check_counts(catalogue, bulk_id)
-    assert used(catalogue) == before
-    assert bulks.add_listed(bulk_id, lost, [Listed("/a", False)], B) and bulks.end_listing(bulk_id, lost)
-    assert [one.position for one in all_taken(catalogue, bulk_id, lost)] == [0, 1, 2]
 
 
 def test_files_whose_paths_cannot_be_stored_are_failed_images(
@@ -481,44 +407,28 @@ def test_files_whose_paths_cannot_be_stored_are_failed_images(
     )  # fmt: skip
     bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
     request = {"files": [{"glob": f"{root}/**/*.fits", "where": {"NAXIS": 2}}]}
-    with catalogue._engine.begin() as connection:
-        connection.execute(update(BulkRow).where(BulkRow.id == bulk_id).values(request=request))
+    change(catalogue, update(BulkRow).where(BulkRow.id == bulk_id).values(request=request))
     begun = catalogue.bulks.begin_listing(bulk_id, lease)
     assert begun is not None
     listing.list_files(context, begun, lease, lambda: None, lambda: False)
     assert row(catalogue, bulk_id).phase == BulkPhase.RUNNING
     (taken,) = all_taken(catalogue, bulk_id, lease)
     assert taken.source == str(root / "a.fits")
-    failed = {
-        item.error["code"]: item
-        for item in catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)
-        if item.error
-    }
-    assert set(failed) == {"unreadable-file", "path-too-long", "path-not-utf-8"}
+    items = catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)
+    failed = {item.error["code"]: item for item in items if item.error}
+    assert set(failed) == {"unreadable-file", "path-too-long", "path-not-utf-8"} and len(items) == 4
     assert row(catalogue, bulk_id).failed == 4
     assert failed["unreadable-file"].source == str(root / "loop.fits")
     assert failed["path-too-long"].source == f"{str(long)[:1023]}…"
     message = failed["path-too-long"].error["message"]  # type: ignore[index]
-    assert message.startswith(f"expected a path of at most 1024 characters; got {len(str(long))}")
-    assert message.endswith("5/long.fits")
-    sources = [item.source for item in catalogue.bulks.progress.items(bulk_id, ItemState.FAILED)]
+    assert "1024" in message and str(len(str(long))) in message and message.endswith("5/long.fits")
+    sources = [item.source for item in items]
     assert f"{root}/\\xff\\xfe/Sonne\\xf6.fits" in sources
     assert max(map(len, sources)) == matching.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
     check_counts(catalogue, bulk_id)
     assert done(catalogue, taken) and catalogue.bulks.retry(bulk_id) == 1, "no row tells where the others lie"
     assert [one.source for one in all_taken(catalogue, bulk_id, lease)] == [str(root / "loop.fits")]
     check_counts(catalogue, bulk_id)
-
-
-def test_a_run_paused_while_listing_resumes_listing(catalogue: Catalogue) -> None:
-    bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
-    bulks = catalogue.bulks
-    assert bulks.begin_listing(bulk_id, lease) and bulks.add_listed(bulk_id, lease, [Listed("/a", False)], B)
-    assert bulks.pause(bulk_id) and not bulks.add_listed(bulk_id, lease, [Listed("/b", False)], C)
-    assert bulks.take(bulk_id, lease, 3) is None
-    assert bulks.resume(bulk_id) and row(catalogue, bulk_id).phase == BulkPhase.LISTING
-    begun = bulks.begin_listing(bulk_id, lease)
-    assert begun is not None and begun.listed_to == B and begun.total == 1
 
 
 def test_images_are_sorted_by_artefact_score_over_pages(catalogue: Catalogue) -> None:
@@ -540,108 +450,61 @@ def test_failed_images_are_counted_by_reason(catalogue: Catalogue, monkeypatch: 
     bulk_id, lease = made(catalogue, 7), turn(catalogue)
     assert catalogue.bulks.progress.reasons(bulk_id) == []
     for code in ("bad", None, "worse", "bad", "bad", "also-bad"):
-        taken = catalogue.bulks.take(bulk_id, lease, 3)
-        assert taken is not None
+        taken = one_taken(catalogue, bulk_id, lease)
         if code is None:
-            catalogue.bulks.finish(taken, reused=False, **DONE)
+            done(catalogue, taken)
         else:
             catalogue.bulks.fail(taken, BAD.model_copy(update={"code": code}))
-    found = catalogue.bulks.progress.reasons(bulk_id)
-    assert [(one.code, one.images, one.example.position) for one in found] == [
+    reasons = catalogue.bulks.progress.reasons(bulk_id)
+    assert [(one.code, one.images, one.example.position) for one in reasons] == [
         ("bad", 3, 0), ("also-bad", 1, 5), ("worse", 1, 2),
     ]  # fmt: skip
     monkeypatch.setattr(bulk_progress, "MOST_EXPLAINED", 2)
-    found = catalogue.bulks.progress.reasons(bulk_id)
-    assert [(one.code, one.images) for one in found] == [("bad", 1), ("worse", 1)], "of the first two"
+    reasons = catalogue.bulks.progress.reasons(bulk_id)
+    assert [(one.code, one.images) for one in reasons] == [("bad", 1), ("worse", 1)], "of the first two"
 
 
-def test_images_without_a_product_are_the_newest_of_their_owner(catalogue: Catalogue) -> None:
+def test_images_without_a_product_are_the_newest_of_their_owner_and_missing_uploads_are_named(
+    catalogue: Catalogue,
+) -> None:
     for number in range(6):
-        owner = "other" if number == 5 else "o"
-        identity = f"{number:064x}"
-        name = f"{number}.fits" if number else None
-        catalogue.add(
-            ImageRow(owner=owner, id=identity, created_at=float(number), bytes=1, filename=name, summary={})
+        owner, name = "other" if number == 5 else "o", f"{number}.fits" if number else None
+        image = ImageRow(
+            owner=owner, id=f"{number:064x}", created_at=float(number), bytes=1, filename=name, summary={}
         )
-    details = {
-        "owner": "o",
-        "kind": "deconvolve",
-        "psf_id": "b" * 64,
-        "psf_version": "1",
-        "bytes": 1,
-        "details": {},
-    }
-    files = {"file_sha256": "d" * 64, "preview_sha256": "e" * 64}
+        catalogue.add(image)
+    products = {}
     for owner, number in (("o", 3), ("other", 2)):
-        product = ProductRow(
-            **{**details, **files, "owner": owner},
-            id=f"{90 + number:064x}",
-            image_id=f"{number:064x}",
-            created_at=9.0,
-        )
-        catalogue.add(product)
+        one = product(f"of {number}", "p", owner=owner)
+        one.image_id = f"{number:064x}"
+        products[owner] = catalogue.add(one)[0].id
     progress = catalogue.bulks.progress
     ids = [f"{number:064x}" for number in (4, 2, 1, 0)]
     assert list(progress.without_product("o", 10)) == ids
     assert list(progress.without_product("o", 2)) == ids[:2]
     assert progress.names_of_uploads([ids[0], ids[3], f"{5:064x}"], "o") == {ids[0]: "4.fits"}
-    assert progress.still_there([f"{93:064x}", f"{92:064x}"], "o") == {f"{93:064x}"}
+    assert progress.still_there(list(products.values()), "o") == {products["o"]}
+    assert progress.first_not_uploaded(ids, "o") is None
+    assert progress.first_not_uploaded([ids[0], "b" * 64], "o") == "b" * 64
+    assert progress.first_not_uploaded(ids[:1], "other") == ids[0]
 
 
-def test_missing_uploads_are_named(catalogue: Catalogue) -> None:
-    catalogue.add(ImageRow(owner="o", id="a" * 64, created_at=1.0, bytes=1, summary={}))
-    assert catalogue.bulks.progress.first_not_uploaded(["a" * 64], "o") is None
-    assert catalogue.bulks.progress.first_not_uploaded(["a" * 64, "b" * 64], "o") == "b" * 64
-    assert catalogue.bulks.progress.first_not_uploaded(["a" * 64], "other") == "a" * 64
-
-
-def test_fifty_thousand_images(catalogue: Catalogue) -> None:
-    """Created in seconds. Taking and finishing one costs as much as in a run of ten, whether few or most are done."""
-
-    def cost(bulk_id: str) -> float:
-        lease, times = turn(catalogue), []
-        for _ in range(30):
-            start = time.perf_counter()
-            taken = catalogue.bulks.take(bulk_id, lease, 3)
-            assert taken is not None and done(catalogue, taken)
-            bulk = row(catalogue, bulk_id)
-            catalogue.bulks.progress.pace(bulk), catalogue.bulks.progress.to_look_at(bulk_id, 1.0)
-            times.append(time.perf_counter() - start)
-        return sorted(times)[len(times) // 2]
-
-    small = cost(made(catalogue, 40, key="small"))
-    start = time.perf_counter()
-    bulk_id = made(catalogue, 50_000, key="large")
-    assert time.perf_counter() - start < 60.0
-    first = cost(bulk_id)
-    with catalogue._engine.begin() as connection:
-        most = update(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.position < 49_000)
-        connection.execute(most.values(state="done", score=0.2, ended_at=time.time()))
-        connection.execute(update(BulkRow).where(BulkRow.id == bulk_id).values(done=49_000))
-    if catalogue._engine.dialect.name == "postgresql":
-        with catalogue._engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-            connection.exec_driver_sql("ANALYZE bulk_items")
-    last = cost(bulk_id)
-    assert max(first, last) < 5 * small + 0.02
-    with catalogue._engine.connect() as connection:
-        assert connection.scalar(select(func.count()).select_from(JobRow).where(JobRow.queue == "bulk")) == 3
-
-
-@pytest.mark.parametrize("gone_s", [0.0, 7200.0])
-def test_the_pace_is_that_of_the_last_images(catalogue: Catalogue, gone_s: float) -> None:
+def test_the_pace_is_that_of_the_last_images(catalogue: Catalogue) -> None:
     bulk_id, lease = made(catalogue, 20), turn(catalogue)
     for taken in list(all_taken(catalogue, bulk_id, lease))[:12]:
         done(catalogue, taken)
-    now = time.time() - gone_s
-    with catalogue._engine.begin() as connection:
-        for position in range(12):  # one every ten seconds, up to now
-            one = update(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.position == position)
-            connection.execute(one.values(ended_at=now - 10 * (11 - position)))
-        began = update(BulkRow).where(BulkRow.id == bulk_id)
-        connection.execute(began.values(running_since=now - 120, ended_at=now if gone_s else None))
-    assert catalogue.bulks.progress.pace(row(catalogue, bulk_id)).images_an_hour == pytest.approx(
-        360.0, rel=0.05
-    )
+    for gone_s in (0.0, 7200.0):
+        now = time.time() - gone_s
+        item, bulk = update(BulkItemRow), update(BulkRow).where(BulkRow.id == bulk_id)
+        change(
+            catalogue,
+            bulk.values(running_since=now - 120, ended_at=now if gone_s else None),
+            *(  # one every ten seconds, up to now
+                item.where(BulkItemRow.position == n).values(ended_at=now - 10 * (11 - n)) for n in range(12)
+            ),
+        )
+        pace = catalogue.bulks.progress.pace(row(catalogue, bulk_id))
+        assert pace.images_an_hour == pytest.approx(360.0, rel=0.05), gone_s
 
 
 def test_images_of_open_bulks_are_counted_together(catalogue: Catalogue) -> None:
@@ -655,40 +518,29 @@ def test_images_of_open_bulks_are_counted_together(catalogue: Catalogue) -> None
     assert catalogue.bulks.progress.open_images() == {"left": 2, "done": 0, "failed": 0}
 
 
+@BOTH
 def test_every_query_of_a_run_uses_an_index(catalogue: Catalogue) -> None:
     """No statement scans or sorts all images, of this run or of others."""
     bulk_id, lease = made(catalogue, 50), turn(catalogue)
-    bulks = catalogue.bulks
-    first, second = bulks.take(bulk_id, lease, 3), bulks.take(bulk_id, lease, 3)
-    assert first is not None and second is not None
+    bulks, progress = catalogue.bulks, catalogue.bulks.progress
+    first, second = one_taken(catalogue, bulk_id, lease), one_taken(catalogue, bulk_id, lease)
     bulk = row(catalogue, bulk_id)
     other = made(catalogue, 0, key="listing", listed=False)
     with statements(catalogue) as sent:
         assert bulks.begin_listing(other, lease) and bulks.begin_listing(other, lease) and bulks.cancel(other)
-        bulks.progress.sources(other)
-        third = bulks.take(bulk_id, lease, 3)
-        assert (
-            third is not None and done(catalogue, first) and bulks.fail(second, BAD) and bulks.release(third)
-        )
-        (
-            bulks.progress.pace(bulk),
-            bulks.progress.to_look_at(bulk_id, 1.0),
-            bulks.at_work(),
-            bulks.progress.open_images(),
-        )
-        (
-            bulks.progress.items(bulk_id, ItemState.DONE, after=3, limit=51),
-            bulks.progress.worst(bulk_id, after=(1.0, 3), limit=51),
-            bulks.progress.without_product("o", 51),
-            bulks.progress.names_of_uploads(["a" * 64], "o"),
-            bulks.progress.still_there(["a" * 64], "o"),
-        )
-        bulks.progress.done_before("o", "c" * 64, "/out/x.fits"), bulks.retry(bulk_id), bulks.pause(bulk_id)
+        progress.sources(other)
+        third = one_taken(catalogue, bulk_id, lease)
+        assert done(catalogue, first) and bulks.fail(second, BAD) and bulks.release(third)
+        progress.pace(bulk), progress.to_look_at(bulk_id, 1.0), bulks.at_work(), progress.open_images()
+        progress.items(bulk_id, ItemState.DONE, after=3, limit=51)
+        progress.worst(bulk_id, after=(1.0, 3), limit=51), progress.without_product("o", 51)
+        progress.names_of_uploads(["a" * 64], "o"), progress.still_there(["a" * 64], "o")
+        progress.done_before("o", "c" * 64, "/out/x.fits"), bulks.retry(bulk_id), bulks.pause(bulk_id)
         catalogue.page(BulkRow, owner="o", limit=51, after=(1.0, "a"))
         assert bulks.delete(bulk_id)
-    asked = [one for one in sent if one[0].lstrip().startswith(("SELECT", "UPDATE", "DELETE"))]
-    assert len(asked) >= 24
-    for statement, parameters in asked:
+    queries = [one for one in sent if one[0].lstrip().startswith(("SELECT", "UPDATE", "DELETE"))]
+    assert len(queries) >= 24
+    for statement, parameters in queries:
         steps = plan(catalogue, statement, parameters, forced=True)
         wrong = [step for step in steps if re.search(r"SCAN bulk|TEMP B-TREE|Seq Scan on bulk|Sort", step)]
         assert wrong == [], (statement, steps)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
 
-from psfcore.errors import DataError
-from tests.workers.psf_examples import OWNER, certify, deprecate, identity, psf, years
+from tests.workers.databases import BOTH
+from tests.workers.psf_examples import OWNER, certify, deprecate, header_of, identity, psf, refused, years
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
 from workers.catalogue.psfs import PsfFilter
@@ -30,24 +29,9 @@ def certified(catalogue: Catalogue) -> Catalogue:
     return catalogue
 
 
-def refused(code: str, change: Callable[[], object]) -> str:
-    with pytest.raises(DataError) as caught:
-        change()
-    assert caught.value.code == code, caught.value.message
-    return caught.value.message
-
-
 def header(**cards: Any) -> dict[str, Any]:
     """What an image's upload is kept with, as far as a PSF is found by it."""
-    return {
-        "instrument": "hri_euv",
-        "telescop": None,
-        "instrume": "EUI",
-        "detector": "HRI_EUV",
-        "wavelnth": 174.0,
-        "date_obs": "2020-06-01T12:00:00.123",
-        **cards,
-    }
+    return header_of("2020-06-01T12:00:00.123", **cards)
 
 
 def pinned(catalogue: Catalogue, name: str) -> list[tuple[str, str | None, str | None, str]]:
@@ -120,6 +104,7 @@ def test_invalid_contexts_are_refused(certified: Catalogue) -> None:
         assert certified.contexts.find(name, OWNER) is None
 
 
+@BOTH
 def test_simultaneous_identical_contexts_are_made_once(certified: Catalogue) -> None:
     start = threading.Barrier(6)
 
@@ -144,47 +129,41 @@ def test_the_default_context_changes_and_keeps_a_history(certified: Catalogue) -
     contexts.set_default("first", OWNER, "ann", "back")
     now = contexts.default(OWNER)
     assert now is not None and now.id == first.id and contexts.default("somebody") is None
-    told = [(move.context_id, move.by, move.reason) for move in contexts.default_changes(OWNER)]
-    assert told == [
-        (first.id, "ann", "back"),
-        (None, "ann", ""),
-        (second.id, "bob", "better"),
-        (first.id, "ann", "good"),
-    ]
+    history = [(move.context_id, move.by, move.reason) for move in contexts.default_changes(OWNER)]
+    assert history == [
+        (first.id, "ann", "back"), (None, "ann", ""), (second.id, "bob", "better"), (first.id, "ann", "good"),
+    ]  # fmt: skip
     refused("no-such-context", lambda: contexts.set_default("third", OWNER, "ann"))
 
 
 # The one PSF ----------------------------------------------------------------------------------------
 
 
-def test_only_certified_psfs_are_searched_by_default(certified: Catalogue) -> None:
+# Filters that leave no PSF, and what the error says of them.
+NOTHING = (
+    (PsfFilter("aia"), "no PSF has instrument aia"),
+    (PsfFilter("hri_euv", "193"), "no PSF with instrument hri_euv has channel 193"),
+    (
+        PsfFilter("hri_euv", "174", "total", valid_at=seconds("2030-01-01")),
+        " has valid_at 2030-01-01T00:00:00Z",
+    ),
+    (PsfFilter(name="draft"), "no PSF with name draft has status certified"),
+)
+
+
+def test_only_certified_psfs_are_searched_by_default_and_one_must_fit(certified: Catalogue) -> None:
     at = seconds("2020-06-01")
-    assert look(certified, PsfFilter("hri_euv", valid_at=at), OWNER, None).one().name == "a"
-    assert look(certified, PsfFilter(version="1.1.0"), OWNER, None).one().name == "b"
-    assert look(certified, PsfFilter(status="draft"), OWNER, None).one().name == "draft"
-
-
-def test_several_fitting_psfs_are_all_named(certified: Catalogue) -> None:
-    found = look(certified, LINE, OWNER, None)
-    message = refused("several-psfs-fit", found.one)
+    for filters, name in (
+        (PsfFilter("hri_euv", valid_at=at), "a"),
+        (PsfFilter(version="1.1.0"), "b"),
+        (PsfFilter(status="draft"), "draft"),
+    ):
+        assert look(certified, filters, OWNER, None).one().name == name
+    message = refused("several-psfs-fit", look(certified, LINE, OWNER, None).one)
     assert all(identity(name) in message for name in ("a", "b")) and identity("draft") not in message
     assert "instrument hri_euv, channel 174, kind total, status certified" in message
-
-
-@pytest.mark.parametrize(
-    ("wanted", "says"),
-    [
-        (PsfFilter("aia"), "no PSF has instrument aia"),
-        (PsfFilter("hri_euv", "193"), "no PSF with instrument hri_euv has channel 193"),
-        (
-            PsfFilter("hri_euv", "174", "total", valid_at=seconds("2030-01-01")),
-            " has valid_at 2030-01-01T00:00:00Z",
-        ),
-        (PsfFilter(name="draft"), "no PSF with name draft has status certified"),
-    ],
-)
-def test_the_filter_that_left_no_psf_is_named(certified: Catalogue, wanted: PsfFilter, says: str) -> None:
-    assert says in refused("no-psf-fits", look(certified, wanted, OWNER, None).one)
+    for filters, words in NOTHING:
+        assert words in refused("no-psf-fits", look(certified, filters, OWNER, None).one)
 
 
 def test_the_default_context_is_searched_unless_the_request_says_now(certified: Catalogue) -> None:
@@ -204,38 +183,30 @@ def test_an_image_gets_the_psf_of_its_time(certified: Catalogue) -> None:
     assert look_for_image(certified, header(), OWNER, None).one().name == "a"
     later = header(date_obs="2021-01-01T00:00:00")
     assert look_for_image(certified, later, OWNER, None).one().name == "b"
-    message = refused(
-        "no-psf-fits", look_for_image(certified, header(date_obs="2030-01-01"), OWNER, None).one
-    )
-    assert "valid_at 2030-01-01" in message
+    far = look_for_image(certified, header(date_obs="2030-01-01"), OWNER, None)
+    assert "valid_at 2030-01-01" in refused("no-psf-fits", far.one)
     other = header(instrument=None, detector="FSI", wavelnth=304.0)
     message = refused("no-psf-fits", look_for_image(certified, other, OWNER, None).one)
     assert "no PSF has instrument fsi" in message
 
 
-def test_an_image_without_a_time_needs_a_psf_for_all_times(certified: Catalogue) -> None:
+def test_an_image_without_a_time_needs_a_psf_for_all_times_and_one_without_a_name_is_refused(
+    certified: Catalogue,
+) -> None:
     for date in (None, "yesterday"):
-        message = refused(
-            "no-date", lambda date=date: look_for_image(certified, header(date_obs=date), OWNER, None)
-        )
+        cards = header(date_obs=date)
+        message = refused("no-date", lambda cards=cards: look_for_image(certified, cards, OWNER, None))
         assert "hri_euv/174/total" in message
     certified.add(psf("always", channel="304"))
     certify(certified, "always", "1.0.0")
     found = look_for_image(certified, header(wavelnth=304.0, date_obs=None), OWNER, None)
     assert found.one().name == "always"
-    refused(
-        "no-instrument",
-        lambda: look_for_image(certified, header(instrument=None, detector=None, instrume=None), OWNER, None),
-    )
-
-
-def test_an_image_of_an_instrument_that_is_not_shipped_is_found_by_its_header_s_word(
-    catalogue: Catalogue,
-) -> None:
-    catalogue.add(psf("aia", instrument="aia_3", channel="193"))
-    certify(catalogue, "aia", "1.0.0")
+    nameless = header(instrument=None, detector=None, instrume=None)
+    refused("no-instrument", lambda: look_for_image(certified, nameless, OWNER, None))
+    certified.add(psf("aia", instrument="aia_3", channel="193"))
+    certify(certified, "aia", "1.0.0")
     cards = header(instrument=None, detector=None, instrume="AIA_3", wavelnth=193.0)
-    assert look_for_image(catalogue, cards, OWNER, None).one().name == "aia"
+    assert look_for_image(certified, cards, OWNER, None).one().name == "aia", "by the header's word"
 
 
 def test_a_deconvolution_uses_the_certified_psf_or_says_why_it_does_not_fit(

@@ -1,4 +1,4 @@
-"""Quotas are kept when several transactions add files at the same moment."""
+"""What counts in an owner's quota, and that it is kept when several transactions add rows at the same moment."""
 
 from __future__ import annotations
 
@@ -9,26 +9,27 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import pytest
-from sqlalchemy import event, select
+from sqlalchemy import select
 
-from tests.workers.psf_examples import OWNER, identity, psf
+from tests.whole.many_rows import statements
+from tests.workers.databases import BOTH, rows
+from tests.workers.psf_examples import OWNER, certify, identity, psf
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Listed, new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
-from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import COUNTED, MIB, ROW_BYTES, OverQuota, counted_bytes
 from workers.catalogue.psfs import StatusAsked
-from workers.catalogue.tables import ImageRow, JobRow, PsfRow, SolutionRow
+from workers.catalogue.tables import ImageRow, JobRow, SolutionRow
 from workers.contract.bulk import BulkPhase
 from workers.versions.status import PsfStatus
 
 ROW = ROW_BYTES + len("{}")  # what the row of such an image counts, besides its file
 
 
-def image(number: int, counted: int) -> ImageRow:
+def image(number: int, counted: int, owner: str = "o") -> ImageRow:
     """An image that counts this number of bytes: its file and its row."""
-    return ImageRow(owner="o", id=f"{number:064x}", created_at=1.0, bytes=counted - ROW, summary={})
+    return ImageRow(owner=owner, id=f"{number:064x}", created_at=1.0, bytes=counted - ROW, summary={})
 
 
 def send(catalogue: Catalogue, row: ImageRow, quota_mib: int = 1) -> bool:
@@ -41,6 +42,7 @@ def send(catalogue: Catalogue, row: ImageRow, quota_mib: int = 1) -> bool:
         return False
 
 
+@BOTH
 def test_simultaneous_uploads_are_accepted_up_to_the_quota(catalogue: Catalogue) -> None:
     with ThreadPoolExecutor(8) as pool:
         came_in = list(pool.map(lambda n: send(catalogue, image(n, MIB // 4)), range(12)))
@@ -49,27 +51,20 @@ def test_simultaneous_uploads_are_accepted_up_to_the_quota(catalogue: Catalogue)
     assert [catalogue.get(ImageRow, f"{n:064x}", "o") is not None for n in range(12)] == came_in
 
 
-def test_an_owner_s_own_limit_counts(catalogue: Catalogue) -> None:
+def test_an_owner_s_own_limit_counts_and_results_of_jobs_are_not_held_to_it(catalogue: Catalogue) -> None:
     catalogue.owners.set_quota("o", 2)
     assert send(catalogue, image(1, 2 * MIB)) and not send(catalogue, image(2, ROW))
     catalogue.owners.set_quota("o", 0)
     assert send(catalogue, image(2, ROW))
     catalogue.owners.set_quota("o", None)
     assert not send(catalogue, image(3, ROW)) and send(catalogue, image(3, ROW), quota_mib=0)
-
-
-@pytest.mark.parametrize("size_bytes", [ROW, MIB])
-def test_results_of_jobs_are_not_held_to_the_quota(catalogue: Catalogue, size_bytes: int) -> None:
-    assert send(catalogue, image(1, MIB))
-    assert catalogue.add(image(2, size_bytes))[1]
-    assert catalogue.owners.usage("o", 1).used_bytes == MIB + size_bytes
+    assert catalogue.add(image(4, MIB))[1]
+    assert catalogue.owners.usage("o", 1).used_bytes == 3 * MIB + 2 * ROW
 
 
 def solution(number: int, size_bytes: int, owner: str = "o") -> SolutionRow:
-    identity = f"{number:064x}"
-    return SolutionRow(
-        owner=owner, id=identity, created_at=float(number), bytes=size_bytes, file_sha256=identity
-    )
+    name = f"{number:064x}"
+    return SolutionRow(owner=owner, id=name, created_at=float(number), bytes=size_bytes, file_sha256=name)
 
 
 def kept(catalogue: Catalogue) -> list[str]:
@@ -77,6 +72,7 @@ def kept(catalogue: Catalogue) -> list[str]:
     return sorted(f"{row.owner}{int(row.id, 16)}" for row in catalogue.owners.solutions_before(1e9))
 
 
+@BOTH
 def test_the_oldest_solutions_make_room_for_an_upload(catalogue: Catalogue) -> None:
     for number in (2, 1, 3):
         assert catalogue.add(solution(number, MIB // 4), 1)[1]
@@ -90,41 +86,29 @@ def test_the_oldest_solutions_make_room_for_an_upload(catalogue: Catalogue) -> N
     assert catalogue.owners.usage("o", 1).full and catalogue.owners.recount() == []
 
 
-def test_a_new_solution_takes_the_room_of_older_ones_only(catalogue: Catalogue) -> None:
+def test_a_new_solution_takes_the_room_of_older_ones_only_and_is_forgotten_once(catalogue: Catalogue) -> None:
     assert send(catalogue, image(1, MIB // 2))
     for number in (1, 2):
         assert catalogue.add(solution(number, MIB // 2), 1)[1]
     assert kept(catalogue) == ["o2"] and catalogue.get(ImageRow, f"{1:064x}", "o") is not None
+    assert not catalogue.owners.usage("o", 1).full, "jobs run: a solution is no file that must stay"
     with pytest.raises(OverQuota):
         catalogue.add(solution(3, MIB), 1)
     assert kept(catalogue) == ["o2"] and catalogue.owners.recount() == []
-
-
-def test_jobs_run_if_only_solutions_fill_the_quota(catalogue: Catalogue) -> None:
-    assert catalogue.add(solution(1, MIB), 1)[1]
-    assert not catalogue.owners.usage("o", 1).full
-
-
-def test_a_solution_is_forgotten_once(catalogue: Catalogue) -> None:
-    catalogue.add(solution(1, 10))
-    rows = catalogue.owners.solutions_before(2.0)
-    assert catalogue.owners.solutions_before(1.0) == []
-    catalogue.owners.forget_solutions(rows)
-    catalogue.owners.forget_solutions(rows)
-    assert kept(catalogue) == [] and catalogue.owners.usage("o", 0).used_bytes == 0
+    assert catalogue.owners.solutions_before(2.0) == []
+    old = catalogue.owners.solutions_before(3.0)
+    for _ in range(2):
+        catalogue.owners.forget_solutions(old)
+    assert kept(catalogue) == [] and catalogue.owners.usage("o", 0).used_bytes == MIB // 2
 
 
 def test_the_json_of_a_row_counts_too_and_when_it_changes(catalogue: Catalogue) -> None:
-    identity = "a" * 64
-    psf = PsfRow(
-        owner="o", id=identity, created_at=1.0, name="n", version="1", kind="total", status="draft", origin="uploaded",
-        file_sha256=identity, bytes=5, details={"text": "sun \u2609" * 100},
-    )  # fmt: skip
-    assert catalogue.add(psf)[1]
-    before = catalogue.owners.usage("o", 0).used_bytes
-    assert before == 5 + ROW_BYTES + len(json.dumps(psf.details))
-    catalogue.psfs.describe(identity, "o", tables_sha256="b" * 64, preview_sha256="c" * 64)
-    assert catalogue.owners.usage("o", 0).used_bytes == before + len(', "tables_sha256": ""') + 64
+    row = psf("a", bytes=5, details={"text": "sun \u2609" * 100})
+    assert catalogue.add(row)[1]
+    before = catalogue.owners.usage(OWNER, 0).used_bytes
+    assert before == 5 + ROW_BYTES + len(json.dumps(row.details))
+    catalogue.psfs.describe(row.id, OWNER, tables_sha256="b" * 64, preview_sha256="c" * 64)
+    assert catalogue.owners.usage(OWNER, 0).used_bytes == before + len(', "tables_sha256": ""') + 64
     assert catalogue.owners.recount() == []
 
 
@@ -132,18 +116,18 @@ def test_the_json_of_a_row_counts_too_and_when_it_changes(catalogue: Catalogue) 
 
 
 @contextmanager
-def counting(catalogue: Catalogue, expected: int, owner: str = OWNER) -> Iterator[None]:
-    """Check that the block changes the count of an owner by so much, and that a recount agrees."""
-    before = catalogue.owners.usage(owner, 0).used_bytes
+def counting(catalogue: Catalogue, expected: int) -> Iterator[None]:
+    """Check that the block changes the count of the owner by so much, and that a recount agrees."""
+    before = catalogue.owners.usage(OWNER, 0).used_bytes
     yield
-    assert catalogue.owners.usage(owner, 0).used_bytes - before == expected
+    assert catalogue.owners.usage(OWNER, 0).used_bytes - before == expected
     assert catalogue.owners.recount() == []
 
 
-def bulk(images_listed: bool = True, key: str = "k") -> BulkRow:
+def bulk(listed: bool = True, key: str = "k") -> BulkRow:
     return BulkRow(
-        id=new_id(), owner=OWNER, name="", phase=BulkPhase.RUNNING if images_listed else BulkPhase.LISTING, request={},
-        request_key=key, psf_id="p" * 64, created_at=time.time(), running_since=time.time(), listed=images_listed,
+        id=new_id(), owner=OWNER, name="", phase=BulkPhase.RUNNING if listed else BulkPhase.LISTING, request={},
+        request_key=key, psf_id="p" * 64, created_at=time.time(), running_since=time.time(), listed=listed,
     )  # fmt: skip
 
 
@@ -151,18 +135,7 @@ def ids(count: int) -> list[str]:
     return [f"{number:064x}" for number in range(count)]
 
 
-def lease_of_a_turn(catalogue: Catalogue) -> Lease:
-    job, _ = catalogue.jobs.submit("bulk", {}, new_id(), OWNER)
-    lease = catalogue.jobs.claim(job.id, "w")
-    assert lease is not None
-    return lease
-
-
-def certification(**more: str) -> StatusAsked:
-    return StatusAsked(PsfStatus.CERTIFIED, "tested", **more)
-
-
-def test_jobs_count_with_their_parameters_until_they_are_destroyed(catalogue: Catalogue) -> None:
+def test_jobs_count_with_their_present_parameters_until_they_are_destroyed(catalogue: Catalogue) -> None:
     parameters = {"instrument_file": "sun \u2609" * 100}
     with counting(catalogue, ROW_BYTES + len(json.dumps(parameters))):
         job, _ = catalogue.jobs.submit("psf-build", parameters, "k", OWNER)
@@ -172,9 +145,6 @@ def test_jobs_count_with_their_parameters_until_they_are_destroyed(catalogue: Ca
         assert lease is not None and catalogue.jobs.complete(lease, "r")
     with counting(catalogue, -ROW_BYTES - len(json.dumps(parameters))):
         assert catalogue.uws.destroy(job.id) and not catalogue.uws.destroy(job.id)
-
-
-def test_uws_jobs_count_by_their_present_parameters(catalogue: Catalogue) -> None:
     with counting(catalogue, ROW_BYTES + len('{"size": "64"}')):
         job = catalogue.uws.draft("psf-build", {"size": "64"}, owner=OWNER)
     with counting(catalogue, len(', "a": "bc"')):
@@ -189,99 +159,87 @@ def test_uws_jobs_count_by_their_present_parameters(catalogue: Catalogue) -> Non
         assert catalogue.uws.destroy(job.id)
 
 
-def test_bulk_runs_count_with_their_images(catalogue: Catalogue) -> None:
-    lease = lease_of_a_turn(catalogue)
-    row = bulk(images_listed=False)
+def test_bulk_runs_parts_contexts_and_changes_count(catalogue: Catalogue) -> None:
+    turn, _ = catalogue.jobs.submit("bulk", {}, new_id(), OWNER)
+    lease = catalogue.jobs.claim(turn.id, "w")
+    assert lease is not None
+    row = bulk(listed=False)
     with counting(catalogue, ROW_BYTES * (1 + 3) + len("{}")):
         assert catalogue.bulks.create(row, ids(3))[1]
     with counting(catalogue, 0):
-        assert not catalogue.bulks.create(bulk(images_listed=False), ids(3))[1], "the same run"
+        assert not catalogue.bulks.create(bulk(listed=False), ids(3))[1], "the same run"
     with counting(catalogue, 2 * ROW_BYTES):
         assert catalogue.bulks.begin_listing(row.id, lease)
         listed = [Listed("/a", False), Listed("/b", False)]
         assert catalogue.bulks.add_listed(row.id, lease, listed, {"pattern": 0, "names": ["b"]})
     with counting(catalogue, 0):
         assert catalogue.bulks.begin_listing(row.id, lease)
-
-
-def test_contexts_and_changes_count(catalogue: Catalogue) -> None:
+    with counting(catalogue, 4 * ROW_BYTES):
+        catalogue.parts.open(OWNER, "k", 3)
+        catalogue.parts.open(OWNER, "k", 4)
     for name in ("a", "b"):
         catalogue.add(psf(name))
     with counting(catalogue, ROW_BYTES):
-        catalogue.psfs.change(identity("a"), OWNER, certification(version="1.0.0"), "x")
-    superseding = StatusAsked(PsfStatus.CERTIFIED, "better", version="2.0.0", supersedes=(identity("a"),))
+        certify(catalogue, "a", "1.0.0")
     with counting(catalogue, 2 * ROW_BYTES):  # of both PSFs
-        catalogue.psfs.change(identity("b"), OWNER, superseding, "x")
-    with counting(catalogue, 2 * ROW_BYTES):
-        assert catalogue.contexts.create("first", OWNER, "x", pins=[Pin(identity("b"))])[1]
-    with counting(catalogue, 0):
-        assert not catalogue.contexts.create("first", OWNER, "x", pins=[Pin(identity("b"))])[1]
+        certify(catalogue, "b", "2.0.0", supersedes=(identity("a"),))
+    for new, expected in ((True, 2 * ROW_BYTES), (False, 0)):
+        with counting(catalogue, expected):
+            assert catalogue.contexts.create("first", OWNER, "x", pins=[Pin(identity("b"))])[1] == new
     with counting(catalogue, ROW_BYTES):
         catalogue.contexts.set_default("first", OWNER, "x")
 
 
-def test_parts_count_once(catalogue: Catalogue) -> None:
-    with counting(catalogue, 4 * ROW_BYTES):
-        catalogue.parts.open(OWNER, "k", 3)
-        catalogue.parts.open(OWNER, "k", 4)
+def certification(**more: str) -> StatusAsked:
+    return StatusAsked(PsfStatus.CERTIFIED, "tested", **more)
 
 
-@pytest.mark.parametrize(
-    "add",
-    [
-        lambda catalogue: catalogue.jobs.submit("psf-build", {}, "new", OWNER, quota_mib=1),
-        lambda catalogue: catalogue.uws.draft("psf-build", {}, owner=OWNER, quota_mib=1),
-        lambda catalogue: catalogue.bulks.create(bulk(), ids(1), 1),
-        lambda catalogue: catalogue.contexts.create("c", OWNER, "x", quota_mib=1),
-        lambda catalogue: catalogue.contexts.set_default(None, OWNER, "x", quota_mib=1),
-        lambda catalogue: catalogue.psfs.change(identity("a"), OWNER, certification(), "x", 1),
-        lambda catalogue: catalogue.psfs.change(identity("b"), OWNER, certification(version="2.0.0"), "x", 1),
-    ],
-    ids=["job", "uws", "bulk", "context", "default", "range", "certification"],
-)
-def test_rows_over_the_quota_are_refused_and_add_nothing(
-    catalogue: Catalogue, add: Callable[[Catalogue], object]
-) -> None:
+ADDED: dict[str, Callable[[Catalogue], object]] = {
+    "job": lambda catalogue: catalogue.jobs.submit("psf-build", {}, "new", OWNER, quota_mib=1),
+    "uws": lambda catalogue: catalogue.uws.draft("psf-build", {}, owner=OWNER, quota_mib=1),
+    "bulk": lambda catalogue: catalogue.bulks.create(bulk(), ids(1), 1),
+    "context": lambda catalogue: catalogue.contexts.create("c", OWNER, "x", quota_mib=1),
+    "default": lambda catalogue: catalogue.contexts.set_default(None, OWNER, "x", quota_mib=1),
+    "range": lambda catalogue: catalogue.psfs.change(identity("a"), OWNER, certification(), "x", 1),
+    "certification": lambda catalogue: catalogue.psfs.change(
+        identity("b"), OWNER, certification(version="2.0.0"), "x", 1
+    ),
+}
+
+
+def test_rows_over_the_quota_are_refused_and_add_nothing(catalogue: Catalogue) -> None:
     catalogue.add(psf("a"))
-    catalogue.psfs.change(identity("a"), OWNER, certification(version="1.0.0"), "x")
+    certify(catalogue, "a", "1.0.0")
     catalogue.add(psf("b", channel="304"))
+    draft = catalogue.uws.draft("psf-build", {}, owner=OWNER)
     used = catalogue.owners.usage(OWNER, 1).used_bytes
-    catalogue.add(
-        ImageRow(owner=OWNER, id="f" * 64, created_at=1.0, bytes=MIB - used - ROW - 100, summary={})
-    )
+    catalogue.add(image(15, MIB - used - 100, OWNER))
+    there = {"psfs": 2, "psf_changes": 1, "images": 1, "jobs": 1}
     with counting(catalogue, 0):
-        with pytest.raises(OverQuota) as refused:
-            add(catalogue)
-        assert refused.value.usage.used_bytes == MIB - 100
-        for table in COUNTED:
-            with catalogue._database.reading() as session:
-                rows = session.scalars(select(table)).all()
-            assert len(rows) == {"psfs": 2, "psf_changes": 1, "images": 1}.get(table.__tablename__, 0)
+        for name, add in ADDED.items():
+            with pytest.raises(OverQuota) as refused:
+                add(catalogue)
+            assert refused.value.usage.used_bytes == MIB - 100, name
+            counts = {table.__tablename__: len(rows(catalogue, select(table))) for table in COUNTED}
+            assert {table: count for table, count in counts.items() if count} == there, name
+        with pytest.raises(OverQuota):
+            catalogue.uws.amend(draft.id, lambda given: {"a": "b" * 100}, 1)
+        job = catalogue.jobs.get(draft.id)
+        assert job is not None and job.parameters == {}, "a pending job does not grow either"
     catalogue.owners.set_quota(OWNER, 2)
-    add(catalogue)
+    for add in ADDED.values():
+        add(catalogue)
     assert catalogue.owners.usage(OWNER, 1).used_bytes > MIB
-
-
-def test_a_wrong_psf_is_deprecated_whatever_the_quota(catalogue: Catalogue) -> None:
-    catalogue.add(psf("a"))
-    catalogue.psfs.change(identity("a"), OWNER, certification(version="1.0.0"), "x")
-    catalogue.add(ImageRow(owner=OWNER, id="f" * 64, created_at=1.0, bytes=MIB, summary={}))
+    catalogue.owners.set_quota(OWNER, None)
     with counting(catalogue, ROW_BYTES):
         wrong = StatusAsked(PsfStatus.DEPRECATED, "wrong")
-        assert catalogue.psfs.change(identity("a"), OWNER, wrong, "x", 1).status == "deprecated"
+        changed = catalogue.psfs.change(identity("a"), OWNER, wrong, "x", 1)
+        assert changed.status == "deprecated", "a wrong PSF is deprecated whatever the quota"
 
 
-def test_a_pending_job_does_not_grow_over_the_quota(catalogue: Catalogue) -> None:
-    job = catalogue.uws.draft("psf-build", {}, owner=OWNER)
-    catalogue.add(ImageRow(owner=OWNER, id="f" * 64, created_at=1.0, bytes=MIB, summary={}))
-    with counting(catalogue, 0), pytest.raises(OverQuota):
-        catalogue.uws.amend(job.id, lambda given: {"a": "b"}, 1)
-    there = catalogue.jobs.get(job.id)
-    assert there is not None and there.parameters == {}
-
-
+@BOTH
 def test_simultaneous_jobs_are_accepted_up_to_the_quota(catalogue: Catalogue) -> None:
-    catalogue.add(ImageRow(owner=OWNER, id="f" * 64, created_at=1.0, bytes=MIB - 5 * ROW, summary={}))
+    catalogue.add(image(15, MIB - 4 * ROW, OWNER))
 
     def submit(number: int) -> bool:
         try:
@@ -298,17 +256,9 @@ def test_simultaneous_jobs_are_accepted_up_to_the_quota(catalogue: Catalogue) ->
 def test_a_large_bulk_run_is_counted_in_one_statement_and_a_refused_one_adds_no_row(
     catalogue: Catalogue,
 ) -> None:
-    said: list[str] = []
-
-    def hear(_connection: object, _cursor: object, statement: str, *_: object) -> None:
-        said.append(statement)
-
-    event.listen(catalogue._engine, "before_cursor_execute", hear)
-    with counting(catalogue, ROW_BYTES * 3001 + len("{}")):
+    with statements(catalogue) as sent, counting(catalogue, ROW_BYTES * 3001 + len("{}")):
         catalogue.bulks.create(bulk(), ids(3000), 4)
-    counts = [one for one in said if one.startswith(("INSERT INTO owners", "UPDATE owners"))]
-    assert len(counts) == 1
-    said.clear()
-    with pytest.raises(OverQuota):
+    assert sum(one.startswith(("INSERT INTO owners", "UPDATE owners")) for one, _ in sent) == 1
+    with statements(catalogue) as sent, pytest.raises(OverQuota):
         catalogue.bulks.create(bulk(key="other"), ids(3000), 4)
-    assert not [one for one in said if one.startswith("INSERT")], "nothing is written to be removed again"
+    assert not [one for one, _ in sent if one.startswith("INSERT")], "nothing is written to be removed again"
