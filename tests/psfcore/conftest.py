@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import pickle
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +19,7 @@ from psfcore.build import build_psf
 from psfcore.fits.header import FitsLimits
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import load_instrument
-from psfcore.psf import Psf
+from psfcore.psf import Psf, crop_centred
 from tests.once_a_run import once_a_run
 
 LIMITS = FitsLimits(max_pixels=4096 * 4096)
@@ -42,8 +46,31 @@ def real() -> Callable[[str], Path]:
 
 @pytest.fixture(scope="session")
 def hri_psf(tmp_path_factory: pytest.TempPathFactory) -> Psf:
-    """The PSF of HRI_EUV in full, with its components."""
-    return once_a_run(lambda: build_psf(load_instrument("hri_euv"), threads=2), "hri_psf", tmp_path_factory)
+    """The PSF of HRI_EUV in full, with its components.
+
+    A process of its own builds it, which takes 1 GiB of memory; here its arrays are mapped from files.
+    """
+    folder = once_a_run(lambda: _built_hri(tmp_path_factory.mktemp("hri_psf")), "hri_psf", tmp_path_factory)
+    small: Psf = pickle.loads((folder / "without_arrays").read_bytes())
+    kernels = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in small.provenance["arrays"]}
+    return replace(small, kernel=kernels.pop("TOTAL"), components=kernels)
+
+
+def _built_hri(folder: Path) -> Path:
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        pool.submit(save_hri_psf, folder).result()
+    return folder
+
+
+def save_hri_psf(folder: Path) -> None:
+    """Build the PSF of HRI_EUV, and write each of its arrays into a file."""
+    psf = build_psf(load_instrument("hri_euv"), threads=2)
+    arrays = {"TOTAL": psf.kernel, **psf.components}
+    for name, kernel in arrays.items():
+        np.save(folder / f"{name}.npy", kernel)
+    small = crop_centred(psf.kernel, (64, 64))
+    psf = replace(psf, kernel=small, components={}, provenance={**psf.provenance, "arrays": list(arrays)})
+    (folder / "without_arrays").write_bytes(pickle.dumps(psf))
 
 
 def gaussian(size: int, sigma_px: float) -> NDArray[np.float64]:
