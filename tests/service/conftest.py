@@ -1,4 +1,4 @@
-"""The application in this process, and its queued jobs run on demand."""
+"""The application in this process, its queued jobs run on demand, and what many tests ask of it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from httpx import Response
 
 from service.app import create_app
 from tests.blank_figures import blank_unless_told
+from tests.service.keyed import Keyed, keyed
 from tests.shared_routes import shared_routes
 from tests.tables import copied_tables
 from workers.bulk.turns import keep_turns
@@ -48,20 +51,48 @@ def _figures(request: pytest.FixtureRequest) -> Iterator[None]:
     yield from blank_unless_told(request)
 
 
+def settings_in(folder: Path, **changes: Any) -> Settings:
+    """The settings of a small service with its data in this folder."""
+    usual = {"allowed_hosts": "testserver", "max_upload_mib": 2, "max_pixels": 512 * 512}
+    return Settings(data_dir=folder, database_url=None, broker_url="filesystem://", **{**usual, **changes})
+
+
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    return Settings(
-        data_dir=tmp_path / "data",
-        database_url=None,
-        broker_url="filesystem://",
-        allowed_hosts="testserver",
-        max_upload_mib=2,
-        max_pixels=512 * 512,
-    )
+    return settings_in(tmp_path / "data")
 
 
 @pytest.fixture
 def api(settings: Settings) -> Iterator[TestClient]:
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture
+def catalogue(api: TestClient) -> Catalogue:
+    """The catalogue of the application."""
+    rows: Catalogue = api.app.state.heliopsf.catalogue
+    return rows
+
+
+@pytest.fixture
+def service(settings: Settings) -> Iterator[Keyed]:
+    """The application with the same settings, but it asks for keys."""
+    with keyed(settings) as service:
+        yield service
+
+
+@pytest.fixture(scope="module")
+def shared_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
+    """An application with keys for a whole file of tests: each test uses owners of its own."""
+    with keyed(settings_in(tmp_path_factory.mktemp("shared"))) as service:
+        yield service
+
+
+@pytest.fixture(scope="module")
+def shared_api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """An application for a whole file of tests: no test depends on what others have left in it."""
+    settings = settings_in(tmp_path_factory.mktemp("shared"))
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
         yield client
 
@@ -95,3 +126,25 @@ def upload(api: TestClient, path: Path, where: str = "/v1/images") -> str:
     assert answer.status_code in (200, 201), answer.text
     identity: str = answer.json()["id"]
     return identity
+
+
+def refusal(answer: Response, status: int, code: str) -> str:
+    """The detail of an answer that must be the problem with this status and code."""
+    assert (answer.status_code, answer.json()["type"]) == (status, f"urn:heliopsf:{code}"), answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    return str(answer.json()["detail"])
+
+
+def job_after(api: TestClient, run_jobs: Callable[[], None], kind: str, **parameters: Any) -> dict[str, Any]:
+    """A job that is submitted and has ended."""
+    answer = api.post("/v1/jobs", json={"kind": kind, "parameters": parameters})
+    assert answer.status_code == 202, answer.text
+    run_jobs()
+    return dict(api.get(answer.headers["Location"]).json())
+
+
+def result_of(api: TestClient, run_jobs: Callable[[], None], kind: str, **parameters: Any) -> dict[str, Any]:
+    """The description of what a job makes."""
+    job = job_after(api, run_jobs, kind, **parameters)
+    assert job["phase"] == "COMPLETED", job["error"]
+    return dict(api.get(job["result"]).json())

@@ -1,4 +1,4 @@
-"""Requests and files that attack the service, as a table: what is sent, and what is to be answered."""
+"""The bad requests and files of the whole API, as a table: what is sent, and what is to be answered."""
 
 from __future__ import annotations
 
@@ -145,6 +145,9 @@ FILES = [
     image("pixels of a word of bits", 422, "bad-card", lambda: primary("'many'", 64, 64) + bytes(8640)),
     image("two widths", 422, "bad-card", lambda: primary(8, 64, 64, more=("NAXIS1  =                   32",)) + bytes(8640)),
     image("a size larger than the file", 422, "truncated-data", lambda: primary(16, 512, 512) + bytes(2880)),
+    image("a file that only begins like FITS", 422, "truncated-header", lambda: b"SIMPLE  =" + b"x" * 5000),
+    image("less than a card", 422, "truncated-header", lambda: b"SIMP"),
+    image("a table alone", 422, "table-only", lambda: written(fits.PrimaryHDU(), fits.BinTableHDU.from_columns([fits.Column("A", "E", array=np.ones(3))]))),
     image("a header without end", 422, "truncated-header", lambda: primary(16, 64, 64)[:400]),
     image("6 MB of cards", 422, "header-too-long", lambda: long_header(6)),
     image("100 MB of cards in gzip", 422, "header-too-long", lambda: gzip.compress(long_header(100), 1)),
@@ -263,10 +266,12 @@ FORM = {"Content-Type": "multipart/form-data; boundary=x"}
 PART = b'--x\r\nContent-Disposition: form-data; name="%s"\r\n\r\n'
 
 
-def form(name: str, content: bytes, kind: str = FORM["Content-Type"], code: str = "bad-form") -> Attack:
+def form(
+    name: str, content: bytes, kind: str = FORM["Content-Type"], code: str = "bad-form", to: str = "images"
+) -> Attack:
     """An upload's form that is none."""
     return Attack(
-        name, 400, code, address="/v1/images", headers={"Content-Type": kind}, content=lambda: content
+        name, 400, code, address=f"/v1/{to}", headers={"Content-Type": kind}, content=lambda: content
     )
 
 
@@ -281,6 +286,20 @@ REQUESTS = [
     body("infinity", 422, "invalid-request", b'{"kind":"deconvolve","parameters":{"image_id":"%s","saturation_dn":1e999}}' % A.encode()),
     body("20 MB of JSON", 413, "too-large", b'"' + b"x" * 20 * MIB + b'"'),
     Attack("JSON that says it is text", 422, "invalid-request", content=lambda: b'{"kind":"psf-build"}', headers={"Content-Type": "text/plain"}),
+    body("null", 422, "invalid-request", b"null"),
+    body("a list", 422, "invalid-request", b"[]"),
+    body("no kind", 422, "invalid-request", b'{"parameters": {}}'),
+    job("no image", 422, "invalid-request", "deconvolve"),
+    job("no steps", 422, "invalid-request", "deconvolve", image_id=A, method={"steps": 0}),
+    job("steps that are a word", 422, "invalid-request", "deconvolve", image_id=A, method={"steps": "many"}),
+    job("an unknown method", 422, "invalid-request", "deconvolve", image_id=A, method={"name": "x"}),
+    job("no instrument", 422, "invalid-request", "psf-build"),
+    job("two instruments", 422, "invalid-request", "psf-build", instrument="hri_euv", instrument_file="x"),
+    job("an unknown component", 422, "invalid-request", "psf-build", instrument="hri_euv", component="x"),
+    job("an odd size", 422, "invalid-request", "psf-build", instrument="hri_euv", size=99),
+    job("a mask that was not uploaded", 404, "no-such-image", "psf-build", instrument="hri_euv", mask_id=A),
+    job("no TOML", 422, "bad-instrument-file", "psf-build", instrument_file="= = ="),
+    job("TOML that lacks keys", 422, "bad-instrument-file", "psf-build", instrument_file="name = 'x'"),
     job("a kind that is code", 422, "invalid-request", "__import__('os').system('true')"),
     job("a parameter more", 422, "invalid-request", "psf-build", instrument="hri_euv", callback="http://evil.example/"),
     job("an instrument that is a path", 422, "unknown-instrument", "psf-build", instrument="../../../etc/passwd"),
@@ -308,6 +327,22 @@ REQUESTS = [
     form("a part with a name of 2 MB", PART % (b"n" * 2 * MIB) + b"1\r\n--x--\r\n"),
     form("a part with 200000 headers", b"--x\r\n" + b"A: b\r\n" * 200_000 + b"\r\n1\r\n--x--\r\n"),
     form("a form that breaks off", PART % b"file" + b"SIMPLE  =", code="upload-ended-early"),
+    form("nothing as a form", b""),
+    form("a form of another boundary", b"no boundary here"),
+    form("a transit's form without a file", PART % b"other" + b"1\r\n--x--\r\n", to="transits"),
+    form("a transit's form that breaks off", PART % b"file" + b"PK\3\4", code="upload-ended-early", to="transits"),
+    got("an address of nothing", 404, "http-404", "/v1/nothing"),
+    got("an id of 5 letters", 422, "invalid-request", "/v1/transits/short"),
+    got("a job that is not there", 404, "no-such-job", f"/v1/jobs/{A[:32]}"),
+    got("an image that is not there", 404, "no-such-image", f"/v1/images/{A}"),
+    got("a transit that is not there", 404, "no-such-transit", f"/v1/transits/{A}"),
+    got("a PSF that is not there", 404, "no-such-psf", f"/v1/psfs/{A}"),
+    got("the file of a PSF that is not there", 404, "no-such-psf", f"/v1/psfs/{A}/file"),
+    got("the picture of a PSF that is not there", 404, "no-such-psf", f"/v1/psfs/{A}/preview"),
+    got("a product that is not there", 404, "no-such-product", f"/v1/products/{A}"),
+    got("the file of a product that is not there", 404, "no-such-product", f"/v1/products/{A}/file"),
+    got("the picture of a product that is not there", 404, "no-such-product", f"/v1/products/{A}/preview"),
+    Attack("an end of a job that is not there", 404, "no-such-job", "DELETE", f"/v1/jobs/{A[:32]}"),
     got("an id that climbs", 404, "http-404", "/v1/images/..%2f..%2fetc%2fpasswd"),
     got("an id that climbs in a download", 404, "http-404", "/v1/products/..%2f..%2fcatalogue.sqlite/file"),
     got("an id of dots", 422, "invalid-request", "/v1/products/%2e%2e/file"),
@@ -315,6 +350,13 @@ REQUESTS = [
     got("an id with a line end", 422, "invalid-request", "/v1/images/%0d%0aSet-Cookie:x=1"),
     got("an id of 9000 letters", 422, "invalid-request", "/v1/images/" + "a" * 9000),
     got("an id in capitals", 422, "invalid-request", "/v1/images/" + "A" * 64),
+    got("a page of nothing", 422, "invalid-request", "/v1/jobs?limit=0"),
+    got("a phase there is not", 422, "invalid-request", "/v1/jobs?phase=SLEEPING"),
+    got("a cursor of nonsense", 422, "bad-cursor", "/v1/transits?cursor=nonsense"),
+    got("a cursor of NUL", 422, "bad-cursor", "/v1/jobs?cursor=MS4wIAA="),
+    got("a cursor that is no number", 422, "bad-cursor", "/v1/psfs?cursor=bmFuIHg="),
+    got("a name of NUL", 422, "invalid-request", "/v1/psfs?name=%00"),
+    Attack("an upload with a name of NUL", 422, "invalid-request", address="/v1/psfs?name=a%00b"),
     got("a page without end", 422, "invalid-request", "/v1/jobs?limit=1000000"),
     got("a page of 5000 digits", 422, "invalid-request", "/v1/jobs?limit=" + "9" * 5000),
     got("a cursor of ours it is not", 422, "bad-cursor", "/v1/jobs?cursor=%FF%00"),
@@ -332,6 +374,3 @@ REQUESTS = [
     got("another's name", 403, "scope-missing", "/v1/jobs", X_Owner="bob"),
     got("the metrics", 403, "scope-missing", "/metrics"),
 ]  # fmt: skip
-
-BOMBS = [*FILES, *ARCHIVES]
-TABLE = [*REQUESTS, *BOMBS]

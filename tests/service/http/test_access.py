@@ -8,7 +8,7 @@ import json
 import logging
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -21,7 +21,7 @@ from service.cli.main import main
 from service.client.http import Client, ServiceError
 from service.http.access import check_can_serve
 from tests.service.conftest import upload
-from tests.service.keyed import Keyed, bearer, keyed
+from tests.service.keyed import Keyed, bearer
 from workers.catalogue.access.keys import KeyRefused, Keys, Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import KeyRow
@@ -35,12 +35,6 @@ OPEN_TO_ALL = {
         "/vo/tables",
     ),  # clients read them before they know how to log in
 }
-
-
-@pytest.fixture
-def service(settings: Settings) -> Iterator[Keyed]:
-    with keyed(settings) as running:
-        yield running
 
 
 @pytest.fixture
@@ -70,134 +64,91 @@ def test_of_a_key_only_a_hash_is_kept(keys: Keys) -> None:
 
 def test_a_key_that_is_not_good_lets_nobody_in(keys: Keys) -> None:
     good, other = keys.make("ann", {Scope.READ}), keys.make("ann", {Scope.READ})
+    assert keys.all()[0].last_used_at is None
     assert keys.check(good).owner == "ann"
+    used_at = keys.all()[0].last_used_at
+    assert used_at is not None and abs(used_at - time.time()) < 5
+    keys.check(good)
+    assert keys.all()[0].last_used_at == used_at, "its use is noted once a minute"
     late = keys.make("ann", {Scope.READ}, expires_at=time.time() - 1)
     assert keys.revoke(other.split("_")[1]) and not keys.revoke("0" * 16)
     revoked_at = keys.all()[1].revoked_at
     assert keys.revoke(other.split("_")[1]) and keys.all()[1].revoked_at == revoked_at, "once is enough"
     mixed = good[:21] + "_" + other.split("_", 2)[2]
-    longer, shorter, no_key = good + "x", good[:-1], ""
-    wanted = {late: "key-expired", other: "key-revoked"}
-    for key in (
-        late,
-        other,
-        mixed,
-        longer,
-        shorter,
-        no_key,
-        good.upper(),
-        "hpsf_" + "0" * 16 + "_" + "a" * 43,
-    ):
+    codes = {late: "key-expired", other: "key-revoked"}
+    unknown = "hpsf_" + "0" * 16 + "_" + "a" * 43
+    for key in (late, other, mixed, good + "x", good[:-1], "", good.upper(), unknown):
         with pytest.raises(KeyRefused) as refused:
             keys.check(key)
-        assert refused.value.code == wanted.get(key, "bad-key")
+        assert refused.value.code == codes.get(key, "bad-key")
         assert good.split("_", 2)[2] not in refused.value.message
-
-
-def test_its_use_is_noted_once_a_minute(keys: Keys) -> None:
-    key = keys.make("ann", {Scope.READ})
-    assert keys.all()[0].last_used_at is None
-    keys.check(key)
-    noted = keys.all()[0].last_used_at
-    assert noted is not None and abs(noted - time.time()) < 5
-    keys.check(key)
-    assert keys.all()[0].last_used_at == noted
-
-
-@pytest.mark.parametrize("owner", ["", "Ann", "a b", "../x", "a" * 65, "-x", "ann\n"])
-def test_owners_that_cannot_be(keys: Keys, owner: str) -> None:
-    with pytest.raises(ValueError, match="expected an owner"):
-        keys.make(owner, {Scope.READ})
+    for owner in ("", "Ann", "a b", "../x", "a" * 65, "-x", "ann\n"):
+        with pytest.raises(ValueError, match="expected an owner"):
+            keys.make(owner, {Scope.READ})
 
 
 # Routes ---------------------------------------------------------------------------------------------
 
 
-def addresses(api: TestClient) -> list[tuple[str, str]]:
-    """Every method and address, with ids filled in that name nothing."""
-    found = []
-    for path, operations in api.get("/openapi.json").json()["paths"].items():
-        found += [(method.upper(), re.sub(r"\{\w+\}", "0" * 32, path)) for method in operations]
-    return [one for one in found if one[1] not in OPEN_TO_ALL]
+def test_each_route_wants_a_key_of_the_right_scope(shared_service: Keyed) -> None:
+    """Every method and address of the description, asked with ids that name nothing: without a key, with an expired key,
+    and with a key of each single scope that is not the one it needs."""
+    api = shared_service.api
+    expired = shared_service.key("ann", lasts_s=-1)
+    keys = {scope: bearer(shared_service.key("ann", scope)) for scope in Scope}
+    operations = 0
+    for path, methods in api.get("/openapi.json").json()["paths"].items():
+        address = re.sub(r"\{\w+\}", "0" * 32, path)
+        for method, operation in methods.items():
+            here = (method, path)
+            scopes = {scope for way in operation.get("security", []) for one in way.values() for scope in one}
+            if path in OPEN_TO_ALL:
+                assert scopes == set(), here
+                assert api.get(path).status_code == (503 if path == "/readyz" else 200), (
+                    "no worker: told to anybody"
+                )
+                continue
+            operations += 1
+            (scope,) = scopes
+            if path == "/metrics":
+                assert scope == "admin"
+            else:
+                writing = {"submit", "certify", "bulk", "admin"}
+                assert scope in ({"read"} if method == "get" else writing), here
+            for headers in ({}, bearer(expired)):
+                answer = api.request(method, address, headers=headers)
+                assert answer.status_code == 401, (here, answer.text)
+                assert answer.headers["WWW-Authenticate"].startswith("Bearer"), here
+                assert expired.split("_", 2)[2] not in answer.text, here
+            for other in set(Scope) - {scope}:
+                answer = api.request(method, address, headers=keys[other])
+                assert answer.status_code == 403, (other, here, answer.text)
+                assert method == "head" or scope in answer.text, here  # its answer has no body
+    assert operations > 40
+    assert api.get("/metrics", headers=keys[Scope.ADMIN]).status_code == 200
 
 
-def test_no_route_answers_without_a_key_or_with_a_bad_one(service: Keyed) -> None:
-    expired = service.key("ann", lasts_s=-1)
-    revoked = service.key("ann")
-    service.catalogue.keys.revoke(revoked.split("_")[1])
-    asked = addresses(service.api)
-    assert len(asked) > 40
-    sent = [
-        {},
+def test_a_key_goes_as_a_bearer_token_or_as_a_password(shared_service: Keyed) -> None:
+    api, key, revoked = shared_service.api, shared_service.key("ann"), shared_service.key("ann")
+    shared_service.catalogue.keys.revoke(revoked.split("_")[1])
+    for headers in (bearer(key), {"Authorization": f"bearer  {key}"}, basic(key), basic(key, user="")):
+        assert api.get("/v1/jobs", headers=headers).status_code == 200
+    broken = (
+        {"Authorization": "Basic %%%"},
+        {"Authorization": "Digest x"},
         bearer("nonsense"),
         basic("nonsense"),
-        bearer(expired),
-        bearer(revoked),
-        {"Authorization": "Digest x"},
-    ]
-    for method, address in asked:
-        for headers in sent:
-            answer = service.api.request(method, address, headers=headers)
-            assert answer.status_code == 401, (method, address, headers, answer.text)
-            assert answer.headers["WWW-Authenticate"].startswith("Bearer"), (method, address)
-            assert expired.split("_", 2)[2] not in answer.text
-
-
-def test_every_route_says_which_scope_it_needs(service: Keyed) -> None:
-    description = service.api.get("/openapi.json").json()
-    for path, operations in description["paths"].items():
-        for method, operation in operations.items():
-            scopes = {scope for way in operation.get("security", []) for s in way.values() for scope in s}
-            if path in OPEN_TO_ALL:
-                assert scopes == set()
-                continue
-            assert len(scopes) == 1, (method, path)
-            if path == "/metrics":
-                assert scopes == {"admin"}
-            elif method == "get":
-                assert scopes == {"read"}, (method, path)
-            else:
-                assert scopes & {"submit", "certify", "bulk", "admin"}, (method, path)
-
-
-def test_a_key_without_the_scope_is_refused_and_told_which(service: Keyed) -> None:
-    for scope in Scope:
-        client = service.client("ann", scope)
-        for path, operations in service.api.get("/openapi.json").json()["paths"].items():
-            for method, operation in operations.items():
-                needed = {s for way in operation.get("security", []) for one in way.values() for s in one}
-                if needed and scope not in needed:
-                    answer = client.request(method, re.sub(r"\{\w+\}", "0" * 32, path))
-                    assert answer.status_code == 403, (scope, method, path, answer.text)
-                    if method != "head":  # its answer has no body
-                        assert needed.pop() in answer.text
-
-
-def test_a_key_goes_as_a_bearer_token_or_as_a_password(service: Keyed) -> None:
-    key = service.key("ann")
-    for headers in (bearer(key), {"Authorization": f"bearer  {key}"}, basic(key), basic(key, user="")):
-        assert service.api.get("/v1/jobs", headers=headers).status_code == 200
-    broken = {"Authorization": "Basic %%%"}
-    assert service.api.get("/v1/jobs", headers=broken).status_code == 401
-    assert service.api.get(f"/v1/jobs?key={key}").status_code == 401, "an address is no place for a key"
-
-
-def test_what_anybody_may_see(service: Keyed) -> None:
-    for address in OPEN_TO_ALL - {"/readyz"}:
-        assert service.api.get(address).status_code == 200
-    assert service.api.get("/readyz").status_code == 503  # there is no worker, and that is said to anybody
-
-
-def test_metrics_are_the_administrators(service: Keyed) -> None:
-    assert service.client("ann").get("/metrics").status_code == 403
-    assert service.client("root", Scope.ADMIN).get("/metrics").status_code == 200
+    )
+    for headers in (*broken, bearer(revoked), basic(revoked)):
+        assert api.get("/v1/jobs", headers=headers).status_code == 401
+    assert api.get(f"/v1/jobs?key={key}").status_code == 401, "an address is no place for a key"
 
 
 def test_no_key_is_in_a_log_or_an_answer(
-    service: Keyed, caplog: pytest.LogCaptureFixture, image_file: Path
+    shared_service: Keyed, caplog: pytest.LogCaptureFixture, image_file: Path
 ) -> None:
     caplog.set_level(logging.DEBUG)
-    client = service.client("ann")
+    client = shared_service.client("ann")
     secret = str(client.headers["Authorization"]).split("_", 2)[2]
     upload(client, image_file)
     texts = [client.get(a).text for a in ("/v1/images", "/v1/jobs/zzz", "/nowhere", "/uws/jobs")]
@@ -210,9 +161,8 @@ def test_no_key_is_in_a_log_or_an_answer(
 # Who may serve --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("bound_to", "access", "keys_asked_for"),
-    [
+def test_open_only_where_this_machine_alone_asks(settings: Settings) -> None:
+    for bound_to, access, keys_needed in (
         ("127.0.0.1", None, False),
         ("127.0.0.2", None, False),
         ("::1", None, False),
@@ -224,27 +174,21 @@ def test_no_key_is_in_a_log_or_an_answer(
         ("localhost.example.org", None, True),
         ("127.0.0.1", "keys", True),
         ("0.0.0.0", "open", False),
-    ],
-)
-def test_open_only_where_this_machine_alone_asks(
-    settings: Settings, bound_to: str, access: str | None, keys_asked_for: bool
-) -> None:
-    with TestClient(create_app(settings.model_copy(update={"access": access}), bound_to)) as api:
-        assert api.get("/v1/jobs").status_code == (401 if keys_asked_for else 200)
+    ):
+        with TestClient(create_app(settings.model_copy(update={"access": access}), bound_to)) as api:
+            status = api.get("/v1/jobs").status_code
+        assert status == (401 if keys_needed else 200), (bound_to, access)
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
+    """A command on the data of the service of this test."""
     for name in ("ACCESS", "KEY", "DATABASE_URL", "BROKER_URL"):
         monkeypatch.delenv(f"HELIOPSF_{name}", raising=False)
-
-    def command(*arguments: str) -> Result:
-        return CliRunner().invoke(main, [*arguments, "--data", str(tmp_path / "data")])
-
-    return command
+    return lambda *words: CliRunner().invoke(main, [*words, "--data", str(tmp_path / "data")])
 
 
-def test_a_service_that_others_reach_does_not_start_without_a_key(run) -> None:  # type: ignore[no-untyped-def]
+def test_a_service_that_others_reach_does_not_start_without_a_key(run: Callable[..., Result]) -> None:
     refused = run("serve", "--host", "0.0.0.0", "--port", "0")
     assert refused.exit_code == 1 and "Traceback" not in refused.output
     assert "heliopsf key create --owner NAME" in refused.output and "127.0.0.1" in refused.output
@@ -261,7 +205,7 @@ def test_it_starts_with_one_or_where_the_operator_decided(settings: Settings) ->
     catalogue.close()
 
 
-def test_keys_are_made_listed_and_revoked_by_command(run, service: Keyed) -> None:  # type: ignore[no-untyped-def]
+def test_keys_are_made_listed_and_revoked_by_command(run: Callable[..., Result], service: Keyed) -> None:
     """In the folder of the running service, which takes notice at once."""
     made = run(
         "key", "create", "--owner", "ann", "--scope", "read", "--expires", "30d", "--label", "for tests"
@@ -289,10 +233,10 @@ def test_keys_are_made_listed_and_revoked_by_command(run, service: Keyed) -> Non
 
 
 def test_client_and_commands_take_a_key_and_never_show_it(
-    service: Keyed, monkeypatch: pytest.MonkeyPatch
+    shared_service: Keyed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    key = service.key("ann")
-    transport = service.api._transport
+    key = shared_service.key("clients")
+    transport = shared_service.api._transport
     with Client("http://testserver", key=key, transport=transport) as client:
         assert list(client.psfs()) == []
     monkeypatch.setenv("HELIOPSF_KEY", f" {key}\n")

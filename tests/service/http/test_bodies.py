@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import uvicorn
 from fastapi.testclient import TestClient
 
 from service.app import create_app
+from tests.service.conftest import refusal, settings_in
 from tests.service.keyed import Keyed, bearer, keyed
-from tests.whole.stack import free_port, wait_for
+from tests.service.serving import serving
+from tests.whole.stack import wait_for
 from workers.catalogue.access.keys import Scope
 from workers.settings import Settings
 
@@ -53,35 +54,15 @@ class Live:
 
 @contextmanager
 def running(folder: Path, **changes: object) -> Iterator[Live]:
-    settings = Settings(data_dir=folder, database_url=None, broker_url="filesystem://", access="keys")
-    app, port = create_app(settings.model_copy(update=changes)), free_port()
-    server = uvicorn.Server(uvicorn.Config(app, port=port, log_level="warning", timeout_graceful_shutdown=1))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    try:
-        wait_for(lambda: server.started, "the server listens", timeout_s=20)
+    app = create_app(settings_in(folder, access="keys", **changes))
+    with serving(app) as port:
         yield Live(("127.0.0.1", port), Keyed(TestClient(app), app.state.heliopsf.catalogue))
-    finally:
-        server.should_exit = True
-        thread.join(20)
 
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
-    with running(tmp_path_factory.mktemp("bodies"), body_s=0.5, body_kib_per_s=64) as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
-    settings = Settings(
-        data_dir=tmp_path_factory.mktemp("bodies"),
-        database_url=None,
-        broker_url="filesystem://",
-        allowed_hosts="testserver",
-    )
-    with keyed(settings) as running:
-        yield running
+    with running(tmp_path_factory.mktemp("bodies"), body_s=0.5, body_kib_per_s=64) as live:
+        yield live
 
 
 # The key first --------------------------------------------------------------------------------------
@@ -89,72 +70,78 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
 
 def routes_that_take_a_body() -> list[tuple[str, str]]:
     app = create_app(Settings(database_url=None, broker_url="filesystem://"))
-    found = [
+    routes = [
         (method.upper(), path.replace("{psf_id}", 64 * "a").replace("{bulk_id}", 32 * "a"))
         for path, operations in app.openapi()["paths"].items()
         for method in operations
         if method in ("post", "put", "patch")
     ]
-    assert len(found) >= 15 and ("POST", "/v1/jobs") in found and ("POST", "/v1/images") in found
-    return found
+    assert len(routes) >= 15 and ("POST", "/v1/jobs") in routes and ("POST", "/v1/images") in routes
+    return routes
 
 
-@pytest.mark.parametrize("authorization", ["", "Bearer nonsense"])
-def test_without_a_key_no_body_is_awaited(live: Live, authorization: str) -> None:
+def test_without_a_key_or_its_scope_no_body_is_awaited(live: Live) -> None:
     """The answer comes while the body has not: nothing of it was read or parsed."""
-    headers = JSON | {"Content-Length": "1000"} | ({"Authorization": authorization} if authorization else {})
-    for method, path in routes_that_take_a_body():
+    no_keys: tuple[dict[str, str], ...] = ({}, {"Authorization": "Bearer nonsense"})
+    cases = [(route, key, 401) for key in no_keys for route in routes_that_take_a_body()]
+    reader = bearer(live.service.key("reader", Scope.READ))
+    for route in (("POST", "/v1/jobs"), ("POST", "/v1/bulk"), ("PUT", "/v1/contexts/default")):
+        cases.append((route, reader, 403))
+    for (method, path), key, status in cases:
+        headers = JSON | {"Content-Length": "1000"} | key
         with live.begin(method, path, headers, b"[[],[],") as connection:
-            assert connection.recv(100).startswith(b"HTTP/1.1 401"), (method, path)
-
-
-def test_without_the_scope_no_body_is_awaited(live: Live) -> None:
-    headers = JSON | {"Content-Length": "1000"} | bearer(live.service.key("reader", Scope.READ))
-    for method, path in (("POST", "/v1/jobs"), ("POST", "/v1/bulk"), ("PUT", "/v1/contexts/default")):
-        with live.begin(method, path, headers, b"{") as connection:
-            assert connection.recv(100).startswith(b"HTTP/1.1 403"), (method, path)
+            assert connection.recv(100).startswith(f"HTTP/1.1 {status}".encode()), (method, path, key)
 
 
 # Sizes ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("declared", [True, False])
-def test_only_a_bulk_run_may_be_large(service: Keyed, declared: bool) -> None:
-    ann = service.client("ann")
+def test_a_body_that_is_declared_too_long_is_refused_before_it_comes(live: Live) -> None:
+    headers = JSON | {"Content-Length": "99999999999"} | bearer(live.service.key("ann"))
+    with live.begin("POST", "/v1/jobs", headers) as connection:
+        assert connection.recv(100).startswith(b"HTTP/1.1 413")
+
+
+def test_only_a_bulk_run_may_be_large(settings: Settings) -> None:
     body = json.dumps({"images": ["a" * 64] * 5000, "psf_id": "b" * 64}).encode()
-    assert 256 * KIB < len(body) < 2**20
+    assert 128 * KIB < len(body) < 2**20
+    with keyed(settings, max_body_kib=128) as service:
+        ann = service.client("ann")
+        for declared in (True, False):
 
-    def sent(path: str, **headers: str) -> Any:
-        content = body if declared else iter([body[:1000], body[1000:]])
-        return ann.post(path, content=content, headers=JSON | headers)
+            def answer(path: str, kind: str = "application/json", declared: bool = declared) -> Any:
+                content = body if declared else iter([body[:1000], body[1000:]])
+                return ann.post(path, content=content, headers={"Content-Type": kind})
 
-    for path in ("/v1/jobs", "/v1/contexts"):
-        refused = sent(path)
-        assert (refused.status_code, refused.json()["type"]) == (413, "urn:heliopsf:too-large")
-        assert "262144 bytes" in refused.json()["detail"]
-        assert refused.headers["content-type"] == "application/problem+json"
-    form = sent("/uws/jobs", **{"Content-Type": "application/x-www-form-urlencoded"})
-    assert form.status_code == 413 and "262144 bytes" in form.text
-    bulk = sent("/v1/bulk")
-    assert bulk.status_code == 404 and bulk.json()["type"] == "urn:heliopsf:no-such-psf", bulk.text
+            for path in ("/v1/jobs", "/v1/contexts"):
+                assert "131072 bytes" in refusal(answer(path), 413, "too-large")
+            form = answer("/uws/jobs", "application/x-www-form-urlencoded")
+            assert form.status_code == 413 and "131072 bytes" in form.text
+            refusal(answer("/v1/bulk"), 404, "no-such-psf")
 
 
 def test_a_body_of_lists_without_end_is_counted_before_it_is_parsed(
-    service: Keyed, monkeypatch: pytest.MonkeyPatch
+    shared_service: Keyed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def parse(*_: object, **__: object) -> None:
-        pytest.fail("it was parsed")
+    lengths: list[int] = []
+    loads = json.loads
 
-    ann = service.client("ann")
-    with monkeypatch.context() as patched:
-        patched.setattr(json, "loads", parse)
-        for unit in (b"[],", b"{},", b'"":0,'):
-            answer = ann.post("/v1/bulk", content=b"[" + unit * 2**20, headers=JSON)
-    assert answer.status_code == 413 and answer.json()["type"] == "urn:heliopsf:too-many-values"
-    assert "expected JSON with at most" in answer.json()["detail"]
+    def parse(content: Any, **options: Any) -> Any:
+        lengths.append(len(content))
+        return loads(content, **options)
+
+    ann = shared_service.client("ann")
+    monkeypatch.setattr(json, "loads", parse)  # also the database parses JSON, of a few bytes
+    answers = [
+        ann.post("/v1/bulk", content=b"[" + unit * 2**18, headers=JSON) for unit in (b"[],", b"{},", b'"":0,')
+    ]
+    monkeypatch.undo()
+    for answer in answers:
+        refusal(answer, 413, "too-many-values")
+    assert all(length < 1000 for length in lengths)
 
 
-def test_json_is_parsed_off_the_event_loop(service: Keyed, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_json_is_parsed_off_the_event_loop(shared_service: Keyed, monkeypatch: pytest.MonkeyPatch) -> None:
     threads: list[str] = []
     loads = json.loads
 
@@ -163,38 +150,33 @@ def test_json_is_parsed_off_the_event_loop(service: Keyed, monkeypatch: pytest.M
         return loads(content)
 
     monkeypatch.setattr("service.http.bodies.json.loads", parse)
-    answer = service.client("ann").post("/v1/jobs", content=b'{"kind": "x"}', headers=JSON)
+    answer = shared_service.client("ann").post("/v1/jobs", content=b'{"kind": "x"}', headers=JSON)
     monkeypatch.undo()
     assert answer.status_code == 422
     assert len(threads) == 1 and "worker" in threads[0].lower(), threads
 
 
-def test_many_wrong_values_get_a_short_answer(service: Keyed) -> None:
-    ann = service.client("ann")
+def test_many_wrong_values_get_a_short_answer(shared_service: Keyed) -> None:
+    ann = shared_service.client("ann")
     wrong = {"images": [f"{n:x}" for n in range(25_000)], "psf_id": "b" * 64}
     answer = ann.post("/v1/bulk", json=wrong)
-    assert answer.status_code == 422 and len(answer.content) < 10_000
-    assert "body/images/0" in answer.json()["detail"]
+    assert "body/images/0" in refusal(answer, 422, "invalid-request") and len(answer.content) < 10_000
     names = ann.post("/v1/jobs", json={"kind": "psf-build", "parameters": {f"x{n}": n for n in range(5000)}})
-    assert names.status_code == 422 and len(names.content) < 50_000
-    assert len(names.json()["errors"]) == 20 and "more errors" in names.json()["detail"]
+    assert "more errors" in refusal(names, 422, "invalid-request") and len(names.content) < 50_000
+    assert len(names.json()["errors"]) == 20
 
 
 # Time -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", ["/v1/jobs", "/v1/images", "/uws/jobs"])
-def test_a_body_that_does_not_come_is_not_awaited_for_ever(live: Live, path: str) -> None:
-    kind = "application/x-www-form-urlencoded" if path == "/uws/jobs" else "application/json"
-    headers = {"Content-Type": kind, "Content-Length": "1000"} | bearer(live.service.key("ann"))
-    with live.begin("POST", path, headers, b"SIMPLE  =") as connection:
-        answer = live.answer(connection)
-    assert answer.startswith(b"HTTP/1.1 408") and b"expected more of the body" in answer
-
-
-def test_a_body_that_drips_is_not_awaited_either(live: Live) -> None:
-    headers = JSON | {"Content-Length": "1000"} | bearer(live.service.key("ann"))
-    with live.begin("POST", "/v1/jobs", headers) as connection:
+def test_a_body_that_does_not_come_is_not_awaited_for_ever(live: Live) -> None:
+    ann, length = bearer(live.service.key("ann")), {"Content-Length": "1000"}
+    form = {"Content-Type": "application/x-www-form-urlencoded"}
+    for path, kind in (("/v1/jobs", JSON), ("/v1/images", JSON), ("/uws/jobs", form)):
+        with live.begin("POST", path, kind | length | ann, b"SIMPLE  =") as connection:
+            answer = live.answer(connection)
+        assert answer.startswith(b"HTTP/1.1 408") and b"expected more of the body" in answer, path
+    with live.begin("POST", "/v1/jobs", JSON | length | ann) as connection:  # a body that drips
         connection.settimeout(0.05)
         answer = b""
         deadline = time.monotonic() + 10  # guards against a hang; the limit is 0.5 s
@@ -249,7 +231,7 @@ def test_an_owner_sends_one_bulk_run_at_a_time(tmp_path: Path) -> None:
     body = json.dumps({"images": ["a" * 64], "psf_id": "b" * 64}).encode()
     with running(tmp_path) as live, ExitStack() as open_:
         ann, bob = (bearer(live.service.key(name)) for name in ("ann", "bob"))
-        at_work = live.service.api.app.state.heliopsf.requests._open  # type: ignore[attr-defined]
+        at_work = live.service.api.app.state.heliopsf.requests
 
         def begin(headers: dict[str, str], sent: bytes) -> socket.socket:
             before = at_work.total()
@@ -267,26 +249,16 @@ def test_an_owner_sends_one_bulk_run_at_a_time(tmp_path: Path) -> None:
             assert live.answer(connection).startswith(b"HTTP/1.1 404")
 
 
-def test_a_caller_holds_only_so_many_requests(tmp_path_factory: pytest.TempPathFactory) -> None:
-    settings = Settings(
-        data_dir=tmp_path_factory.mktemp("held"),
-        database_url=None,
-        broker_url="filesystem://",
-        allowed_hosts="testserver",
-    )
+def test_a_caller_holds_only_so_many_requests(settings: Settings) -> None:
     with keyed(settings, requests_per_caller=2) as service:
         ann, bob = service.client("ann"), service.client("bob")
-        held = service.api.app.state.heliopsf.requests  # type: ignore[attr-defined]
+        held = service.api.app.state.heliopsf.requests
         who = ann.headers["Authorization"].split("_")[1]
         held.open(who), held.open(who)
-        refused = ann.get("/v1/jobs")
-        assert (refused.status_code, refused.json()["type"]) == (
-            429,
-            "urn:heliopsf:too-many-requests-at-once",
-        )
+        refusal(ann.get("/v1/jobs"), 429, "too-many-requests-at-once")
         assert bob.get("/v1/jobs").status_code == 200
         held.close(who)
         for path in ("/v1/jobs", "/v1/jobs/x", "/v1/images/x", "/v1/jobs"):
             assert ann.get(path).status_code in (200, 422)
         held.close(who)
-        assert not held._open
+        assert held.total() == 0

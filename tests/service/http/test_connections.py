@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import resource
 import socket
 import threading
@@ -10,11 +9,11 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+import anyio
 import pytest
-import uvicorn
 
 from service.http.connections import FEWEST, ConnectionLimits, bounded
-from tests.whole.stack import free_port, wait_for
+from tests.service.serving import serving
 from workers.settings import Settings
 
 LARGE = bytes(2**20)
@@ -32,7 +31,6 @@ def held() -> Iterator[threading.Event]:
 @pytest.fixture
 def address(held: threading.Event) -> Iterator[tuple[str, int]]:
     """A server of four connections, without the application: /large answers what no socket buffers."""
-    import anyio
 
     async def app(scope: Any, receive: Any, send: Any) -> None:
         if scope["path"] == "/held":
@@ -45,18 +43,9 @@ def address(held: threading.Event) -> Iterator[tuple[str, int]]:
         await send({"type": "http.response.body", "body": b"ok"})
 
     limits = ConnectionLimits(most=MOST, header_s=20.0, stalled_s=0.3)
-    port = free_port()
-    config = uvicorn.Config(
-        app, port=port, http=bounded(limits), lifespan="off", log_level="warning", timeout_graceful_shutdown=1
-    )
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    wait_for(lambda: server.started, "the server listens", timeout_s=20)
-    yield "127.0.0.1", port
-    held.set()
-    server.should_exit = True
-    thread.join(20)
+    with serving(app, http=bounded(limits), lifespan="off") as port:
+        yield "127.0.0.1", port
+        held.set()
 
 
 def connected(address: tuple[str, int], path: str | None = None) -> socket.socket:
@@ -80,13 +69,9 @@ def answer(connection: socket.socket) -> bytes:
 def test_the_connection_that_waits_longest_gives_way(
     address: tuple[str, int], caplog: pytest.LogCaptureFixture
 ) -> None:
-    idle = []
-    for number in range(MOST):
-        idle.append(connected(address, "/" if number == 0 else None))
-        if number == 0:
-            assert answer(idle[0]).startswith(
-                b"HTTP/1.1 200"
-            )  # it waits from now on, so it has waited longest
+    idle = [connected(address, "/")]
+    assert answer(idle[0]).startswith(b"HTTP/1.1 200")  # it waits from now on, so it has waited longest
+    idle += [connected(address) for _ in range(MOST - 1)]
     with connected(address, "/") as another:
         assert answer(another).startswith(b"HTTP/1.1 200")
         assert idle[0].recv(1) == b"", "closed"
@@ -139,29 +124,20 @@ def test_a_client_that_takes_its_answer_slowly_gets_it(address: tuple[str, int])
 # File descriptors -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("soft", "hard", "most", "raised"),
-    [
+def test_connections_are_as_many_as_there_are_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
+    infinity = resource.RLIM_INFINITY
+    for soft, hard, most, raised in (
         (10_000, 10_000, 1024, None),
         (1024, 10_000, 1024, 2128),
-        (1024, resource.RLIM_INFINITY, 1024, 2128),
+        (1024, infinity, 1024, 2128),
         (1024, 1024, 472, 1024),
         (256, 512, 216, 512),
         (64, 64, FEWEST, 64),
-        (resource.RLIM_INFINITY, resource.RLIM_INFINITY, 1024, None),
-    ],
-)
-def test_connections_are_as_many_as_there_are_descriptors(
-    soft: int,
-    hard: int,
-    most: int,
-    raised: int | None,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    set_to: list[tuple[int, int]] = []
-    monkeypatch.setattr(resource, "getrlimit", lambda _what: (soft, hard))
-    monkeypatch.setattr(resource, "setrlimit", lambda _what, limits: set_to.append(limits))
-    caplog.set_level(logging.WARNING)
-    assert ConnectionLimits.of(Settings(max_connections=1024)).most == most
-    assert set_to == ([] if raised is None else [(raised, hard)])
+        (infinity, infinity, 1024, None),
+    ):
+        limits: list[tuple[int, int]] = []
+        with monkeypatch.context() as patched:
+            patched.setattr(resource, "getrlimit", lambda _what, both=(soft, hard): both)
+            patched.setattr(resource, "setrlimit", lambda _what, both, limits=limits: limits.append(both))
+            assert ConnectionLimits.of(Settings(max_connections=1024)).most == most, (soft, hard)
+        assert limits == ([] if raised is None else [(raised, hard)]), (soft, hard)

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import signal
 import socket
 import threading
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
 import uvicorn
-from fastapi import FastAPI
 
 from service import server
+from tests.service.conftest import settings_in
+from tests.service.serving import in_own_loop
 from tests.whole.stack import wait_for
-from workers.settings import Settings
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
@@ -35,9 +36,9 @@ def test_answers_on_a_connection_that_is_used_again_do_not_wait_for_an_acknowled
         with server.listening(host, 0) as listener:
             async with await asyncio.start_server(look, sock=listener):
                 _, client = await asyncio.open_connection(*listener.getsockname()[:2])
-                found = await asyncio.wait_for(accepted, 10)
+                off = await asyncio.wait_for(accepted, 10)
                 client.close()
-        return found
+        return off
 
     try:
         server.listening(host, 0).close()
@@ -45,7 +46,7 @@ def test_answers_on_a_connection_that_is_used_again_do_not_wait_for_an_acknowled
         if host != "::1":
             raise
         pytest.skip(f"this machine has no IPv6: {error}")
-    assert asyncio.run(delay_is_off())
+    assert in_own_loop(delay_is_off)
 
 
 def test_a_port_that_is_in_use_is_refused() -> None:
@@ -55,41 +56,35 @@ def test_a_port_that_is_in_use_is_refused() -> None:
             server.listening("127.0.0.1", listener.getsockname()[1])
 
 
-class Configured(Exception):
-    """Raised in place of a start. settings: those of uvicorn."""
-
-    def __init__(self, settings: dict[str, Any]) -> None:
-        self.settings = settings
-
-
-def test_an_idle_connection_stays_open_longer_than_clients_use_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def config(_: FastAPI, **settings: Any) -> None:
-        raise Configured(settings)
-
-    monkeypatch.setattr(server.uvicorn, "Config", config)
-    monkeypatch.setattr(server.logs, "configure", lambda settings, *, verbose: None)
-    with pytest.raises(Configured) as raised:
-        server.serve(Settings(data_dir=tmp_path), "127.0.0.1", 0, lambda address: None)
-    used_for_s = httpx.Limits().keepalive_expiry
-    assert used_for_s is not None and raised.value.settings["timeout_keep_alive"] > 2 * used_for_s
-
-
 @pytest.fixture
 def unfrozen() -> Iterator[None]:
-    """The garbage collector, as it was before."""
+    """Nothing is kept from the garbage collector, now and afterwards; signals are handled afterwards as before."""
+    handler = signal.getsignal(signal.SIGTERM)
+    gc.unfreeze()
     yield
     gc.unfreeze()
+    signal.signal(signal.SIGTERM, handler)
 
 
 @pytest.mark.usefixtures("unfrozen")
-def test_the_garbage_collector_does_not_look_again_at_what_the_start_has_loaded() -> None:
-    assert gc.get_freeze_count() == 0
-    with server.listening("127.0.0.1", 0) as listener:
-        running = server._Server(uvicorn.Config(FastAPI(), log_level="warning", lifespan="off"))
-        thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
+def test_a_started_server_keeps_idle_connections_and_spares_the_garbage_collector(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An idle connection stays open longer than clients use it; what the start has loaded is not looked at again."""
+    servers: list[uvicorn.Server] = []
+    run = uvicorn.Server.run
+
+    def run_and_stop(running: uvicorn.Server, sockets: list[socket.socket]) -> None:
+        servers.append(running)
+        thread = threading.Thread(target=run, args=(running, sockets))
         thread.start()
         wait_for(lambda: running.started and gc.get_freeze_count() > 0, "the server listens", timeout_s=20)
         running.should_exit = True
         thread.join(20)
+
+    monkeypatch.setattr(uvicorn.Server, "run", run_and_stop)
+    monkeypatch.setattr(server, "embedded_worker", lambda settings: nullcontext())
+    monkeypatch.setattr(server.logs, "configure", lambda settings, *, verbose: None)
+    server.serve(settings_in(tmp_path), "127.0.0.1", 0, lambda address: None)
+    used_for_s = httpx.Limits().keepalive_expiry
+    assert used_for_s is not None and servers[0].config.timeout_keep_alive > 2 * used_for_s
