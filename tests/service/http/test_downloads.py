@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,12 @@ from fastapi.testclient import TestClient
 from service.cli.main import main
 from service.client.errors import ServiceError
 from service.client.http import Client
-from tests.service.conftest import upload
+from tests.conftest import write_psf
+from tests.service.conftest import job_after, refusal, result_of, upload
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
 from workers.files.store import Store
 from workers.settings import Settings
-from workers.tasks import deconvolve
 
 
 @pytest.fixture
@@ -30,36 +30,15 @@ def store(settings: Settings) -> Store:
 
 
 @pytest.fixture
-def catalogue(settings: Settings, api: TestClient) -> Iterator[Catalogue]:
-    catalogue = Catalogue(settings.catalogue_url)
-    yield catalogue
-    catalogue.close()
-
-
-@pytest.fixture
-def request_body(api: TestClient, image_file: Path, psf_file: Path) -> dict[str, Any]:
+def parameters(api: TestClient, image_file: Path, psf_file: Path) -> dict[str, Any]:
     image, psf = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
-    method = {"name": "richardson-lucy", "steps": 2}
-    return {"kind": "deconvolve", "parameters": {"image_id": image, "psf_id": psf, "method": method}}
+    return {"image_id": image, "psf_id": psf, "method": {"name": "richardson-lucy", "steps": 1}}
 
 
 @pytest.fixture
-def product(api: TestClient, run_jobs: Callable[[], None], request_body: dict[str, Any]) -> dict[str, Any]:
+def product(api: TestClient, run_jobs: Callable[[], None], parameters: dict[str, Any]) -> dict[str, Any]:
     """A product that was just made."""
-    return done(api, run_jobs, request_body)
-
-
-def done(api: TestClient, run_jobs: Callable[[], None], body: dict[str, Any]) -> dict[str, Any]:
-    job = api.post("/v1/jobs", json=body).json()
-    run_jobs()
-    found = api.get(f"/v1/jobs/{job['id']}").json()
-    assert found["phase"] == "COMPLETED", found["error"]
-    made: dict[str, Any] = api.get(found["result"]).json()
-    return made
-
-
-def code_of(answer: httpx.Response) -> str:
-    return str(answer.json()["type"]).removeprefix("urn:heliopsf:")
+    return result_of(api, run_jobs, "deconvolve", **parameters)
 
 
 def halve(path: Path) -> None:
@@ -70,50 +49,36 @@ def zero(path: Path) -> None:
     path.write_bytes(bytes(path.stat().st_size))
 
 
-def test_a_good_file_declares_its_hash(api: TestClient, product: dict[str, Any]) -> None:
-    answer = api.get(product["file"])
-    content = base64.b64encode(hashlib.sha256(answer.content).digest()).decode()
-    assert answer.status_code == 200 and answer.headers["repr-digest"] == f"sha-256=:{content}:"
-
-
-@pytest.mark.parametrize(("spoil", "code"), [(halve, "file-damaged"), (Path.unlink, "file-lost")])
-def test_a_product_that_is_not_whole_is_not_sent(
+def test_a_product_that_is_not_whole_is_not_sent_and_is_made_again(
     api: TestClient,
+    run_jobs: Callable[[], None],
+    parameters: dict[str, Any],
     product: dict[str, Any],
     store: Store,
     catalogue: Catalogue,
-    spoil: Callable[[Path], None],
-    code: str,
 ) -> None:
+    spoilers: tuple[tuple[Callable[[Path], None], str], ...] = (
+        (halve, "file-damaged"),
+        (Path.unlink, "file-lost"),
+    )
+    for spoil, code in spoilers:
+        good = api.get(product["file"])
+        content = base64.b64encode(hashlib.sha256(good.content).digest()).decode()
+        assert good.status_code == 200 and good.headers["repr-digest"] == f"sha-256=:{content}:"
+        row = catalogue.get(ProductRow, product["id"], DEFAULT_OWNER)
+        assert row is not None
+        for part, digest in (("file", row.file_sha256), ("preview", row.preview_sha256)):
+            spoil(store.path(digest))
+            assert "submit the same request again" in refusal(api.get(product[part]), 410, code)
+        again = result_of(api, run_jobs, "deconvolve", **parameters)
+        assert again["id"] == product["id"]
+        file = api.get(again["file"])
+        assert file.status_code == 200 and len(file.content) == len(good.content)
+        assert hashlib.sha256(file.content).hexdigest() == again["sha256"]
     row = catalogue.get(ProductRow, product["id"], DEFAULT_OWNER)
     assert row is not None
-    for part, digest in (("file", row.file_sha256), ("preview", row.preview_sha256)):
-        spoil(store.path(digest))
-        answer = api.get(product[part])
-        assert (answer.status_code, code_of(answer)) == (410, code)
-        assert "submit the same request again" in answer.json()["detail"]
     store.path(row.preview_sha256).write_bytes(bytes(1000))  # a picture's size is not recorded
-    assert code_of(api.get(product["preview"])) == "file-damaged"
-
-
-@pytest.mark.parametrize("spoil", [halve, Path.unlink])
-def test_the_same_request_makes_a_lost_product_again(
-    api: TestClient,
-    run_jobs: Callable[[], None],
-    request_body: dict[str, Any],
-    product: dict[str, Any],
-    store: Store,
-    spoil: Callable[[Path], None],
-) -> None:
-    before = api.get(product["file"]).content
-    spoil(store.path(product["sha256"]))
-    answer = api.post("/v1/jobs", json=request_body)
-    assert (answer.status_code, answer.json()["phase"]) == (202, "QUEUED")
-    again = done(api, run_jobs, request_body)
-    assert again["id"] == product["id"]
-    found = api.get(again["file"])
-    assert found.status_code == 200 and len(found.content) == len(before)
-    assert hashlib.sha256(found.content).hexdigest() == again["sha256"]
+    refusal(api.get(product["preview"]), 410, "file-damaged")
 
 
 def test_the_client_refuses_what_has_another_hash(
@@ -133,36 +98,30 @@ def test_the_client_refuses_what_has_another_hash(
     assert list(tmp_path.glob("product*")) == []
 
 
-@pytest.mark.parametrize(
-    ("which", "spoil", "code"),
-    [
-        ("image_id", zero, "file-damaged"),
-        ("image_id", Path.unlink, "file-lost"),
-        ("psf_id", zero, "file-damaged"),
-    ],
-)
 def test_a_changed_upload_is_refused_until_it_is_uploaded_again(
     api: TestClient,
     run_jobs: Callable[[], None],
-    request_body: dict[str, Any],
+    parameters: dict[str, Any],
     store: Store,
     image_file: Path,
     psf_file: Path,
-    which: str,
-    spoil: Callable[[Path], None],
-    code: str,
 ) -> None:
-    deconvolve._prepared.cache_clear()  # a worker may still have the PSF in its memory
-    digest = request_body["parameters"][which]
-    spoil(store.path(digest))
-    job = api.post("/v1/jobs", json=request_body).json()
-    run_jobs()
-    error = api.get(f"/v1/jobs/{job['id']}").json()["error"]
-    assert (error["fault"], error["code"]) == ("user", code)
-    assert digest in error["message"] and "upload it again" in error["message"]
-    upload(api, image_file)
-    upload(api, psf_file, "/v1/psfs")
-    done(api, run_jobs, request_body)
+    psf_file.unlink()
+    write_psf(psf_file, size=40)  # as no other test has it: a worker keeps PSFs in its memory
+    parameters["psf_id"] = upload(api, psf_file, "/v1/psfs")
+    spoilers: tuple[tuple[str, Callable[[Path], None], str], ...] = (
+        ("psf_id", zero, "file-damaged"),
+        ("image_id", zero, "file-damaged"),
+        ("image_id", Path.unlink, "file-lost"),
+    )
+    for which, spoil, code in spoilers:
+        spoil(store.path(parameters[which]))
+        error = job_after(api, run_jobs, "deconvolve", **parameters)["error"]
+        assert (error["fault"], error["code"]) == ("user", code)
+        assert parameters[which] in error["message"] and "upload it again" in error["message"]
+        upload(api, image_file)
+        upload(api, psf_file, "/v1/psfs")
+    result_of(api, run_jobs, "deconvolve", **parameters)
 
 
 def store_check(settings: Settings, *options: str) -> tuple[int, str]:
@@ -176,38 +135,30 @@ def test_store_check_finds_lost_and_damaged_files_and_has_them_made_again(
     settings: Settings,
     store: Store,
     product: dict[str, Any],
-    request_body: dict[str, Any],
+    parameters: dict[str, Any],
+    image_file: Path,
 ) -> None:
+    image = parameters["image_id"]
     assert store_check(settings) == (0, "all files are good\n")
     zero(store.path(product["sha256"]))
-    store.path(request_body["parameters"]["image_id"]).unlink()
+    store.path(image).unlink()
     status, text = store_check(settings, "--sizes")
     assert status == 1 and "image" in text and "product" not in text, "its size is right"
     status, text = store_check(settings)
     lines = text.splitlines()
     assert status == 1 and len(lines) == 3
-    assert lines[0].split() == [
-        "image", DEFAULT_OWNER, request_body["parameters"]["image_id"], "lost", request_body["parameters"]["image_id"],
-    ]  # fmt: skip
+    assert lines[0].split() == ["image", DEFAULT_OWNER, image, "lost", image]
     assert lines[1].split()[:3] == ["product", DEFAULT_OWNER, product["id"]]
     assert f"damaged {product['sha256']}" in lines[1] and "--repair" in lines[2]
     status, text = store_check(settings, "--repair")
-    assert "must upload the file again" in text
-    assert "makes it again" in text
+    assert status == 1 and "must upload the file again" in text and "makes it again" in text
     assert api.get(product["file"]).status_code == 410, "until the job has run, the damaged file is not sent"
-
-
-def test_a_repaired_product_is_good_again(
-    api: TestClient, run_jobs: Callable[[], None], settings: Settings, store: Store, product: dict[str, Any]
-) -> None:
-    zero(store.path(product["sha256"]))
-    assert store_check(settings, "--repair")[0] == 1
+    upload(api, image_file)
     run_jobs()
     assert store_check(settings) == (0, "all files are good\n")
     assert api.get(product["file"]).status_code == 200
-    assert len(list((settings.data_dir / "damaged").iterdir())) == 1, (
-        "what was damaged is kept for the operator"
-    )
+    damaged = list((settings.data_dir / "damaged").iterdir())
+    assert len(damaged) == 1, "what was damaged is kept for the operator"
 
 
 def test_a_product_whose_job_was_deleted_is_made_again(

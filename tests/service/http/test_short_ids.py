@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
 from fastapi.testclient import TestClient
 
 from tests.conftest import write_psf
-from tests.service.conftest import upload
-from tests.service.keyed import Keyed, keyed
+from tests.service.conftest import refusal, result_of, upload
+from tests.service.keyed import Keyed
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.owners import counted_bytes
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, ProductRow
 from workers.contract.phases import Phase
-from workers.settings import Settings
 
 SAME = "0123456789"  # the first digits of several ids
 
@@ -25,12 +23,6 @@ def product(identity: str, owner: str = DEFAULT_OWNER) -> ProductRow:
         owner=owner, id=identity, created_at=1.0, kind="deconvolved", image_id="1" * 64, psf_id="2" * 64,
         psf_version="1", file_sha256="3" * 64, bytes=1, preview_sha256="4" * 64, details={},
     )  # fmt: skip
-
-
-@pytest.fixture
-def catalogue(api: TestClient) -> Catalogue:
-    found: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
-    return found
 
 
 def test_the_first_digits_of_an_id_stand_for_it(
@@ -45,12 +37,9 @@ def test_the_first_digits_of_an_id_stand_for_it(
     assert api.get(f"/v1/images/{image[:9]}/psf").status_code == 409, "found; it has no known instrument"
     write_psf(tmp_path / "other.fits", size=48)
     other = upload(api, tmp_path / "other.fits", "/v1/psfs")
-    refused = api.get(f"/v1/psfs/{psf[:8]}/compare/{other[:8]}").json()
-    assert refused["type"] == "urn:heliopsf:no-tables", "both were found"
-    job = api.post(
-        "/v1/jobs",
-        json={"kind": "deconvolve", "parameters": {"image_id": image, "psf_id": psf}},
-    ).json()["id"]
+    refusal(api.get(f"/v1/psfs/{psf[:8]}/compare/{other[:8]}"), 409, "no-tables")  # both were found
+    body = {"kind": "deconvolve", "parameters": {"image_id": image, "psf_id": psf}}
+    job = api.post("/v1/jobs", json=body).json()["id"]
     assert api.get(f"/v1/jobs/{job[:8]}").json()["id"] == job
     assert f"{job}</" in api.get(f"/uws/jobs/{job[:10]}").text
     assert api.get(f"/uws/jobs/{job[:10]}/phase").text == "QUEUED"
@@ -62,46 +51,29 @@ def test_digits_of_several_ids_are_refused_with_the_candidates(api: TestClient, 
     for identity in ids:
         catalogue.add(product(identity))
     refused = api.get(f"/v1/products/{SAME}")
-    assert refused.status_code == 409 and refused.json()["type"] == "urn:heliopsf:several-ids-fit"
-    assert refused.json()["candidates"] == ids
-    assert all(identity in refused.json()["detail"] for identity in ids)
+    detail = refusal(refused, 409, "several-ids-fit")
+    assert refused.json()["candidates"] == ids and all(identity in detail for identity in ids)
     assert api.get(f"/v1/products/{SAME}a").json()["id"] == ids[1]
     many = api.delete(f"/v1/products/{SAME}")
     assert many.status_code == 409 and len(api.get("/v1/products").json()["items"]) == 3
 
 
-@pytest.mark.parametrize(
-    ("address", "code"),
-    [
-        ("/v1/products/01234567", "no-such-product"),
-        ("/v1/psfs/01234567/file", "no-such-psf"),
-        ("/v1/jobs/01234567", "no-such-job"),
-        ("/v1/bulk/01234567", "no-such-bulk"),
-        ("/v1/images/01234567", "no-such-image"),
-        ("/v1/reports/01234567", "no-such-report"),
-        ("/v1/transits/01234567", "no-such-transit"),
-        ("/v1/products/0123456", "invalid-request"),
-        ("/v1/products/0123456_", "invalid-request"),
-        ("/v1/products/%2e%2e%2f01234567", "http-404"),
-    ],
-)
-def test_digits_of_no_id_are_refused(api: TestClient, address: str, code: str) -> None:
-    refused = api.get(address)
-    assert refused.status_code in (404, 422)
-    assert refused.json()["type"] == f"urn:heliopsf:{code}"
-    if code.startswith("no-such"):
-        assert "its first 8 or more digits" in refused.json()["detail"]
-
-
-def test_uws_answers_in_plain_text(api: TestClient) -> None:
-    refused = api.get("/uws/jobs/01234567/phase")
+def test_digits_of_no_id_are_refused(shared_api: TestClient) -> None:
+    for kind, code in (
+        ("products", "no-such-product"),
+        ("psfs", "no-such-psf"),
+        ("jobs", "no-such-job"),
+        ("bulk", "no-such-bulk"),
+        ("images", "no-such-image"),
+        ("reports", "no-such-report"),
+        ("transits", "no-such-transit"),
+    ):
+        detail = refusal(shared_api.get(f"/v1/{kind}/01234567"), 404, code)
+        assert "its first 8 or more digits" in detail
+        for digits in ("0123456", "0123456_"):
+            refusal(shared_api.get(f"/v1/{kind}/{digits}"), 422, "invalid-request")
+    refused = shared_api.get("/uws/jobs/01234567/phase")
     assert refused.status_code == 404 and refused.headers["content-type"].startswith("text/plain")
-
-
-@pytest.fixture
-def service(settings: Settings) -> Keyed:
-    with keyed(settings) as found:
-        yield found
 
 
 def test_ids_of_other_owners_are_not_found_and_do_not_make_digits_ambiguous(service: Keyed) -> None:
@@ -122,13 +94,10 @@ def test_a_product_is_deleted_and_the_same_request_makes_it_again(
     psf_file: Path,
 ) -> None:
     image, psf = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
-    asked = {
-        "kind": "deconvolve",
-        "parameters": {"image_id": image, "psf_id": psf, "method": {"name": "linear", "steps": 1}},
-    }
-    first = api.post("/v1/jobs", json=asked).json()["id"]
-    run_jobs()
-    made = api.get(api.get(f"/v1/jobs/{first}").json()["result"]).json()
+    parameters = {"image_id": image, "psf_id": psf, "method": {"name": "linear", "steps": 1}}
+    body = {"kind": "deconvolve", "parameters": parameters}
+    made = result_of(api, run_jobs, "deconvolve", **parameters)
+    first = made["details"]["job_id"]
     used = catalogue.owners.usage(DEFAULT_OWNER, 0).used_bytes
     product = catalogue.get(ProductRow, made["id"], DEFAULT_OWNER)
     assert product is not None
@@ -140,12 +109,11 @@ def test_a_product_is_deleted_and_the_same_request_makes_it_again(
     assert list(catalogue.owners.recount()) == []
     row = catalogue.jobs.get(first)
     assert row is not None and row.phase == Phase.COMPLETED, "the job stays"
-    again = api.post("/v1/jobs", json=asked).json()
+    again = api.post("/v1/jobs", json=body).json()
     assert again["id"] != first and again["phase"] == "QUEUED"
     run_jobs()
-    remade = api.get(f"/v1/products/{made['id']}").json()
-    assert remade["sha256"] == made["sha256"]
-    assert api.post("/v1/jobs", json=asked).json()["id"] == again["id"], "shared as before"
+    assert api.get(f"/v1/products/{made['id']}").json()["sha256"] == made["sha256"]
+    assert api.post("/v1/jobs", json=body).json()["id"] == again["id"], "shared as before"
     assert len(catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=9)) == 2
 
 

@@ -8,7 +8,7 @@ import os
 import random
 import sqlite3
 import string
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +18,8 @@ from astropy.io import fits
 from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
-from service.app import create_app
 from tests.conftest import write_image
-from tests.service.conftest import upload
+from tests.service.conftest import refusal, upload
 from tests.service.keyed import keyed
 from tests.whole.stack import Missing, postgres_database
 from workers import checks
@@ -28,8 +27,6 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.owners import ROW_BYTES
 from workers.catalogue.tables import ImageRow
 from workers.settings import Settings
-
-PLACES = ("/v1/images", "/v1/psfs")
 
 
 def blobs(settings: Settings) -> list[str]:
@@ -76,25 +73,24 @@ def test_a_header_with_long_texts_is_cut(any_database: Settings) -> None:
         assert ann.get(f"/v1/psfs?name={long[:80]}").json()["items"][0]["id"] == psf.json()["id"]
 
 
-@pytest.mark.parametrize("where", PLACES)
 def test_the_file_of_a_row_that_fails_goes(
-    settings: Settings, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch, where: str
+    api: TestClient, settings: Settings, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = psf_file if where == "/v1/psfs" else image_file
-
     def fail(*_: object) -> None:
         raise OperationalError("INSERT", {}, Exception("the disk is on fire"))
 
-    with TestClient(create_app(settings), raise_server_exceptions=False) as api:
+    def fails(file: Path, where: str) -> None:
         with monkeypatch.context() as patched:
             patched.setattr(Catalogue, "add", fail)
             assert api.post(where, content=file.read_bytes()).status_code == 503
-        assert blobs(settings) == []
-        identity = upload(api, file, where)
-        with monkeypatch.context() as patched:
-            patched.setattr(Catalogue, "add", fail)
-            assert api.post(where, content=file.read_bytes()).status_code == 503
-        assert blobs(settings) == [identity], "it was there before"
+
+    there: list[str] = []
+    for file, where in ((image_file, "/v1/images"), (psf_file, "/v1/psfs")):
+        fails(file, where)
+        assert blobs(settings) == sorted(there), where
+        there.append(upload(api, file, where))
+        fails(file, where)
+        assert blobs(settings) == sorted(there), "it was there before"
 
 
 def test_an_upload_that_does_not_fit_leaves_no_file(settings: Settings, tmp_path: Path) -> None:
@@ -112,7 +108,7 @@ def test_an_upload_that_does_not_fit_leaves_no_file(settings: Settings, tmp_path
 
         headers = {"Content-Length": str(len(content))}
         refused = ann.post("/v1/images", content=body(), headers=headers)
-        assert (refused.status_code, refused.json()["type"]) == (413, "urn:heliopsf:quota-exceeded")
+        refusal(refused, 413, "quota-exceeded")
         assert blobs(settings) == [one["id"] for one in ann.get("/v1/images").json()["items"]]
 
 
@@ -136,7 +132,7 @@ def test_rows_count_in_the_quota(settings: Settings, image_file: Path) -> None:
             if answer.status_code != 201:
                 break
             sent += 1
-        assert (answer.status_code, answer.json()["type"]) == (413, "urn:heliopsf:quota-exceeded")
+        refusal(answer, 413, "quota-exceeded")
         assert 3 < sent < left / ROW_BYTES
         assert service.catalogue.owners.recount() == []
 
@@ -144,12 +140,11 @@ def test_rows_count_in_the_quota(settings: Settings, image_file: Path) -> None:
 # A full disk ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("where", PLACES)
 def test_a_full_disk_is_said_to_be_full(
-    api: TestClient, settings: Settings, image_file: Path, monkeypatch: pytest.MonkeyPatch, where: str
+    shared_api: TestClient, image_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """/dev/full answers every write as a full disk does."""
-    store = api.app.state.heliopsf.store  # type: ignore[attr-defined]
+    state = shared_api.app.state.heliopsf
 
     class Full:
         def __enter__(self) -> Path:
@@ -158,10 +153,11 @@ def test_a_full_disk_is_said_to_be_full(
         def __exit__(self, *_: object) -> None:
             return None
 
-    monkeypatch.setattr(store, "temporary", Full)
-    answer = api.post(where, content=image_file.read_bytes())
-    assert (answer.status_code, answer.json()["type"]) == (507, "urn:heliopsf:storage-full"), answer.text
-    assert "disk is full" in answer.json()["detail"] and str(settings.data_dir) not in answer.text
+    monkeypatch.setattr(state.store, "temporary", Full)
+    for where in ("/v1/images", "/v1/psfs"):
+        answer = shared_api.post(where, content=image_file.read_bytes())
+        assert "disk is full" in refusal(answer, 507, "storage-full")
+        assert str(state.settings.data_dir) not in answer.text
 
 
 def full_sqlite() -> Exception:
@@ -175,25 +171,20 @@ def full_sqlite() -> Exception:
     return error.value
 
 
-@pytest.mark.parametrize("original", [full_sqlite, psycopg.errors.DiskFull])
-def test_a_full_disk_of_the_database_is_said_to_be_full(
-    api: TestClient, monkeypatch: pytest.MonkeyPatch, original: Callable[[], Exception]
+def test_errors_of_the_system_behind_the_database(
+    shared_api: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise OperationalError("INSERT", {}, original())
+    for error, status, code in (
+        (OperationalError("INSERT", {}, full_sqlite()), 507, "storage-full"),
+        (OperationalError("INSERT", {}, psycopg.errors.DiskFull()), 507, "storage-full"),
+        (OSError(5, os.strerror(5)), 500, "internal-error"),
+    ):
 
-    monkeypatch.setattr(Catalogue, "page", fail)
-    answer = api.get("/v1/images")
-    assert (answer.status_code, answer.json()["type"]) == (507, "urn:heliopsf:storage-full")
+        def fail(*_: object, error: Exception = error, **__: object) -> None:
+            raise error
 
-
-def test_other_errors_of_the_system_are_internal(api: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise OSError(5, os.strerror(5))
-
-    monkeypatch.setattr(Catalogue, "page", fail)
-    answer = api.get("/v1/images")
-    assert (answer.status_code, answer.json()["type"]) == (500, "urn:heliopsf:internal-error")
+        monkeypatch.setattr(Catalogue, "page", fail)
+        refusal(shared_api.get("/v1/images"), status, code)
 
 
 def test_little_room_is_refused_before_it_is_used_up(
@@ -204,8 +195,7 @@ def test_little_room_is_refused_before_it_is_used_up(
     content = image_file.read_bytes()
     for body in (content, iter([content[:2880], content[2880:]])):
         answer = api.post("/v1/images", content=body)
-        assert (answer.status_code, answer.json()["type"]) == (507, "urn:heliopsf:storage-full"), answer.text
-        assert "ask the operator to make room" in answer.json()["detail"]
+        assert "ask the operator" in refusal(answer, 507, "storage-full")
     assert blobs(settings) == []
     assert api.get("/readyz").json()["parts"]["storage"] == "ok"
     free = settings.min_free_mib * 2**20 - 1
