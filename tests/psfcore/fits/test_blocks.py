@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from psfcore.errors import HeaderError
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.header import FitsLimits, check_all_headers, read_summary
 from tests.psfcore.fits.raw_files import block, compressed, cube, empty_primary, good, image_cards, table
 
 SMALL = FitsLimits(max_pixels=4096 * 4096, max_header_bytes=64 * 1024, max_hdus=8)
@@ -27,9 +28,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::astropy.utils.exceptions.Astrop
 BAD = {
     "empty": (b"", "empty-file"),
     "text": (b"hello, I am an image\n" * 200, "not-fits"),
-    "html": (b"<html>" + b" " * 3000, "not-fits"),
     "jpeg 2000": (b"\x00\x00\x00\x0cjP  \r\n\x87\n" + bytes(5000), "not-fits"),
-    "zip": (b"PK\x03\x04" + bytes(5000), "not-fits"),
     "zeros": (bytes(5760), "not-fits"),
     "five bytes": (b"SIMPL", "truncated-header"),
     "cut in the header": (good()[:400], "truncated-header"),
@@ -79,32 +78,29 @@ BAD = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_a_bad_file_raises_its_error_code(tmp_path: Path, name: str) -> None:
-    content, code = BAD[name]
+def test_a_bad_file_raises_its_error_code(tmp_path: Path, subtests: pytest.Subtests) -> None:
     path = tmp_path / "file.fits"
-    path.write_bytes(content)
-    with pytest.raises(HeaderError) as caught:
-        read_summary(path, SMALL)
-    assert caught.value.code == code
-    assert "expected" in caught.value.message
-    assert len(caught.value.message) < 300
+    for name, (content, code) in BAD.items():
+        path.write_bytes(content)
+        with subtests.test(name), pytest.raises(HeaderError, match=f"^{code}: .*expected") as caught:
+            read_summary(path, SMALL)
+        assert len(caught.value.message) < 300, name
 
 
-@pytest.mark.parametrize("shape", [(1, 5, 6), (1, 2, 5, 6)])
-@pytest.mark.parametrize("hdu", [0, 1])
 def test_the_error_about_a_cube_says_how_to_write_one_plane(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, ...], hdu: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cube = np.arange(np.prod(shape), dtype="f4").reshape(shape)
-    image = fits.PrimaryHDU(cube) if hdu == 0 else fits.ImageHDU(cube)
-    fits.HDUList([*[fits.PrimaryHDU()] * hdu, image]).writeto(tmp_path / "FILE")
-    with pytest.raises(HeaderError) as caught:
-        read_summary(tmp_path / "FILE", SMALL)
     monkeypatch.chdir(tmp_path)
-    exec(caught.value.message.partition("astropy: ")[2], {"fits": fits})
-    assert read_summary(tmp_path / "NEW", SMALL).shape == (5, 6)
-    np.testing.assert_array_equal(fits.getdata(tmp_path / "NEW", hdu), cube.reshape(-1, 5, 6)[0])
+    for shape, hdu in (((1, 5, 6), 0), ((1, 2, 5, 6), 1)):
+        cube = np.arange(np.prod(shape), dtype="f4").reshape(shape)
+        image = fits.PrimaryHDU(cube) if hdu == 0 else fits.ImageHDU(cube)
+        fits.HDUList([*[fits.PrimaryHDU()] * hdu, image]).writeto(tmp_path / "FILE", overwrite=True)
+        (tmp_path / "NEW").unlink(missing_ok=True)
+        with pytest.raises(HeaderError) as caught:
+            read_summary(tmp_path / "FILE", SMALL)
+        exec(caught.value.message.partition("astropy: ")[2], {"fits": fits})
+        assert read_summary(tmp_path / "NEW", SMALL).shape == (5, 6)
+        np.testing.assert_array_equal(fits.getdata(tmp_path / "NEW", hdu), cube.reshape(-1, 5, 6)[0])
 
 
 def test_a_gzip_bomb_is_refused_before_it_is_inflated(tmp_path: Path) -> None:
@@ -113,9 +109,8 @@ def test_a_gzip_bomb_is_refused_before_it_is_inflated(tmp_path: Path) -> None:
     cards = ["BITPIX  = 8", "NAXIS   = 2", "NAXIS1  = 8", f"NAXIS2  = {rows}", "PCOUNT  = 0", "GCOUNT  = 1"]
     path = tmp_path / "bomb.fits.gz"
     path.write_bytes(gzip.compress(empty_primary() + block("XTENSION= 'BINTABLE'", *cards) + bytes(10**7)))
-    with pytest.raises(HeaderError) as caught:
+    with pytest.raises(HeaderError, match=r"^too-many-bytes"):
         read_summary(path, SMALL)
-    assert caught.value.code == "too-many-bytes"
 
 
 def test_no_pixel_is_inflated(tmp_path: Path) -> None:
@@ -126,69 +121,57 @@ def test_no_pixel_is_inflated(tmp_path: Path) -> None:
     assert (summary.hdu, summary.shape, summary.codec, summary.bitpix) == (1, (16, 32), "RICE_1", 16)
 
 
-@pytest.mark.parametrize("codec", ["RICE_1", "GZIP_1", "GZIP_2", "NOCOMPRESS"])
-def test_files_compressed_by_astropy_are_accepted(tmp_path: Path, codec: str) -> None:
-    path = tmp_path / "tiles.fits"
-    hdu = fits.CompImageHDU(
-        np.arange(40 * 50, dtype=np.int16).reshape(40, 50), compression_type=codec, tile_shape=(7, 9)
-    )
-    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(path)
-    summary = read_summary(path, SMALL)
-    assert (summary.shape, summary.codec) == ((40, 50), codec)
+def test_all_headers_together_obey_one_limit(tmp_path: Path) -> None:
+    long = fits.PrimaryHDU()
+    for number in range(400):
+        long.header.add_history(f"{number}")
+    more = [fits.ImageHDU(header=long.header.copy()) for _ in range(5)]
+    fits.HDUList([long, *more]).writeto(tmp_path / "long.fits")
+    check_all_headers(tmp_path / "long.fits", FitsLimits(max_pixels=100, max_header_bytes=250_000))
+    with pytest.raises(HeaderError, match=r"^header-too-long"):
+        check_all_headers(tmp_path / "long.fits", FitsLimits(max_pixels=100, max_header_bytes=150_000))
 
 
-def only_header_errors(folder: Path, content: bytes) -> None:
-    path = folder / "fuzz.fits"
-    path.write_bytes(content)
+def damaged(base: bytes, changes: list[tuple[int, bytes]]) -> bytes:
+    content = bytearray(base)
+    for at, new in changes:
+        content[at : at + len(new)] = new
+    return bytes(content)
+
+
+KEYS = (
+    *("NAXIS", "NAXIS1", "NAXIS2", "PCOUNT", "GCOUNT", "BITPIX", "ZNAXIS", "ZNAXIS1", "ZTILE1", "ZTILE2"),
+    *("ZBITPIX", "ZIMAGE", "ZCMPTYPE", "CDELT1", "XPOSURE", "PXBEG1"),
+)
+VALUES = st.one_of(
+    st.integers(-(2**70), 2**70), st.sampled_from(["T", "F", "'x'", "1E400", "nan", "", "(1,2)", "&"])
+)
+CHANGES = st.lists(
+    st.tuples(st.integers(0, 5759), st.binary(min_size=1, max_size=30)), min_size=1, max_size=8
+)
+MUTATED = st.builds(damaged, st.sampled_from([good(), compressed(), table(), cube(4, 4, 4)]), CHANGES)
+JUNK = st.builds(
+    bytes.__add__, st.sampled_from([b"", b"SIMPLE  =", b"\x1f\x8b\x08"]), st.binary(max_size=6000)
+)
+FALSE_CARDS = st.dictionaries(st.sampled_from(KEYS), VALUES, min_size=1).map(
+    lambda cards: compressed(**cards)
+)
+
+
+@hypothesis_settings(
+    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.one_of(JUNK, MUTATED, MUTATED.map(gzip.compress), FALSE_CARDS))
+def test_random_bytes_and_damaged_headers_raise_only_header_errors(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "fuzz.fits").write_bytes(content)
     try:
-        summary = read_summary(path, FitsLimits(max_pixels=10**6, max_header_bytes=20_000, max_hdus=4))
+        limits = FitsLimits(max_pixels=10**6, max_header_bytes=20_000, max_hdus=4)
+        summary = read_summary(tmp_path / "fuzz.fits", limits)
     except HeaderError as error:
         assert error.code
     else:
         assert 0 < summary.shape[0] * summary.shape[1] <= 10**6
         json.dumps(dataclasses.asdict(summary), allow_nan=False)
-
-
-FUZZ = settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-@FUZZ
-@given(st.binary(max_size=6000), st.sampled_from([b"", b"SIMPLE  =", b"\x1f\x8b\x08"]))
-def test_random_bytes_raise_only_header_errors(tmp_path: Path, junk: bytes, start: bytes) -> None:
-    only_header_errors(tmp_path, start + junk)
-
-
-@FUZZ
-@given(
-    st.sampled_from([good(), compressed(), table(), cube(4, 4, 4)]),
-    st.lists(st.tuples(st.integers(0, 5759), st.binary(min_size=1, max_size=30)), min_size=1, max_size=8),
-    st.booleans(),
-)
-def test_mutated_headers_raise_only_header_errors(
-    tmp_path: Path, base: bytes, changes: list[tuple[int, bytes]], packed: bool
-) -> None:
-    content = bytearray(base)
-    for at, new in changes:
-        content[at : at + len(new)] = new
-    only_header_errors(tmp_path, gzip.compress(bytes(content), 1) if packed else bytes(content))
-
-
-VALUES = st.one_of(
-    st.integers(-(2**70), 2**70), st.sampled_from(["T", "F", "'x'", "1E400", "nan", "", "(1,2)", "&"])
-)
-
-
-@FUZZ
-@given(
-    st.dictionaries(
-        st.sampled_from(["NAXIS", "NAXIS1", "NAXIS2", "PCOUNT", "GCOUNT", "BITPIX", "ZNAXIS", "ZNAXIS1", "ZTILE1",
-                         "ZTILE2", "ZBITPIX", "ZIMAGE", "ZCMPTYPE", "CDELT1", "XPOSURE", "PXBEG1"]),
-        VALUES,
-        min_size=1,
-    )
-)  # fmt: skip
-def test_false_cards_raise_only_header_errors(tmp_path: Path, changes: dict[str, object]) -> None:
-    only_header_errors(tmp_path, compressed(**changes))
 
 
 def test_a_real_jpeg_2000_is_named(real: Callable[[str], Path]) -> None:

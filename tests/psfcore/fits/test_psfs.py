@@ -70,21 +70,20 @@ def test_single_precision_keeps_the_sum_of_the_full_psf(
     assert read_psf(tmp_path / "p.fits", limits).total == pytest.approx(1.0, abs=1e-7)
 
 
-@pytest.mark.parametrize("shape", [(31, 31), (32, 32), (33, 48)])
-def test_a_psf_of_another_program_is_named_after_its_file(
-    tmp_path: Path, limits: FitsLimits, shape: tuple[int, int]
-) -> None:
-    kernel = np.full(shape, 1e-6)
-    kernel[shape[0] // 2, shape[1] // 2] = 0.9
-    psf = read_psf(save(tmp_path / "other_psf.v2.fits", kernel), limits)
-    assert (psf.name, psf.status, psf.instrument, psf.plate_scale_arcsec) == ("other_psf", "user", None, None)
+def test_a_psf_of_another_program_is_named_after_its_file(tmp_path: Path, limits: FitsLimits) -> None:
+    for shape in ((31, 31), (32, 32), (33, 48)):
+        kernel = np.full(shape, 1e-6)
+        kernel[shape[0] // 2, shape[1] // 2] = 0.9
+        (tmp_path / f"{shape}").mkdir()
+        psf = read_psf(save(tmp_path / f"{shape}" / "other_psf.v2.fits", kernel), limits)
+        assert (psf.name, psf.status) == ("other_psf", "user")
+        assert (psf.instrument, psf.plate_scale_arcsec) == (None, None)
 
 
 def test_a_psf_with_its_peak_in_the_corner_says_so(tmp_path: Path, limits: FitsLimits) -> None:
     path = save(tmp_path / "corner.fits", np.fft.ifftshift(gaussian(32, 1.0)))
-    with pytest.raises(DataError, match="corner origin") as caught:
+    with pytest.raises(DataError, match=r"^psf-not-centred: .*corner origin"):
         read_psf(path, limits)
-    assert caught.value.code == "psf-not-centred"
 
 
 def test_a_real_psf_of_another_program(real: Find, limits: FitsLimits) -> None:

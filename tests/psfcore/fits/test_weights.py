@@ -6,6 +6,7 @@ import gzip
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -20,79 +21,60 @@ from psfcore.fits.weights import check_is_psf
 from psfcore.weight_rules import REACH_GRID_PX
 from tests.conftest import write_image, write_psf
 
-Kernel = NDArray[np.float64]
 LIMITS = FitsLimits(max_pixels=2**24)
 
 
-def told(path: Path) -> str | None:
-    """The code with which a file is refused; None if it can be a PSF."""
+def code_of(read: Callable[[], object]) -> str | None:
+    """The code with which a file is refused; None if it is read."""
     try:
-        check_is_psf(path, read_summary(path, LIMITS), LIMITS)
+        read()
     except DataError as error:
         return error.code
     return None
 
 
-def kernel(ny: int = 33, nx: int = 40) -> Kernel:
+def verdict(path: Path) -> str | None:
+    """The code with which the check refuses a file; None if the file can be a PSF."""
+    return code_of(lambda: check_is_psf(path, read_summary(path, LIMITS), LIMITS))
+
+
+def kernel(ny: int = 33, nx: int = 40, **first: float) -> NDArray[np.float64]:
+    """A Gaussian of sum 1; ``first`` may give another value of its first pixel."""
     y, x = np.indices((ny, nx))
     weights = np.exp(-((y - ny // 2) ** 2 + (x - nx // 2) ** 2) / 8.0)
-    return np.asarray(weights / weights.sum())
-
-
-def off_centre(weights: Kernel) -> Kernel:
-    return np.roll(weights, 1, axis=1)
-
-
-def with_nan(weights: Kernel) -> Kernel:
-    weights[0, 0] = np.nan
+    weights /= weights.sum()
+    weights[0, 0] = first.get("value", weights[0, 0])
     return weights
 
 
-def below_zero(weights: Kernel) -> Kernel:
-    weights[0, 0] = -0.01
-    return weights
+WEIGHTS = [
+    (kernel(), None),
+    (3 * kernel(), "psf-sum"),
+    (0.01 * kernel(), "psf-sum"),
+    (np.roll(kernel(), 1, axis=1), "psf-not-centred"),
+    (kernel(value=np.nan), "psf-nonfinite"),
+    (kernel(value=-0.01), "psf-negative"),
+]
 
 
-def same(weights: Kernel) -> Kernel:
-    return weights
-
-
-@pytest.mark.parametrize(
-    ("change", "code"),
-    [
-        (same, None),
-        (lambda w: w * 3, "psf-sum"),
-        (lambda w: w * 0.01, "psf-sum"),
-        (off_centre, "psf-not-centred"),
-        (with_nan, "psf-nonfinite"),
-        (below_zero, "psf-negative"),
-    ],
-)
-@pytest.mark.parametrize("stored", [">f4", ">f8"])
-@pytest.mark.parametrize("place", ["first", "second", "gzip"])
-def test_weights_are_judged_as_the_jobs_judge_them(
-    tmp_path: Path, change: Callable[[Kernel], Kernel], code: str | None, stored: str, place: str
-) -> None:
-    data = change(kernel()).astype(stored)
-    path = tmp_path / ("p.fits.gz" if place == "gzip" else "p.fits")
-    hdus = [fits.PrimaryHDU(data)] if place != "second" else [fits.PrimaryHDU(), fits.ImageHDU(data)]
-    fits.HDUList(hdus).writeto(tmp_path / "plain.fits")
-    content = (tmp_path / "plain.fits").read_bytes()
-    path.write_bytes(gzip.compress(content) if place == "gzip" else content)
-    assert told(path) == code
-    if code is None:
-        read_psf(path, LIMITS)
-    else:
-        with pytest.raises(DataError) as caught:
-            read_psf(path, LIMITS)
-        assert caught.value.code == code
+def test_weights_are_judged_as_the_jobs_judge_them(tmp_path: Path) -> None:
+    places = ["first", "second", "gzip"]
+    for number, ((weights, code), stored, place) in enumerate(product(WEIGHTS, [">f4", ">f8"], places)):
+        data = weights.astype(stored)
+        hdus = [fits.PrimaryHDU(data)] if place != "second" else [fits.PrimaryHDU(), fits.ImageHDU(data)]
+        path = tmp_path / f"{number}.fits"
+        fits.HDUList(hdus).writeto(path)
+        if place == "gzip":
+            path.write_bytes(gzip.compress(path.read_bytes()))
+        judged = verdict(path), code_of(lambda path=path: read_psf(path, LIMITS))
+        assert judged == (code, code), (code, stored, place)
 
 
 def test_stored_integers_are_scaled(tmp_path: Path) -> None:
     hdu = fits.PrimaryHDU(kernel(32, 32))
     hdu.scale("int16", bscale=2**-20, bzero=10485 * 2**-20)
     hdu.writeto(tmp_path / "p.fits")
-    assert told(tmp_path / "p.fits") is None
+    assert verdict(tmp_path / "p.fits") is None
     assert read_psf(tmp_path / "p.fits", LIMITS).total == pytest.approx(1, abs=1e-3)
 
 
@@ -101,20 +83,20 @@ def test_the_sum_is_that_within_the_reach(tmp_path: Path) -> None:
     wide[1, wide.shape[1] // 2] = 0.9
     wide[:, :10] = 0.5  # beyond the reach
     fits.PrimaryHDU(wide).writeto(tmp_path / "wide.fits")
-    assert told(tmp_path / "wide.fits") is None
+    assert verdict(tmp_path / "wide.fits") is None
     wide[1, 10] = 0.5  # the first pixel of the reach
     fits.PrimaryHDU(wide).writeto(tmp_path / "more.fits")
-    assert told(tmp_path / "more.fits") == "psf-sum"
+    assert verdict(tmp_path / "more.fits") == "psf-sum"
 
 
 def test_images_and_products_are_no_psfs(tmp_path: Path) -> None:
     write_psf(tmp_path / "psf.fits")
-    assert told(tmp_path / "psf.fits") is None
+    assert verdict(tmp_path / "psf.fits") is None
     write_image(tmp_path / "image.fits")
-    assert told(tmp_path / "image.fits") == "psf-sum"
+    assert verdict(tmp_path / "image.fits") == "psf-sum"
     weights = fits.getdata(tmp_path / "psf.fits")
     fits.PrimaryHDU(weights, fits.Header({"PSFID": "a"})).writeto(tmp_path / "product.fits")
-    assert told(tmp_path / "product.fits") == "image-as-psf"
+    assert verdict(tmp_path / "product.fits") == "image-as-psf"
     for name, cards, code in (
         ("seen", {"XPOSURE": 2.0}, "image-as-psf"),
         ("own", {"XPOSURE": 2.0, "PSFSUM": 1.0}, None),
@@ -122,7 +104,7 @@ def test_images_and_products_are_no_psfs(tmp_path: Path) -> None:
     ):
         packed = fits.CompImageHDU(fits.getdata(tmp_path / "image.fits"), fits.Header(cards))
         fits.HDUList([fits.PrimaryHDU(), packed]).writeto(tmp_path / f"{name}.fits")
-        assert told(tmp_path / f"{name}.fits") == code, name
+        assert verdict(tmp_path / f"{name}.fits") == code, name
 
 
 def test_the_check_needs_no_numerics() -> None:

@@ -57,6 +57,5 @@ def test_a_damaged_card_is_listed_and_all_values_are_json(tmp_path: Path) -> Non
 def test_headers_beyond_the_limits_are_refused(tmp_path: Path) -> None:
     cards = raw_files.image_cards(4, 2, 8, *["COMMENT x"] * 100)
     (tmp_path / "x.fits").write_bytes(raw_files.block(*cards, data=bytes(8)))
-    with pytest.raises(HeaderError) as e:
+    with pytest.raises(HeaderError, match=r"^header-too-long"):
         all_cards(tmp_path / "x.fits", FitsLimits(max_pixels=100, max_header_bytes=2880))
-    assert e.value.code == "header-too-long"

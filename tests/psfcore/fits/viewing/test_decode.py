@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import tracemalloc
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from astropy.io import fits
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.images import read_plane, write_image
+from psfcore.fits.images import write_image
 from psfcore.fits.viewing.decode import decode_plane
 from psfcore.image import Image
 from tests.psfcore.fits import raw_files
@@ -32,27 +33,25 @@ def field(shape: tuple[int, int] = (300, 211), seed: int = 3) -> np.ndarray:
     return np.random.default_rng(seed).poisson(900, shape).astype(np.int32)
 
 
-@pytest.mark.parametrize("ending", [".fits", ".fits.gz"])
-@pytest.mark.parametrize("kind", ["u2", "i4", "f4", "f8"])
-def test_plain_pixels(tmp_path: Path, kind: str, ending: str) -> None:
-    stored = field().astype(kind)
-    if kind in ("f4", "f8"):
-        stored[3, 5], stored[7, 9] = np.nan, np.inf
-    path = tmp_path / f"x{ending}"
-    fits.PrimaryHDU(stored, fits.Header({"BUNIT": "DN/s"})).writeto(path)
-    pixels, unit = decoded(path)
-    np.testing.assert_array_equal(pixels, stored.astype("f4"))
-    assert unit == "DN/s"
+def test_plain_pixels(tmp_path: Path) -> None:
+    for kind, ending in product(("u2", "i4", "f4", "f8"), (".fits", ".fits.gz")):
+        stored = field().astype(kind)
+        if kind in ("f4", "f8"):
+            stored[3, 5], stored[7, 9] = np.nan, np.inf
+        path = tmp_path / f"{kind}{ending}"
+        fits.PrimaryHDU(stored, fits.Header({"BUNIT": "DN/s"})).writeto(path)
+        pixels, unit = decoded(path)
+        np.testing.assert_array_equal(pixels, stored.astype("f4"))
+        assert unit == "DN/s"
 
 
-@pytest.mark.parametrize("tile", [(1, 211), (64, 50), (300, 211)])
-@pytest.mark.parametrize("codec", ["RICE_1", "GZIP_1", "GZIP_2"])
-def test_tile_compressed_pixels(tmp_path: Path, codec: str, tile: tuple[int, int]) -> None:
-    hdu = fits.CompImageHDU(field(), compression_type=codec, tile_shape=tile)
-    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "x.fits")
-    pixels, unit = decoded(tmp_path / "x.fits")
-    np.testing.assert_array_equal(pixels, field().astype("f4"))
-    assert unit is None
+def test_tile_compressed_pixels(tmp_path: Path) -> None:
+    for codec, tile in product(("RICE_1", "GZIP_1", "GZIP_2"), ((1, 211), (64, 50), (300, 211))):
+        hdu = fits.CompImageHDU(field(), compression_type=codec, tile_shape=tile)
+        fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "x.fits", overwrite=True)
+        pixels, unit = decoded(tmp_path / "x.fits")
+        np.testing.assert_array_equal(pixels, field().astype("f4"))
+        assert unit is None
 
 
 def test_a_plane_of_several_blocks_with_quantised_tiles(tmp_path: Path) -> None:
@@ -73,7 +72,7 @@ def test_blank_and_scaled_pixels(tmp_path: Path) -> None:
     np.testing.assert_array_equal(decoded(tmp_path / "x.fits")[0], expected)
 
 
-def product(path: Path) -> dict[str, np.ndarray]:
+def write_product(path: Path) -> dict[str, np.ndarray]:
     """A product with planes; returns its planes as they were given."""
     rng = np.random.default_rng(5)
     shape = (40, 60)
@@ -89,7 +88,7 @@ def product(path: Path) -> dict[str, np.ndarray]:
 
 
 def test_the_planes_of_a_product(tmp_path: Path) -> None:
-    for name, plane in product(tmp_path / "p.fits").items():
+    for name, plane in write_product(tmp_path / "p.fits").items():
         pixels, unit = decoded(tmp_path / "p.fits", name.lower())
         np.testing.assert_array_equal(pixels, plane.astype("f4"))
         assert unit == (None if name == "QUALITY" else "DN/s")
@@ -107,18 +106,14 @@ def test_a_plane_of_an_early_product_in_a_table(tmp_path: Path) -> None:
 
 def test_a_plane_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
     fits.PrimaryHDU(field()).writeto(tmp_path / "x.fits")
-    with pytest.raises(
-        DataError, match=r"\(image\); got error: submit the deconvolution with error_draws"
-    ) as e:
+    with pytest.raises(DataError, match=r"^no-such-plane: .*\(image\); got error: .*error_draws"):
         decoded(tmp_path / "x.fits", "error")
-    assert e.value.code == "no-such-plane"
 
 
 def test_a_damaged_file_is_an_error_of_its_data(tmp_path: Path) -> None:
     (tmp_path / "x.fits").write_bytes(raw_files.compressed("GZIP_1"))
-    with pytest.raises(DataError) as e:
+    with pytest.raises(DataError, match=r"^(bad-tile|unreadable-pixels)"):
         decoded(tmp_path / "x.fits")
-    assert e.value.code in ("bad-tile", "unreadable-pixels")
 
 
 def test_memory_holds_some_rows_and_not_the_plane(tmp_path: Path) -> None:
@@ -130,20 +125,3 @@ def test_memory_holds_some_rows_and_not_the_plane(tmp_path: Path) -> None:
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
     assert peak < 2048 * 2048 * 4, "less than the plane itself"
-
-
-def test_real_images(shared: Path) -> None:
-    folder = shared / "data" / "real"
-    found = [
-        path
-        for name in ("eui/solo_L2_*.fits", "aia/AIA2011*.fits.gz", "aia/aia_171_cutout_*.fits")
-        for path in folder.glob(name)
-    ]
-    if not found:
-        pytest.skip(f"no real images below {folder}")
-    limits = FitsLimits(max_pixels=4096 * 4096)
-    for path in found:
-        target = io.BytesIO()
-        about = decode_plane(path, "image", limits, target)
-        pixels = np.frombuffer(target.getvalue(), "<f4").reshape(about.shape)
-        np.testing.assert_array_equal(pixels, read_plane(path, limits).astype("f4"), err_msg=path.name)
