@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
-from alembic import command
-from sqlalchemy import text
+from sqlalchemy import update
 
 from tests.whole.stack import wait_for
+from tests.workers.databases import BOTH, change
 from workers.broker import app as queue
 from workers.broker.reconciler import reconcile
-from workers.catalogue import schema
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, PsfRow
@@ -48,6 +47,7 @@ def waiting(catalogue: Catalogue) -> set[str]:
     return {job.id for job in catalogue.jobs.unsubmitted(3600.0)}
 
 
+@BOTH
 def test_of_equal_jobs_that_are_claimed_at_one_moment_one_is_at_work(catalogue: Catalogue) -> None:
     jobs = [started(catalogue) for _ in range(8)]
     catalogue.jobs.mark_submitted(*jobs)
@@ -62,27 +62,28 @@ def test_of_equal_jobs_that_are_claimed_at_one_moment_one_is_at_work(catalogue: 
     assert all(row(catalogue, job).attempt == 0 for job, lease in zip(jobs, leases, strict=True) if not lease)
 
 
-@pytest.mark.parametrize("end", ["complete", "fail", "requeue", "hand_back", "destroy", "silent"])
-def test_once_it_is_no_longer_at_work_the_next_may_be(catalogue: Catalogue, end: str) -> None:
-    first, second = started(catalogue), started(catalogue)
-    catalogue.jobs.mark_submitted(first, second)
-    lease = claim(catalogue, first)
-    assert lease is not None and claim(catalogue, second) is None
-    match end:
-        case "complete":
-            assert catalogue.jobs.complete(lease, "r")
-        case "fail":
-            assert catalogue.jobs.fail(lease, JobError(fault=Fault.INTERNAL, code="c", message="m"))
-        case "requeue":
-            assert catalogue.jobs.requeue(lease)
-        case "hand_back":
-            assert catalogue.jobs.hand_back(lease)
-        case "destroy":
-            assert catalogue.uws.destroy(first)
-        case "silent":
-            assert catalogue.jobs.give_up_silent(-1.0, 3) == [first]
-    assert second in waiting(catalogue)
-    assert claim(catalogue, second) is not None
+ENDS: dict[str, Callable[[Catalogue, Lease], object]] = {
+    "complete": lambda catalogue, lease: catalogue.jobs.complete(lease, "r"),
+    "fail": lambda catalogue, lease: catalogue.jobs.fail(lease, JobError(fault=Fault.INTERNAL, code="c", message="m")),
+    "requeue": lambda catalogue, lease: catalogue.jobs.requeue(lease),
+    "hand back": lambda catalogue, lease: catalogue.jobs.hand_back(lease),
+    "destroy": lambda catalogue, lease: catalogue.uws.destroy(lease.job_id),
+    "silent": lambda catalogue, lease: catalogue.jobs.give_up_silent(-1.0, 3) == [lease.job_id],
+}  # fmt: skip
+
+
+@BOTH
+def test_once_it_is_no_longer_at_work_the_next_may_be(catalogue: Catalogue) -> None:
+    for name, end in ENDS.items():
+        first, second = started(catalogue, name), started(catalogue, name)
+        catalogue.jobs.mark_submitted(first, second)
+        lease = claim(catalogue, first)
+        assert lease is not None and claim(catalogue, second) is None
+        assert end(catalogue, lease), name
+        assert second in waiting(catalogue)
+        last = claim(catalogue, second)
+        assert last is not None and catalogue.jobs.complete(last, "r"), name
+        catalogue.jobs.cancel(first)
 
 
 def test_others_are_not_kept_waiting(catalogue: Catalogue) -> None:
@@ -135,22 +136,6 @@ def test_two_at_once_compute_once(
     assert row(catalogue, second).phase == Phase.COMPLETED
 
 
-def test_jobs_from_before_say_what_they_make_by_their_key(catalogue: Catalogue) -> None:
-    draft = catalogue.uws.draft("psf-build", {}, owner=DEFAULT_OWNER)
-    job = started(catalogue)
-    with catalogue._engine.begin() as connection:  # as revision 0008 had it
-        connection.execute(text("DROP INDEX one_at_work_a_result"))
-        connection.execute(text("ALTER TABLE jobs DROP COLUMN work_key"))
-        latest = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one()
-        config = schema._config()
-        config.attributes["connection"] = connection
-        command.stamp(config, "0008")
-        command.upgrade(config, "0009")
-        command.stamp(config, latest)  # the later revisions' changes are in the tables
-    assert (row(catalogue, job).work_key, row(catalogue, draft.id).work_key) == ("k", None)
-    assert claim(catalogue, job) is not None and claim(catalogue, started(catalogue)) is None
-
-
 def asked_for(catalogue: Catalogue, key: str = "k") -> tuple[JobRow, bool]:
     return catalogue.jobs.submit("psf-build", {"key": key}, key, DEFAULT_OWNER)
 
@@ -170,6 +155,7 @@ def test_a_job_that_was_told_to_stop_is_not_shared(catalogue: Catalogue) -> None
     assert claim(catalogue, again.id) is not None
 
 
+@BOTH
 def test_after_a_cancel_many_equal_requests_at_once_make_one_job(catalogue: Catalogue) -> None:
     doomed = asked_for(catalogue)[0].id
     assert claim(catalogue, doomed) is not None
@@ -180,25 +166,25 @@ def test_after_a_cancel_many_equal_requests_at_once_make_one_job(catalogue: Cata
     assert len({job.id for job, _ in answers}) == 1 and doomed not in {job.id for job, _ in answers}
 
 
-def test_a_second_cancel_does_not_take_a_third_request_with_it(catalogue: Catalogue) -> None:
+def test_a_second_cancel_does_not_take_a_third_request_with_it_and_a_job_that_was_done_is_shared(
+    catalogue: Catalogue,
+) -> None:
     first = asked_for(catalogue)[0].id
-    assert claim(catalogue, first) is not None
+    lease = claim(catalogue, first)
+    assert lease is not None
     catalogue.jobs.cancel(first)
     second = asked_for(catalogue)[0].id
     catalogue.jobs.cancel(second)
     assert row(catalogue, second).phase == Phase.ABORTED
     third, new = asked_for(catalogue)
     assert new and third.phase == Phase.QUEUED
-
-
-def test_a_job_that_was_done_before_it_could_stop_is_shared(catalogue: Catalogue) -> None:
-    done = asked_for(catalogue)[0].id
-    lease = claim(catalogue, done)
+    late = asked_for(catalogue, "late")[0].id
+    lease = claim(catalogue, late)
     assert lease is not None
-    catalogue.jobs.cancel(done)
-    assert catalogue.jobs.complete(lease, "r")
-    shared, new = asked_for(catalogue)
-    assert shared.id == done and not new
+    catalogue.jobs.cancel(late)
+    assert catalogue.jobs.complete(lease, "r"), "it was done before it could stop"
+    shared, new = asked_for(catalogue, "late")
+    assert shared.id == late and not new
 
 
 @pytest.mark.parametrize("end", ["too long", "destroyed"])
@@ -211,18 +197,14 @@ def test_a_job_that_ends_on_terms_is_not_shared(catalogue: Catalogue, end: str) 
     assert lease is not None and claim(catalogue, other.id) is None
     if end == "too long":
         catalogue.uws.set_terms(limited, execution_duration_s=1)
-        time.sleep(1.1)
+        change(catalogue, update(JobRow).values(started_at=JobRow.started_at - 1.1))
         assert catalogue.uws.end_by_terms() == [] and catalogue.jobs.abort(lease)
     else:
         catalogue.uws.set_terms(limited, destruction_at=time.time() - 1)
         assert catalogue.uws.end_by_terms() == [limited]
     assert row(catalogue, other.id).phase == Phase.QUEUED and not row(catalogue, other.id).cancel_requested
     assert claim(catalogue, other.id) is not None
-
-
-def test_a_job_that_is_given_terms_is_shared_no_longer(catalogue: Catalogue) -> None:
-    job = asked_for(catalogue)[0].id
-    assert asked_for(catalogue)[0].id == job
-    catalogue.uws.set_terms(job, execution_duration_s=1)
-    other, new = asked_for(catalogue)
-    assert new and other.id != job and asked_for(catalogue)[0].id == other.id
+    given = asked_for(catalogue, "given")[0].id
+    catalogue.uws.set_terms(given, execution_duration_s=1)
+    later, new = asked_for(catalogue, "given")
+    assert new and later.id != given and asked_for(catalogue, "given")[0].id == later.id

@@ -21,9 +21,10 @@ from workers.run.child import Child
 from workers.run.runner import Runner
 from workers.run.stopping import Stopping
 from workers.settings import Settings
+from workers.tasks import stage_timer
 from workers.tasks.context import Context
 
-STEPS, STEP_S = 20, 0.02
+STEPS, STEP_S = 10, 0.01
 FREE_MIB = 1000
 
 
@@ -51,7 +52,7 @@ class Bench:
         self._folder, self._number = folder, 0
 
     def submit(
-        self, owner: str, *, seconds: float = 0.1, memory_mib: int = 100, queue: Queue = Queue.INTERACTIVE
+        self, owner: str, *, seconds: float = 0.03, memory_mib: int = 100, queue: Queue = Queue.INTERACTIVE
     ) -> JobRow:
         """A waiting job that the broker has received."""
         self._number += 1
@@ -67,7 +68,7 @@ class Bench:
         settings = Settings(
             data_dir=self._folder / "data",
             broker_url="filesystem://",
-            heartbeat_s=0.02,
+            heartbeat_s=0.01,
             max_job_memory_mib=FREE_MIB,
             **changes,
         )
@@ -103,54 +104,80 @@ def test_a_long_job_pauses_for_the_short_job_of_another_owner(bench: Bench) -> N
     assert (row.phase, row.result_id, row.attempt) == (Phase.COMPLETED, "result of long", 1)
     row = bench.row(short)
     assert (row.phase, row.result_id, row.attempt) == (Phase.COMPLETED, "result of short", 1)
+    assert bench.catalogue.turns.claim_next(short.id, Queue.INTERACTIVE, "w") is None, (
+        "its message does nothing"
+    )
 
 
-def test_the_time_of_a_pause_counts_for_the_short_job_alone(bench: Bench) -> None:
+class Clock:
+    """A clock that a test moves."""
+
+    now = 100.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    monotonic = perf_counter
+
+
+def test_the_time_of_a_pause_counts_for_the_short_job_alone(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    clock.now = time.perf_counter()  # a timer begins with the true time
+    monkeypatch.setattr(stage_timer, "time", clock)
+
+    def work(owner: str, step: int) -> None:
+        clock.now += 100.0 if owner == "long" else 10_000.0
+
+    bench.during = work
     long = bench.submit("long", seconds=60)
     bench.submit("short")
-    since = time.perf_counter()
     bench.run(long)
-    took_s = time.perf_counter() - since
+    assert bench.ended == ["short", "long"]
     spent = sum(stage.seconds for stage in bench.catalogue.stage_times.all().values())
-    assert 2 * STEPS * STEP_S <= spent <= took_s
+    assert spent == pytest.approx(10_100.0 * STEPS, rel=1e-3)
 
 
-def test_a_pause_needs_as_much_work_since_the_last_one_as_the_short_job_takes(catalogue: Catalogue) -> None:
-    asked: list[tuple[float, float]] = []
+def test_a_pause_needs_as_much_work_as_the_short_job_takes_and_does_not_count_in_the_time_limit(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, looks = Clock(), []
+    monkeypatch.setattr(attempt, "time", clock)
 
     def run_short(seconds: float) -> bool:
-        asked.append((seconds, time.monotonic()))
-        time.sleep(0.05)
-        return len(asked) == 2  # the second look finds a job
+        looks.append(seconds)
+        clock.now += 5.0
+        return len(looks) == 2  # the second look finds a job
 
     job, _ = catalogue.jobs.submit("psf-build", {}, "k", "long")
     lease = catalogue.jobs.claim(job.id, "w")
     assert lease is not None
-    began = time.monotonic()
-    one = Attempt(catalogue, lease, 1.0, Stopping(), None, 60.0, run_short=run_short)
-    for _ in range(3):
-        one._let_short_jobs_run()
-    (first, at_first), (second, at_second), (third, at_third) = asked
-    assert 0 <= first <= at_first - began
-    assert second >= 0.05, "a look without a job starts nothing anew"
-    assert third <= at_third - at_second - 0.05, "counted from the end of the pause"
+    started = clock.now
+    one = Attempt(
+        catalogue, lease, 1.0, Stopping(), None, limit_s=12.0, run_short=run_short,
+        started=started, resumed=started,
+    )  # fmt: skip
+    for step, worked_s in enumerate((10.0, 0.5, 1.0)):
+        clock.now += worked_s
+        one.report("at work", step, 9)
+    assert looks == [10.0, 15.5, 1.0], "a look without a job starts nothing anew; a pause does"
+    assert one.started == started + 15.0
+    clock.now += 0.6
+    with pytest.raises(attempt.TookTooLong):
+        one.report("at work", 9, 9)
 
 
-@pytest.mark.parametrize(
-    "waiting",
-    [
-        {"owner": "long"},
-        {"owner": "short", "seconds": 100.0},
-        {"owner": "short", "memory_mib": FREE_MIB - 99},
-        {"owner": "short", "queue": Queue.BULK},
-    ],
-    ids=["of the same owner", "too long", "too large", "not interactive"],
-)
-def test_other_jobs_wait_for_their_turn(bench: Bench, waiting: dict[str, Any]) -> None:
+def test_other_jobs_wait_for_their_turn(bench: Bench) -> None:
+    others = [
+        bench.submit("long"),
+        bench.submit("short", seconds=100.0),  # too long
+        bench.submit("short", memory_mib=FREE_MIB - 99),  # too large
+        bench.submit("short", queue=Queue.BULK),
+    ]
     long = bench.submit("long", seconds=60)
-    other = bench.submit(**waiting)
     assert bench.run(long).phase == Phase.COMPLETED
-    assert bench.row(other).phase == Phase.QUEUED
+    assert [bench.row(other).phase for other in others] == [Phase.QUEUED] * 4
 
 
 def test_a_bulk_turn_pauses_for_its_own_owner_too(bench: Bench) -> None:
@@ -186,14 +213,14 @@ def test_a_job_cancelled_during_its_pause_ends_after_the_short_one(bench: Bench)
 
     bench.during = cancel
     # The rest of the short job takes longer than a task may ignore its cancellation.
-    row = bench.run(long, cancel_s=0.1)
+    row = bench.run(long, cancel_s=0.03)
     assert (row.phase, bench.row(short).phase) == (Phase.ABORTED, Phase.COMPLETED)
     assert not bench.child.ended, "the process was not ended"
 
 
 def test_a_short_job_that_fails_or_is_cancelled_does_not_concern_the_long_one(bench: Bench) -> None:
     long = bench.submit("long", seconds=60)
-    fails, cancelled = bench.submit("fails"), bench.submit("cancelled", seconds=0.11)
+    fails, cancelled = bench.submit("fails"), bench.submit("cancelled", seconds=0.04)
 
     def fail(owner: str, step: int) -> None:
         if owner == "fails":
@@ -207,22 +234,6 @@ def test_a_short_job_that_fails_or_is_cancelled_does_not_concern_the_long_one(be
     assert bench.row(cancelled).phase == Phase.ABORTED
 
 
-def test_the_time_limit_of_a_job_does_not_count_its_pause(catalogue: Catalogue) -> None:
-    job, _ = catalogue.jobs.submit("psf-build", {}, "k", "long")
-    lease = catalogue.jobs.claim(job.id, "w")
-    assert lease is not None
-
-    def run_short(seconds: float) -> bool:
-        time.sleep(0.3)
-        return True
-
-    one = Attempt(catalogue, lease, 1.0, Stopping(), None, limit_s=0.3, run_short=run_short)
-    began = one.started
-    one.last_report = 0.0
-    one.report("at work", 1, 2)  # no TookTooLong, although more than 0.3 s have passed
-    assert one.started >= began + 0.3
-
-
 def test_a_report_from_another_thread_does_not_pause(bench: Bench) -> None:
     long = bench.submit("long", seconds=60)
     short = bench.submit("short")
@@ -231,10 +242,3 @@ def test_a_report_from_another_thread_does_not_pause(bench: Bench) -> None:
     runner.join()
     assert bench.row(long).phase == Phase.COMPLETED
     assert bench.row(short).phase == Phase.QUEUED
-
-
-def test_the_message_of_a_job_that_ran_in_a_pause_has_no_effect(bench: Bench) -> None:
-    long = bench.submit("long", seconds=60)
-    short = bench.submit("short")
-    bench.run(long)
-    assert bench.catalogue.turns.claim_next(short.id, Queue.INTERACTIVE, "w") is None

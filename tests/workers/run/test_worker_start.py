@@ -12,6 +12,7 @@ import pytest
 from sqlalchemy import text
 from sqlalchemy.exc import OperationalError
 
+from tests.workers.databases import change
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.schema import Schema, SchemaError
 from workers.run import worker
@@ -19,49 +20,40 @@ from workers.settings import Settings
 
 
 def put_at(catalogue: Catalogue, revision: str | None) -> None:
-    with catalogue._engine.begin() as connection:
-        if revision is None:
-            connection.execute(text("DELETE FROM alembic_version"))
-        else:
-            connection.execute(text("UPDATE alembic_version SET version_num = :one"), {"one": revision})
+    change(catalogue, text("DELETE FROM alembic_version"))
+    if revision is not None:
+        change(catalogue, text(f"INSERT INTO alembic_version VALUES ('{revision}')"))
 
 
-def put_back(catalogue: Catalogue) -> None:
-    """Other tests use the same PostgreSQL database."""
-    with catalogue._engine.begin() as connection:
-        connection.execute(text("DELETE FROM alembic_version"))
-        connection.execute(
-            text("INSERT INTO alembic_version VALUES (:one)"), {"one": catalogue.schema.status().wanted}
-        )
-
-
-@pytest.mark.parametrize(
-    ("revision", "said"),
-    [
-        ("9999", ("at revision 9999", "does not know", "use the version that made the database")),
-        ("0003", ("at revision 0003", "expected a database at revision", "`heliopsf database upgrade`")),
-        (None, ("without a revision", "`heliopsf database upgrade`")),
-    ],
-)
-def test_what_is_wrong_with_a_revision_and_what_to_do(
-    catalogue: Catalogue, revision: str | None, said: tuple[str, ...]
-) -> None:
+def test_what_is_wrong_with_a_revision_and_what_to_do(catalogue: Catalogue, tmp_path: Path) -> None:
     catalogue.schema.check()
-    put_at(catalogue, revision)
-    with pytest.raises(SchemaError) as refused:
-        catalogue.schema.check()
-    put_back(catalogue)
-    for words in said:
-        assert words in str(refused.value)
-    assert "\n" not in str(refused.value)
+    empty = Catalogue(f"sqlite:///{tmp_path / 'empty.sqlite'}")
+    for schema, revision, words in (
+        (catalogue.schema, "9999", ("at revision 9999", "does not know", "version that made the database")),
+        (catalogue.schema, "0001", ("at revision 0001", "`heliopsf database upgrade`")),
+        (catalogue.schema, None, ("without a revision", "`heliopsf database upgrade`")),
+        (empty.schema, None, ("is empty", "`heliopsf database upgrade`")),
+    ):
+        put_at(catalogue, revision)
+        with pytest.raises(SchemaError) as refused:
+            schema.check()
+        assert all(word in str(refused.value) for word in words) and "\n" not in str(refused.value)
+    assert empty.schema.status().state == "empty", "it stays so"
+    empty.close()
 
 
-def test_an_empty_database_is_said_to_be_empty_and_stays_so(tmp_path: Path) -> None:
-    catalogue = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
-    with pytest.raises(SchemaError, match="is empty"):
-        catalogue.schema.check()
-    assert catalogue.schema.status().state == "empty"
-    catalogue.close()
+def test_workers_of_one_host_name_and_process_id_have_different_names() -> None:
+    """As in containers: each has its own process ids, and may have the host name of another."""
+    code = (
+        "import os, socket\n"
+        "os.getpid = lambda: 1\n"
+        "socket.gethostname = lambda: 'worker'\n"
+        "from workers.run.runner import worker_name\n"
+        "print(worker_name() == worker_name(), worker_name())"
+    )
+    command = [sys.executable, "-c", code]
+    names = {subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)}
+    assert len(names) == 2 and all(name.startswith("True worker:1:") for name in names)
 
 
 def test_a_database_that_is_away_is_waited_for(
@@ -88,7 +80,9 @@ def test_a_database_that_is_away_is_waited_for(
     "command",
     [
         [sys.executable, "-m", "service.cli", "worker"],
-        [sys.executable, "-m", "celery", "-A", "workers.run.worker", "worker"],
+        pytest.param(
+            [sys.executable, "-m", "celery", "-A", "workers.run.worker", "worker"], marks=pytest.mark.slow
+        ),
     ],
     ids=["heliopsf worker", "celery"],
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from sqlalchemy import update
 
+from tests.workers.databases import change
 from workers.catalogue.access.keys import Scope, TooManyKeys
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import KeyRow
@@ -53,6 +54,6 @@ def test_an_owner_has_a_largest_number_of_valid_keys(catalogue: Catalogue) -> No
 def test_old_keys_that_ended_are_forgotten(catalogue: Catalogue) -> None:
     ids = [made(catalogue) for _ in range(5)]
     bobs = made(catalogue, "bob")
-    catalogue._database.change(update(KeyRow).values(revoked_at=1.0))
+    change(catalogue, update(KeyRow).values(revoked_at=1.0))
     new = made(catalogue, most=2)
     assert {row.id for row in catalogue.keys.all()} == {*ids[3:], bobs, new}

@@ -8,6 +8,7 @@ import time
 import pytest
 from sqlalchemy import select, update
 
+from tests.workers.databases import change, rows
 from workers.catalogue.access.keys import KeyRefused, Scope
 from workers.catalogue.access.sessions import MOST_OF_A_KEY, SessionRow
 from workers.catalogue.catalogue import Catalogue
@@ -21,13 +22,8 @@ def key_of(catalogue: Catalogue, owner: str = "ann", lasts_s: float | None = Non
     return catalogue.keys.check(catalogue.keys.make(owner, {Scope.READ}, expires_at=expires_at))
 
 
-def rows(catalogue: Catalogue) -> list[SessionRow]:
-    with catalogue._database.reading() as session:
-        return list(session.scalars(select(SessionRow).order_by(SessionRow.created_at)))
-
-
-def change(catalogue: Catalogue, table: type[KeyRow | SessionRow], **values: float) -> None:
-    catalogue._database.change(update(table).values(**values))
+def stored(catalogue: Catalogue) -> list[SessionRow]:
+    return rows(catalogue, select(SessionRow).order_by(SessionRow.created_at))
 
 
 def refusal(catalogue: Catalogue, token: str) -> str:
@@ -47,62 +43,48 @@ def test_a_session_is_found_by_its_token_and_only_a_hash_is_stored(catalogue: Ca
         assert found.id == hashlib.sha256(token.encode()).hexdigest()
         assert catalogue.sessions.is_open(found.id)
         assert token not in (found.id, found.form_token)
-    assert len({row.form_token for row in rows(catalogue)}) == 2
+    assert len({row.form_token for row in stored(catalogue)}) == 2
     assert refusal(catalogue, tokens[0][:-1]) == refusal(catalogue, "0") == "session-ended"
-    assert refusal(catalogue, rows(catalogue)[0].id) == "session-ended", "the stored hash is no token"
+    assert refusal(catalogue, stored(catalogue)[0].id) == "session-ended", "the stored hash is no token"
 
 
-def test_a_session_never_lasts_longer_than_its_key(catalogue: Catalogue) -> None:
-    short, long, endless = (
-        key_of(catalogue, lasts_s=60),
-        key_of(catalogue, lasts_s=9 * DAY_S),
-        key_of(catalogue),
-    )
-    for key, wanted in ((short, 60), (long, DAY_S), (endless, DAY_S)):
-        session, _ = catalogue.sessions.find(catalogue.sessions.open(key, DAY_S))
-        assert session.expires_at - time.time() == pytest.approx(wanted, abs=10)
+def test_a_session_never_lasts_longer_than_its_key_and_records_its_use(catalogue: Catalogue) -> None:
+    for lasts_s, expected_s in ((60, 60), (9 * DAY_S, DAY_S), (None, DAY_S)):
+        token = catalogue.sessions.open(key_of(catalogue, lasts_s=lasts_s), DAY_S)
+        change(catalogue, update(KeyRow).values(last_used_at=1.0))
+        session, key = catalogue.sessions.find(token)
+        assert session.expires_at - time.time() == pytest.approx(expected_s, abs=10)
+        (row,) = (one for one in catalogue.keys.all() if one.id == key.id)
+        assert row.last_used_at == pytest.approx(time.time(), abs=10)
 
 
-def test_a_session_ends_at_its_time_and_is_swept(catalogue: Catalogue) -> None:
-    token = catalogue.sessions.open(key_of(catalogue), DAY_S)
-    assert catalogue.sessions.sweep() == 0
-    change(catalogue, SessionRow, expires_at=time.time() - 1)
+def test_a_session_ends_at_its_time_is_swept_and_can_be_closed(catalogue: Catalogue) -> None:
+    token, other = (catalogue.sessions.open(key_of(catalogue), DAY_S) for _ in range(2))
+    assert catalogue.sessions.close(token) and not catalogue.sessions.close(token)
     assert refusal(catalogue, token) == "session-ended"
-    assert not catalogue.sessions.is_open(rows(catalogue)[0].id)
-    assert catalogue.sessions.sweep() == 1 and rows(catalogue) == []
+    assert catalogue.sessions.find(other) and catalogue.sessions.sweep() == 0
+    change(catalogue, update(SessionRow).values(expires_at=time.time() - 1))
+    assert refusal(catalogue, other) == "session-ended"
+    assert not catalogue.sessions.is_open(stored(catalogue)[0].id)
+    assert catalogue.sessions.sweep() == 1 and stored(catalogue) == []
 
 
 @pytest.mark.parametrize(("column", "code"), [("revoked_at", "key-revoked"), ("expires_at", "key-expired")])
 def test_a_key_that_ends_takes_its_sessions_along(catalogue: Catalogue, column: str, code: str) -> None:
     token = catalogue.sessions.open(key_of(catalogue), DAY_S)
-    change(catalogue, KeyRow, **{column: time.time() - 1})
+    change(catalogue, update(KeyRow).values(**{column: time.time() - 1}))
     other = catalogue.sessions.open(key_of(catalogue, "bob"), DAY_S)
     assert refusal(catalogue, token) == code
-    assert not catalogue.sessions.is_open(rows(catalogue)[0].id)
+    assert not catalogue.sessions.is_open(stored(catalogue)[0].id)
     assert catalogue.sessions.sweep() == 1
     assert refusal(catalogue, token) == "session-ended"
     assert catalogue.sessions.find(other)[1].owner == "bob"
-
-
-def test_a_closed_session_is_over(catalogue: Catalogue) -> None:
-    token, other = (catalogue.sessions.open(key_of(catalogue), DAY_S) for _ in range(2))
-    assert catalogue.sessions.close(token) and not catalogue.sessions.close(token)
-    assert refusal(catalogue, token) == "session-ended"
-    assert catalogue.sessions.find(other)
 
 
 def test_the_oldest_sessions_of_a_key_give_way(catalogue: Catalogue) -> None:
     key, other = key_of(catalogue), key_of(catalogue)
     kept = catalogue.sessions.open(other, DAY_S)
     tokens = [catalogue.sessions.open(key, DAY_S) for _ in range(MOST_OF_A_KEY + 2)]
-    assert len(rows(catalogue)) == MOST_OF_A_KEY + 1
+    assert len(stored(catalogue)) == MOST_OF_A_KEY + 1
     assert [refusal(catalogue, token) for token in tokens[:2]] == 2 * ["session-ended"]
     assert all(catalogue.sessions.find(token) for token in (*tokens[2:], kept))
-
-
-def test_a_session_records_the_use_of_its_key(catalogue: Catalogue) -> None:
-    token = catalogue.sessions.open(key_of(catalogue), DAY_S)
-    change(catalogue, KeyRow, last_used_at=1.0)
-    catalogue.sessions.find(token)
-    (row,) = catalogue.keys.all()
-    assert row.last_used_at == pytest.approx(time.time(), abs=10)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import time
 
 import pytest
-from sqlalchemy import event, insert, text
+from sqlalchemy import insert, text
 
+from tests.whole.many_rows import plan, statements
+from tests.workers.databases import BOTH, change, database
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
@@ -27,9 +29,7 @@ def job(number: int, owner: str = "ann", **values: object) -> dict[str, object]:
 
 
 def add_jobs(catalogue: Catalogue, *jobs: dict[str, object]) -> None:
-    with catalogue._database.writing.begin() as session:
-        for one in jobs:
-            session.execute(insert(JobRow), one)
+    change(catalogue, *(insert(JobRow).values(**one) for one in jobs))
 
 
 def test_rows_are_read_by_owner_phase_and_end(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,30 +73,19 @@ def test_open_bulk_runs_are_followed_also_when_paused(catalogue: Catalogue) -> N
     assert [one.id for one in bulks.ended("ann", Place(time.time() - 60))] == [ids[1]]
 
 
+@BOTH
 def test_every_query_uses_an_index_on_what_it_asks_for(catalogue: Catalogue) -> None:
     """With many ended jobs, and the statistics of PostgreSQL: no query reads all jobs of the owner."""
-    with catalogue._database.writing.begin() as session:
-        session.execute(insert(JobRow), [job(number) for number in range(5000)])
-    with catalogue._engine.execution_options(isolation_level="AUTOCOMMIT").connect() as connection:
+    with database(catalogue).engine.begin() as connection:
+        connection.execute(insert(JobRow), [job(number) for number in range(2000)])
+    with database(catalogue).engine.execution_options(isolation_level="AUTOCOMMIT").connect() as connection:
         connection.execute(text("ANALYZE"))
-    plans: list[str] = []
-
-    @event.listens_for(catalogue._engine, "before_cursor_execute")
-    def explain(_connection: object, cursor: object, statement: str, parameters: object, *_: object) -> None:
-        if not statement.startswith("SELECT"):
-            return
-        how = "EXPLAIN QUERY PLAN" if catalogue._database.sqlite else "EXPLAIN"
-        cursor.execute(f"{how} {statement}", parameters)  # type: ignore[attr-defined]
-        plans.append("\n".join(str(row) for row in cursor.fetchall()))  # type: ignore[attr-defined]
-
     jobs = catalogue.followed_jobs
-    jobs.ended("ann", Place(4990.0))
-    jobs.open("ann")
-    jobs.among("ann", [ANY])
-    jobs.rows("ann", [ANY])
-    event.remove(catalogue._engine, "before_cursor_execute", explain)
+    with statements(catalogue) as sent:
+        jobs.ended("ann", Place(1990.0)), jobs.open("ann"), jobs.among("ann", [ANY]), jobs.rows("ann", [ANY])
+    plans = ["\n".join(plan(catalogue, *one, forced=False)) for one in sent if one[0].startswith("SELECT")]
     ended, executing, queued, among, read = plans
     assert "jobs_ended" in ended and "ended_at" in ended
-    assert all("USING INDEX jobs_" in plan or "Index Scan" in plan for plan in (executing, queued)), plans
-    assert not any("SCAN jobs" in plan or "Seq Scan" in plan for plan in plans), plans
-    assert all("id" in plan for plan in (among, read))
+    assert all("USING INDEX jobs_" in one or "Index Scan" in one for one in (executing, queued)), plans
+    assert not any("SCAN jobs" in one or "Seq Scan" in one for one in plans), plans
+    assert all("id" in one for one in (among, read))

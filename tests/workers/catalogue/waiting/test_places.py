@@ -31,7 +31,7 @@ def started(catalogue: Catalogue, count: int) -> list[str]:
     return order
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_places_are_those_in_which_the_jobs_start(catalogue: Catalogue, seed: int) -> None:
     chance = random.Random(seed)
     # Some owners were served before, in some order.
