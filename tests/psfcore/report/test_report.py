@@ -1,27 +1,38 @@
-"""A report evaluates held-out images, contains the numbers of the fit, and lists what it does not show."""
+"""A report evaluates held-out images, contains the numbers of the fit, and lists what it does not show; and its page."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache, partial
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 
+from psfcore.drawing.page import with_error
 from psfcore.errors import DataError
+from psfcore.evaluation.evaluation import evaluate
+from psfcore.psf import Psf, crop_or_pad, cumulative_curve
+from psfcore.report import report as report_module
 from psfcore.report.page import page_of
+from psfcore.report.plot import beyond_of
 from psfcore.report.report import PsfReport, make_report, report_json
 from psfcore.scatter import fit
 from psfcore.scatter.as_published.equations import free_fit
-from psfcore.scatter.validation.cross_validation import FoldSample, shared_step
+from psfcore.scatter.samples import SCATTER
+from psfcore.scatter.validation.cross_validation import FoldSample, bootstrap_samples, shared_step
 from psfcore.simulate.scatter_truth import total_kernel
+from psfcore.tables.make import TOTAL, tables_of
 from psfcore.transit.blocks import folds
 from psfcore.transit.prepare import FrameCounts, Prepared
 from psfcore.transit.transit import Transit
-from tests.html_page import check_stands_alone
+from tests.blank_figures import blank_figures
+from tests.html_page import check_stands_alone, read_page
 from tests.psfcore import small_transits
 from tests.psfcore.conftest import make_psf
 from tests.psfcore.small_transits import DIFFRACTION, TRUE_VALUES, observed, sky
@@ -29,7 +40,21 @@ from tests.psfcore.small_transits import DIFFRACTION, TRUE_VALUES, observed, sky
 PROVENANCE = {"software_version": "1.2.3", "libraries": {"numpy": "9.9"}, "algorithm_version": 1}
 
 
-QUICK = patch.object(fit, "free_fit", partial(free_fit, subsets=20))  # quicker than 100
+@contextmanager
+def quick() -> Iterator[None]:
+    """Free shells from 20 draws instead of 100, a cross-validation of 3 runs instead of 10, and tables of 512 px."""
+
+    def small_tables(psf: Psf, **options: Any) -> dict[str, Any]:
+        kernel, *parts = (crop_or_pad(part, 512) for part in (psf.kernel, *psf.components.values()))
+        components = dict(zip(psf.components, parts, strict=True))
+        return tables_of(dataclasses.replace(psf, kernel=kernel, components=components), **options)
+
+    with (
+        patch.object(fit, "free_fit", partial(free_fit, subsets=20)),
+        patch.object(report_module, "tables_of", small_tables),
+        patch.object(report_module, "bootstrap_samples", partial(bootstrap_samples, runs=3)),
+    ):
+        yield
 
 
 def untouched(transit: Transit) -> Prepared:
@@ -37,16 +62,17 @@ def untouched(transit: Transit) -> Prepared:
 
 
 @cache
-def told() -> list[tuple[str, int, int]]:
-    return []
-
-
-@cache
-def whole() -> PsfReport:
-    """The report on twelve small images. Its progress is in told()."""
+def progress_of_whole() -> tuple[PsfReport, list[tuple[str, int, int]]]:
+    """The report on twelve small images, and its progress."""
+    steps: list[tuple[str, int, int]] = []
     transit = observed(sky()).transit
-    with QUICK:
-        return make_report(transit, untouched(transit), seed=5, progress=lambda *step: told().append(step))
+    with quick():
+        made = make_report(transit, untouched(transit), seed=5, progress=lambda *step: steps.append(step))
+    return made, steps
+
+
+def whole() -> PsfReport:
+    return progress_of_whole()[0]
 
 
 @cache
@@ -71,10 +97,8 @@ def test_the_parameters_are_the_truth_within_their_errors() -> None:
 
 def test_each_image_is_evaluated_with_the_psf_of_the_fold_that_holds_it_out() -> None:
     """By hand for one fold: the step of its fitted images, and the light that its PSF scatters into the discs."""
-    from psfcore.evaluation.evaluation import evaluate
-
     report = whole()
-    assert report.held_out and report.fit is not None
+    assert report.fit is not None and report.held_out
     solution, images = report.fit.solution, len(report.transit.frames)
     fold = folds(images)[1]
     counts = tuple(int(n in fold.fitted) for n in range(images))
@@ -89,8 +113,7 @@ def test_each_image_is_evaluated_with_the_psf_of_the_fold_that_holds_it_out() ->
 
 
 def test_progress_covers_all_stages_and_never_decreases() -> None:
-    whole()
-    shares = [step / steps for _, step, steps in told()]
+    shares = [step / steps for _, step, steps in progress_of_whole()[1]]
     assert len(shares) > 50 and shares[0] < 0.1 and 0.8 < shares[-1] <= 1
     assert all(later >= earlier for earlier, later in itertools.pairwise(shares))
 
@@ -100,7 +123,7 @@ def test_the_json_holds_the_numbers_of_the_page() -> None:
     assert found["schema"] == "psf-report/1" and found["sentence"] == whole().sentence
     assert [o["offset_dn"] for o in found["evaluation"]["dark_offsets"]["offsets"]] == [-5.0, -3.0, 3.0, 5.0]
     assert found["evaluation"]["held_out"] is True and found["not_shown"] == []
-    assert len(found["cross_validation"]["totals"]) == found["cross_validation"]["fits"] == 40
+    assert len(found["cross_validation"]["totals"]) == found["cross_validation"]["fits"] == 12
     assert {s["name"] for s in found["fit"]["shapes"]} >= {"stretched", "core"}
     assert found["inputs"]["noise"]["photon_gain_dn"] > 0 and found["seed"] == 5
 
@@ -108,11 +131,8 @@ def test_the_json_holds_the_numbers_of_the_page() -> None:
 def test_a_given_psf_fitted_to_these_images_is_not_tested_independently() -> None:
     transit = dataclasses.replace(observed(sky()).transit, sha256={"000.fits": "ab" * 32})
     kernel = total_kernel(small_transits.SCATTER, DIFFRACTION, 256)
-    history = [
-        "psf_id: 1",
-        f"inputs_sha256: {{'000.fits': '{'ab' * 16}",
-        f"{'ab' * 16}'}}",
-    ]  # broken into lines, as in a FITS header
+    # Broken into lines, as in a FITS header.
+    history = ["psf_id: 1", f"inputs_sha256: {{'000.fits': '{'ab' * 16}", f"{'ab' * 16}'}}"]
     report = make_report(
         transit, untouched(transit), psf=make_psf(kernel, provenance={"history": history}), seed=2
     )
@@ -123,7 +143,7 @@ def test_a_given_psf_fitted_to_these_images_is_not_tested_independently() -> Non
 def test_too_few_images_for_folds_are_evaluated_with_their_own_fit_and_the_page_says_so() -> None:
     transit = observed(sky()).transit
     few = dataclasses.replace(transit, frames=transit.frames[:4] + transit.frames[6:7])
-    with QUICK:
+    with quick():
         report = make_report(few, untouched(few), dark_offsets=False)
     assert not report.held_out and report.cross is None
     said = {missing.what: missing.why for missing in report.missing}
@@ -137,8 +157,68 @@ def test_too_few_images_for_folds_are_evaluated_with_their_own_fit_and_the_page_
 def test_a_psf_of_another_scale_is_refused() -> None:
     transit = dataclasses.replace(observed(sky()).transit, plate_scale_arcsec=0.5)
     psf = make_psf(DIFFRACTION, plate_scale_arcsec=1.0)
-    with pytest.raises(
-        DataError, match=r"expected images with the plate scale of PSF .* 1 arcsec/px; got 0.5"
-    ) as caught:
+    with pytest.raises(DataError, match=r"1 arcsec/px; got 0\.5") as caught:
         make_report(transit, untouched(transit), psf=psf)
     assert caught.value.code == "plate-scale-mismatch"
+
+
+# --- the page ---------------------------------------------------------------------------------------------
+
+
+def test_the_curve_on_the_page_is_that_of_the_psf() -> None:
+    report = whole()
+    for name, kernel in ((TOTAL, report.psf.kernel), (SCATTER, report.psf.components[SCATTER])):
+        radii, beyond, _ = beyond_of(report.tables, name)
+        some = np.searchsorted(radii, [0.5, 2.0, 10.0, 100.0])
+        want = cumulative_curve(kernel, radii[some])
+        assert beyond[some] == pytest.approx(want, abs=1e-4)
+    assert report.fit is not None
+    _, _, sigma = beyond_of(report.tables, TOTAL)
+    at_half = report.fit.curve.sigma[list(report.fit.curve.radii_px).index(0.5)]
+    assert sigma[0] == pytest.approx(at_half, rel=0.02)
+
+
+def test_the_page_shows_every_part_and_every_image() -> None:
+    html = page_of(whole(), PROVENANCE).html()
+    check_stands_alone(html)
+    tags = read_page(html)
+    text = next(t for t in tags if t.name == "body").text
+    for frame in whole().evaluation.frames:
+        assert any(t.name == "td" and t.text == frame.file for t in tags)
+    assert len([t for t in tags if t.name == "img"]) == 9
+    for name, parameter in whole_json()["fit"]["parameters"].items():
+        shown = next(t for t in tags if t.name == "dt" and t.text.startswith(name))
+        row = shown.within[-1].text.replace("\N{NO-BREAK SPACE}", " ")
+        assert with_error(parameter["value"], parameter["sigma"]) in row
+    assert "1.2.3" in text and "9.9" in text and "-5" in text
+    assert all(limit[1:] in text for limit in whole_json()["fit"]["limits"])
+
+
+def test_the_page_of_a_given_psf_lists_what_it_does_not_show_and_why() -> None:
+    report = given()
+    assert report.given and not report.held_out and not report.fitted_to_these
+    residuals = np.array([f.residual_pct / f.noise_pct for f in report.evaluation.frames])
+    assert abs(residuals.mean()) < 4 / np.sqrt(residuals.size)
+    with blank_figures():
+        html = page_of(report, PROVENANCE).html()
+    check_stands_alone(html)
+    text = next(t for t in read_page(html) if t.name == "body").text
+    assert "Not shown: other shapes of scatter" in text
+    assert "Not shown: errors of the PSF's curve and profile" in text
+    assert "fit" not in report_json(report, PROVENANCE)
+
+
+def test_a_malicious_file_name_is_text() -> None:
+    report = given()
+    name = "</td><script>alert(1)</script>.fits"
+    frames = (dataclasses.replace(report.transit.frames[0], file=name), *report.transit.frames[1:])
+    judged = tuple(dataclasses.replace(f, file=name) if f.index == 0 else f for f in report.evaluation.frames)
+    changed = dataclasses.replace(
+        report,
+        transit=dataclasses.replace(report.transit, frames=frames, sha256={name: "0" * 64}),
+        evaluation=dataclasses.replace(report.evaluation, frames=judged, left_out={name: name}),
+    )
+    with blank_figures():
+        html = page_of(changed, {"file": name}).html()
+    check_stands_alone(html)
+    assert [t.text for t in read_page(html) if t.name == "td"].count(name) == 4
