@@ -112,72 +112,47 @@ REFUSED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("fields", "status", "told"), [r[1:] for r in REFUSED], ids=[r[0] for r in REFUSED])
-def test_nothing_stays_of_a_refused_form(
-    api: TestClient,
-    settings: Settings,
-    image_file: Path,
-    fields: dict[str, str | list[str]],
-    status: int,
-    told: str,
-) -> None:
-    answer = post(api, JOBS, fields, {"f": ("sun.fits", image_file.read_bytes())})
-    assert answer.status_code == status and told in answer.text, answer.text
-    assert answer.headers["content-type"].startswith("text/plain")
-    assert kept(api) == NOTHING and len(document(api.get(JOBS))) == 0
-    assert temporary(settings) == [] and list((settings.data_dir / "blobs").rglob("*/*")) == []
-
-
-@pytest.mark.parametrize(
-    ("kind", "name", "content", "status", "told"),
-    [
-        ("deconvolve", "image", b"hello, I am an image", 415, "expected a FITS file"),
-        ("deconvolve", "image", b"", 400, "got 0 bytes"),
-        ("deconvolve", "image", b"SIMPLE  = " + bytes(3000), 422, ""),
-        ("deconvolve", "image", b"SIMPLE  =" + bytes(2 * 2**20), 413, "at most 2097152 bytes"),
-        ("psf-fit", "transit", b"hello, I am a transit", 415, "expected a .zip, .tar or .tar.gz"),
-        ("psf-fit", "transit", tar_without_images(), 422, "expected a file transit.json"),
-    ],
-    ids=["no FITS", "empty", "no header", "too large", "no archive", "no transit.json"],
-)
-def test_a_file_is_checked_as_an_upload_is(
-    api: TestClient, image_file: Path, kind: str, name: str, content: bytes, status: int, told: str
-) -> None:
-    answer = post(api, JOBS, {"KIND": kind, "UPLOAD": f"{name},param:f"}, {"f": ("x", content)})
-    assert answer.status_code == status and told in answer.text, answer.text
-    assert kept(api) == NOTHING and len(document(api.get(JOBS))) == 0
-
-
-def test_if_one_of_two_files_is_bad_neither_is_kept(api: TestClient, image_file: Path) -> None:
-    fields: dict[str, str | list[str]] = {**IMAGE, "UPLOAD": "image,param:f;psf,param:g"}
-    files = {"f": ("sun.fits", image_file.read_bytes()), "g": ("psf.fits", b"a letter")}
-    assert post(api, JOBS, fields, files).status_code == 415
-    assert kept(api) == NOTHING
-
-
+FILES: list[tuple[str, str, str, bytes, int, str]] = [
+    ("no FITS", "deconvolve", "image", b"hello, I am an image", 415, "expected a FITS file"),
+    ("empty", "deconvolve", "image", b"", 400, "got 0 bytes"),
+    ("no header", "deconvolve", "image", b"SIMPLE  = " + bytes(3000), 422, ""),
+    ("too large", "deconvolve", "image", b"SIMPLE  =" + bytes(2 * 2**20), 413, "at most 2097152 bytes"),
+    ("no archive", "psf-fit", "transit", b"hello, I am a transit", 415, "expected a .zip, .tar or .tar.gz"),
+    ("no transit.json", "psf-fit", "transit", tar_without_images(), 422, "expected a file transit.json"),
+]
 BOUNDARY = "multipart/form-data; boundary=x"
 PART = b'--x\r\nContent-Disposition: form-data; name="f"; filename="a"\r\n\r\nSIMPLE  =\r\n'
+BROKEN: list[tuple[str, str, bytes, str]] = [
+    ("no boundary", "multipart/form-data", PART, "expected a boundary"),
+    ("cut", BOUNDARY, PART, "it ended before its last boundary"),
+    ("no form", BOUNDARY, b"no boundary", "expected multipart/form-data"),
+    ("twice", BOUNDARY, PART * 2 + b"--x--", "in parts of different names"),
+    ("no name", BOUNDARY, PART.replace(b'name="f"; ', b"") + b"--x--", "expected a name for every part"),
+    ("name of a file", BOUNDARY, PART.replace(b'"a"', b'"\xff"') + b"--x--", "in UTF-8"),
+    ("field", BOUNDARY, b'--x\r\nContent-Disposition: form-data; name="a"\r\n\r\n\xff\r\n--x--', "in UTF-8"),
+]
 
 
-@pytest.mark.parametrize(
-    ("media_type", "body", "told"),
-    [
-        ("multipart/form-data", PART, "expected a boundary"),
-        (BOUNDARY, PART, "it ended before its last boundary"),
-        (BOUNDARY, b"no boundary", "expected multipart/form-data"),
-        (BOUNDARY, PART * 2 + b"--x--", "in parts of different names"),
-        (BOUNDARY, PART.replace(b'name="f"; ', b"") + b"--x--", "expected a name for every part"),
-        (BOUNDARY, PART.replace(b'"a"', b'"\xff"') + b"--x--", "in UTF-8"),
-        (BOUNDARY, b'--x\r\nContent-Disposition: form-data; name="a"\r\n\r\n\xff\r\n--x--', "in UTF-8"),
-    ],
-    ids=["no boundary", "cut", "no form", "twice", "no name", "name of a file", "field"],
-)  # fmt: skip
-def test_a_broken_form_is_refused(
-    api: TestClient, settings: Settings, media_type: str, body: bytes, told: str
+def test_nothing_stays_of_a_refused_form(
+    api: TestClient, settings: Settings, image_file: Path, psf_file: Path
 ) -> None:
-    answer = api.post(JOBS, content=body, headers={"Content-Type": media_type})
-    assert answer.status_code == 400 and told in answer.text, answer.text
-    assert temporary(settings) == []
+    def refused(name: str, answer: httpx.Response, status: int, told: str) -> None:
+        assert answer.status_code == status and told in answer.text, (name, answer.text)
+        assert answer.headers["content-type"].startswith("text/plain"), name
+        assert kept(api) == NOTHING and len(document(api.get(JOBS))) == 0, name
+        assert temporary(settings) == [] and list((settings.data_dir / "blobs").rglob("*/*")) == [], name
+
+    for name, fields, status, told in REFUSED:
+        refused(name, post(api, JOBS, fields, {"f": ("sun.fits", image_file.read_bytes())}), status, told)
+    for name, kind, part, content, status, told in FILES:
+        answer = post(api, JOBS, {"KIND": kind, "UPLOAD": f"{part},param:f"}, {"f": ("x", content)})
+        refused(name, answer, status, told)
+    for name, media_type, body, told in BROKEN:
+        answer = api.post(JOBS, content=body, headers={"Content-Type": media_type})
+        refused(name, answer, 400, told)
+    both: dict[str, str | list[str]] = {**IMAGE, "UPLOAD": "image,param:f;psf,param:g"}
+    files = {"f": ("sun.fits", image_file.read_bytes()), "g": ("psf.fits", b"a letter")}
+    refused("one of two files is bad", post(api, JOBS, both, files), 415, "")
 
 
 def test_forms_without_files_may_be_multipart_and_are_bounded(api: TestClient) -> None:

@@ -62,7 +62,7 @@ def add_product(
     api: TestClient, folder: Path, *, owner: str = "local", wcs: bool = True, number: int = 1, **details: Any
 ) -> dict[str, str]:
     """Add an image, a PSF, a completed job and its product; returns their ids: "image", "psf", "job", "product"."""
-    state = api.app.state.heliopsf  # type: ignore[attr-defined]
+    state = api.app.state.heliopsf
     write_image(folder / f"image-{number}.fits", seed=number, **OBSERVED, **(WCS_CARDS if wcs else {}))
     image = upload(api, folder / f"image-{number}.fits")
     if not (folder / "psf.fits").exists():
@@ -75,45 +75,28 @@ def add_product(
     preview = state.store.keep(folder / "preview.png")
     product, job = f"{number:064x}", f"{number:032x}"
     parameters = {"image_id": image, "psf_id": psf, "method": {"name": "linear", "steps": 2}}
-    row = ProductRow(
-        owner=owner,
-        id=product,
-        created_at=time.time(),
-        kind="deconvolved-image",
-        image_id=image,
-        psf_id=psf,
-        psf_version="1.0.0",
-        file_sha256=digest,
-        bytes=size,
-        preview_sha256=preview,
-        details={
-            "filename": f"product-{number}.fits",
-            "method": {"name": "linear"},
-            "job_id": job,
-            "algorithm_version": 1,
-            "software_version": "0.1.0",
-            "libraries": {"numpy": "2.4.6", "astropy": "8.0.2"},
-            "parameters": parameters,
-            "changes": {"artefacts": {"score": 0.25}},
-            "thumbnail_sha256": preview,
-            **details,
-        },
+    known = {
+        "filename": f"product-{number}.fits",
+        "method": {"name": "linear"},
+        "job_id": job,
+        "algorithm_version": 1,
+        "software_version": "0.1.0",
+        "libraries": {"numpy": "2.4.6", "astropy": "8.0.2"},
+        "parameters": parameters,
+        "changes": {"artefacts": {"score": 0.25}},
+        "thumbnail_sha256": preview,
+    }
+    files = {"file_sha256": digest, "preview_sha256": preview, "bytes": size}
+    made = {"image_id": image, "psf_id": psf, "psf_version": "1.0.0", "kind": "deconvolved-image"}
+    state.catalogue.add(
+        ProductRow(
+            owner=owner, id=product, created_at=time.time(), **made, **files, details={**known, **details}
+        )
     )
-    state.catalogue.add(row)
-    done = JobRow(
-        id=job,
-        owner=owner,
-        kind="deconvolve",
-        parameters=parameters,
-        request_key=product,
-        work_key=product,
-        phase=Phase.COMPLETED,
-        queue="interactive",
-        created_at=STARTED_AT - 1,
-        started_at=STARTED_AT,
-        ended_at=ENDED_AT,
-        result_id=product,
-    )
+    keys = {"request_key": product, "work_key": product, "queue": "interactive"}
+    times = {"created_at": STARTED_AT - 1, "started_at": STARTED_AT, "ended_at": ENDED_AT}
+    done = {"phase": Phase.COMPLETED, "result_id": product}
+    row = JobRow(id=job, owner=owner, kind="deconvolve", parameters=parameters, **keys, **times, **done)
     with state.catalogue._database.writing.begin() as session:
-        session.add(done)
+        session.add(row)
     return {"image": image, "psf": psf, "job": job, "product": product}

@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from fastapi.testclient import TestClient
 
-from tests.service.keyed import keyed
+from tests.service.keyed import Keyed
 from tests.service.vo.made import SHAPE, add_product, pixels
 from workers.settings import Settings
 
@@ -25,9 +25,14 @@ def cut(api: TestClient, identity: str, **fields: str) -> fits.HDUList:
     return fits.open(io.BytesIO(answer.content), checksum=True)
 
 
-@pytest.mark.parametrize(
-    ("fields", "columns", "rows"),
-    [
+@pytest.fixture(scope="module")
+def product(shared_api: TestClient, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The id of a product."""
+    return add_product(shared_api, tmp_path_factory.mktemp("product"))["product"]
+
+
+def test_the_smallest_rectangle_of_whole_pixels(shared_api: TestClient, product: str) -> None:
+    for fields, columns, rows in (
         ({"CIRCLE": "40 30 2"}, (38, 42), (28, 32)),
         ({"circle": "40.4 30 2.2"}, (38, 43), (28, 32)),
         ({"BOX": "40 30 5 3"}, (38, 42), (29, 31)),
@@ -35,30 +40,24 @@ def cut(api: TestClient, identity: str, **fields: str) -> fits.HDUList:
         ({"POLYGON": "1 2 9 2 9 20"}, (1, 9), (2, 20)),
         ({"BOX": "0 0 8 8"}, (0, 4), (0, 4)),
         ({"CIRCLE": "64 48 1000"}, (0, SHAPE[1] - 1), (0, SHAPE[0] - 1)),
-    ],
-    ids=str,
-)
-def test_the_smallest_rectangle_of_whole_pixels(
-    api: TestClient, tmp_path: Path, fields: dict[str, str], columns: tuple[int, int], rows: tuple[int, int]
-) -> None:
-    ids = add_product(api, tmp_path)
-    part = (slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1))
-    with cut(api, ids["product"], **fields) as hdus:
-        assert [hdu.name for hdu in hdus] == ["PRIMARY", "QUALITY", "ERROR"]
-        for hdu, whole in zip(hdus, (pixels(), pixels() % 7, pixels() / 2), strict=True):
-            np.testing.assert_array_equal(hdu.data, whole[part])
-        assert hdus["QUALITY"].data.dtype == np.uint8
-        assert "PXBEG1" not in hdus[0].header and "columns" in str(hdus[0].header["HISTORY"])
+    ):
+        part = (slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1))
+        with cut(shared_api, product, **fields) as hdus:
+            assert [hdu.name for hdu in hdus] == ["PRIMARY", "QUALITY", "ERROR"]
+            for hdu, whole in zip(hdus, (pixels(), pixels() % 7, pixels() / 2), strict=True):
+                np.testing.assert_array_equal(hdu.data, whole[part], err_msg=str(fields))
+            assert hdus["QUALITY"].data.dtype == np.uint8
+            assert "PXBEG1" not in hdus[0].header and "columns" in str(hdus[0].header["HISTORY"])
 
 
-def test_a_pixel_keeps_its_place_on_the_sky(api: TestClient, tmp_path: Path) -> None:
-    ids = add_product(api, tmp_path)
-    whole = WCS(fits.getheader(io.BytesIO(api.get(f"/v1/products/{ids['product']}/file").content)))
+def test_a_pixel_keeps_its_place_on_the_sky(shared_api: TestClient, product: str) -> None:
+    api = shared_api
+    whole = WCS(fits.getheader(io.BytesIO(api.get(f"/v1/products/{product}/file").content)))
     x, y = 70, 20
     longitude, latitude = (float(n) * 3600 for n in whole.wcs_pix2world([[x, y]], 0)[0])
     radius = 3.0  # arcsec: 6 px
     fields = {"CIRCLE": f"{longitude!r} {latitude!r} {radius}", "FRAME": "helioprojective"}
-    with cut(api, ids["product"], **fields) as hdus:
+    with cut(api, product, **fields) as hdus:
         ny, nx = hdus[0].shape
         assert hdus[0].data[ny // 2, nx // 2] == pixels()[y, x]
         assert (ny, nx) == (13, 13)
@@ -67,60 +66,64 @@ def test_a_pixel_keeps_its_place_on_the_sky(api: TestClient, tmp_path: Path) -> 
             np.testing.assert_allclose(place, (longitude, latitude), atol=1e-6)
 
 
-def test_a_region_on_the_sky_is_inside_its_cutout(api: TestClient, tmp_path: Path) -> None:
+def test_a_region_on_the_sky_is_inside_its_cutout(shared_api: TestClient, product: str) -> None:
     """Every pixel whose centre is in a rotated box on the sky is in the cut-out: compared with all pixels of the image."""
-    ids = add_product(api, tmp_path)
-    header = fits.getheader(io.BytesIO(api.get(f"/v1/products/{ids['product']}/file").content))
+    api = shared_api
+    header = fits.getheader(io.BytesIO(api.get(f"/v1/products/{product}/file").content))
     y, x = np.indices(SHAPE)
     sky = WCS(header).wcs_pix2world(np.column_stack((x.ravel(), y.ravel())), 0) * 3600
     centre, width, height = sky[50 * SHAPE[1] + 60], 8.0, 4.0
     inside = (abs(sky[:, 0] - centre[0]) <= width / 2) & (abs(sky[:, 1] - centre[1]) <= height / 2)
     box = f"{float(centre[0])!r} {float(centre[1])!r} {width} {height}"
-    with cut(api, ids["product"], BOX=box, FRAME="helioprojective") as hdus:
+    with cut(api, product, BOX=box, FRAME="helioprojective") as hdus:
         assert set(pixels().ravel()[inside]) <= set(hdus[0].data.ravel())
         diagonal = math.hypot(width, height) / 0.5
         assert max(hdus[0].shape) <= diagonal + 2
 
 
-@pytest.mark.parametrize(
-    ("fields", "status", "said"),
-    [
-        ({}, 400, "expected CIRCLE, BOX or POLYGON, exactly one of them; got none"),
-        ({"CIRCLE": "1 2 3", "BOX": "1 2 3 4"}, 400, "exactly one of them; got 'CIRCLE and BOX'"),
-        ({"CIRCLE": "1 2"}, 400, "expected CIRCLE, finite numbers: x y radius; got '1 2'"),
-        ({"CIRCLE": "1 2 nan"}, 400, "expected CIRCLE, finite numbers"),
-        ({"CIRCLE": "1 2 0"}, 400, "sizes above 0; got '1 2 0'"),
-        ({"BOX": "1 2 3 -4"}, 400, "sizes above 0"),
-        ({"POLYGON": "1 2 3 4"}, 400, "expected POLYGON, finite numbers"),
-        ({"POLYGON": " ".join(["1"] * 300)}, 400, "with 3 to 100 corners"),
-        ({"CIRCLE": "1 2 3", "FRAME": "icrs"}, 400, "expected FRAME, pixel or helioprojective; got 'icrs'"),
-        ({"CIRCLE": "-50 2 3"}, 422, "expected a region with pixels of the image, 128 x 96 px"),
-        ({"CIRCLE": "1 2 3", "FRAME": "helioprojective"}, 409, "give the region in pixels"),
-        (
-            {"CIRCLE": "1 2 3", "ID": "nothing"},
-            404,
-            "expected ID, the id of one of your products; got 'nothing'",
-        ),
-        ({"CIRCLE": "1 2 3", "ID": ""}, 400, "expected ID, of one product; got none"),
-    ],
-    ids=str,
-)
-def test_bad_requests(
-    api: TestClient, tmp_path: Path, fields: dict[str, str], status: int, said: str
-) -> None:
+BAD: list[tuple[dict[str, str], int, str]] = [
+    ({}, 400, "expected CIRCLE, BOX or POLYGON, exactly one of them; got none"),
+    ({"CIRCLE": "1 2 3", "BOX": "1 2 3 4"}, 400, "exactly one of them; got 'CIRCLE and BOX'"),
+    ({"CIRCLE": "1 2"}, 400, "expected CIRCLE, finite numbers: x y radius; got '1 2'"),
+    ({"CIRCLE": "1 2 nan"}, 400, "expected CIRCLE, finite numbers"),
+    ({"CIRCLE": "1 2 0"}, 400, "sizes above 0; got '1 2 0'"),
+    ({"BOX": "1 2 3 -4"}, 400, "sizes above 0"),
+    ({"POLYGON": "1 2 3 4"}, 400, "expected POLYGON, finite numbers"),
+    ({"POLYGON": " ".join(["1"] * 300)}, 400, "with 3 to 100 corners"),
+    ({"CIRCLE": "1 2 3", "FRAME": "icrs"}, 400, "expected FRAME, pixel or helioprojective; got 'icrs'"),
+    ({"CIRCLE": "-50 2 3"}, 422, "expected a region with pixels of the image, 128 x 96 px"),
+    ({"CIRCLE": "1 2 3", "FRAME": "helioprojective"}, 409, "give the region in pixels"),
+    (
+        {"CIRCLE": "1 2 3", "ID": "nothing"},
+        404,
+        "expected ID, the id of one of your products; got 'nothing'",
+    ),
+    ({"CIRCLE": "1 2 3", "ID": ""}, 400, "expected ID, of one product; got none"),
+]
+
+
+def test_bad_requests(api: TestClient, tmp_path: Path) -> None:
     ids = add_product(api, tmp_path, wcs=False)
-    answer = api.get("/vo/cutout", params={"ID": ids["product"], **fields})
-    assert answer.status_code == status and said in answer.text, answer.text
-    assert answer.headers["content-type"].startswith("text/plain")
+    for fields, status, said in BAD:
+        answer = api.get("/vo/cutout", params={"ID": ids["product"], **fields})
+        assert answer.status_code == status and said in answer.text, (fields, answer.text)
+        assert answer.headers["content-type"].startswith("text/plain"), fields
 
 
-def test_owners_and_caches(settings: Settings, tmp_path: Path) -> None:
-    with keyed(settings) as service:
-        mine = service.client("me")
-        query = {"ID": add_product(mine, tmp_path, owner="me")["product"], "CIRCLE": "9 9 3"}
-        first = mine.get("/vo/cutout", params=query)
-        again = mine.get("/vo/cutout", params=query, headers={"If-None-Match": first.headers["etag"]})
-        assert (first.status_code, again.status_code) == (200, 304)
-        assert service.client("other").get("/vo/cutout", params=query).status_code == 404
-        assert service.api.get("/vo/cutout", params=query).status_code == 401
-        assert list((settings.data_dir / "tmp").iterdir()) == [], "no temporary file is left"
+def test_owners_and_caches(service: Keyed, settings: Settings, tmp_path: Path) -> None:
+    mine, other = service.client("me"), service.client("other")
+    product = add_product(mine, tmp_path, owner="me")["product"]
+    query = {"ID": product, "CIRCLE": "9 9 3"}
+    first = mine.get("/vo/cutout", params=query)
+    again = mine.get("/vo/cutout", params=query, headers={"If-None-Match": first.headers["etag"]})
+    assert (first.status_code, again.status_code) == (200, 304)
+    assert other.get("/vo/cutout", params=query).status_code == 404
+    assert service.api.get("/vo/cutout", params=query).status_code == 401
+    assert list((settings.data_dir / "tmp").iterdir()) == [], "no temporary file is left"
+    assert len(mine.get("/vo/products?responseformat=json").json()["rows"]) == 1
+    for table in ("products", "psfs"):
+        assert other.get(f"/vo/{table}?responseformat=json").json()["rows"] == []
+    nobody = "0" * 64
+    own, others = (client.get("/vo/links", params={"ID": product}).text for client in (mine, other))
+    assert "NotFoundFault" not in own and "file" in own
+    assert others.replace(product, nobody) == other.get("/vo/links", params={"ID": nobody}).text

@@ -13,9 +13,8 @@ from vo_models.vosi.tables.models import VOSITableSet
 
 from service.vo.columns import TABLES
 from service.vo.interfaces import OFFERED
-from tests.service.keyed import keyed
+from tests.service.keyed import Keyed
 from workers import checks
-from workers.settings import Settings
 
 
 def test_availability(api: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,18 +49,17 @@ def test_capabilities_name_addresses_that_answer(api: TestClient) -> None:
         assert api.get(address).status_code == status, standard
 
 
-def test_a_service_with_keys_shows_its_interfaces_to_everybody(settings: Settings) -> None:
-    with keyed(settings) as service:
-        for name in ("availability", "capabilities", "tables"):
-            assert service.api.get(f"/vo/{name}").status_code == 200
-        found = VOSICapabilities.from_xml(service.api.get("/vo/capabilities").content)
-        for one in found.capability:
-            [interface] = one.interface or []
-            needs_key = "VOSI" not in str(one.standard_id)
-            assert bool(interface.security_method) == needs_key
-            if needs_key:
-                refused = service.api.get(str(interface.access_url[0].value))
-                assert refused.status_code == 401 and "Basic" in refused.headers["WWW-Authenticate"]
+def test_a_service_with_keys_shows_its_interfaces_to_everybody(service: Keyed) -> None:
+    for name in ("availability", "capabilities", "tables"):
+        assert service.api.get(f"/vo/{name}").status_code == 200
+    found = VOSICapabilities.from_xml(service.api.get("/vo/capabilities").content)
+    for one in found.capability:
+        [interface] = one.interface or []
+        needs_key = "VOSI" not in str(one.standard_id)
+        assert bool(interface.security_method) == needs_key
+        if needs_key:
+            refused = service.api.get(str(interface.access_url[0].value))
+            assert refused.status_code == 401 and "Basic" in refused.headers["WWW-Authenticate"]
 
 
 def test_tables_list_every_column(api: TestClient) -> None:

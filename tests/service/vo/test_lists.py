@@ -12,9 +12,7 @@ from astropy.time import Time
 from fastapi.testclient import TestClient
 
 from service.vo.columns import OBSCORE, PRODUCTS
-from tests.service.keyed import keyed
 from tests.service.vo.made import SHAPE, add_product
-from workers.settings import Settings
 
 
 def table(content: bytes) -> tuple[Any, dict[str, str]]:
@@ -46,9 +44,6 @@ def test_a_product_has_the_columns_of_obscore(api: TestClient, tmp_path: Path) -
     assert api.get(row["access_url"]).headers["content-type"] == row["access_format"]
     assert api.get(row["provenance_url"]).status_code == 200
 
-
-def test_psfs_and_json(api: TestClient, tmp_path: Path) -> None:
-    ids = add_product(api, tmp_path)
     rows, _ = table(api.get("/vo/psfs").content)
     [row] = rows
     assert row["obs_publisher_did"] == f"urn:heliopsf:psf:{ids['psf']}" and row["status"] == "draft"
@@ -72,28 +67,16 @@ def test_pages(api: TestClient, tmp_path: Path) -> None:
     assert table(api.post("/vo/products", data={"maxrec": "1"}).content)[1]["QUERY_STATUS"] == "OVERFLOW"
 
 
-def test_an_owner_sees_only_own_rows(settings: Settings, tmp_path: Path) -> None:
-    with keyed(settings) as service:
-        mine, other = service.client("me"), service.client("other")
-        add_product(mine, tmp_path, owner="me")
-        assert len(mine.get("/vo/products?responseformat=json").json()["rows"]) == 1
-        assert other.get("/vo/products?responseformat=json").json()["rows"] == []
-        assert other.get("/vo/psfs?responseformat=json").json()["rows"] == []
-
-
-@pytest.mark.parametrize(
-    ("query", "status", "said"),
-    [
+def test_errors_are_votables(shared_api: TestClient) -> None:
+    for query, status, said in (
         ("MAXREC=-1", 400, "expected MAXREC, a whole number of 0 or more; got '-1'"),
         ("MAXREC=many", 400, "expected MAXREC, a whole number of 0 or more; got 'many'"),
         ("MAXREC=1&maxrec=2", 400, "expected MAXREC once; got it 2 times"),
         ("RESPONSEFORMAT=fits", 400, "expected RESPONSEFORMAT, votable or json; got 'fits'"),
         ("CURSOR=xyz", 422, "expected the cursor in the `next` address"),
-    ],
-)
-def test_errors_are_votables(api: TestClient, query: str, status: int, said: str) -> None:
-    answer = api.get(f"/vo/products?{query}")
-    assert answer.status_code == status and answer.headers["content-type"] == "application/x-votable+xml"
-    votable = parse(io.BytesIO(answer.content))
-    [info] = votable.resources[0].infos
-    assert (info.name, info.value) == ("QUERY_STATUS", "ERROR") and said in info.content
+    ):
+        answer = shared_api.get(f"/vo/products?{query}")
+        kind = answer.headers["content-type"]
+        assert (answer.status_code, kind) == (status, "application/x-votable+xml"), query
+        [info] = parse(io.BytesIO(answer.content)).resources[0].infos
+        assert (info.name, info.value) == ("QUERY_STATUS", "ERROR") and said in info.content, query

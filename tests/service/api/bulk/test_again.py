@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +11,18 @@ import pytest
 from click.testing import CliRunner
 from fastapi.testclient import TestClient
 
-from service.app import create_app
 from service.cli import bulk as cli_bulk
 from service.cli.main import main
 from service.client.http import Client
 from tests.conftest import write_image
-from tests.service.conftest import upload
+from tests.service.api.bulk.conftest import FEW, now, started
+from tests.service.conftest import refusal
 from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.files import archive as archive_files
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
-
-FEW = {"method": {"name": "richardson-lucy", "steps": 2}}
 
 
 @pytest.fixture
@@ -40,46 +38,17 @@ def archive(tmp_path: Path) -> Path:
     return root
 
 
-@pytest.fixture
-def settings(settings: Settings, archive: Path) -> Settings:
-    return settings.model_copy(update={"bulk_roots": str(archive)})
-
-
-@pytest.fixture
-def api(settings: Settings) -> Iterator[TestClient]:
-    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
-        yield client
-
-
-@pytest.fixture
-def catalogue(settings: Settings, api: TestClient) -> Iterator[Catalogue]:
-    catalogue = Catalogue(settings.catalogue_url)
-    yield catalogue
-    catalogue.close()
-
-
-def turns(catalogue: Catalogue, settings: Settings) -> None:
-    """Turns run until no bulk goes on."""
-    runner = Runner(settings, catalogue, Store(settings.data_dir))
-    while catalogue.bulks.at_work():
-        keep_turns(catalogue, settings)
-        for turn in catalogue.jobs.of_kind("bulk"):
-            runner.run(turn.id)
-
-
 def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
     api: TestClient,
     archive: Path,
-    psf_file: Path,
-    catalogue: Catalogue,
-    settings: Settings,
+    psf_id: str,
+    work: Callable[[], None],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    psf_id = upload(api, psf_file, "/v1/psfs")
     request = {"files": [{"glob": f"{archive}/*.fits"}], "psf_id": psf_id, "parameters": FEW}
-    first = api.post("/v1/bulk", json=request).json()
-    turns(catalogue, settings)
-    ended = api.get(f"/v1/bulk/{first['id']}").json()
+    first = started(api, **request)
+    work()
+    ended = now(api, first)
     assert (ended["phase"], ended["images"]["done"], ended["images"]["failed"]) == ("COMPLETED", 1, 2)
     failed = {line["error"]["code"]: line for line in api.get(ended["failures"]).json()["items"]}
     assert set(failed) == {"not-fits", "path-not-utf-8"}
@@ -87,10 +56,9 @@ def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
     assert "expected a path in UTF-8; got" in failed["path-not-utf-8"]["error"]["message"]
 
     second = api.post("/v1/bulk", json=request).json()
-    refused = api.post(f"/v1/bulk/{first['id']}/retry")
-    assert (refused.status_code, refused.json()["type"]) == (409, "urn:heliopsf:equal-bulk-open")
-    assert f"run {second['id']} is LISTING" in refused.json()["detail"]
-    assert api.get(f"/v1/bulk/{first['id']}").json() == ended
+    detail = refusal(api.post(f"/v1/bulk/{first['id']}/retry"), 409, "equal-bulk-open")
+    assert f"run {second['id']} is LISTING" in detail
+    assert now(api, first) == ended
 
     class Here(Client):
         def close(self) -> None:
@@ -103,12 +71,12 @@ def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
     (line,) = answer.output.splitlines()
     assert line.startswith("Error: ") and f"run {second['id']} is LISTING" in line
 
-    turns(catalogue, settings)
+    work()
     (archive / "letter.fits").unlink()
     write_image(archive / "letter.fits", seed=1)
     assert CliRunner().invoke(main, ["bulk", "retry", first["id"]]).exit_code == 0
-    turns(catalogue, settings)
-    again = api.get(f"/v1/bulk/{first['id']}").json()
+    work()
+    again = now(api, first)
     assert (again["phase"], again["images"]["done"], again["images"]["failed"]) == ("COMPLETED", 2, 1)
     (line,) = api.get(ended["failures"]).json()["items"]
     assert line == failed["path-not-utf-8"], "its reason stays: there is no path to try again"
@@ -117,14 +85,13 @@ def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
 def test_a_run_can_be_cancelled_while_it_lists_and_finds_no_file(
     api: TestClient,
     archive: Path,
-    psf_file: Path,
+    psf_id: str,
     catalogue: Catalogue,
     settings: Settings,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
     monkeypatch.setattr("workers.bulk.listing.ADD_EVERY_S", 0.0)
-    psf_id = upload(api, psf_file, "/v1/psfs")
     request = {"files": [{"glob": f"{archive}/**/*.none"}], "psf_id": psf_id, "parameters": FEW}
     bulk = api.post("/v1/bulk", json=request).json()
     keep_turns(catalogue, settings)
@@ -147,10 +114,3 @@ def test_a_run_can_be_cancelled_while_it_lists_and_finds_no_file(
         "it saw that the run, or that itself is cancelled"
     )
     assert api.get(f"/v1/bulk/{bulk['id']}").json()["phase"] == "CANCELLED"
-
-
-def test_a_pattern_below_a_link_to_itself_is_refused(api: TestClient, archive: Path, psf_file: Path) -> None:
-    (archive / "loop").symlink_to(archive / "loop")
-    psf_id = upload(api, psf_file, "/v1/psfs")
-    answer = api.post("/v1/bulk", json={"files": [{"glob": f"{archive}/loop/*.fits"}], "psf_id": psf_id})
-    assert (answer.status_code, answer.json()["type"]) == (422, "urn:heliopsf:bad-path"), answer.text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from tests.conftest import write_image
-from tests.service.conftest import work_through_bulks
-from workers.settings import Settings
+from tests.service.api.bulk.conftest import FEW, failures, results, started
 
-FEW = {"method": {"name": "richardson-lucy", "steps": 1}}
+Work = Callable[[], None]
 LAYOUT = "{telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits"
 
 
@@ -29,34 +28,20 @@ def archive(tmp_path: Path) -> Path:
     return root
 
 
-@pytest.fixture
-def out(tmp_path: Path) -> Path:
-    return tmp_path / "out"
-
-
-@pytest.fixture
-def settings(settings: Settings, archive: Path, out: Path) -> Settings:
-    return settings.model_copy(update={"bulk_roots": str(archive), "bulk_output_roots": str(out)})
-
-
-def done(api: TestClient, settings: Settings, **request: Any) -> tuple[list[dict[str, Any]], dict[str, str]]:
+def done(api: TestClient, work: Work, **request: Any) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """The results of a run, and the codes of its failures by file."""
-    answer = api.post("/v1/bulk", json={"parameters": FEW, **request})
-    assert answer.status_code == 202, answer.text
-    work_through_bulks(settings)
-    here = f"/v1/bulk/{answer.json()['id']}"
-    failed = api.get(f"{here}/failures").json()["items"]
-    lines = [json.loads(line) for line in api.get(f"{here}/results").text.splitlines()]
-    return lines, {one["source"]: one["error"]["code"] for one in failed}
+    bulk = started(api, **request)
+    work()
+    return results(api, bulk), {one["source"]: one["error"]["code"] for one in failures(api, bulk)}
 
 
 @pytest.mark.parametrize("only", [False, True])
 def test_products_have_the_names_of_the_layout(
-    api: TestClient, settings: Settings, archive: Path, out: Path, psf_id: str, only: bool
+    api: TestClient, work: Work, archive: Path, out: Path, psf_id: str, only: bool
 ) -> None:
     output = {"folder": str(out), "layout": LAYOUT, "only": only}
     request = {"files": [{"glob": f"{archive}/*/*"}], "psf_id": psf_id, "output": output}
-    lines, failed = done(api, settings, **request)
+    lines, failed = done(api, work, **request)
     wanted = [out / f"TEST/{year}/03/01/one_deconvolved.fits" for year in (2020, 2021)]
     assert [line["output"] for line in lines] == list(map(str, wanted))
     assert failed == {f"{archive}/2022/one.fits": "no-output-name"}
@@ -64,53 +49,44 @@ def test_products_have_the_names_of_the_layout(
         line["sha256"] for line in lines
     ]
     assert sorted(path for path in out.rglob("*") if path.is_file()) == wanted, "nothing else is left"
-    again, _ = done(api, settings, **request)
+    again, _ = done(api, work, **request)
     assert [line["reused"] for line in again] == [True, True]
     assert [line["output"] for line in again] == list(map(str, wanted))
 
 
 @pytest.mark.parametrize("only", [False, True])
 def test_the_second_image_with_a_name_fails_and_replaces_nothing(
-    api: TestClient, settings: Settings, archive: Path, out: Path, psf_id: str, only: bool
+    api: TestClient, work: Work, archive: Path, out: Path, psf_id: str, only: bool
 ) -> None:
     output = {"folder": str(out), "layout": "{stem}.fits", "only": only}
     request = {"files": [{"glob": f"{archive}/*/*"}], "psf_id": psf_id, "output": output}
     told = api.post("/v1/bulk/estimate", json={"parameters": FEW, **request}).json()
     assert [one["error"]["code"] for one in told["refused"]] == ["output-name-taken"] * 2
-    (line,), failed = done(api, settings, **request)
+    (line,), failed = done(api, work, **request)
     assert set(failed.values()) == {"output-name-taken"} and len(failed) == 2
     assert hashlib.sha256((out / "one.fits").read_bytes()).hexdigest() == line["sha256"]
     assert [path.name for path in out.iterdir()] == ["one.fits"]
 
 
 def test_a_file_of_somebody_else_is_not_replaced(
-    api: TestClient, settings: Settings, archive: Path, out: Path, psf_id: str
+    api: TestClient, work: Work, archive: Path, out: Path, psf_id: str
 ) -> None:
     out.mkdir()
     (out / "one.fits").write_text("a letter")
     output = {"folder": str(out), "layout": "{stem}.fits"}
-    lines, failed = done(api, settings, files=[{"glob": f"{archive}/2020/*"}], psf_id=psf_id, output=output)
+    lines, failed = done(api, work, files=[{"glob": f"{archive}/2020/*"}], psf_id=psf_id, output=output)
     assert lines == [] and list(failed.values()) == ["output-name-taken"]
     assert (out / "one.fits").read_text() == "a letter"
 
 
 def test_a_link_in_the_output_folder_is_not_followed_out_of_it(
-    api: TestClient, settings: Settings, archive: Path, out: Path, psf_id: str
+    api: TestClient, work: Work, archive: Path, out: Path, psf_id: str
 ) -> None:
     (out / "elsewhere").mkdir(parents=True)
     (out / "run").mkdir()
     (out / "run" / "2020").symlink_to(out / "elsewhere")
     output = {"folder": str(out / "run"), "layout": "{folder}/{stem}.fits"}
-    lines, failed = done(
-        api, settings, files=[{"glob": f"{archive}/202[01]/*"}], psf_id=psf_id, output=output
-    )
+    lines, failed = done(api, work, files=[{"glob": f"{archive}/202[01]/*"}], psf_id=psf_id, output=output)
     assert failed == {f"{archive}/2020/one.fits": "path-not-allowed"}
     assert [line["output"] for line in lines] == [str(out / "run" / "2021" / "one.fits")]
     assert list((out / "elsewhere").iterdir()) == []
-
-
-def test_an_unknown_field_is_refused_at_once(api: TestClient, archive: Path, out: Path, psf_id: str) -> None:
-    output = {"folder": str(out), "layout": "{telescope}/{stem}.fits"}
-    request = {"files": [{"glob": f"{archive}/*/*"}], "psf_id": psf_id, "output": output}
-    answer = api.post("/v1/bulk", json=request)
-    assert answer.status_code == 422 and "got 'telescope'" in answer.text
