@@ -4,43 +4,35 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from astropy.io.fits import Header
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.memory import MIB, Asked, check_memory, deconvolution_bytes
 from psfcore.deconvolve.methods.registry import method_named, method_names
 from psfcore.errors import DataError
-from psfcore.image import Image
 from psfcore.psf import Psf
+from tests.psfcore.conftest import make_image, make_psf
 
 
-@pytest.mark.parametrize("method", method_names())
-@pytest.mark.parametrize(
-    ("edges", "shape"), [("zero", (96, 130)), ("symmetric", (96, 96)), (None, (64, 200))]
-)
-def test_the_transforms_are_those_of_the_engine(
-    method: str, edges: str | None, shape: tuple[int, int]
-) -> None:
+def test_the_transforms_are_those_of_the_engine() -> None:
     weights = np.zeros((80, 80))
     weights[40, 40] = 1.0
     weights[0, :] = weights[:, 0] = 1e-6  # so that the whole array is needed
-    psf = Psf(kernel=weights / weights.sum(), name="p", version="1", instrument=None, status="user")
-    pixels = np.full(shape, 5.0)
-    made: list[Engine] = []
+    psf = make_psf(weights / weights.sum())
+    engines: list[Engine] = []
 
     def engine_for(psf: Psf, plane: tuple[int, int], span: tuple[int, int], threads: int) -> Engine:
-        made.append(Engine(psf.kernel, plane, span=span, threads=threads))
-        return made[-1]
+        engines.append(Engine(psf.kernel, plane, span=span, threads=threads))
+        return engines[-1]
 
-    conditions = Conditions(edges=edges, margin_px=16, engine_for=engine_for)  # type: ignore[arg-type]
-    method_named(method)(
-        Image(pixels, np.zeros(shape, np.uint8), Header(), "DN", 1.0), psf, conditions, steps=1
-    )
-    asked = Asked(method, shape, (80, 80), edges=edges, margin_px=16)
-    [engine] = made
-    assert asked.plane == engine.field_shape
-    assert asked.transform == (engine.column_plan.length, engine.row_plan.length)
+    for method in method_names():
+        for edges, shape in (("zero", (96, 130)), ("symmetric", (96, 96)), (None, (64, 200))):
+            conditions = Conditions(edges=edges, margin_px=16, engine_for=engine_for)  # type: ignore[arg-type]
+            method_named(method)(make_image(np.full(shape, 5.0)), psf, conditions, steps=1)
+            sizes = Asked(method, shape, (80, 80), edges=edges, margin_px=16)
+            engine = engines.pop()
+            assert not engines and sizes.plane == engine.field_shape, (method, edges)
+            assert sizes.transform == (engine.column_plan.length, engine.row_plan.length), (method, edges)
 
 
 def test_more_pixels_need_more_memory() -> None:
@@ -56,6 +48,6 @@ def test_what_does_not_fit_is_refused_with_both_figures() -> None:
     with pytest.raises(DataError) as refused:
         check_memory((4096, 2048), 101 * MIB, 100 * MIB)
     assert refused.value.code == "too-much-memory"
-    for told in ("2048 x 4096 px", "101 MiB", "100 MiB", "region"):
-        assert told in refused.value.message
+    for text in ("2048 x 4096 px", "101 MiB", "100 MiB", "region"):
+        assert text in refused.value.message
     assert refused.value.fields == {"needed_mib": 101, "free_mib": 100}

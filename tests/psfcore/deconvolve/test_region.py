@@ -57,48 +57,49 @@ def image(psf: Psf) -> Image:
 
 
 def both(
-    image: Image, psf: Psf, method: str, box: Box, *, largest_error: float = 0.1, **more: Any
+    image: Image, psf: Psf, method: str, box: Box, *, largest_error: float = 0.1, steps: int = 0, **more: Any
 ) -> tuple[Any, ...]:
-    """The box alone, the same box of the whole image, and the work on the box."""
-    work = Work(image, psf, method, Conditions(**more))
+    """The box alone, the same box of the whole image, and the work on the box. steps: 0 for the method's default."""
+    work = Work(image, psf, method, Conditions(**more), {"steps": steps} if steps else {})
     alone = box_work(work, box, largest_error=largest_error)
     return alone.run(), work.run().pixels[box.slices], alone
 
 
 @pytest.mark.parametrize("method", method_names())
-@pytest.mark.parametrize("box", [BRIGHT, HOLE], ids=["bright", "hole"])
 def test_a_box_alone_differs_from_the_whole_image_by_at_most_its_bound(
-    image: Image, psf: Psf, method: str, box: Box
+    image: Image, psf: Psf, method: str
 ) -> None:
-    result, expected, alone = both(image, psf, method, box)
-    assert result.pixels.shape == box.shape and result.of_box is not None
-    assert 0 < result.of_box.error <= 0.1 * image.pixels[box.slices].mean()
-    assert alone.rim.shape != alone.shape, "a part of the image alone was deconvolved"
-    difference = np.abs(result.pixels - expected)
-    assert difference.max() <= result.of_box.error
-    # Without light from beyond the rim, the box would be wrong: the bound is not met by any result.
-    assert np.abs(image.pixels[box.slices] - expected).max() > 2 * result.of_box.error
+    whole = Work(image, psf, method, Conditions()).run().pixels
+    for box in (BRIGHT, HOLE):
+        alone = box_work(Work(image, psf, method, Conditions()), box, largest_error=0.1)
+        result, expected = alone.run(), whole[box.slices]
+        assert result.pixels.shape == box.shape and result.of_box is not None
+        assert 0 < result.of_box.error <= 0.1 * image.pixels[box.slices].mean()
+        assert alone.rim.shape != alone.shape, "a part of the image alone was deconvolved"
+        assert np.abs(result.pixels - expected).max() <= result.of_box.error
+        # Without light from beyond the rim, the box would be wrong: the bound is not met by any result.
+        assert np.abs(image.pixels[box.slices] - expected).max() > 2 * result.of_box.error
 
 
-@pytest.mark.parametrize("steps", [1, 2, 60])
-@pytest.mark.parametrize("method", ["richardson-lucy", "linear", "basic-iterative"])
-def test_the_bound_holds_before_and_after_convergence(
-    image: Image, psf: Psf, method: str, steps: int
-) -> None:
-    work = Work(image, psf, method, Conditions(), {"steps": steps})
-    result = box_work(work, HOLE, largest_error=0.3).run()
-    assert result.of_box is not None and result.of_box.error > 0
-    assert np.abs(result.pixels - work.run().pixels[HOLE.slices]).max() <= result.of_box.error
+def test_the_bound_holds_before_and_after_convergence(image: Image, psf: Psf) -> None:
+    for method, steps in (
+        ("richardson-lucy", 1),
+        ("linear", 2),
+        ("basic-iterative", 1),
+        ("richardson-lucy", 60),
+    ):
+        result, expected, _ = both(image, psf, method, HOLE, largest_error=0.3, steps=steps)
+        assert 0 < np.abs(result.pixels - expected).max() <= result.of_box.error, (method, steps)
 
 
-@pytest.mark.parametrize("edges", ["zero", "symmetric"])
-@pytest.mark.parametrize("method", ["richardson-lucy", "linear"])
-def test_the_bound_holds_at_an_edge_of_the_image(image: Image, psf: Psf, method: str, edges: str) -> None:
-    box = Box(0, 60, 0, 50)
-    result, expected, _ = both(image, psf, method, box, largest_error=0.3, edges=edges)
+def test_the_bound_holds_at_an_edge_of_the_image(image: Image, psf: Psf) -> None:
     inner = np.s_[8:, 8:]  # at the edge itself, the margin of the whole image is deconvolved too
-    assert np.abs(result.pixels - expected)[inner].max() <= result.of_box.error
-    assert result.edges == edges
+    for method in ("richardson-lucy", "linear"):
+        for edges in ("zero", "symmetric"):
+            box = Box(0, 60, 0, 50)
+            result, expected, _ = both(image, psf, method, box, largest_error=0.3, edges=edges)
+            assert np.abs(result.pixels - expected)[inner].max() <= result.of_box.error, (method, edges)
+            assert result.edges == edges
 
 
 def test_an_image_of_coarse_pixels_has_the_same_bound() -> None:
@@ -156,18 +157,12 @@ def test_the_quality_of_a_box_is_that_of_its_place_in_the_image(image: Image, ps
     assert quality[:, 0].all() and not quality[-1, -1] & QualityBit.EDGE
 
 
-@pytest.mark.parametrize(
-    ("box", "code"),
-    [
-        (Box(0, 257, 0, 20), "region-outside"),
-        (Box(30, 20, 0, 20), "region-outside"),
-        (Box(0, 20, 0, 15), "region-too-small"),
-    ],
-)
-def test_a_box_that_is_no_part_of_the_image_is_refused(image: Image, psf: Psf, box: Box, code: str) -> None:
-    with pytest.raises(DataError) as refused:
-        box_work(Work(image, psf, "linear", Conditions()), box)
-    assert (refused.value.code == code and str(box) in refused.value.message) or code == "region-too-small"
+def test_a_box_that_is_no_part_of_the_image_is_refused(image: Image, psf: Psf) -> None:
+    for box in (Box(0, 257, 0, 20), Box(30, 20, 0, 20)):
+        with pytest.raises(DataError, match=f"region-outside: .*{box}"):
+            box_work(Work(image, psf, "linear", Conditions()), box)
+    with pytest.raises(DataError, match="region-too-small"):
+        box_work(Work(image, psf, "linear", Conditions()), Box(0, 20, 0, 15))
 
 
 def test_what_depends_on_the_whole_image_is_refused(image: Image, psf: Psf) -> None:
@@ -188,12 +183,9 @@ def test_what_depends_on_the_whole_image_is_refused(image: Image, psf: Psf) -> N
         alone.errors(alone.run(), 4)
 
 
-@pytest.mark.parametrize("text", ["1:2", "1:2,3", "a:2,3:4", "1:2,3:4,5:6", "-1:20,0:20", "1.5:20,0:20"])
-def test_a_text_of_another_form_is_refused(text: str) -> None:
-    with pytest.raises(DataError, match="bad-region"):
-        Box.parse(text)
-
-
 def test_a_text_becomes_a_box_and_a_text_again() -> None:
     assert Box.parse("10:40,5:25") == Box(10, 40, 5, 25)
     assert str(Box(10, 40, 5, 25)) == "10:40,5:25"
+    for text in ("1:2", "1:2,3", "a:2,3:4", "1:2,3:4,5:6", "-1:20,0:20", "1.5:20,0:20"):
+        with pytest.raises(DataError, match="bad-region"):
+            Box.parse(text)
