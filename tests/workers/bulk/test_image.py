@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from tests.s3 import s3_bucket
+from tests.s3 import s3_bucket, shared_server
 from tests.service.conftest import upload
 from workers.bulk import image as bulk_image
 from workers.bulk.turns import keep_turns
@@ -21,7 +23,7 @@ from workers.settings import Settings
 def test_a_local_copy_removed_during_a_wait_is_downloaded_again(
     tmp_path: Path, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with s3_bucket(monkeypatch) as (url, _):
+    with s3_bucket(monkeypatch, shared_server()) as (url, _):
         data = {"data_dir": tmp_path / "data", "store_url": url}
         settings = Settings.model_validate(
             data | {"broker_url": "filesystem://", "allowed_hosts": "testserver"}
@@ -38,11 +40,12 @@ def test_a_local_copy_removed_during_a_wait_is_downloaded_again(
         assert lease is not None
         (copy,) = (path for path in tmp_path.rglob(image_id) if path.is_file())
 
-        def rest() -> None:
+        def rest(_seconds: float) -> None:
             copy.unlink()
             assert catalogue.jobs.requeue(lease)
 
-        monkeypatch.setattr(bulk_image, "_rest", rest)
+        clock = SimpleNamespace(time=time.time, monotonic=time.monotonic, sleep=rest)
+        monkeypatch.setattr(bulk_image, "time", clock)
         keep_turns(catalogue, settings)
         (turn,) = catalogue.jobs.of_kind("bulk")
         Runner(settings, catalogue, open_store(settings)).run(turn.id)

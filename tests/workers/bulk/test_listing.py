@@ -16,10 +16,11 @@ from sqlalchemy import select
 from service.app import create_app
 from tests.conftest import write_image
 from tests.service.conftest import upload
+from tests.workers.databases import rows
 from workers.bulk import listing, task
 from workers.bulk.matching import Place
 from workers.bulk.turns import keep_turns
-from workers.catalogue.bulk_tables import BulkItemRow
+from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.files import archive as archive_files
@@ -89,17 +90,16 @@ class Run:
         assert self.api.post(f"/v1/bulk/{self.id}/{name}").status_code == 200
 
     def rows(self) -> list[BulkItemRow]:
-        with self.catalogue._database.reading() as session:
-            query = select(BulkItemRow).where(BulkItemRow.bulk_id == self.id)
-            return list(session.scalars(query.order_by(BulkItemRow.position)))
+        query = select(BulkItemRow).where(BulkItemRow.bulk_id == self.id)
+        return rows(self.catalogue, query.order_by(BulkItemRow.position))
 
     def check_all_done_once(self) -> None:
         """Every file is one image, which was computed once; the counts and the quota agree with the rows."""
-        now, rows = self.now(), self.rows()
-        names = [Path(row.source).name for row in rows]
+        now, items = self.now(), self.rows()
+        names = [Path(row.source).name for row in items]
         assert Counter(names) == Counter(f"{number}.fits" for number in range(ALL))
-        assert [(row.state, row.attempts, row.reused) for row in rows] == [("done", 1, False)] * ALL
-        assert [row.position for row in rows] == list(range(ALL))
+        assert [(row.state, row.attempts, row.reused) for row in items] == [("done", 1, False)] * ALL
+        assert [row.position for row in items] == list(range(ALL))
         images = now["images"]
         assert (now["phase"], now["listed"]) == ("COMPLETED", True)
         assert (images["total"], images["done"], images["waiting"], images["failed"]) == (ALL, ALL, 0, 0)
@@ -204,11 +204,8 @@ def test_a_search_that_was_stopped_at_every_step_finds_each_file_once(run: Run) 
 
 def test_a_worker_that_is_lost_while_it_lists_is_followed_by_another(run: Run) -> None:
     run.start()
-    bulks, lost = run.catalogue.bulks, _lease(run)
-    begun = bulks.begin_listing(run.id, lost)
-    assert begun is not None
-    steps = iter([False] * (1 + FOLDERS + IN_FOLDER) + [True])  # the top, its folders, a folder and its files
-    listing.list_files(_context(run), begun, lost, lambda: None, lambda: next(steps))
+    lost = _lease(run)
+    begun = _list_first_folder(run, lost)
     partly = run.now()
     assert (partly["phase"], partly["listed"]) == ("LISTING", False) and 0 < partly["images"]["total"] < ALL
     run.catalogue.jobs.give_up_silent(-1.0, 99)
@@ -259,16 +256,24 @@ def test_a_run_that_is_cancelled_while_it_lists_keeps_its_products(
 def test_a_listing_that_fails_midway_keeps_what_is_done_and_continues_when_resumed(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def broken() -> None:
+        raise ZeroDivisionError
+
     def unreadable() -> None:
         raise PermissionError(13, "Permission denied")
 
     run.start()
+    with monkeypatch.context() as patched:
+        at_folder(patched, run.archive, "1", broken)
+        run.turn()
+    keep_turns(run.catalogue, run.settings)
+    assert (run.now()["phase"], run.now()["error"]["code"]) == ("ERROR", "internal-error")
+    run.change("resume")
     at_folder(monkeypatch, run.archive, "1", unreadable)
     run.turn()
     failed = run.now()
-    assert (failed["phase"], failed["listed"], failed["error"]["code"]) == (
-        "ERROR", False, "unreadable-folder",
-    )  # fmt: skip
+    assert (failed["phase"], failed["listed"]) == ("ERROR", False)
+    assert failed["error"]["code"] == "unreadable-folder"
     assert failed["images"]["total"] == IN_FOLDER, "what was found before the error is listed"
     assert "at least 2" in run.api.get(f"/bulk/{run.id}", headers={"Accept": "text/html"}).text
     run.change("resume")
@@ -276,30 +281,17 @@ def test_a_listing_that_fails_midway_keeps_what_is_done_and_continues_when_resum
     run.check_all_done_once()
 
 
-def test_an_internal_error_of_the_listing_stops_the_run(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken() -> None:
-        raise ZeroDivisionError
-
-    run.start()
-    at_folder(monkeypatch, run.archive, "1", broken)
-    run.turn()
-    keep_turns(run.catalogue, run.settings)
-    assert (run.now()["phase"], run.now()["error"]["code"]) == ("ERROR", "internal-error")
-
-
 def test_a_listing_that_finds_nothing_lets_other_jobs_go_first(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A search of a large archive must not keep a worker from the jobs of people."""
     run.start("**/*.none")
-    begun = threading.Event()
-    monkeypatch.setattr(Runner, "_let_others_go_first", _noted(Runner._let_others_go_first, begun))
-    at_folder(
-        monkeypatch,
-        run.archive,
-        "1",
-        lambda: run.catalogue.jobs.submit("psf-build", {}, "k", "somebody") and None,
+    handed_back, submit = [], lambda: run.catalogue.jobs.submit("psf-build", {}, "k", "somebody") and None
+    hand_back = run.catalogue.jobs.hand_back
+    monkeypatch.setattr(
+        run.catalogue.jobs, "hand_back", lambda lease: handed_back.append(1) or hand_back(lease)
     )
+    at_folder(monkeypatch, run.archive, "1", submit)
     monkeypatch.setattr(listing, "ADD_EVERY_S", 0.0)
     real = listing.found_files
 
@@ -307,11 +299,11 @@ def test_a_listing_that_finds_nothing_lets_other_jobs_go_first(
         for step in real(*given, **named):
             yield step
             if step.place.names[0] == "1":
-                threading.Event().wait(0.3)
+                threading.Event().wait(0.2)
 
     monkeypatch.setattr(listing, "found_files", slow)
     run.turn()
-    assert begun.is_set()
+    assert handed_back == [1]
     now = run.now()
     assert (now["phase"], now["images"]["total"]) == ("LISTING", 0)
 
@@ -321,16 +313,10 @@ def test_as_many_turns_as_workers_process_images_while_one_lists(
 ) -> None:
     run.start()
     monkeypatch.setattr(type(run.catalogue.census), "workers", lambda *_: [object()] * 3)
+    lease = _lease(run)
+    _list_first_folder(run, lease)
     keep_turns(run.catalogue, run.settings)
-    (first,) = run.catalogue.jobs.of_kind("bulk")
-    lease = run.catalogue.jobs.claim(first.id, "w")
-    assert lease is not None
-    begun = run.catalogue.bulks.begin_listing(run.id, lease)
-    assert begun is not None
-    steps = iter([False] * (1 + FOLDERS + IN_FOLDER) + [True])  # the top, its folders, a folder and its files
-    listing.list_files(_context(run), begun, lease, lambda: None, lambda: next(steps))
-    keep_turns(run.catalogue, run.settings)
-    others = [job for job in run.catalogue.jobs.of_kind("bulk") if job.id != first.id]
+    others = [job for job in run.catalogue.jobs.of_kind("bulk") if job.id != lease.job_id]
     assert len(others) == IN_FOLDER - 1
     Runner(run.settings, run.catalogue, Store(run.settings.data_dir), previews=False).run(others[0].id)
     now = run.now()
@@ -348,20 +334,21 @@ def _must_be_set(event: threading.Event) -> None:
     assert event.wait(WAIT_S), "no image was processed while files are listed"
 
 
-def _noted(function: Callable[..., None], event: threading.Event) -> Callable[..., None]:
-    def noting(*given: Any) -> None:
-        event.set()
-        function(*given)
-
-    return noting
-
-
 def _lease(run: Run) -> Lease:
     keep_turns(run.catalogue, run.settings)
     (job,) = run.catalogue.jobs.of_kind("bulk")
     lease = run.catalogue.jobs.claim(job.id, "w")
     assert lease is not None
     return lease
+
+
+def _list_first_folder(run: Run, lease: Lease) -> BulkRow:
+    """The run as it was before the top, its folders, a folder and its files were listed."""
+    begun = run.catalogue.bulks.begin_listing(run.id, lease)
+    assert begun is not None
+    steps = iter([False] * (1 + FOLDERS + IN_FOLDER) + [True])
+    listing.list_files(_context(run), begun, lease, lambda: None, lambda: next(steps))
+    return begun
 
 
 def _context(run: Run) -> Context:

@@ -15,6 +15,7 @@ from psfcore.errors import DataError
 from service.app import create_app
 from tests.conftest import write_image
 from tests.service.conftest import upload
+from tests.workers.databases import rows
 from workers.bulk import task
 from workers.bulk.turns import keep_turns
 from workers.catalogue.bulk_tables import BulkItemRow
@@ -31,19 +32,23 @@ class Run:
     """A bulk run of uploaded images, and its turns in this process."""
 
     def __init__(self, api: TestClient, settings: Settings, images: list[str], psf_id: str) -> None:
-        self.catalogue = Catalogue(settings.catalogue_url)
-        self._settings, self._store = settings, Store(settings.data_dir)
-        body = {"images": images, "psf_id": psf_id, "parameters": FEW}
-        self.id = api.post("/v1/bulk", json=body).json()["id"]
+        self.catalogue, self.settings = Catalogue(settings.catalogue_url), settings
+        self._api, self._store = api, Store(settings.data_dir)
+        self._body = {"images": images, "psf_id": psf_id}
+        self.id = self.requested()
+
+    def requested(self, **parameters: object) -> str:
+        """The id of the run of a request for these images."""
+        body = self._body | {"parameters": FEW | parameters}
+        return str(self._api.post("/v1/bulk", json=body).json()["id"])
 
     def turn(self) -> None:
-        keep_turns(self.catalogue, self._settings)
+        keep_turns(self.catalogue, self.settings)
         job = self.catalogue.jobs.of_kind("bulk")[0]
-        Runner(self._settings, self.catalogue, self._store).run(job.id)
+        Runner(self.settings, self.catalogue, self._store).run(job.id)
 
     def rows(self) -> list[BulkItemRow]:
-        with self.catalogue._database.reading() as session:
-            return list(session.scalars(select(BulkItemRow).order_by(BulkItemRow.position)))
+        return rows(self.catalogue, select(BulkItemRow).order_by(BulkItemRow.position))
 
 
 @pytest.fixture
@@ -63,6 +68,12 @@ def run(settings: Settings, tmp_path: Path, psf_file: Path) -> Iterator[Run]:
         run = Run(api, settings, images, upload(api, psf_file, "/v1/psfs"))
         yield run
         run.catalogue.close()
+
+
+def test_an_identical_request_finds_the_open_run(run: Run) -> None:
+    assert run.requested() == run.requested(other_channel=False, again=False) == run.id
+    others = [run.requested(**{name: True}) for name in ("other_channel", "again")]
+    assert len({run.id, *others}) == 3
 
 
 def number_of(ready: Any) -> int:
@@ -185,5 +196,5 @@ def test_files_of_equal_content_are_computed_once(
 
 
 def _turn_of(run: Run) -> str:
-    keep_turns(run.catalogue, run._settings)
+    keep_turns(run.catalogue, run.settings)
     return run.catalogue.jobs.of_kind("bulk")[0].id

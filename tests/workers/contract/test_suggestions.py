@@ -29,27 +29,21 @@ def test_only_a_close_name_is_suggested() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("change", "suggested"),
-    [
-        ({"kind": "evaluate"}, "report"),
-        ({"kind": "deconvolv"}, "deconvolve"),
-        ({"parameters": {"image_id": A, "effects_picture": True}}, "changes_picture"),
-        ({"parameters": {"image_id": A, "eror_draws": 4}}, "error_draws"),
-        ({"parameters": {"image_id": A, "method": {"name": "linar"}}}, "linear"),
-        ({"parameters": {"image_id": A, "method": {"name": "linear", "stepz": 4}}}, "steps"),
-        ({"quue": "bulk"}, "queue"),
-    ],
+CHANGES: tuple[tuple[dict[str, Any], str], ...] = (
+    ({"kind": "evaluate"}, "report"),
+    ({"kind": "deconvolv"}, "deconvolve"),
+    ({"parameters": {"image_id": A, "effects_picture": True}}, "changes_picture"),
+    ({"parameters": {"image_id": A, "eror_draws": 4}}, "error_draws"),
+    ({"parameters": {"image_id": A, "method": {"name": "linar"}}}, "linear"),
+    ({"parameters": {"image_id": A, "method": {"name": "linear", "stepz": 4}}}, "steps"),
+    ({"quue": "bulk"}, "queue"),
 )
-def test_the_name_that_was_meant_is_suggested(change: dict[str, Any], suggested: str) -> None:
-    body = {"kind": "deconvolve", "parameters": {"image_id": A}} | change
-    assert f"did you mean '{suggested}'?" in messages(JobRequest, body)
 
 
-def test_a_missing_kind_is_told_with_the_known_ones() -> None:
-    assert "gap-diagnose" in messages(JobRequest, {})
-
-
-def test_names_inside_lists_are_suggested_too() -> None:
-    body = {"files": [{"glob": "/data/*", "were": {}}], "psf_id": A}
-    assert "did you mean 'where'?" in messages(BulkRequest, body)
+def test_the_name_that_was_meant_is_suggested() -> None:
+    for change, suggested in CHANGES:
+        body = {"kind": "deconvolve", "parameters": {"image_id": A}} | change
+        assert f"did you mean '{suggested}'?" in messages(JobRequest, body), change
+    assert "gap-diagnose" in messages(JobRequest, {}), "a missing kind is told with the known ones"
+    listed = {"files": [{"glob": "/data/*", "were": {}}], "psf_id": A}
+    assert "did you mean 'where'?" in messages(BulkRequest, listed)

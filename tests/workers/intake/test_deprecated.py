@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from workers.contract.kinds import JobRequest
 from workers.contract.requests import PsfBuild, PsfFit
 from workers.intake import requests
 from workers.intake.deprecated import details_now
+from workers.settings import Settings
 from workers.versions.status import PsfStatus
 
 HRI = {"TELESCOP": "SOLO/EUI/HRI_EUV", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174}
@@ -36,17 +38,18 @@ def change(catalogue: Catalogue, status: PsfStatus, reason: str = "", **more: An
 
 
 @pytest.fixture
-def catalogue(local: LocalService, psf_file: Path, tmp_path: Path) -> Catalogue:
+def catalogue(local: LocalService, settings: Settings, psf_file: Path, tmp_path: Path) -> Iterator[Catalogue]:
     """The catalogue holds the PSF that is built for HRI_EUV, with other pixels, as a certified PSF."""
     write_image(tmp_path / "i.fits", **HRI, **AT)
-    found = local._catalogue
+    found = Catalogue(settings.catalogue_url)
     uploaded = found.get(PsfRow, local.upload_psf(psf_file)["id"], OWNER)
     assert uploaded is not None
     row = psf("built", file_sha256=uploaded.file_sha256, bytes=uploaded.bytes, details=uploaded.details)
     row.id = BUILT
     found.add(row)
     change(found, PsfStatus.CERTIFIED, version="1.0.0")
-    return found
+    yield found
+    found.close()
 
 
 def test_the_service_does_not_choose_a_psf_that_was_deprecated(
@@ -72,18 +75,7 @@ def test_the_error_names_the_successor(local: LocalService, catalogue: Catalogue
     assert f"no reason was given) (its successor is {identity('better')[:12]})" in caught.value.message
 
 
-def test_a_named_deprecated_psf_is_used_with_a_warning(
-    local: LocalService, catalogue: Catalogue, tmp_path: Path
-) -> None:
-    change(catalogue, PsfStatus.DEPRECATED, "wrong mesh")
-    product = local.deconvolve(tmp_path / "i.fits", tmp_path / "o.fits", psf_id=BUILT, **FEW)
-    (warning,) = (one for one in product["details"]["warnings"] if one["code"] == "psf-deprecated")
-    assert f"PSF {BUILT[:12]} (built 1.0.0) was deprecated (reason: wrong mesh)" in warning["message"]
-    history = "".join(str(line) for line in fits.getheader(tmp_path / "o.fits")["HISTORY"])
-    assert "WARNING (psf-deprecated)" in history
-
-
-def test_a_product_that_was_made_before_has_the_warning_too(
+def test_a_named_deprecated_psf_is_used_with_a_warning_also_for_a_product_made_before(
     local: LocalService, catalogue: Catalogue, tmp_path: Path
 ) -> None:
     before = local.deconvolve(tmp_path / "i.fits", psf_id=BUILT, **FEW)
@@ -95,6 +87,11 @@ def test_a_product_that_was_made_before_has_the_warning_too(
     row = catalogue.get(ProductRow, again["id"], OWNER)
     assert row is not None
     assert "psf-deprecated" in statistics_of(details_now(catalogue, row))["warnings"], "of a bulk run"
+    product = local.deconvolve(tmp_path / "i.fits", tmp_path / "o.fits", psf_id=BUILT, steps=2)
+    (warning,) = (one for one in product["details"]["warnings"] if one["code"] == "psf-deprecated")
+    assert BUILT[:12] in warning["message"] and "wrong mesh" in warning["message"]
+    history = "".join(str(line) for line in fits.getheader(tmp_path / "o.fits")["HISTORY"])
+    assert "WARNING (psf-deprecated)" in history
 
 
 def test_a_context_of_an_earlier_moment_still_chooses_it(
@@ -107,21 +104,22 @@ def test_a_context_of_an_earlier_moment_still_chooses_it(
     assert "psf-deprecated" in [one["code"] for one in product["details"]["warnings"]]
 
 
-def test_a_fit_does_not_choose_a_diffraction_psf_that_was_deprecated(local: LocalService) -> None:
+def test_a_fit_does_not_choose_a_diffraction_psf_that_was_deprecated(catalogue: Catalogue) -> None:
     build = PsfBuild(instrument="hri_euv", component="diffraction")
     row = psf("diffraction", kind="diffraction")
     row.id = psf_identity(build)
-    found = local._catalogue
-    found.add(row)
+    catalogue.add(row)
     summary = {"instrument": "hri_euv", "known_psf": None, "noise": {"photon_gain_dn": 5, "read_noise_dn": 2}}
     transit_id = identity("transit")
-    found.add(TransitRow(owner=OWNER, id=transit_id, created_at=0, bytes=1, filename="t", summary=summary))
+    catalogue.add(
+        TransitRow(owner=OWNER, id=transit_id, created_at=0, bytes=1, filename="t", summary=summary)
+    )
     asked = TypeAdapter[JobRequest](JobRequest).validate_python(
         {"kind": "psf-fit", "parameters": PsfFit(transit_id=transit_id).model_dump()}
     )
-    assert requests.resolve(asked, found, OWNER)[0]["diffraction_recipe"] is not None
+    assert requests.resolve(asked, catalogue, OWNER)[0]["diffraction_recipe"] is not None
     for status, version in ((PsfStatus.CERTIFIED, "1.0.0"), (PsfStatus.DEPRECATED, None)):
-        found.psfs.change(row.id, OWNER, StatusAsked(status, "blurred", version=version), "tester")
+        catalogue.psfs.change(row.id, OWNER, StatusAsked(status, "blurred", version=version), "tester")
     with pytest.raises(DataError) as caught:
-        requests.resolve(asked, found, OWNER)
+        requests.resolve(asked, catalogue, OWNER)
     assert caught.value.code == "psf-deprecated" and "known_psf" in caught.value.message

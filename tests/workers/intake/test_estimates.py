@@ -5,10 +5,13 @@ from __future__ import annotations
 import itertools
 import re
 import time
+import uuid
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from sqlalchemy import delete
 
 from psfcore.deconvolve.memory import MARGIN_SHARE, WORKING_BYTES
 from psfcore.errors import DataError
@@ -17,20 +20,16 @@ from psfcore.instruments.workload import check_workload
 from service.client.http import ServiceError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT
+from tests.workers.databases import add, change
+from tests.workers.psf_examples import psf as psf_row
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import ImageRow, JobRow, PsfRow, TransitRow
+from workers.catalogue.tables import ImageRow, JobRow, TransitRow
 from workers.contract.methods import Method, RichardsonLucy
 from workers.contract.phases import Phase
 from workers.contract.requests import PsfBuild
+from workers.intake import estimates
 from workers.intake.cost_model import COSTS
-from workers.intake.estimates import (
-    BOUNDS,
-    FEWEST_JOBS,
-    _build,
-    _factors,
-    checked,
-    estimate,
-)
+from workers.intake.estimates import BOUNDS, FEWEST_JOBS, KEEP_FACTOR_S, checked, estimate
 from workers.settings import Settings
 from workers.tasks.context import Context
 
@@ -38,24 +37,14 @@ OWNER = "ann"
 
 
 def image(catalogue: Catalogue, px: int) -> str:
-    identity = f"{px:064x}"
-    catalogue.add(
-        ImageRow(
-            owner=OWNER, id=identity, created_at=0.0, bytes=1, filename=None, summary={"shape": [px, px]}
-        )
-    )
-    return identity
+    summary = {"shape": [px, px]}
+    row = ImageRow(owner=OWNER, id=f"{px:064x}", created_at=0.0, bytes=1, filename=None, summary=summary)
+    return catalogue.add(row)[0].id
 
 
 def psf(catalogue: Catalogue, px: int, **details: Any) -> str:
-    identity = f"{px:064x}"
-    catalogue.add(
-        PsfRow(
-            owner=OWNER, id=identity, created_at=0.0, name="p", version="1", status="uploaded", origin="uploaded",
-            file_sha256=identity, bytes=1, details={"shape": [px, px], **details},
-        )
-    )  # fmt: skip
-    return identity
+    row = psf_row(str(px), owner=OWNER, details={"shape": [px, px], **details})
+    return catalogue.add(row)[0].id
 
 
 def deconvolution(catalogue: Catalogue, px: int = 1024, **changes: Any) -> dict[str, Any]:
@@ -131,49 +120,37 @@ def test_a_psf_that_may_have_to_be_interpolated_first_counts(catalogue: Catalogu
         assert needs(catalogue, "deconvolve", missing)[0] == pytest.approx(both, abs=0.15)
 
 
-@pytest.mark.parametrize(
-    ("change", "least"),
-    [
-        (
-            "bandpass = ["
-            + ",".join("{wavelength_angstrom=171.0,weight=1.0}" for _ in range(64))
-            + "]\n[aperture]",
-            64,
-        ),
-        (
-            "meshes = ["
-            + ",".join(
-                "{name='m',place='filter_wheel',pitch_um=9.0,wire_um=1.0,windows=9}" for _ in range(16)
-            )
-            + "]\n[aperture]",
-            56,
-        ),
-    ],
-)
-def test_an_instrument_file_that_asks_for_much_is_seen_for_it(
-    catalogue: Catalogue, change: str, least: float
-) -> None:
-    small = PsfBuild(instrument_file=SMALL_INSTRUMENT).model_dump(mode="json")
-    large = PsfBuild(instrument_file=SMALL_INSTRUMENT.replace("[aperture]", change)).model_dump(mode="json")
-    assert needs(catalogue, "psf-build", large)[0] >= least > 10 * needs(catalogue, "psf-build", small)[0]
+def of_file(catalogue: Catalogue, text: str) -> tuple[float, float]:
+    return needs(catalogue, "psf-build", PsfBuild(instrument_file=text).model_dump(mode="json"))
 
 
-@pytest.mark.parametrize("extremes", list(itertools.product(("1e-9", "1e9"), repeat=4)))
-def test_an_instrument_file_of_extremes_can_be_estimated(extremes: tuple[str, ...]) -> None:
-    text = SMALL_INSTRUMENT
+def test_an_instrument_file_that_asks_for_much_is_seen_for_it(catalogue: Catalogue) -> None:
+    small = of_file(catalogue, SMALL_INSTRUMENT)[0]
+    mesh = "{name='m',place='filter_wheel',pitch_um=9.0,wire_um=1.0,windows=9}"
+    for key, entry, count, least_s in (
+        ("bandpass", "{wavelength_angstrom=171.0,weight=1.0}", 64, 64),
+        ("meshes", mesh, 16, 56),
+    ):
+        entries = f"{key} = [{','.join([entry] * count)}]\n[aperture]"
+        large = of_file(catalogue, SMALL_INSTRUMENT.replace("[aperture]", entries))[0]
+        assert large >= least_s > 10 * small, key
+
+
+def test_an_instrument_file_of_extremes_can_be_estimated(catalogue: Catalogue) -> None:
     keys = ("wavelength_angstrom", "focal_length_mm", "diameter_mm", "pixel_pitch_um")
-    for key, value in zip(keys, extremes, strict=True):
-        text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
     mount = "\n[mount]\nbasis = 'assumed'\nrays = [{count = 4, width_mm = 1e-9}]\n"
-    parameters = PsfBuild(instrument_file=text + mount).model_dump(mode="json")
-    seconds, mib = _build(parameters)
-    assert seconds > 0 and mib > 0
-    try:
-        check_workload(parse_instrument(text + mount, "extreme.toml"), "extreme.toml")
-    except DataError as error:
-        assert error.code == "bad-instrument-file"
-    else:
-        assert seconds < 600 and mib < 6000
+    for extremes in itertools.product(("1e-9", "1e9"), repeat=4):
+        text = SMALL_INSTRUMENT + mount
+        for key, value in zip(keys, extremes, strict=True):
+            text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
+        seconds, mib = of_file(catalogue, text)
+        assert seconds > 0 and mib > 0, extremes
+        try:
+            check_workload(parse_instrument(text, "extreme.toml"), "extreme.toml")
+        except DataError as error:
+            assert error.code == "bad-instrument-file", extremes
+        else:
+            assert seconds < 600 and mib < 6000, extremes
 
 
 def test_a_mask_image_counts(catalogue: Catalogue) -> None:
@@ -185,15 +162,9 @@ def test_a_mask_image_counts(catalogue: Catalogue) -> None:
 
 def test_studies_go_with_the_transit_s_length(catalogue: Catalogue) -> None:
     for name, length in (("1", 10**6), ("2", 10**9)):
+        summary = {"unpacked_bytes": length}
         catalogue.add(
-            TransitRow(
-                owner=OWNER,
-                id=name * 64,
-                created_at=0.0,
-                bytes=1,
-                filename=None,
-                summary={"unpacked_bytes": length},
-            )
+            TransitRow(owner=OWNER, id=name * 64, created_at=0.0, bytes=1, filename=None, summary=summary)
         )
     for kind, more in {
         "psf-fit": {"as_published": False},
@@ -211,36 +182,44 @@ def test_studies_go_with_the_transit_s_length(catalogue: Catalogue) -> None:
     assert exact[0] > 5 * shared[0]
 
 
-def completed(catalogue: Catalogue, kind: str, name: str, start_s: float, took_s: float) -> None:
-    """Add a completed job with this estimate and this duration."""
-    row = JobRow(
-        id=f"{name:0>32}", owner=OWNER, kind=kind, parameters={}, request_key=name, work_key=name,
-        phase=Phase.COMPLETED, created_at=0.0, started_at=100.0, ended_at=100.0 + took_s,
-        estimate={"memory_mib": 1, "seconds": start_s, "start_s": start_s},
-    )  # fmt: skip
-    with catalogue._database.writing.begin() as session:
-        session.add(row)
+def completed(catalogue: Catalogue, count: int, took_s: float) -> None:
+    """Add completed deconvolutions that were expected to take a second and took so long."""
+    rows = [
+        JobRow(
+            id=uuid.uuid4().hex, owner=OWNER, kind="deconvolve", parameters={}, request_key=f"{n}", work_key=f"{n}",
+            phase=Phase.COMPLETED, created_at=0.0, started_at=100.0, ended_at=100.0 + took_s,
+            estimate={"memory_mib": 1, "seconds": 1.0, "start_s": 1.0},
+        )
+        for n in range(count)
+    ]  # fmt: skip
+    add(catalogue, *rows)
 
 
-@pytest.mark.parametrize(
-    ("took_s", "expected"),
-    [(3.0, 3.0), (0.5, 0.5), (100.0, BOUNDS[1]), (0.06, BOUNDS[0]), (0.001, 1.0)],
-    ids=["slower", "faster", "much slower", "much faster", "result was there already"],
-)
 def test_the_estimate_follows_the_times_of_completed_jobs(
-    catalogue: Catalogue, took_s: float, expected: float
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = deconvolution(catalogue)
-    start_s, memory = needs(catalogue, "deconvolve", asked)
-    for n in range(FEWEST_JOBS - 1):
-        completed(catalogue, "deconvolve", str(n), 1.0, took_s)
-    _factors.clear()
-    assert needs(catalogue, "deconvolve", asked) == (start_s, memory), "too few jobs to learn from"
-    completed(catalogue, "deconvolve", "99", 1.0, took_s)
-    _factors.clear()
-    seconds, same = needs(catalogue, "deconvolve", asked)
-    assert seconds == pytest.approx(start_s * expected, abs=0.2) and same == memory
-    assert estimate("deconvolve", asked, catalogue, OWNER, 1).start_s == pytest.approx(start_s, abs=0.1)
+    now = [1000.0]
+    monkeypatch.setattr(estimates, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    job = deconvolution(catalogue)
+    start_s, memory = needs(catalogue, "deconvolve", job)
+    for took_s, expected in (
+        (3.0, 3.0),
+        (0.5, 0.5),
+        (100.0, BOUNDS[1]),  # much slower
+        (0.06, BOUNDS[0]),  # much faster
+        (0.001, 1.0),  # the result was there already
+    ):
+        change(catalogue, delete(JobRow))
+        completed(catalogue, FEWEST_JOBS - 1, took_s)
+        now[0] += 2 * KEEP_FACTOR_S
+        assert needs(catalogue, "deconvolve", job) == (start_s, memory), "too few jobs to learn from"
+        completed(catalogue, 1, took_s)
+        assert needs(catalogue, "deconvolve", job) == (start_s, memory), "it is kept for a while"
+        now[0] += 2 * KEEP_FACTOR_S
+        seconds, same = needs(catalogue, "deconvolve", job)
+        assert seconds == pytest.approx(start_s * expected, abs=0.2) and same == memory, took_s
+        start = estimate("deconvolve", job, catalogue, OWNER, 1).start_s
+        assert start == pytest.approx(start_s, abs=0.1)
 
 
 def test_a_kind_without_figures_of_its_own_has_an_estimate(catalogue: Catalogue) -> None:
@@ -249,6 +228,9 @@ def test_a_kind_without_figures_of_its_own_has_an_estimate(catalogue: Catalogue)
 
 
 def test_what_is_over_a_limit_is_refused_and_told_how_to_get_under_it(catalogue: Catalogue) -> None:
+    largest = {"name": "richardson-lucy-total-variation", "steps": 200}
+    by_default = deconvolution(catalogue, 4096, method=largest)
+    checked("deconvolve", by_default, catalogue, OWNER, Settings())
     asked = deconvolution(catalogue, 4096, error_draws=64)
     free = Settings(worker_threads=1)
     said = checked("deconvolve", asked, catalogue, OWNER, free)
@@ -261,11 +243,6 @@ def test_what_is_over_a_limit_is_refused_and_told_how_to_get_under_it(catalogue:
         assert refused.value.code == code
         for told in (str(figure), "500", setting.upper(), way):
             assert told in refused.value.message
-
-
-def test_all_that_can_be_asked_for_with_one_image_is_taken_by_default(catalogue: Catalogue) -> None:
-    largest = {"name": "richardson-lucy-total-variation", "steps": 200}
-    checked("deconvolve", deconvolution(catalogue, 4096, method=largest), catalogue, OWNER, Settings())
 
 
 def test_a_job_that_executes_too_long_ends_with_its_next_step(

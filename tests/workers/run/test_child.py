@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from mmap import MAP_ANONYMOUS, MAP_PRIVATE, mmap
+from mmap import MAP_ANONYMOUS, MAP_PRIVATE, PROT_READ, mmap
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import pytest
 from celery import Celery
 
 from tests.whole.stack import wait_for
+from tests.workers.run.processes import started_worker
 from workers.broker import app as queue
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
@@ -102,31 +102,21 @@ class Worker:
 @pytest.fixture(scope="module")
 def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Worker]:
     folder = tmp_path_factory.mktemp("worker")
-    data = folder / "data"
-    data.mkdir()
-    environment = {
-        "HELIOPSF_DATA_DIR": str(data),
-        "HELIOPSF_BROKER_URL": "filesystem://",
-        "HELIOPSF_STOP_S": "0.1",
-        "HELIOPSF_HEARTBEAT_S": "0.1",
-        "HELIOPSF_LEASE_S": str(LEASE_S),
-        "HELIOPSF_CANCEL_S": "0.3",
-        "HELIOPSF_WORKER_THREADS": "2",
-        "HELIOPSF_LOG_FORMAT": "json",
-        "OMP_NUM_THREADS": "1",
-    }
-    settings = Settings(data_dir=data, broker_url="filesystem://")
+    settings = Settings(data_dir=folder / "data", broker_url="filesystem://")
+    settings.data_dir.mkdir()
     catalogue = Catalogue(settings.catalogue_url)
     catalogue.upgrade()
-    with (folder / "worker.log").open("wb") as written:
-        process = subprocess.Popen(
-            [sys.executable, "-c", WORKER],
-            env={k: v for k, v in os.environ.items() if not k.startswith("HELIOPSF_")} | environment,
-            stdout=subprocess.DEVNULL,
-            stderr=written,
-        )
+    log = folder / "worker.log"
+    environment = {
+        "stop_s": 0.1,
+        "heartbeat_s": 0.1,
+        "lease_s": LEASE_S,
+        "cancel_s": 0.3,
+        "worker_threads": 2,
+    }
+    process = started_worker(WORKER, settings, log, **environment)
     try:
-        yield Worker(process, catalogue, queue.make_app(settings), folder / "worker.log")
+        yield Worker(process, catalogue, queue.make_app(settings), log)
     finally:
         process.send_signal(signal.SIGTERM)
         try:
@@ -142,7 +132,7 @@ def test_a_greedy_job_fails_at_its_limit_and_the_next_one_runs(worker: Worker) -
     row = worker.wait(job, "ERROR")
     assert row.error is not None
     assert (row.error["code"], row.error["fault"]) == ("out-of-memory", "user")
-    assert "expected a job of at most 300 MiB, 1.5 times its estimate of 200 MiB" in row.error["message"]
+    assert "300 MiB" in row.error["message"] and "200 MiB" in row.error["message"]
     before = worker.child()
     worker.wait(worker.submit("large", estimate_mib=200, mib=250), "COMPLETED")
     assert worker.child() == before, "the same process: memory beyond the estimate was free again"
@@ -179,26 +169,21 @@ def test_the_limit_holds_in_the_block_and_ends_with_it() -> None:
 
 
 def test_memory_that_is_only_reserved_is_not_counted() -> None:
-    import mmap
-
     before = data_bytes()
-    with mmap.mmap(-1, 2**34, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ):
+    with mmap(-1, 2**34, flags=MAP_PRIVATE | MAP_ANONYMOUS, prot=PROT_READ):
         assert data_bytes() - before < 2**30
 
 
-@pytest.mark.parametrize(
-    ("error", "expected"),
-    [
+def test_which_errors_say_that_no_memory_is_left() -> None:
+    for error, expected in (
         (MemoryError(), True),
         (OSError(12, "Cannot allocate memory"), True),
         (RuntimeError("can't start new thread"), True),
         (OSError(28, "No space left on device"), False),
         (RuntimeError("other"), False),
         (ValueError("other"), False),
-    ],
-)
-def test_which_errors_say_that_no_memory_is_left(error: Exception, expected: bool) -> None:
-    assert is_out_of_memory(error) is expected
+    ):
+        assert is_out_of_memory(error) is expected, error
 
 
 def test_a_thread_beyond_the_limit_is_no_memory() -> None:

@@ -73,12 +73,7 @@ def test_noise_realisations_are_a_stage_of_their_own(
         error_draws=3,
         progress=lambda *progress: told.append(progress),
     )
-    assert [step for stage, step, steps in told if stage == "error estimate" and steps == 3] == [
-        0,
-        0,
-        1,
-        2,
-        3,
-    ]
+    draws = [step for stage, step, steps in told if stage == "error estimate" and steps == 3]
+    assert draws == [0, 0, 1, 2, 3]
     last = told.index(("deconvolving", 2, 2))
     assert told[last + 1] == ("error estimate", 0, 3), "at once, before the first of them is done"
