@@ -1,17 +1,20 @@
-"""Summaries, trends and the JSON report of an evaluation."""
+"""Summaries, trends, the JSON report and the plot of an evaluation."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.evaluation.evaluation import evaluate
 from psfcore.evaluation.frame import FrameEvaluation
+from psfcore.evaluation.plot import evaluation_png
 from psfcore.evaluation.report import report, slope_of, summary_of, trends
 from psfcore.evaluation.summary_lines import summary_lines
 from psfcore.transit.occulter import FoundPlace
@@ -148,3 +151,16 @@ def test_the_report_is_json_with_the_values_of_the_summary_lines() -> None:
     assert f"all pointings: 12 images, mean {said['all']['mean_pct']:+.2f} %" in text
     assert f"MAPE {maps['mape_mean_pct']:.2f} %" in text
     assert f"at most {said['dark_offsets']['largest_weight_change_pct']:.1f} %" in text
+
+
+def test_an_evaluation_and_one_of_a_single_pointing_are_drawn(tmp_path: Path) -> None:
+    path = tmp_path / "e.png"
+    evaluation_png(noisy(11), path, title="a PSF", study=offsets())
+    picture = imread(path)
+    assert picture.shape[:2] == (1570, 1600)
+    for band in np.array_split(picture[:, :, :3], 4):
+        assert band.std() > 0.1
+    transit = noise_free(sky())
+    alone = dataclasses.replace(transit, frames=transit.frames[4:6])
+    evaluation_png(evaluate(alone, lambda _: kernel_with()), tmp_path / "e.png", title="two images")
+    assert imread(tmp_path / "e.png").shape[:2] == (1200, 1600)

@@ -1,46 +1,49 @@
-"""Shapes compared by their held-out errors: a real stretch is visible, and no false one appears."""
+"""Held-out evaluation: every image gets a PSF that was fitted without it. Shapes are compared by these errors."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from functools import cache
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from psfcore.errors import DataError
+from psfcore.evaluation import shapes
 from psfcore.evaluation.evaluation import evaluate
+from psfcore.evaluation.report import report
 from psfcore.evaluation.shapes import (
     FIGURES,
     FREE_SHELLS,
     STRETCHED,
     ShapesByErrors,
-    _figures,
     compare_shapes_by_errors,
+    held_out_kernels,
 )
+from psfcore.evaluation.summary_lines import summary_lines
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.shapes import SHAPES
+from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
+from psfcore.simulate.transit import simulate
+from psfcore.transit.blocks import folds
+from studies.transits import diffraction, drawn_truth
+from tests.psfcore.evaluation.small_evaluations import rms
 from tests.psfcore.small_transits import BRIGHT, IMAGES, observed, sky, solved
 
 
 @cache
 def compared() -> ShapesByErrors:
-    return compare_shapes_by_errors(solved())
+    """Compared with the knee, which is fitted much more quickly than the stretched shapes."""
+    with patch.object(shapes, "STRETCHED", ("knee",)):
+        return compare_shapes_by_errors(solved())
 
 
-@cache
-def compared_stretched() -> ShapesByErrors:
-    """A bright sky with strongly stretched scatter."""
-    much = ScatterTruth(6.15, 2.53, 0.411, stretch=0.4, angle_deg=-15.0)
-    return compare_shapes_by_errors(invert(observed(sky(much, brightness=BRIGHT)).transit))
-
-
-@pytest.mark.slow
 def test_all_shapes_are_compared_on_the_same_images() -> None:
     found = compared()
-    assert [s.name for s in found.shapes] == ["softened-power-law", *STRETCHED, FREE_SHELLS]
+    assert [s.name for s in found.shapes] == ["softened-power-law", "knee", FREE_SHELLS]
     assert found.images == IMAGES and found.folds == 4
     for shape in found.shapes:
         assert set(shape.figures) == set(FIGURES) == set(shape.minus_first)
@@ -53,38 +56,43 @@ def test_all_shapes_are_compared_on_the_same_images() -> None:
 
 
 @pytest.mark.slow
+def test_a_real_stretch_is_visible_in_held_out_errors() -> None:
+    much = ScatterTruth(6.15, 2.53, 0.411, stretch=0.4, angle_deg=-15.0)
+    found = compare_shapes_by_errors(invert(observed(sky(much, brightness=BRIGHT)).transit))
+    by_name = {shape.name: shape for shape in found.shapes}
+    value, sigma = by_name["stretched"].minus_first["mpe_rms_pct"]
+    assert value < -3 * sigma
+    assert value < by_name[FREE_SHELLS].minus_first["mpe_rms_pct"][0]
+
+
+@pytest.mark.slow
 def test_shapes_do_not_differ_where_the_truth_is_isotropic() -> None:
-    for shape in compared().shapes[1:]:
+    found = compare_shapes_by_errors(solved())
+    assert [s.name for s in found.shapes[1:]] == [*STRETCHED, FREE_SHELLS]
+    for shape in found.shapes[1:]:
         for name in ("mpe_rms_pct", "mape_mean_pct"):
             value, sigma = shape.minus_first[name]
             assert abs(value) < 4 * sigma
             assert sigma < shape.figures[name][1]  # the same images: better known than the figures themselves
 
 
-@pytest.mark.slow
-def test_a_real_stretch_is_visible_in_held_out_errors() -> None:
-    shapes = {shape.name: shape for shape in compared_stretched().shapes}
-    value, sigma = shapes["stretched"].minus_first["mpe_rms_pct"]
-    assert value < -3 * sigma
-    assert value < shapes[FREE_SHELLS].minus_first["mpe_rms_pct"][0]
-
-
 def test_figures_are_those_of_the_evaluation() -> None:
-    """With each image once, the figures agree with the superposed maps."""
-    kernel = solved().total.kernel(solved().inversion.coordinates)
-    looked = evaluate(solved().transit, lambda _n: kernel, noise_realisations=0)
-    mean, rms, mpe, mape = _figures(list(looked.frames), np.ones((1, len(looked.frames))))[:, 0]
+    """Those of the power law agree with the superposed maps of its held-out PSFs."""
+    looked = evaluate(solved().transit, held_out_kernels(solved()), noise_realisations=0)
+    figures = compared().shapes[0].figures
     residual = np.array([frame.residual_pct for frame in looked.frames])
-    assert mean == pytest.approx(residual.mean()) and rms == pytest.approx(np.sqrt((residual**2).mean()))
-    assert mpe == pytest.approx(looked.superposed.mpe_rms_pct)
-    assert mape == pytest.approx(looked.superposed.mape_mean_pct)
+    assert figures["residual_mean_pct"][0] == pytest.approx(residual.mean())
+    assert figures["residual_rms_pct"][0] == pytest.approx(np.sqrt((residual**2).mean()))
+    assert figures["mpe_rms_pct"][0] == pytest.approx(looked.superposed.mpe_rms_pct)
+    assert figures["mape_mean_pct"][0] == pytest.approx(looked.superposed.mape_mean_pct)
 
 
 def test_it_is_written_as_json_and_as_a_table() -> None:
-    said = json.loads(json.dumps(compared().to_json(), allow_nan=False))
-    assert said["shapes"][2]["parameters"]["stretch_q"]["sigma"] > 0
-    assert len(compared().lines()) == 2 + 4 + 3
-    assert f"{compared().shapes[0].figures['mpe_rms_pct'][0]:.2f}" in compared().lines()[1]
+    found = compared()
+    said = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert said["shapes"][1]["parameters"]["bend"]["sigma"] > 0
+    assert len(found.lines()) == 2 + 3 + 2
+    assert f"{found.shapes[0].figures['mpe_rms_pct'][0]:.2f}" in found.lines()[1]
 
 
 def test_other_shapes_and_few_images_are_refused() -> None:
@@ -92,5 +100,45 @@ def test_other_shapes_and_few_images_are_refused() -> None:
     with pytest.raises(DataError, match=r"unknown-shape.*softened-power-law.*knee"):
         compare_shapes_by_errors(dataclasses.replace(solved(), inversion=knee))
     few = dataclasses.replace(solved().transit, frames=solved().transit.frames[:5])
-    with pytest.raises(DataError, match=r"too-few-images.*got 5"):
-        compare_shapes_by_errors(dataclasses.replace(solved(), transit=few))
+    for function in (compare_shapes_by_errors, held_out_kernels):
+        with pytest.raises(DataError, match=r"too-few-images.*got 5"):
+            function(dataclasses.replace(solved(), transit=few))
+
+
+def test_every_image_has_the_psf_of_the_fold_that_holds_it_out() -> None:
+    kernels = held_out_kernels(solved())
+    parts = folds(IMAGES)
+    assert len(parts) == 4
+    of_fold = [kernels(fold.held_out[0]) for fold in parts]
+    assert len({id(kernel) for kernel in of_fold}) == 4
+    for fold, kernel in zip(parts, of_fold, strict=True):
+        assert all(kernels(n) is kernel for n in fold.held_out)
+    found = evaluate(observed(sky()).transit, kernels)
+    against = [f.residual_against_pct(sky().noise_free[f.index]) for f in found.frames]
+    assert 0.2 < rms(against) < 2.5
+
+
+@pytest.mark.slow
+def test_held_out_discs_of_clean_transits_are_predicted() -> None:
+    """Relative to simulated discs without noise: mean within 1 % and rms within 2 % at every pointing.
+
+    Noise in the fitted images changes the mean of a limb pointing by 0.6 to 0.7 %, one standard error. The mean of a
+    single transit may therefore slightly exceed 1 %, but not the mean of three.
+    """
+    off: dict[int, list[float]] = {1: [], 2: [], 3: []}
+    for seed in (0, 1, 2):
+        made = simulate(default_plan(30, 512), drawn_truth(seed), diffraction(1024), seed)
+        found = evaluate(made.transit, held_out_kernels(invert(made.transit)))
+        print("\n".join(["", f"seed {seed}", *summary_lines(report(found))]))
+        for fov in off:
+            planes = made.noise_free
+            here = [f.residual_against_pct(planes[f.index]) for f in found.frames if f.pointing == fov]
+            print(f"pointing {fov}, discs without noise: mean {np.mean(here):+.2f} %, rms {rms(here):.2f} %")
+            assert abs(np.mean(here)) < 1.5 and rms(here) < 2
+            off[fov] += here
+        maps = found.superposed
+        assert maps.mape_mean_pct == pytest.approx(maps.mape_noise_mean_pct, rel=0.05)
+        assert maps.mpe_rms_pct == pytest.approx(maps.mpe_noise_rms_pct, rel=0.15)
+    for fov, values in off.items():
+        print(f"pointing {fov} of three transits: mean {np.mean(values):+.2f} %, rms {rms(values):.2f} %")
+        assert abs(np.mean(values)) < 1 and rms(values) < 2
