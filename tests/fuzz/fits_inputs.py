@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import io
 from functools import cache
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from astropy.io import fits
+
+from psfcore.fits.psfs import write_psf
+from psfcore.psf import FittedShape
+from tests.psfcore.conftest import gaussian, make_psf
 
 CARD = 80
 NUMBERS = (
@@ -107,19 +114,15 @@ def _compressed_bases() -> tuple[bytes, ...]:
     bases = []
     for codec in ("RICE_1", "GZIP_1", "GZIP_2", "NOCOMPRESS"):
         for dtype in ("u1", "i2", "i4", "f4", "f8"):
-            for tile in ((1, 67), (20, 30)):
-                pixels = rng.integers(1, 120, (64, 67)).astype(dtype)
-                if dtype.startswith("f"):
-                    pixels += rng.normal(0, 3, pixels.shape).astype(dtype)
-                for quantise in (0, 1, 2) if dtype.startswith("f") else (None,):
-                    if quantise == 0 and codec == "RICE_1":
-                        continue
-                    options = {} if not quantise else {"quantize_method": quantise, "dither_seed": 7}
-                    level = {} if quantise is None else {"quantize_level": float(16 if quantise else 0)}
-                    hdu = fits.CompImageHDU(
-                        pixels, compression_type=codec, tile_shape=tile, **options, **level
-                    )
-                    bases.append(_written([fits.PrimaryHDU(), hdu]))
+            pixels = rng.integers(1, 120, (64, 67)).astype(dtype)
+            ways: list[dict[str, float]] = [{}]
+            if dtype.startswith("f"):
+                pixels += rng.normal(0, 3, pixels.shape).astype(dtype)
+                ways = [{"quantize_level": 16.0, "quantize_method": q, "dither_seed": 7} for q in (1, 2)]
+                ways += [] if codec == "RICE_1" else [{"quantize_level": 0.0}]
+            for options, tile in product(ways, ((1, 67), (20, 30))):
+                hdu = fits.CompImageHDU(pixels, compression_type=codec, tile_shape=tile, **options)
+                bases.append(_written([fits.PrimaryHDU(), hdu]))
     return tuple(bases)
 
 
@@ -127,43 +130,26 @@ def _compressed_bases() -> tuple[bytes, ...]:
 def _plain_bases() -> tuple[bytes, ...]:
     rng = np.random.default_rng(0)
     bases = []
+    header = fits.Header({"TELESCOP": "SOLO", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174})
+    header.update({"DATE-BEG": "2022-03-17T00:00:00", "XPOSURE": 2.0, "CDELT1": 0.492, "CUNIT1": "arcsec"})
+    header.update({"GAINCOMB": "combined", "PXBEG1": 1, "PXEND1": 66, "LONG": "x" * 100, "BUNIT": "DN/s"})
+    header["HIERARCH a long key"] = 3.5
+    header.add_history("made")
     for dtype in ("u1", "i2", "i4", "i8", "f4", "f8"):
-        header = fits.Header(
-            {"TELESCOP": "SOLO", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174, "BUNIT": "DN/s"}
-        )
-        header.update(
-            {"DATE-BEG": "2022-03-17T00:00:00", "XPOSURE": 2.0, "CDELT1": 0.492, "CUNIT1": "arcsec"}
-        )
-        header.update({"GAINCOMB": "combined", "PXBEG1": 1, "PXEND1": 66, "LONG": "x" * 100})
-        header["HIERARCH a long key"] = 3.5
-        header.add_history("made")
         pixels = rng.integers(1, 120, (64, 66)).astype(dtype)
         bases.append(_written([fits.PrimaryHDU(pixels, header)]))
         bases.append(_written([fits.PrimaryHDU(), fits.ImageHDU(pixels, header), fits.ImageHDU(pixels)]))
-    bases += [_psf(), _psf()]
-    return tuple(bases)
+    return (*bases, _psf(), _psf())
 
 
 def _psf() -> bytes:
-    """A PSF with components and tables in the layout of `psfcore.fits.psfs.write_psf`."""
-    y, x = np.indices((64, 64)) - 32
-    kernel = np.exp(-0.5 * (x**2 + y**2) / 1.5**2).astype("f4")
-    kernel /= kernel.sum(dtype=float)
-    first = fits.PrimaryHDU(kernel, fits.Header({"PSFNAME": "mine", "PSFVERS": "1.0.0", "PSFSTAT": "draft"}))
-    toml = np.frombuffer(b'name = "mine"', dtype=np.uint8)[None]
-    text = fits.BinTableHDU.from_columns(
-        [fits.Column("TOML", f"{toml.size}B", array=toml)], name="INSTRUMENT"
-    )
-    fit = fits.BinTableHDU.from_columns(
-        [
-            fits.Column("parameter", "16A", array=np.array(["b_px", "c"])),
-            fits.Column("coordinate", "D", array=np.array([1.0, 2.0])),
-            fits.Column("covariance", "2D", array=np.eye(2)),
-        ],
-        name="FIT",
-    )
-    fit.header["SHAPE"] = "softened-power-law"
-    return _written([first, fits.ImageHDU(kernel, name="SCATTER"), text, fit])
+    """A PSF with components and tables, as heliopsf writes it."""
+    kernel = gaussian(64, 1.5)
+    fit = FittedShape("softened-power-law", ("b_px", "c"), (1.0, 2.0), ((1.0, 0.0), (0.0, 1.0)))
+    psf = make_psf(kernel, name="mine", status="draft", components={"SCATTER": kernel}, fitted=fit)
+    with TemporaryDirectory() as folder:
+        write_psf(Path(folder) / "psf.fits", psf, instrument_file=b'name = "mine"')
+        return (Path(folder) / "psf.fits").read_bytes()
 
 
 def _written(hdus: list[fits.PrimaryHDU]) -> bytes:

@@ -4,14 +4,26 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from typing import Any
 
 import numpy as np
+
+from psfcore.instruments.files import instrument_names, instrument_path
 
 VALUES: tuple[Any, ...] = (
     *(None, True, False, 0, -1, 1, 2**31, 2**63, 10**30, 1e308, -1e308, 1e-308, 0.5, float("nan"), float("inf"), "", "x"),
     *("transit/1", "../a.fits", "a/b", "C:x", "a\0b", "\u202e", "$\\frac{$", "a" * 300, [], {}, [[]], [{}], {"file": 1}),
 )  # fmt: skip
+NUMBERS = ("0", "-1", "1e-9", "1e9", "-1e300", "nan", "inf", "1", "2", "0.5", "255", "257", "9999", "10001")
+# Tables and keys that no shipped instrument has, or not so many of.
+TABLES = (
+    "[[meshes]]\nname = 'm'\nplace = 'entrance'\npitch_um = 400.0\nwire_um = 30.0\nwindows = 37\nangle_deg = 49.84\n",
+    "[[meshes]]\nname = 'w'\nplace = 'filter_wheel'\npitch_um = 400.0\nwire_um = 30.0\nwindows = 9\nshare = 0.5\n",
+    "[[bandpass]]\nwavelength_angstrom = 171.0\nweight = 3.0\n",
+    "[mount]\nbasis = 'assumed'\nhub_diameter_mm = 5.0\npolygons = [{ corners_mm = [[0, 1], [1, 0], [1, 1]] }]\n",
+    "[scatter]\nb_px = 6.0\nc = 2.5\ntotal = 0.999999\nbasis = 'fitted'\n",
+)
 
 
 def manifest(seed: int) -> bytes:
@@ -33,10 +45,11 @@ def manifest(seed: int) -> bytes:
                 content[str(rng.choice([*content, "new", "images"]))] = _any(rng)
             case 2 | 3:
                 images = content.get("images")
-                if isinstance(images, list) and images and isinstance(images[0], dict):
-                    image = images[int(rng.integers(len(images)))]
-                    if isinstance(image, dict):
-                        image[str(rng.choice(["file", "fov", "x", "y", "r", "other"]))] = _any(rng)
+                image = (
+                    images[int(rng.integers(len(images)))] if isinstance(images, list) and images else None
+                )
+                if isinstance(image, dict):
+                    image[str(rng.choice(["file", "fov", "x", "y", "r", "other"]))] = _any(rng)
             case 4:
                 content.pop(str(rng.choice(list(content) or ["x"])), None)
             case _:
@@ -44,93 +57,45 @@ def manifest(seed: int) -> bytes:
                 for _ in range(int(rng.choice([3, 50, 2000]))):
                     deep = [deep]
                 content["deep"] = deep if rng.random() < 0.5 else [_any(rng)] * int(rng.choice([10, 200_000]))
-    text = bytearray(_json(content))
-    if rng.random() < 0.3:
-        low = int(rng.integers(len(text)))
-        text[low : low + int(rng.integers(3))] = rng.bytes(int(rng.integers(1, 6)))
-    return bytes(text)
-
-
-def _json(content: Any) -> bytes:
     try:
-        return json.dumps(content).encode()
+        text = json.dumps(content)
     except RecursionError:
-        return b'{"deep": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"
+        text = '{"deep": ' + "[" * 100_000 + "]" * 100_000 + "}"
+    return _with_junk(text, rng)
+
+
+def instrument(seed: int) -> bytes:
+    """A shipped instrument file with one to five faults: other numbers, lost and repeated lines, more tables."""
+    rng = np.random.default_rng([4, seed])
+    text = instrument_path(str(rng.choice(instrument_names()))).read_text("utf-8")
+    for _ in range(int(rng.integers(1, 6))):
+        lines = text.splitlines()
+        match int(rng.integers(8)):
+            case 0:
+                del lines[int(rng.integers(len(lines)))]
+                text = "\n".join(lines)
+            case 1:
+                lines.insert(int(rng.integers(len(lines))), str(rng.choice(lines)))
+                text = "\n".join(lines)
+            case 2 | 3:
+                text += "\n" + str(rng.choice(TABLES)) * int(
+                    rng.choice([1, 2, 17, 65], p=[0.7, 0.2, 0.05, 0.05])
+                )
+            case _:
+                number = rng.choice(list(re.finditer(r"(?<== )-?\d[\d.e-]*|(?<=\[)\d+(?=,)", text)))
+                usual = f"{float(number[0]) * 2 ** rng.uniform(-2, 2):.6g}"
+                value = str(rng.choice(NUMBERS)) if rng.random() < 0.3 else usual
+                text = text[: number.start()] + value + text[number.end() :]
+    return _with_junk(text, rng)
+
+
+def _with_junk(text: str, rng: np.random.Generator) -> bytes:
+    content = bytearray(text.encode())
+    if rng.random() < 0.2:
+        low = int(rng.integers(len(content)))
+        content[low : low + int(rng.integers(3))] = rng.bytes(int(rng.integers(1, 6)))
+    return bytes(content)
 
 
 def _any(rng: np.random.Generator) -> Any:
     return copy.deepcopy(VALUES[int(rng.integers(len(VALUES)))])  # a later fault may change it
-
-
-def instrument(seed: int) -> bytes:
-    """An instrument file: every key within the limits of its own, plausible or extreme; sometimes with a fault."""
-    rng = np.random.default_rng([4, seed])
-    wild = rng.random() < 0.3
-
-    def size(usual: float) -> str:
-        if wild and rng.random() < 0.3:
-            return f"{float(10 ** rng.uniform(-9, 9)):.6e}"
-        return f"{usual * 2 ** rng.uniform(-2, 2):.6e}"
-
-    def angle() -> str:
-        return str(rng.choice(["0.0", "45.0", "90", "49.84", "1e-9", "-1e300", "1e9"]))
-
-    lines = [
-        'name = "fuzz"', 'version = "1.0.0"', f'status = "{rng.choice(["draft", "released"])}"',
-        f"wavelength_angstrom = {size(174)}", f"focal_length_mm = {size(4187)}",
-        "[aperture]", f"diameter_mm = {size(47)}",
-        f"obscuration_diameter_mm = {rng.choice(['0.0', size(10)])}",
-        "[detector]", f"pixel_pitch_um = {size(10)}", "pixels = 512", "readout_pixels = 512",
-        f"plate_scale_arcsec = {size(0.5)}",
-    ]  # fmt: skip
-    if rng.random() < 0.4:
-        names = (
-            "aperture_to_primary",
-            "primary_to_secondary",
-            "secondary_to_filter_wheel",
-            "filter_wheel_to_detector",
-        )
-        lines += ["[distances]", *(f"{name}_mm = {size(500)}" for name in names)]
-    for number in range(int(rng.choice([0, 0, 0, 1, 2, 3] + [16, 17] * wild))):
-        lines += [
-            "[[meshes]]", f'name = "m{number}"', f'place = "{rng.choice(["entrance", "filter_wheel"])}"',
-            f"pitch_um = {size(400)}", f"wire_um = {size(30)}",
-            f"windows = {rng.choice([1, 2, 13, 37, 551] + [9_999, 10_000, 10_001] * (rng.random() < 0.02))}",
-            f"angle_deg = {angle()}", f"share = {rng.choice([1, 1, 0.5])}",
-        ]  # fmt: skip
-    if rng.random() < 0.5:
-        lines += ["[mount]", 'basis = "assumed"', f"hub_diameter_mm = {rng.choice(['0.0', size(5)])}"]
-        sets = [
-            f"{{ count = {rng.choice([1, 3, 8, 255, 256, 257])}, width_mm = {size(0.5)}, first_angle_deg = {angle()} }}"
-            for _ in range(int(rng.integers(3)))
-        ]
-        rings = [
-            f"{{ radius_mm = {size(8)}, width_mm = {size(0.4)} }}"
-            for _ in range(int(rng.choice([0, 1, 3, 64, 65])))
-        ]
-        corners = [
-            f"{{ corners_mm = [{', '.join(_corner(rng, wild) for _ in range(int(rng.choice([2, 3, 4, 100, 1025]))))}] }}"
-            for _ in range(int(rng.choice([0, 0, 1, 2])))
-        ]
-        lines += [
-            f"rays = [{', '.join(sets)}]",
-            f"rings = [{', '.join(rings)}]",
-            f"polygons = [{', '.join(corners)}]",
-        ]
-    if rng.random() < 0.4:
-        lines += [
-            "[scatter]", f"b_px = {size(6)}", f"c = {size(2.5)}", f"total = {rng.choice([0.4, 1e-300, 0.999999])}",
-            'basis = "fitted"',
-        ]  # fmt: skip
-    for _ in range(int(rng.choice([0, 0, 0, 2] + [64, 65] * (rng.random() < 0.05)))):
-        lines += ["[[bandpass]]", f"wavelength_angstrom = {size(174)}", f"weight = {size(1)}"]
-    text = bytearray("\n".join(lines).encode())
-    if rng.random() < 0.2:
-        low = int(rng.integers(len(text)))
-        text[low : low + int(rng.integers(3))] = rng.bytes(int(rng.integers(1, 6)))
-    return bytes(text)
-
-
-def _corner(rng: np.random.Generator, wild: bool) -> str:
-    reach = 1e9 if wild and rng.random() < 0.1 else 20.0
-    return f"[{rng.uniform(-reach, reach):.6e}, {rng.uniform(-reach, reach):.6e}]"
