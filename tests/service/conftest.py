@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from httpx import Response
+from sqlalchemy import Executable
 
 from service.app import create_app
 from tests.blank_figures import blank_unless_told
@@ -148,3 +149,8 @@ def result_of(api: TestClient, run_jobs: Callable[[], None], kind: str, **parame
     job = job_after(api, run_jobs, kind, **parameters)
     assert job["phase"] == "COMPLETED", job["error"]
     return dict(api.get(job["result"]).json())
+
+
+def execute(catalogue: Catalogue, statement: Executable) -> None:
+    """Change rows in a way that no method of the catalogue does."""
+    catalogue._database.change(statement)

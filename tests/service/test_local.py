@@ -34,69 +34,55 @@ from workers.files.store import sha256_of
 from workers.settings import Settings
 
 
-def test_files_are_served_where_they_are(tmp_path: Path) -> None:
+def test_files_are_served_where_they_are_and_read_only_as_they_were(tmp_path: Path) -> None:
     write_image(tmp_path / "image.fits")
     store = LocalStore(tmp_path / "data")
     digest = store.add_file(tmp_path / "image.fits")
     assert digest == sha256_of(tmp_path / "image.fits")
     assert store.path(digest) == (tmp_path / "image.fits").resolve()
     assert list(store.blobs()) == []
-
-
-def test_a_file_that_changed_is_not_read(tmp_path: Path) -> None:
-    write_image(tmp_path / "image.fits")
-    store = LocalStore(tmp_path / "data")
-    digest = store.add_file(tmp_path / "image.fits")
     os.utime(tmp_path / "image.fits", ns=(1, 1))
     with pytest.raises(OSError, match=r"image\.fits changed while it was read"):
         store.path(digest)
 
 
 def test_a_folder_is_read_in_place_and_an_archive_is_unpacked(tmp_path: Path) -> None:
-    write_transit(tmp_path / "transit")
-    limits = Settings().archive_limits
-    with local_service() as service:
-        store = service._store
-        uploaded = service.upload_transit(tmp_path / "transit")
-        with store.unpacked(uploaded["id"], limits) as folder:
-            assert folder == (tmp_path / "transit").resolve()
-        assert list(store.blobs()) == [] and (tmp_path / "transit" / "transit.json").is_file()
-        (tmp_path / "transit" / "transit.json").touch()
-        with pytest.raises(OSError, match="changed"), store.unpacked(uploaded["id"], limits):
-            pass
-    with local_service() as service:
-        pack(tmp_path / "transit", tmp_path / "transit.tar")
-        archive = service.upload_transit(tmp_path / "transit.tar")
-        assert archive["id"] == uploaded["id"]
-        with service._store.unpacked(archive["id"], limits) as folder:
-            assert folder != (tmp_path / "transit").resolve()
-            assert (folder / "transit.json").is_file()
-        assert not folder.exists()
-
-
-def test_a_folder_without_a_transit_is_refused(tmp_path: Path) -> None:
+    folder = write_transit(tmp_path / "transit")
+    pack(folder, tmp_path / "transit.tar")
+    limits, store = Settings().archive_limits, LocalStore(tmp_path / "data")
+    digest = store.add_folder(folder).sha256
+    with store.unpacked(digest, limits) as place:
+        assert place == folder.resolve()
+    assert list(store.blobs()) == [] and (folder / "transit.json").is_file()
+    (folder / "transit.json").touch()
+    with pytest.raises(OSError, match="changed"), store.unpacked(digest, limits):
+        pass
+    other = LocalStore(tmp_path / "other")
+    assert other.add_file(tmp_path / "transit.tar") == digest
+    with other.unpacked(digest, limits) as place:
+        assert place != folder.resolve() and (place / "transit.json").is_file()
+    assert not place.exists()
     with local_service() as service, pytest.raises(ServiceError) as caught:
         service.upload_transit(tmp_path)
     assert caught.value.code == "no-manifest"
 
 
-def test_a_product_does_not_replace_the_image_that_it_was_made_from(tmp_path: Path) -> None:
-    write_image(tmp_path / "image.fits")
+def test_a_product_does_not_replace_its_image_and_may_have_no_picture(tmp_path: Path) -> None:
+    image = tmp_path / "image.fits"
+    write_image(image)
     write_psf(tmp_path / "psf.fits")
-    before = sha256_of(tmp_path / "image.fits")
-    with local_service() as service:
-        psf = service.upload_psf(tmp_path / "psf.fits")
+    before = sha256_of(image)
+    with local_service(previews=False) as service:
+        psf_id = service.upload_psf(tmp_path / "psf.fits")["id"]
         for overwrite in (False, True):
             with pytest.raises(ServiceError) as caught:
-                service.deconvolve(
-                    tmp_path / "image.fits",
-                    tmp_path / "image.fits",
-                    psf_id=psf["id"],
-                    steps=2,
-                    overwrite=overwrite,
-                )
+                service.deconvolve(image, image, psf_id=psf_id, steps=1, overwrite=overwrite)
             assert caught.value.code == "output-is-input"
-            assert sha256_of(tmp_path / "image.fits") == before
+            assert sha256_of(image) == before
+        product = service.deconvolve(image, psf_id=psf_id, steps=1)
+        for part in ("preview", "thumbnail"):
+            service.download(product[part], tmp_path / f"{part}.png")
+    assert (tmp_path / "preview.png").read_bytes() == (tmp_path / "thumbnail.png").read_bytes()
 
 
 @pytest.fixture(scope="module")
@@ -130,30 +116,37 @@ def test_the_file_of_a_built_psf_keeps_its_id_and_that_of_its_products(
     assert (wanted["psf_id"], asked["result_id"]) == (identity, product["id"])
 
 
-@pytest.mark.parametrize("how", ["pixel", "card", "rebinned", "cutout", "rewritten", "without checksums"])
-def test_a_file_that_was_changed_does_not_keep_the_id(
-    built: tuple[Path, str], tmp_path: Path, how: str
-) -> None:
-    limits, changed = FitsLimits(max_pixels=2**20), tmp_path / "changed.fits"
-    shutil.copyfile(built[0], changed)
-    if how == "pixel":
+def test_a_file_that_was_changed_does_not_keep_the_id(built: tuple[Path, str], tmp_path: Path) -> None:
+    limits, file = FitsLimits(max_pixels=2**20), built[0]
+
+    def pixel(changed: Path) -> None:
+        shutil.copyfile(file, changed)
         with fits.open(changed, mode="update") as hdus:
             hdus[0].data[3, 3] += np.float32(1e-6)
-    elif how == "card":
+
+    def card(changed: Path) -> None:
+        shutil.copyfile(file, changed)
         fits.setval(changed, "PSFNAME", value="mine")
-    elif how == "rebinned":
-        write_built(changed, rebinned(read_psf(built[0], limits), 2))
-    elif how == "cutout":
-        cutout(built[0], 32, limits).write(changed)
-    elif how == "rewritten":
-        write_built(changed, read_psf(built[0], limits))
-    else:
-        with fits.open(built[0]) as hdus:
+
+    def no_checksums(changed: Path) -> None:
+        with fits.open(file) as hdus:
             for hdu in hdus:
                 del hdu.header["CHECKSUM"]
-            hdus.writeto(changed, overwrite=True)
+            hdus.writeto(changed)
+
+    changes: dict[str, Callable[[Path], object]] = {
+        "pixel": pixel,
+        "card": card,
+        "no checksums": no_checksums,
+        "rebinned": lambda changed: write_built(changed, rebinned(read_psf(file, limits), 2)),
+        "cutout": lambda changed: cutout(file, 32, limits).write(changed),
+        "rewritten": lambda changed: write_built(changed, read_psf(file, limits)),
+    }
     with local_service() as service:
-        assert service.upload_psf(changed)["id"] == sha256_of(changed) != built[1]
+        for name, change in changes.items():
+            change(tmp_path / f"{name}.fits")
+            digest = sha256_of(tmp_path / f"{name}.fits")
+            assert service.upload_psf(tmp_path / f"{name}.fits")["id"] == digest != built[1], name
 
 
 def _built(folder: Path) -> tuple[dict[str, Any], list[str], bytes]:
@@ -179,14 +172,10 @@ def test_a_psf_is_built_once_and_is_the_same_afterwards(tmp_path: Path) -> None:
     assert "building the PSF" not in stages
     assert same == content
     assert again | {"created_at": None} == first | {"created_at": None}
-
-
-def test_a_damaged_psf_of_the_cache_is_built_again(tmp_path: Path) -> None:
-    _, _, content = _built(tmp_path)
     for file in psf_cache().folder.glob("*.fits"):
         file.write_bytes(content[:-1] + b"?")
     _, stages, same = _built(tmp_path)
-    assert "building the PSF" in stages and same == content
+    assert "building the PSF" in stages and same == content, "a damaged file of the cache is not used"
 
 
 def test_a_deconvolution_builds_the_total_psf_and_a_later_command_the_rest(
@@ -204,6 +193,7 @@ def test_a_deconvolution_builds_the_total_psf_and_a_later_command_the_rest(
         made = service.deconvolve(
             tmp_path / "image.fits",
             tmp_path / name,
+            steps=1,
             progress=lambda stage, step, steps: stages.append(stage),
         )
         return made["psf_id"], stages
@@ -228,35 +218,19 @@ def test_a_deconvolution_builds_the_total_psf_and_a_later_command_the_rest(
     files.match_table.cache_clear()
 
 
-def test_a_psf_that_python_built_is_used(tmp_path: Path) -> None:
+def test_a_psf_that_python_built_is_used_and_a_cache_that_cannot_be_written_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
     heliopsf.build_psf(tmp_path / "small.toml", size=64)
     used, stages, content = _built(tmp_path)
     assert "building the PSF" not in stages
-    psf_cache().clear()
-    built, stages, same = _built(tmp_path)
-    assert "building the PSF" in stages and same == content
-    assert used["id"] == built["id"] and used["details"]["provenance"] == built["details"]["provenance"]
-
-
-def test_a_cache_that_cannot_be_written_is_no_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
     (tmp_path / "file").write_text("not a folder")
     monkeypatch.setenv("HELIOPSF_CACHE_DIR", str(tmp_path / "file"))
-    psf, _, _ = _built(tmp_path)
-    assert psf["name"] == "small" and "not kept for later commands" in caplog.text
-
-
-def test_a_deconvolution_without_a_picture_draws_none(tmp_path: Path) -> None:
-    write_image(tmp_path / "image.fits")
-    write_psf(tmp_path / "psf.fits")
-    with local_service(previews=False) as service:
-        psf_id = service.upload_psf(tmp_path / "psf.fits")["id"]
-        product = service.deconvolve(tmp_path / "image.fits", psf_id=psf_id, steps=1)
-        service.download(product["preview"], tmp_path / "preview.png")
-        service.download(product["thumbnail"], tmp_path / "thumbnail.png")
-    assert (tmp_path / "preview.png").read_bytes() == (tmp_path / "thumbnail.png").read_bytes()
+    built, stages, same = _built(tmp_path)
+    assert "building the PSF" in stages and same == content
+    assert "not kept for later commands" in caplog.text
+    assert used["id"] == built["id"] and used["details"]["provenance"] == built["details"]["provenance"]
 
 
 def test_the_command_loads_neither_the_web_framework_nor_what_only_other_commands_need(

@@ -8,12 +8,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import httpx
-import uvicorn
 from fastapi import FastAPI
 
 from service.app import create_app
 from service.client.http import Client
-from tests.whole.stack import free_port
+from tests.service.serving import serving
+from tests.whole.stack import wait_for
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
@@ -36,7 +36,8 @@ class Live:
         return found
 
     def streams(self) -> int:
-        return sum(self.app.state.heliopsf.streams._open.values())
+        """The number of streams that are open."""
+        return int(self.app.state.heliopsf.streams.total())
 
     def job(self) -> tuple[str, Lease]:
         """A job that is at work."""
@@ -49,17 +50,11 @@ class Live:
 @contextmanager
 def running(settings: Settings) -> Iterator[Live]:
     """A server with these settings."""
-    port = free_port()
     app = create_app(settings)
-    server = uvicorn.Server(uvicorn.Config(app, port=port, log_level="warning", timeout_graceful_shutdown=1))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    url = f"http://127.0.0.1:{port}"
-    with Client(url) as client:
-        client.wait_until_up()
-        yield Live(url, app, client)
-    server.should_exit = True
-    thread.join()
+    with serving(app) as port:
+        url = f"http://127.0.0.1:{port}"
+        with Client(url) as client:
+            yield Live(url, app, client)
 
 
 class Following(threading.Thread):
@@ -81,6 +76,10 @@ class Following(threading.Thread):
             self.type = answer.headers.get("content-type", "")
             for line in answer.iter_lines():
                 self.lines.append(line)
+
+    def await_lines(self, start: str, count: int) -> None:
+        """Wait until so many lines that begin like this have come."""
+        wait_for(lambda: len(self.said(start)) >= count, f"{count} lines {start}", timeout_s=20)
 
     def said(self, start: str) -> list[str]:
         return [line.removeprefix(start).strip() for line in self.lines if line.startswith(start)]

@@ -10,6 +10,7 @@ from fastapi.testclient import TestClient
 
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload
+from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import PsfRow
 
 HEADER = {
@@ -49,6 +50,8 @@ def test_an_estimate_is_what_the_job_then_gets(
     done = api.get(f"/v1/jobs/{job['id']}").json()
     assert done["result"] == f"/v1/products/{told['result_id']}" and done["waiting_before"] is None
     assert asked(api, **parameters)["existing"] == done["result"]
+    first, second = (asked(api, "rerun", of="product", id=told["result_id"]) for _ in range(2))
+    assert first["result_id"] != second["result_id"] and first["existing"] is None, "always a new result"
     api.delete(done["result"])
     assert asked(api, **parameters)["existing"] is None
 
@@ -71,31 +74,26 @@ def test_why_a_psf_is_chosen(api: TestClient, tmp_path: Path) -> None:
     image_id = upload(api, tmp_path / "i.fits")
     built = asked(api, image_id=image_id)["psf"]
     assert (built["name"], built["status"]) == ("hri_euv", None)
-    assert built["why"] == (
-        "No PSF of hri_euv/174/total is certified, so the PSF is built from the instrument file that heliopsf ships; the job "
-        "builds it first."
-    )
+    assert "No PSF of hri_euv/174/total is certified" in built["why"] and "builds it first" in built["why"]
     write_psf(tmp_path / "p.fits")
     where = "/v1/psfs?name=fitted&instrument=hri_euv&channel=174&kind=total"
     psf_id = upload(api, tmp_path / "p.fits", where)
     certified = {"status": "certified", "version": "1.0.0"}
     assert api.post(f"/v1/psfs/{psf_id}/status", json=certified).status_code == 200
-    seen = "for the images of hri_euv/174/total at the time of this image."
-    found = asked(api, image_id=image_id)["psf"]
-    assert found == {
-        "id": psf_id, "name": "fitted", "version": "1.0.0", "status": "certified",
-        "why": f"This PSF is certified {seen}",
-    }  # fmt: skip
+    choice = asked(api, image_id=image_id)["psf"]
+    assert "is certified for the images of hri_euv/174/total" in choice.pop("why")
+    assert choice == {"id": psf_id, "name": "fitted", "version": "1.0.0", "status": "certified"}
     assert api.post("/v1/contexts", json={"name": "release", "reason": "x"}).status_code == 201
     pinned = asked(api, image_id=image_id, context="release")["psf"]
-    assert pinned["why"] == f"Context release pins this PSF {seen}"
+    assert "Context release pins this PSF" in pinned["why"]
 
 
-def test_a_psf_that_was_built_before_is_told_with_its_status(api: TestClient, tmp_path: Path) -> None:
+def test_a_psf_that_was_built_before_is_told_with_its_status(
+    api: TestClient, catalogue: Catalogue, tmp_path: Path
+) -> None:
     write_image(tmp_path / "i.fits", **HEADER)
     image_id = upload(api, tmp_path / "i.fits")
     psf_id = asked(api, image_id=image_id)["psf"]["id"]
-    catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
     catalogue.add(
         PsfRow(
             owner="local", id=psf_id, created_at=0.0, name="hri_euv", version="1.0.0+abc", instrument="hri_euv", kind="total",
@@ -123,14 +121,3 @@ def test_errors_are_those_of_a_job(api: TestClient, image_file: Path) -> None:
         assert estimate.status_code == job.status_code >= 400
         assert estimate.json() == job.json()
     assert "psfs" in api.post("/v1/estimates", json=bodies[0]).json(), "with the fields of the error"
-
-
-def test_a_kind_that_always_makes_a_new_result_has_none_yet(
-    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
-) -> None:
-    parameters = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
-    api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
-    run_jobs()
-    (product,) = api.get("/v1/products").json()["items"]
-    first, second = (asked(api, "rerun", of="product", id=product["id"]) for _ in range(2))
-    assert first["result_id"] != second["result_id"] and first["existing"] is None

@@ -16,6 +16,7 @@ from service.api import events
 from service.app import create_app
 from service.client.http import ServiceError
 from tests.service.api.live import Following, Live, running
+from tests.service.conftest import execute, refusal
 from tests.service.keyed import bearer, keyed
 from tests.whole.stack import wait_for
 from workers.catalogue.bulk_tables import BulkRow
@@ -58,7 +59,7 @@ def test_a_job_is_followed_to_its_end(live: Live) -> None:
 def test_a_reconnected_client_gets_what_changed_meanwhile(live: Live) -> None:
     job_id, lease = live.job()
     first = Following(f"{live.url}/v1/jobs/{job_id}/events")
-    wait_for(lambda: len(first.said("id:")) == 1, "an event", timeout_s=10)
+    first.await_lines("id:", 1)
     assert first.type.startswith("text/event-stream") and first.said("retry:") == ["2000"]
     knows = {"Last-Event-ID": first.said("id:")[0]}
     second = Following(f"{live.url}/v1/jobs/{job_id}/events", **knows)
@@ -73,55 +74,37 @@ def test_a_reconnected_client_gets_what_changed_meanwhile(live: Live) -> None:
     assert httpx.get(f"{live.url}/v1/jobs/{job_id}/events", headers=ended).status_code == 204
 
 
-def test_an_idle_stream_sends_comments(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_idle_stream_sends_comments_and_a_closed_connection_frees_its_stream(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(events, "ALIVE_EVERY_S", 0.1)
-    job_id, lease = live.job()
+    (job_id, lease), (other_id, _) = live.job(), live.job()
     following = Following(f"{live.url}/v1/jobs/{job_id}/events")
-    wait_for(lambda: len(following.said(": still here")) >= 3, "it says so again and again", timeout_s=10)
+    following.await_lines(": still here", 3)
+    with httpx.stream("GET", f"{live.url}/v1/jobs/{other_id}/events") as answer:
+        lines = answer.iter_lines()  # let go of, it would close the connection
+        next(lines)
+        assert live.streams() == 2
+        refusal(httpx.get(f"{live.url}/v1/jobs/{job_id}/events"), 429, "too-many-streams")
+    wait_for(lambda: live.streams() == 1, "the place is free", timeout_s=10)
     live.catalogue.jobs.complete(lease, "r" * 64)
     following.join(10)
     assert following.said("event:") == ["progress", "end"]
 
 
-def test_the_number_of_streams_per_caller_is_limited(live: Live) -> None:
-    (job_id, lease), (other_id, _) = live.job(), live.job()
+def test_a_job_that_is_destroyed_and_a_server_that_stops_end_their_streams(live: Live) -> None:
+    (job_id, _), (other_id, _) = live.job(), live.job()
     both = [Following(f"{live.url}/v1/jobs/{one}/events") for one in (job_id, other_id)]
-    wait_for(lambda: all(one.said("event:") for one in both), "two are open", timeout_s=10)
-    refused = httpx.get(f"{live.url}/v1/jobs/{job_id}/events")
-    assert refused.status_code == 429 and refused.json()["type"] == "urn:heliopsf:too-many-streams"
-    live.catalogue.jobs.complete(lease, "r" * 64)
-    both[0].join(10)
-    assert httpx.get(f"{live.url}/v1/jobs/{job_id}/events").status_code == 200
-
-
-def test_a_closed_connection_frees_its_stream(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(events, "ALIVE_EVERY_S", 0.1)
-    job_id, _ = live.job()
-    with httpx.stream("GET", f"{live.url}/v1/jobs/{job_id}/events") as answer:
-        lines = answer.iter_lines()  # let go of, it would close the connection
-        next(lines)
-        assert live.streams() == 1
-    wait_for(lambda: live.streams() == 0, "the place is free", timeout_s=10)
-
-
-def test_a_job_that_is_destroyed_ends_its_stream(live: Live) -> None:
-    job_id, _ = live.job()
-    following = Following(f"{live.url}/v1/jobs/{job_id}/events")
-    wait_for(lambda: bool(following.said("event:")), "an event", timeout_s=10)
+    for one in both:
+        one.await_lines("event:", 1)
     live.catalogue.uws.destroy(job_id)
-    following.join(10)
-    assert following.said("event:") == ["progress", "gone"]
+    both[0].join(10)
+    assert both[0].said("event:") == ["progress", "gone"]
     with pytest.raises(ServiceError, match="expected the id of one of your jobs"):
         list(live.client.follow(f"/v1/jobs/{job_id}"))
-
-
-def test_a_server_that_stops_ends_its_streams(live: Live) -> None:
-    job_id, _ = live.job()
-    following = Following(f"{live.url}/v1/jobs/{job_id}/events")
-    wait_for(lambda: bool(following.said("event:")), "an event", timeout_s=10)
     live.app.state.stopping = True
-    following.join(5)
-    assert not following.is_alive() and following.said("event:") == ["progress"]
+    both[1].join(10)
+    assert not both[1].is_alive() and both[1].said("event:") == ["progress"]
 
 
 def test_a_bulk_is_followed(live: Live) -> None:
@@ -131,10 +114,10 @@ def test_a_bulk_is_followed(live: Live) -> None:
     )  # fmt: skip
     bulk_id = live.catalogue.bulks.create(row, ["a" * 64, "b" * 64])[0].id
     following = Following(f"{live.url}/v1/bulk/{bulk_id}/events")
-    wait_for(lambda: bool(following.said("data:")), "an event", timeout_s=10)
+    following.await_lines("data:", 1)
     assert '"total":2' in following.said("data:")[0]
     live.client.pause_bulk(bulk_id)
-    wait_for(lambda: len(following.said("data:")) == 2, "the next", timeout_s=10)
+    following.await_lines("data:", 2)
     assert live.client.wait_for_bulk(bulk_id)["phase"] == "PAUSED", "nobody waits for what does not go on"
     live.client.cancel_bulk(bulk_id)
     following.join(10)
@@ -146,7 +129,7 @@ def test_a_stream_ends_after_its_time_and_can_be_continued(
 ) -> None:
     monkeypatch.setattr(events, "LOOK_EVERY_S", 0.02)
     with TestClient(create_app(settings.model_copy(update={"stream_s": 0.2}))) as api:
-        catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+        catalogue = api.app.state.heliopsf.catalogue
         job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
         said = api.get(f"/v1/jobs/{job.id}/events").text
         assert said.count("event: progress") == 1 and "event: end" not in said
@@ -154,37 +137,26 @@ def test_a_stream_ends_after_its_time_and_can_be_continued(
         assert "event:" not in api.get(f"/v1/jobs/{job.id}/events", headers={"Last-Event-ID": known}).text
 
 
-@pytest.mark.parametrize("how", ["revoked", "expired"])
-def test_a_stream_ends_with_its_key(settings: Settings, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+def test_a_stream_ends_with_its_key(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events, "LOOK_EVERY_S", 0.02)
     with keyed(settings, stream_s=10.0) as service:  # guards against a hang
-        key = service.key("ann")
-        identity = key.split("_")[1]
-        job, _ = service.catalogue.jobs.submit("psf-build", {}, "k", "ann")
-        end = update(KeyRow).where(KeyRow.id == identity)
-        end = end.values(revoked_at=1.0) if how == "revoked" else end.values(expires_at=1.0)
-        get, looks = service.catalogue.jobs.get, 0
+        for how, change in (("revoked", {"revoked_at": 1.0}), ("expired", {"expires_at": 1.0})):
+            key = service.key("ann")
+            job, _ = service.catalogue.jobs.submit("psf-build", {}, how, "ann")
+            end = update(KeyRow).where(KeyRow.id == key.split("_")[1]).values(**change)
+            get, looks = service.catalogue.jobs.get, []
 
-        def look(job_id: str) -> JobRow | None:
-            nonlocal looks
-            looks += 1
-            if looks == 5:  # the stream is open and has sent an event
-                service.catalogue._database.change(end)
-            return get(job_id)
+            def look(job_id: str, get: Any = get, looks: list[str] = looks, end: Any = end) -> JobRow | None:
+                looks.append(job_id)
+                if len(looks) == 5:  # the stream is open and has sent an event
+                    execute(service.catalogue, end)
+                row: JobRow | None = get(job_id)
+                return row
 
-        monkeypatch.setattr(service.catalogue.jobs, "get", look)
-        said = service.api.get(f"/v1/jobs/{job.id}/events", headers=bearer(key))
-        assert said.status_code == 200 and looks == 5
-        assert said.text.count("event: progress") == 1 and "event: end" not in said.text
-        refused = service.api.get(f"/v1/jobs/{job.id}/events", headers=bearer(key))
-        assert (refused.status_code, refused.json()["type"]) == (401, f"urn:heliopsf:key-{how}")
-
-
-def test_an_owner_follows_nothing_of_another_s(settings: Settings) -> None:
-    with keyed(settings) as service:
-        job, _ = service.catalogue.jobs.submit("psf-build", {}, "k", "ann")
-        for identity in (job.id, "0" * 32):
-            refused = service.client("bob").get(f"/v1/jobs/{identity}/events")
-            assert refused.status_code == 404 and refused.json()["type"] == "urn:heliopsf:no-such-job"
-            refused = service.client("bob").get(f"/v1/bulk/{identity}/events")
-            assert refused.status_code == 404 and refused.json()["type"] == "urn:heliopsf:no-such-bulk"
+            with monkeypatch.context() as patched:
+                patched.setattr(service.catalogue.jobs, "get", look)
+                said = service.api.get(f"/v1/jobs/{job.id}/events", headers=bearer(key))
+            assert said.status_code == 200 and len(looks) == 5
+            assert said.text.count("event: progress") == 1 and "event: end" not in said.text
+            refused = service.api.get(f"/v1/jobs/{job.id}/events", headers=bearer(key))
+            refusal(refused, 401, f"key-{how}")

@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
 from service.api.keys import MOST_KEYS
-from service.app import create_app
 from tests.conftest import SMALL_INSTRUMENT
+from tests.service.conftest import refusal
 from tests.service.keyed import Keyed, bearer, keyed
+from tests.whole.stack import wait_for
 from workers.catalogue.access.keys import Scope
 from workers.settings import Settings
 
 DAY_S = 86_400
-
-
-@pytest.fixture
-def service(settings: Settings) -> Iterator[Keyed]:
-    with keyed(settings) as running:
-        yield running
 
 
 def made(client: TestClient, **body: Any) -> dict[str, Any]:
@@ -33,11 +27,8 @@ def made(client: TestClient, **body: Any) -> dict[str, Any]:
     return found
 
 
-def refused(client: TestClient, **body: Any) -> str:
-    answer = client.post("/v1/keys", json={"scopes": ["read"]} | body)
-    assert answer.status_code in (403, 409, 422), answer.text
-    code: str = answer.json()["type"]
-    return code.removeprefix("urn:heliopsf:")
+def refused(client: TestClient, status: int, code: str, **body: Any) -> None:
+    refusal(client.post("/v1/keys", json={"scopes": ["read"]} | body), status, code)
 
 
 def test_a_key_makes_a_key_that_is_shown_once(service: Keyed) -> None:
@@ -62,8 +53,8 @@ def test_a_key_makes_a_key_that_is_shown_once(service: Keyed) -> None:
 def test_a_key_gives_no_more_than_it_has(service: Keyed) -> None:
     ann = service.client("ann", Scope.READ, Scope.SUBMIT)
     for scope in (Scope.ADMIN, Scope.BULK, Scope.CERTIFY):
-        assert refused(ann, scopes=["read", scope]) == "scope-missing"
-    assert refused(ann, owner="bob") == "scope-missing"
+        refused(ann, 403, "scope-missing", scopes=["read", scope])
+    refused(ann, 403, "scope-missing", owner="bob")
     assert ann.post("/v1/keys", json={"scopes": ["read"]}, headers={"X-Owner": "bob"}).status_code == 403
     assert made(ann, owner="ann")["owner"] == "ann"
 
@@ -72,9 +63,9 @@ def test_a_key_does_not_outlive_its_maker(service: Keyed) -> None:
     short = TestClient(service.api.app, headers=bearer(service.key("ann", lasts_s=DAY_S)))
     assert made(short)["expires_at"] == pytest.approx(time.time() + DAY_S, abs=60)
     assert made(short, lasts_days=0.5)["expires_at"] == pytest.approx(time.time() + DAY_S / 2, abs=60)
-    assert refused(short, lasts_days=2) == "outlives-its-maker"
-    assert refused(short, expires_at=time.time() + 2 * DAY_S) == "outlives-its-maker"
-    assert refused(short, expires_at=time.time() - 1) == "end-in-the-past"
+    refused(short, 403, "outlives-its-maker", lasts_days=2)
+    refused(short, 403, "outlives-its-maker", expires_at=time.time() + 2 * DAY_S)
+    refused(short, 422, "end-in-the-past", expires_at=time.time() - 1)
     assert made(service.client("ann"))["expires_at"] is None
 
 
@@ -92,9 +83,9 @@ def test_an_administrator_is_bound_by_none_of_this(service: Keyed) -> None:
         assert service.client("ann").get("/v1/keys", params={"owner": owner}).status_code == 403
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
+def test_wrong_requests_make_nothing(service: Keyed) -> None:
+    root = service.client("root", *Scope)
+    for body in (
         {"scopes": []},
         {"scopes": ["all"]},
         {"scopes": ["read"], "lasts_days": 1, "expires_at": 9e9},
@@ -103,11 +94,9 @@ def test_an_administrator_is_bound_by_none_of_this(service: Keyed) -> None:
         {"scopes": ["read"], "owner": "A B"},
         {"scopes": ["read"], "label": "x" * 81},
         {"scopes": ["read"], "days": 3},
-    ],
-)
-def test_wrong_requests_make_nothing(service: Keyed, body: dict[str, Any]) -> None:
-    answer = service.client("root", *Scope).post("/v1/keys", json=body)
-    assert answer.status_code == 422, answer.text
+    ):
+        answer = root.post("/v1/keys", json=body)
+        assert answer.status_code == 422, (body, answer.text)
     assert len(service.catalogue.keys.all()) == 1
 
 
@@ -145,7 +134,7 @@ def test_a_stolen_key_goes_with_what_was_made_with_it(service: Keyed) -> None:
 def test_an_owner_makes_a_bounded_number(service: Keyed) -> None:
     ann = service.client("ann")
     ids = [made(ann)["id"] for _ in range(MOST_KEYS - 1)]
-    assert refused(ann) == "too-many-keys"
+    refused(ann, 409, "too-many-keys")
     ann.delete(f"/v1/keys/{ids[0]}")
     made(ann)
 
@@ -158,21 +147,16 @@ def test_keys_count_as_submissions(settings: Settings) -> None:
         assert tried == [201, 201, 429]
 
 
-def test_an_open_service_uses_no_keys(settings: Settings) -> None:
-    with TestClient(create_app(settings)) as api:
-        for method, address in (
-            ("GET", ""),
-            ("POST", ""),
-            ("GET", "/" + 16 * "0"),
-            ("DELETE", "/" + 16 * "0"),
-        ):
-            body = {"json": {"scopes": ["read"]}} if method == "POST" else {}
-            answer = api.request(method, f"/v1/keys{address}", **body)  # type: ignore[arg-type]
-            assert answer.status_code == 409 and answer.json()["type"] == "urn:heliopsf:keys-not-used"
+def test_an_open_service_uses_no_keys(shared_api: TestClient) -> None:
+    one = "/v1/keys/" + 16 * "0"
+    for method, address in (("GET", "/v1/keys"), ("POST", "/v1/keys"), ("GET", one), ("DELETE", one)):
+        body: dict[str, Any] = {"json": {"scopes": ["read"]}} if method == "POST" else {}
+        refusal(shared_api.request(method, address, **body), 409, "keys-not-used")
 
 
 @pytest.mark.parametrize("how", ["logout", "revoke"])
-def test_the_stream_of_a_session_ends_with_it(service: Keyed, how: str, psf_job: dict[str, Any]) -> None:
+def test_the_stream_of_a_session_ends_with_it(service: Keyed, how: str) -> None:
+    psf_job = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 128}}
     key = service.key("ann")
     client = TestClient(service.api.app, headers={"Sec-Fetch-Site": "same-origin"})
     client.post("/login", data={"key": key}, follow_redirects=False)
@@ -184,19 +168,13 @@ def test_the_stream_of_a_session_ends_with_it(service: Keyed, how: str, psf_job:
 
     thread = threading.Thread(target=follow)
     thread.start()
-    streams, deadline = service.api.app.state.heliopsf.streams, time.monotonic() + 20  # type: ignore[attr-defined]
-    while not streams._open and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert streams._open and thread.is_alive(), "the job waits, so the stream stays open"
+    streams = service.api.app.state.heliopsf.streams
+    wait_for(lambda: streams.total() == 1, "the stream is open", timeout_s=20)
+    assert thread.is_alive(), "the job waits, so the stream stays open"
     if how == "logout":
         assert client.post("/logout", follow_redirects=False).status_code == 303
     else:
         assert client.delete(f"/v1/keys/{key.split('_')[1]}").status_code == 200
     thread.join(20)
     assert len(got) == 1, "it would last an hour"
-    assert not streams._open
-
-
-@pytest.fixture
-def psf_job() -> dict[str, Any]:
-    return {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 128}}
+    assert streams.total() == 0

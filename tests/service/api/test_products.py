@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import pytest
 from fastapi.testclient import TestClient
 from matplotlib.image import imread
-from sqlalchemy import update
 
 from psfcore.drawing.thumbnail import write_thumbnail
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_plane
-from tests.service.conftest import upload
+from tests.service.conftest import refusal, result_of, upload
+from tests.service.vo.made import add_product
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
 from workers.files.intact import intact
@@ -22,25 +20,12 @@ from workers.files.store import Store
 from workers.settings import Settings
 
 
-@pytest.fixture
-def catalogue(api: TestClient) -> Catalogue:
-    found = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
-    assert isinstance(found, Catalogue)
-    return found
-
-
-@pytest.fixture
-def product(
-    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
-) -> dict[str, Any]:
-    parameters = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
-    parameters |= {"method": {"name": "richardson-lucy", "steps": 2}}
-    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()
-    run_jobs()
-    return dict(api.get(api.get(f"/v1/jobs/{job['id']}").json()["result"]).json())
-
-
-def test_a_product_has_a_thumbnail(api: TestClient, product: dict[str, Any], tmp_path: Path) -> None:
+def test_a_product_has_a_thumbnail(
+    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None], tmp_path: Path
+) -> None:
+    ids = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
+    method = {"name": "richardson-lucy", "steps": 1}
+    product = result_of(api, run_jobs, "deconvolve", **ids, method=method)
     answer = api.get(product["thumbnail"])
     digest = product["details"]["thumbnail_sha256"]
     assert answer.status_code == 200 and answer.headers["Content-Type"] == "image/png"
@@ -54,32 +39,24 @@ def test_a_product_has_a_thumbnail(api: TestClient, product: dict[str, Any], tmp
     assert difference.max() < 0.03  # the file has 32-bit numbers, the picture was made from 64-bit ones
 
 
-def test_a_product_without_a_thumbnail_says_so(
-    api: TestClient, product: dict[str, Any], catalogue: Catalogue
+def test_a_thumbnail_that_is_lost_deleted_or_was_never_made(
+    api: TestClient, catalogue: Catalogue, settings: Settings, tmp_path: Path
 ) -> None:
-    details = {name: value for name, value in product["details"].items() if name != "thumbnail_sha256"}
-    older = update(ProductRow).where(ProductRow.id == product["id"]).values(details=details)
-    catalogue._database.change(older)
-    answer = api.get(f"/v1/products/{product['id']}/thumbnail")
-    assert answer.status_code == 404 and answer.json()["type"] == "urn:heliopsf:no-thumbnail"
-    assert "made before products had one" in answer.json()["detail"]
-    assert api.get(f"/v1/products/{product['id']}").json()["thumbnail"] is None
+    store = Store(settings.data_dir)
+    older = add_product(api, tmp_path, thumbnail_sha256=None)["product"]
+    detail = refusal(api.get(f"/v1/products/{older}/thumbnail"), 404, "no-thumbnail")
+    assert "made before products had one" in detail
+    assert api.get(f"/v1/products/{older}").json()["thumbnail"] is None
 
-
-def test_a_lost_thumbnail_is_found(
-    api: TestClient, product: dict[str, Any], catalogue: Catalogue, settings: Settings
-) -> None:
-    store, digest = Store(settings.data_dir), product["details"]["thumbnail_sha256"]
-    row = catalogue.get(ProductRow, product["id"], DEFAULT_OWNER)
+    (tmp_path / "thumbnail.png").write_bytes(b"\x89PNG\r\n\x1a\nsmall")
+    digest = store.keep(tmp_path / "thumbnail.png")
+    own = add_product(api, tmp_path, number=2, thumbnail_sha256=digest)["product"]
+    row = catalogue.get(ProductRow, own, DEFAULT_OWNER)
     assert row is not None and intact(store, row) and digest in set(catalogue.named_files.all())
+    content = store.path(digest).read_bytes()
     store.path(digest).unlink()
-    assert not intact(store, row) and api.get(product["thumbnail"]).status_code == 410
-
-
-def test_a_deleted_product_leaves_no_thumbnail(
-    api: TestClient, product: dict[str, Any], settings: Settings
-) -> None:
-    store, digest = Store(settings.data_dir), product["details"]["thumbnail_sha256"]
+    assert not intact(store, row) and api.get(f"/v1/products/{own}/thumbnail").status_code == 410
+    store.path(digest).write_bytes(content)
     assert store.size(digest)
-    assert api.delete(f"/v1/products/{product['id']}").status_code == 204
+    assert api.delete(f"/v1/products/{own}").status_code == 204
     assert store.size(digest) is None

@@ -11,12 +11,11 @@ from fastapi.testclient import TestClient
 from prov.model import ProvDocument, ProvEntity
 from prov.scripts.convert import main as prov_convert
 
-from tests.service.keyed import keyed
+from tests.service.conftest import refusal
 from tests.service.vo.made import ENDED_AT, STARTED_AT, add_product
 from tests.workers.psf_examples import identity, product, psf
 from workers.catalogue.catalogue import Catalogue
 from workers.provenance import provenance, provenance_text
-from workers.settings import Settings
 
 
 def read(text: str) -> ProvDocument:
@@ -80,6 +79,10 @@ def test_prov_convert_reads_both_forms(
     api: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ids = add_product(api, tmp_path)
+    wrong = api.get(f"/v1/products/{ids['product']}/provenance?format=xml")
+    assert "'json' or 'provn'" in refusal(wrong, 422, "invalid-request")
+    for of in ("product", "psf"):
+        refusal(api.get(f"/v1/{of}s/{'f' * 64}/provenance"), 404, f"no-such-{of}")
     for of, form, other in (
         ("product", "json", "provn"),
         ("product", "provn", "json"),
@@ -94,7 +97,7 @@ def test_prov_convert_reads_both_forms(
         assert read(out.read_text()) == read(text)
 
 
-def test_generations_weights_and_deleted_parents(settings: Settings, tmp_path: Path) -> None:
+def test_generations_weights_and_deleted_parents(tmp_path: Path) -> None:
     """An interpolated PSF, its two ends, of which one was deleted, and a transit."""
     catalogue = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
     catalogue.upgrade()
@@ -120,15 +123,3 @@ def test_generations_weights_and_deleted_parents(settings: Settings, tmp_path: P
     [late] = named(document, f"psf:{identity('late')}")
     assert late["heliopsf:deleted"] == ["True"] and "heliopsf:sha256" not in late
     catalogue.close()
-
-
-def test_refusals(api: TestClient, settings: Settings, tmp_path: Path) -> None:
-    ids = add_product(api, tmp_path)
-    wrong = api.get(f"/v1/products/{ids['product']}/provenance?format=xml")
-    assert wrong.status_code == 422 and "'json' or 'provn'" in wrong.json()["detail"]
-    for of in ("product", "psf"):
-        missing = api.get(f"/v1/{of}s/{'f' * 64}/provenance")
-        assert missing.status_code == 404 and missing.json()["type"] == f"urn:heliopsf:no-such-{of}"
-    with keyed(settings) as service:
-        hidden = service.client("other").get(f"/v1/products/{ids['product']}/provenance")
-        assert hidden.status_code == 404

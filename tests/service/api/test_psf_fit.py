@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
+from httpx import Response
 
 from psfcore.transit.archive import pack
-from tests.service.conftest import upload
+from tests.service.conftest import job_after, refusal, upload
 from tests.transit_files import write_simulated, write_transit
 
 
@@ -25,9 +26,7 @@ def test_a_transit_becomes_a_psf_version_with_a_report(
     api: TestClient, run_jobs: Callable[[], None], archive: Path
 ) -> None:
     transit_id = upload(api, archive, "/v1/transits")
-    job = api.post("/v1/jobs", json={"kind": "psf-fit", "parameters": {"transit_id": transit_id}}).json()
-    run_jobs()
-    job = api.get(f"/v1/jobs/{job['id']}").json()
+    job = job_after(api, run_jobs, "psf-fit", transit_id=transit_id)
     assert job["phase"] == "COMPLETED", job["error"]
     psf = api.get(job["result"]).json()
     assert psf["origin"] == "fitted" and psf["details"]["transit_id"] == transit_id
@@ -40,27 +39,16 @@ def test_a_transit_becomes_a_psf_version_with_a_report(
     assert api.get(psf["file"]).content.startswith(b"SIMPLE")
 
 
-def test_a_psf_that_was_not_fitted_has_no_report(api: TestClient, psf_file: Path) -> None:
+def test_requests_that_cannot_be(api: TestClient, psf_file: Path, tmp_path: Path) -> None:
     psf_id = upload(api, psf_file, "/v1/psfs")
-    assert api.get(f"/v1/psfs/{psf_id}").json()["report"] is None
-    answer = api.get(f"/v1/psfs/{psf_id}/report")
-    assert answer.status_code == 404 and answer.json()["type"].endswith("no-report")
+    assert api.get(f"/v1/psfs/{psf_id}").json()["report"] is None, "it was not fitted"
+    refusal(api.get(f"/v1/psfs/{psf_id}/report"), 404, "no-report")
 
+    def answer(**parameters: object) -> Response:
+        return api.post("/v1/jobs", json={"kind": "psf-fit", "parameters": parameters})
 
-def test_requests_that_cannot_be(api: TestClient, tmp_path: Path) -> None:
-    missing = api.post("/v1/jobs", json={"kind": "psf-fit", "parameters": {"transit_id": "0" * 64}})
-    assert missing.status_code == 404 and missing.json()["type"].endswith("no-such-transit")
-    path = tmp_path / "t.tar"
-    pack(write_transit(tmp_path / "silent", noise=None), path)
-    silent = upload(api, path, "/v1/transits")
-    refused = api.post("/v1/jobs", json={"kind": "psf-fit", "parameters": {"transit_id": silent}})
-    assert refused.status_code == 422 and refused.json()["type"].endswith("no-noise-figures")
-    for wrong in (
-        {"shape": "round"},
-        {"seed": -1},
-        {"noise": {"photon_gain_dn": -1, "read_noise_dn": 1}},
-        {"a": 1},
-    ):
-        parameters = {"transit_id": "0" * 64} | wrong
-        answer = api.post("/v1/jobs", json={"kind": "psf-fit", "parameters": parameters})
-        assert answer.status_code == 422, wrong
+    pack(write_transit(tmp_path / "silent", noise=None), tmp_path / "t.tar")
+    refusal(answer(transit_id=upload(api, tmp_path / "t.tar", "/v1/transits")), 422, "no-noise-figures")
+    noise = {"photon_gain_dn": -1, "read_noise_dn": 1}
+    for wrong in ({"shape": "round"}, {"seed": -1}, {"noise": noise}, {"a": 1}):
+        refusal(answer(transit_id="0" * 64, **wrong), 422, "invalid-request")

@@ -7,12 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
 from httpx import Response
 
-from tests.service.conftest import upload
+from tests.service.conftest import refusal, upload
 
 DEFAULT = {"method": {"name": "linear"}}
 
@@ -28,9 +27,8 @@ def test_the_product_of_a_region_is_the_box(
     fits.setval(image_file, "CRPIX1", value=1.5)
     image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
     whole = ask(api, image_id, psf_id).json()
-    assert ask(api, image_id, psf_id, region_error=0.5).json()["id"] == whole["id"], (
-        "without a region it means nothing"
-    )
+    same = ask(api, image_id, psf_id, region_error=0.5).json()
+    assert same["id"] == whole["id"], "without a region it means nothing"
     job = ask(api, image_id, psf_id, region="10:50,20:60", region_error=0.9).json()
     assert job["id"] != whole["id"]
     run_jobs()
@@ -46,35 +44,26 @@ def test_the_product_of_a_region_is_the_box(
     assert abs(found.data - expected.data[20:60, 10:50]).max() <= told["error"]
 
 
-@pytest.mark.parametrize(
-    ("asked", "code", "said"),
-    [
+def test_a_region_that_cannot_be_is_refused(api: TestClient, image_file: Path, psf_file: Path) -> None:
+    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    box = {"region": "0:40,0:40"}
+    discrepancy = {"name": "linear", "stop": "discrepancy"}
+    cases: list[tuple[dict[str, Any], str, str]] = [
         ({"region": "10-50,20-60"}, "invalid-request", "region"),
         ({"region": "0:5000,0:50"}, "region-outside", "the size of the image"),
         ({"region": "0:40,0:8"}, "region-too-small", "16 px"),
-        ({"region": "0:40,0:40", "error_draws": 4}, "invalid-request", "error_draws 0 with a region"),
-        (
-            {"region": "0:40,0:40", "method": {"name": "linear", "stop": "discrepancy"}},
-            "invalid-request",
-            "stopping rule fixed",
-        ),
-        ({"region": "0:40,0:40", "region_error": 0}, "invalid-request", "region_error"),
-    ],
-)
-def test_a_region_that_cannot_be_is_refused(
-    api: TestClient, image_file: Path, psf_file: Path, asked: dict[str, Any], code: str, said: str
-) -> None:
-    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
-    answer = ask(api, image_id, psf_id, **asked)
-    assert answer.status_code == 422 and answer.json()["type"] == f"urn:heliopsf:{code}"
-    assert said in answer.json()["detail"]
-
-
-def test_a_region_needs_less_time_and_memory(api: TestClient, image_file: Path, psf_file: Path) -> None:
-    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
-    asked = {"image_id": image_id, "psf_id": psf_id, "method": {"name": "linear", "steps": 2}}
+        (box | {"error_draws": 4}, "invalid-request", "error_draws 0 with a region"),
+        (box | {"method": discrepancy}, "invalid-request", "stopping rule fixed"),
+        (box | {"region_error": 0}, "invalid-request", "region_error"),
+    ]
+    for parameters, code, said in cases:
+        assert said in refusal(ask(api, image_id, psf_id, **parameters), 422, code)
+    method = {"name": "linear", "steps": 2}
     whole, part = (
-        api.post("/v1/estimates", json={"kind": "deconvolve", "parameters": asked | more}).json()["estimate"]
-        for more in ({}, {"region": "0:16,0:16"})
+        api.post("/v1/estimates", json={"kind": "deconvolve", "parameters": parameters}).json()["estimate"]
+        for parameters in (
+            {"image_id": image_id, "psf_id": psf_id, "method": method},
+            {"image_id": image_id, "psf_id": psf_id, "method": method, "region": "0:16,0:16"},
+        )
     )
     assert part["memory_mib"] <= whole["memory_mib"] and part["seconds"] <= whole["seconds"]

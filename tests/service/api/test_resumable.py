@@ -19,8 +19,8 @@ from psfcore.transit.archive import pack
 from service.client import resumable
 from service.client.errors import ServiceError
 from tests.service.api.live import Live, running
-from tests.service.keyed import keyed
 from tests.transit_files import write_transit
+from tests.whole.stack import wait_for
 from workers.files import partial_uploads
 from workers.files.partial_uploads import PartialUploads
 from workers.settings import Settings
@@ -79,11 +79,8 @@ def checksum(content: bytes) -> str:
     return "sha256 " + base64.b64encode(hashlib.sha256(content).digest()).decode()
 
 
-def wait_for_offset(url: str, wanted: int) -> None:
-    deadline = time.monotonic() + 20.0
-    while offset(url) != wanted:
-        assert time.monotonic() < deadline, f"expected offset {wanted}; got {offset(url)}"
-        time.sleep(0.05)
+def wait_for_offset(url: str, expected: int) -> None:
+    wait_for(lambda: offset(url) == expected, f"offset {expected}", timeout_s=20)
 
 
 def test_an_upload_continues_where_the_connection_was_cut(live: Live, archive: Path) -> None:
@@ -157,19 +154,21 @@ def test_another_process_continues_the_upload(
     live: Live, archive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(resumable, "PART_BYTES", 20_000)
-    monkeypatch.setattr(resumable, "PATIENCE_S", -1.0)
-    with pytest.raises(ServiceError, match="no answer"):
-        resumable.upload(Broken(live, ["", "", "before"]), archive, "transit", "m.tar", print)
+    with monkeypatch.context() as patched:
+        patched.setattr(resumable, "PATIENCE_S", -1.0)
+        with pytest.raises(ServiceError, match="no answer"):
+            resumable.upload(Broken(live, ["", "", "before"]), archive, "transit", "m.tar", print)
     second = Broken(live, [])
     time.sleep(0.5)
     resumable.upload(second, archive, "transit", "m.tar", print)
     assert second.parts[0] == 40_000
-
-
-def test_a_large_transit_is_sent_in_parts(live: Live, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_transit(archive.parent / "other", images=3)
+    pack(archive.parent / "other", archive)
     monkeypatch.setattr(resumable, "FROM_BYTES", 1000)
-    monkeypatch.setattr(resumable, "PART_BYTES", 50_000)
-    assert live.client.upload_transit(archive)["id"] == hashlib.sha256(archive.read_bytes()).hexdigest()
+    sent = live.client.upload_transit(archive)
+    assert sent["id"] == hashlib.sha256(archive.read_bytes()).hexdigest(), (
+        "a large transit, by the client itself"
+    )
 
 
 def test_a_file_that_cannot_be_used_is_refused_and_removed(live: Live, settings: Settings) -> None:
@@ -183,9 +182,8 @@ def test_a_file_that_cannot_be_used_is_refused_and_removed(live: Live, settings:
     assert list((settings.data_dir / "uploads").iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("headers", "status", "words"),
-    [
+def test_the_protocol_of_uploads(live: Live) -> None:
+    for headers, status, words in (
         ({"Tus-Resumable": "0.2.0"}, 412, "Tus-Resumable: 1.0.0"),
         ({"Upload-Length": "many"}, 400, "a number of bytes"),
         ({"Upload-Length": "0"}, 400, "got 0 bytes"),
@@ -193,16 +191,9 @@ def test_a_file_that_cannot_be_used_is_refused_and_removed(live: Live, settings:
         ({"Upload-Metadata": "kind !"}, 400, "a value in base64"),
         ({"Upload-Metadata": encoded(kind="film")}, 422, "transit or image; got 'film'"),
         ({"Upload-Metadata": encoded(sha256="abc")}, 422, "64 hexadecimal digits"),
-    ],
-)
-def test_requests_that_do_not_keep_the_protocol_are_refused(
-    live: Live, headers: dict[str, str], status: int, words: str
-) -> None:
-    answer = httpx.post(f"{live.url}/v1/uploads", headers=TUS | {"Upload-Length": "10"} | headers)
-    assert answer.status_code == status and words in answer.json()["detail"]
-
-
-def test_what_the_service_supports_and_deletion(live: Live) -> None:
+    ):
+        answer = httpx.post(f"{live.url}/v1/uploads", headers=TUS | {"Upload-Length": "10"} | headers)
+        assert answer.status_code == status and words in answer.json()["detail"], headers
     options = httpx.options(f"{live.url}/v1/uploads")
     assert options.status_code == 204 and options.headers["tus-version"] == "1.0.0"
     assert options.headers["tus-extension"] == "creation,termination,expiration,checksum"
@@ -229,15 +220,3 @@ def test_only_one_request_sends_bytes_and_uploads_expire(
     monkeypatch.setattr(partial_uploads, "MOST_OPEN", 1)
     many = httpx.post(f"{live.url}/v1/uploads", headers=TUS | {"Upload-Length": "10"})
     assert many.status_code == 429 and "at most 1 open uploads" in many.json()["detail"]
-
-
-def test_an_upload_belongs_to_its_owner(settings: Settings) -> None:
-    with keyed(settings) as service:
-        headers = TUS | {"Upload-Length": "10"}
-        begun_by_ann = service.client("ann").post("/v1/uploads", headers=headers).headers["location"]
-        assert service.client("ann").head(begun_by_ann, headers=TUS).status_code == 200
-        eve = service.client("eve")
-        assert eve.head(begun_by_ann, headers=TUS).status_code == 404
-        assert eve.delete(begun_by_ann, headers=TUS).status_code == 404
-        sent = eve.patch(begun_by_ann, content=b"x", headers=PART | {"Upload-Offset": "0"})
-        assert sent.status_code == 404

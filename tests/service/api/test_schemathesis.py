@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,6 @@ from urllib.parse import urlencode
 import httpx
 import pytest
 import schemathesis
-import uvicorn
 from hypothesis import HealthCheck, Phase, settings
 from schemathesis.checks import (
     content_type_conformance,
@@ -33,6 +31,7 @@ from schemathesis.schemas import BaseSchema
 from service.app import create_app
 from service.openapi import description
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from tests.service.serving import serving
 from workers.catalogue.access.keys import Scope
 from workers.settings import Settings
 
@@ -55,10 +54,8 @@ CHECKS = [
 ]
 # The requests are made when the test runs. Made while tests are collected, they take each worker of xdist ten seconds.
 DESCRIBED = schemathesis.pytest.from_fixture("described")
-# Requests that are not derived from each property of a schema. The slow test makes those too: they take minutes.
+# Requests that are not derived from each property of a schema. The longest test makes those too: they take minutes.
 QUICKLY_DESCRIBED = schemathesis.pytest.from_fixture("described_without_coverage")
-# Their bodies are those of POST /v1/jobs: the same models check them.
-SAME_BODIES = r"^/v1/(estimates|jobs/identity)$"
 LONGEST_ADDRESS = 60_000  # characters
 KNOWN: dict[str, str] = {}
 FILES: dict[str, bytes] = {}
@@ -96,23 +93,14 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]
         submissions_per_minute=0, max_upload_mib=2, uws_max_wait_s=0.05, stream_s=0.05, lease_s=100_000,
     )  # fmt: skip
     app = create_app(asks)
-    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error", timeout_graceful_shutdown=1))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    try:
-        deadline = time.monotonic() + 30
-        while not server.started and time.monotonic() < deadline:
-            time.sleep(0.02)
-        url = f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    with serving(app, log_level="error") as port:
+        url = f"http://127.0.0.1:{port}"
         catalogue = app.state.heliopsf.catalogue
         catalogue.census.announce("host:1", time.time() + 10_000, "1")
         headers = {"Authorization": "Bearer " + catalogue.keys.make("ann", set(Scope))}
         with httpx.Client(base_url=url, headers=headers) as client:
             seed(client, folder)
         yield {"base_url": url, "headers": headers}
-    finally:
-        server.should_exit = True
-        thread.join(30)
 
 
 def seed(client: httpx.Client, folder: Path) -> None:
@@ -183,15 +171,9 @@ def ask(case: Any, service: dict[str, Any]) -> None:
     )
 
 
-@QUICKLY_DESCRIBED.exclude(path_regex=SAME_BODIES).parametrize()
-@settings(max_examples=5, **STEADY)  # few, because there are many operations; the slow test makes 100 of each
+@QUICKLY_DESCRIBED.parametrize()
+@settings(max_examples=1, **STEADY)  # one, because there are many operations
 def test_the_service_is_as_it_is_described(case: Any, service: dict[str, Any]) -> None:
-    ask(case, service)
-
-
-@QUICKLY_DESCRIBED.include(path_regex=SAME_BODIES).parametrize()
-@settings(max_examples=20, **STEADY)
-def test_operations_with_the_bodies_of_a_job_are_as_described(case: Any, service: dict[str, Any]) -> None:
     ask(case, service)
 
 

@@ -8,7 +8,8 @@ import io
 import json
 import tarfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from psfcore.transit.archive import ArchiveLimits, pack, unpack
 from service.app import create_app
 from service.client.http import Client, ServiceError
 from service.local import LocalService
-from tests.service.conftest import upload
+from tests.service.conftest import refusal
 from tests.transit_files import READ_NOISE, write_transit
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, TransitRow
@@ -34,14 +35,6 @@ Members = dict[str, bytes]
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     return write_transit(tmp_path / "mercury", images=4)
-
-
-@pytest.fixture
-def tight(settings: Settings) -> Iterator[TestClient]:
-    """A service that takes 1 MiB, and lets 2 MiB come out of it."""
-    limits = {"max_transit_mib": 1, "max_transit_unpacked_mib": 2}
-    with TestClient(create_app(settings.model_copy(update=limits)), raise_server_exceptions=False) as client:
-        yield client
 
 
 def members_of(folder: Path) -> Members:
@@ -74,16 +67,20 @@ def as_tar_gz(members: Members) -> bytes:
     return as_tar(members, "w:gz")
 
 
-def left(settings: Settings) -> list[Path]:
-    return [p for part in ("tmp", "blobs") for p in (settings.data_dir / part).rglob("*") if p.is_file()]
+MAKERS = (as_zip, as_tar, as_tar_gz)
 
 
 # --- what is taken ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [as_zip, as_tar, as_tar_gz])
+@pytest.mark.parametrize(("make", "archive"), [(as_zip, "zip"), (as_tar, "tar"), (as_tar_gz, "tar.gz")])
 def test_a_transit_goes_in_and_is_described(
-    api: TestClient, settings: Settings, folder: Path, tmp_path: Path, make: Callable[[Members], bytes]
+    api: TestClient,
+    settings: Settings,
+    folder: Path,
+    tmp_path: Path,
+    make: Callable[[Members], bytes],
+    archive: str,
 ) -> None:
     content = make(members_of(folder))
     answer = api.post(f"{WHERE}?filename=../mercury.zip", content=content)
@@ -91,16 +88,13 @@ def test_a_transit_goes_in_and_is_described(
     transit = answer.json()
     assert answer.headers["Location"] == f"{WHERE}/{transit['id']}"
     assert transit["id"] == hashlib.sha256(content).hexdigest() and transit["bytes"] == len(content)
-    assert transit["archive"] == {as_zip: "zip", as_tar: "tar", as_tar_gz: "tar.gz"}[make]
-    assert (transit["images"], transit["instrument"]) == (4, "hri_euv")
+    assert (transit["archive"], transit["images"], transit["instrument"]) == (archive, 4, "hri_euv")
     assert transit["pointings"] == [{"fov": 1, "images": 3}, {"fov": 2, "images": 1}]
     assert transit["noise"] == READ_NOISE and transit["known_psf"] == "diffraction.fits"
     assert transit["filename"] == "mercury.zip"
     sizes = {name: len(data) for name, data in members_of(folder).items()}
-    assert transit["files"] == [
-        {"name": name, "bytes": sizes[name]}
-        for name in ("000.fits", "001.fits", "002.fits", "003.fits", "diffraction.fits")
-    ]
+    files = {one["name"]: one["bytes"] for one in transit["files"]}
+    assert files == {name: size for name, size in sizes.items() if name != "transit.json"}
     assert transit["unpacked_bytes"] == sum(sizes.values())
 
     assert api.get(answer.headers["Location"]).json() == transit
@@ -108,153 +102,89 @@ def test_a_transit_goes_in_and_is_described(
     assert listed == {key: value for key, value in transit.items() if key != "files"}
     unpack(Store(settings.data_dir).path(transit["id"]), tmp_path / "out", settings.archive_limits)
     assert members_of(tmp_path / "out") == members_of(folder)
+    assert api.get(f"/v1/images/{transit['id']}").status_code == 404, "a transit is no image"
 
     form = api.post(WHERE, files={"file": ("again.zip", content)})
     assert form.status_code == 200 and form.json() == transit, "the same bytes are the same transit"
 
 
-def test_optional_parts_of_a_transit(api: TestClient, tmp_path: Path) -> None:
-    bare = write_transit(tmp_path / "bare", images=2, noise=None, known_psf=None, instrument=None)
-    transit = api.post(WHERE, content=as_zip(members_of(bare))).json()
-    assert (transit["noise"], transit["known_psf"], transit["instrument"]) == (None, None, None)
-
-
-def test_transits_are_listed_a_page_at_a_time_newest_first(api: TestClient, tmp_path: Path) -> None:
-    made = [
-        api.post(WHERE, content=as_zip(members_of(write_transit(tmp_path / str(n), images=n)))).json()["id"]
-        for n in (1, 2, 3)
-    ]
+def test_transits_without_optional_parts_are_listed_a_page_at_a_time_newest_first(
+    api: TestClient, tmp_path: Path
+) -> None:
+    ids = []
+    for number in (1, 2, 3):
+        bare = {"noise": None, "known_psf": None, "instrument": None}
+        folder = write_transit(tmp_path / str(number), images=number, **bare)
+        transit = api.post(WHERE, content=as_zip(members_of(folder))).json()
+        assert (transit["noise"], transit["known_psf"], transit["instrument"]) == (None, None, None)
+        ids.append(transit["id"])
     first = api.get(WHERE, params={"limit": 2}).json()
     second = api.get(first["next"]).json()
-    assert [item["id"] for item in first["items"] + second["items"]] == made[::-1]
+    assert [item["id"] for item in first["items"] + second["items"]] == ids[::-1]
     assert second["next"] is None
 
 
-def test_a_transit_is_no_image(api: TestClient, folder: Path) -> None:
-    identity = api.post(WHERE, content=as_zip(members_of(folder))).json()["id"]
-    assert api.get(f"/v1/images/{identity}").status_code == 404
-
-
-def test_an_upload_larger_than_an_image_may_be(api: TestClient, settings: Settings, folder: Path) -> None:
-    """Transits have a limit of their own."""
+def test_transits_have_limits_of_their_own(api: TestClient, settings: Settings, folder: Path) -> None:
     content = as_tar({**members_of(folder), "more.bin": bytes(settings.max_upload_bytes)})
     assert api.post(WHERE, content=content).status_code == 201
     assert api.post("/v1/images", content=content).status_code in (413, 415)
+    limited = Settings(max_transit_mib=3, max_transit_unpacked_mib=5)
+    assert limited.max_transit_bytes == 3 * MIB
+    assert limited.archive_limits == ArchiveLimits(max_bytes=5 * MIB)
+    defaults = Settings.model_fields
+    assert (defaults["max_transit_mib"].default, defaults["max_transit_unpacked_mib"].default) == (4096, 8192)
 
 
 # --- what is refused --------------------------------------------------------------------------------------
 
 
-def without(name: str) -> Callable[[Members], Members]:
-    return lambda members: {key: value for key, value in members.items() if key != name}
-
-
-def having(name: str, content: bytes) -> Callable[[Members], Members]:
-    return lambda members: {**members, name: content}
-
-
-def nothing_in(key: str) -> Callable[[Members], Members]:
-    def change(members: Members) -> Members:
-        content = json.loads(members["transit.json"])
-        content[key] = []
-        return {**members, "transit.json": json.dumps(content).encode()}
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("change", "status", "code", "told"),
-    [
-        (without("transit.json"), 422, "no-manifest", "transit.json"),
-        (without("002.fits"), 422, "missing-file", "002.fits"),
-        (without("diffraction.fits"), 422, "missing-file", "diffraction.fits"),
-        (having("transit.json", b"{"), 422, "bad-manifest", "JSON"),
-        (having("transit.json", b" " * 5 * MIB), 422, "bad-manifest", "bytes"),
-        (nothing_in("images"), 422, "bad-manifest", "images"),
-        (having("002.fits", b"a letter"), 422, "not-fits", "002.fits"),
-        (having("../evil", b"x"), 422, "archive-climbs", "evil"),
-        (having("/etc/evil", b"x"), 422, "archive-climbs", "evil"),
-        (having("a/b/c.fits", b"x"), 422, "archive-not-plain", "a/b/c.fits"),
-    ],
-)
-def test_archives_that_cannot_be_used(
-    api: TestClient,
-    settings: Settings,
-    folder: Path,
-    change: Callable[[Members], Members],
-    status: int,
-    code: str,
-    told: str,
-) -> None:
-    for make in (as_zip, as_tar, as_tar_gz):
-        refused(api, settings, make(change(members_of(folder))), status, code, told)
-
-
-def refused(api: TestClient, settings: Settings, content: bytes, status: int, code: str, told: str) -> None:
-    for options in ({"content": content}, {"files": {"file": ("a.zip", content)}}):
-        answer = api.post(WHERE, **options)  # type: ignore[arg-type]
-        assert answer.status_code == status, answer.text
-        assert answer.headers["content-type"] == "application/problem+json"
-        problem = answer.json()
-        assert problem["type"] == f"urn:heliopsf:{code}" and problem["status"] == status
-        assert "expected" in problem["detail"] and told in problem["detail"]
-    assert api.get(WHERE).json()["items"] == []
-    assert left(settings) == []
-
-
-@pytest.mark.parametrize(
-    ("content", "status", "code"),
-    [
-        (b"A letter, and no archive.\n" * 100, 415, "not-an-archive"),
-        (b"SIMPLE  =" + bytes(5000), 415, "not-an-archive"),
-        (b"PK", 415, "not-an-archive"),
-        (bytes(2048), 415, "not-an-archive"),
-        (gzip.compress(b"SIMPLE  =" + bytes(5000), mtime=0), 415, "not-an-archive"),
-        (b"", 400, "empty-upload"),
-        (b"PK\x03\x04" + bytes(5000), 422, "archive-broken"),
-        (b"\x1f\x8b" + bytes(5000), 422, "archive-broken"),
-    ],
-    ids=["text", "image", "two-letters", "zeros", "gzipped-image", "nothing", "half-a-zip", "half-a-gzip"],
-)
-def test_files_that_are_not_archives_are_refused(
-    api: TestClient, settings: Settings, content: bytes, status: int, code: str
-) -> None:
-    refused(api, settings, content, status, code, "expected")
-
-
-def test_a_link_in_a_tar(api: TestClient, settings: Settings, folder: Path) -> None:
-    content = as_tar(members_of(folder), links=("x.fits",))
-    refused(api, settings, content, 422, "archive-not-plain", "x.fits")
-
-
-def test_an_archive_that_stops_short(api: TestClient, settings: Settings, folder: Path) -> None:
-    for make in (as_zip, as_tar, as_tar_gz):
-        content = make(members_of(folder))
-        refused(api, settings, content[: len(content) // 2], 422, "archive-broken", "expected")
-
-
-def test_too_large_as_sent(tight: TestClient, settings: Settings, folder: Path) -> None:
-    content = as_tar({**members_of(folder), "x.bin": bytes(MIB)})
-    refused(tight, settings, content, 413, "too-large", str(MIB))
-
-
-@pytest.mark.parametrize("make", [as_zip, as_tar_gz])
-def test_too_large_as_it_comes_out(
-    tight: TestClient, settings: Settings, folder: Path, make: Callable[[Members], bytes]
-) -> None:
-    content = make({**members_of(folder), "x.bin": bytes(40 * MIB)})
-    assert len(content) < MIB
-    refused(tight, settings, content, 413, "archive-too-large", str(2 * MIB))
-
-
-def test_a_form_with_more_than_the_file(api: TestClient, folder: Path) -> None:
-    bad = api.post(WHERE, files={"other": ("a.zip", as_zip(members_of(folder)))})
-    assert bad.status_code == 400 and bad.json()["type"] == "urn:heliopsf:bad-form"
-
-
-def test_images_are_still_images(api: TestClient, image_file: Path) -> None:
-    upload(api, image_file)
-    assert api.post(WHERE, content=image_file.read_bytes()).status_code == 415
+def test_archives_that_cannot_be_used(settings: Settings, folder: Path, image_file: Path) -> None:
+    """As each kind of archive, in a body and in a form. More of them are in the table tests/service/http/attacks.py."""
+    good = members_of(folder)
+    manifest = json.loads(good["transit.json"])
+    changes: tuple[tuple[str, Members, int, str], ...] = (
+        ("transit.json", {name: good[name] for name in good if name != "transit.json"}, 422, "no-manifest"),
+        ("diffraction.fits", {name: good[name] for name in good if name[0] != "d"}, 422, "missing-file"),
+        (
+            "images",
+            {**good, "transit.json": json.dumps(manifest | {"images": []}).encode()},
+            422,
+            "bad-manifest",
+        ),
+        ("002.fits", {**good, "002.fits": b"a letter"}, 422, "not-fits"),
+        ("evil", {**good, "../evil": b"x"}, 422, "archive-climbs"),
+        ("a/b/c.fits", {**good, "a/b/c.fits": b"x"}, 422, "archive-not-plain"),
+    )
+    cases = [
+        (told, make(members), status, code) for told, members, status, code in changes for make in MAKERS
+    ]
+    halves = [make(good)[: len(make(good)) // 2] for make in MAKERS]
+    packed = [make({**good, "x.bin": bytes(40 * MIB)}) for make in (as_zip, as_tar_gz)]
+    cases += [("expected", half, 422, "archive-broken") for half in halves]
+    cases += [
+        ("x.fits", as_tar(good, links=("x.fits",)), 422, "archive-not-plain"),
+        (str(MIB), as_tar({**good, "x.bin": bytes(MIB)}), 413, "too-large"),
+        *((str(2 * MIB), content, 413, "archive-too-large") for content in packed),
+        ("expected", b"A letter, and no archive.\n" * 100, 415, "not-an-archive"),
+        ("expected", image_file.read_bytes(), 415, "not-an-archive"),
+        ("expected", b"PK", 415, "not-an-archive"),
+        ("expected", bytes(2048), 415, "not-an-archive"),
+        ("expected", gzip.compress(b"SIMPLE  =" + bytes(5000), mtime=0), 415, "not-an-archive"),
+        ("expected", b"", 400, "empty-upload"),
+        ("expected", b"PK\x03\x04" + bytes(5000), 422, "archive-broken"),
+        ("expected", b"\x1f\x8b" + bytes(5000), 422, "archive-broken"),
+    ]
+    # A service that takes 1 MiB, and lets 2 MiB come out of it.
+    tight = settings.model_copy(update={"max_transit_mib": 1, "max_transit_unpacked_mib": 2})
+    with TestClient(create_app(tight), raise_server_exceptions=False) as api:
+        for told, content, status, code in cases:
+            for options in ({"content": content}, {"files": {"file": ("a.zip", content)}}):
+                detail = refusal(api.post(WHERE, **options), status, code)
+                assert "expected" in detail and told in detail, (code, told)
+        assert api.get(WHERE).json()["items"] == []
+        refusal(api.post(WHERE, files={"other": ("a.zip", as_zip(good))}), 400, "bad-form")
+    folders = [settings.data_dir / part for part in ("tmp", "blobs")]
+    assert not [path for place in folders for path in place.rglob("*") if path.is_file()]
 
 
 # --- clients ----------------------------------------------------------------------------------------------
@@ -278,27 +208,15 @@ def test_a_client_sends_a_folder_or_an_archive(api: TestClient, folder: Path, tm
         assert caught.value.code == "missing-file"
 
 
-def test_the_local_service_takes_the_same(settings: Settings, api: TestClient, folder: Path) -> None:
+def test_the_local_service_takes_the_same(api: TestClient, folder: Path) -> None:
     with Client("http://testserver", transport=api._transport) as sun:
         there = sun.upload_transit(folder)
-    local = LocalService(Settings.apart(folder.parent / "local"))
-    try:
+    apart = Settings.apart(folder.parent / "local")
+    with closing(LocalService(apart)) as local, closing(Catalogue(apart.catalogue_url)) as catalogue:
         here = local.upload_transit(folder)
         assert here | {"created_at": 0} == there | {"created_at": 0}
         (folder / "letter.zip").write_text("a letter")
         with pytest.raises(DataError, match="not-an-archive"):
             local.upload_transit(folder / "letter.zip")
-        catalogue = Catalogue(Settings.apart(folder.parent / "local").catalogue_url)
         row = catalogue.get(TransitRow, here["id"], DEFAULT_OWNER)
         assert row is not None and row.summary["images"] == 4
-        catalogue.close()
-    finally:
-        local.close()
-
-
-def test_the_limits_are_settings() -> None:
-    settings = Settings(max_transit_mib=3, max_transit_unpacked_mib=5)
-    assert settings.max_transit_bytes == 3 * MIB
-    assert settings.archive_limits == ArchiveLimits(max_bytes=5 * MIB)
-    defaults = Settings.model_fields
-    assert (defaults["max_transit_mib"].default, defaults["max_transit_unpacked_mib"].default) == (4096, 8192)

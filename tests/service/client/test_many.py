@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from service.client.errors import ServiceError, WaitInterrupted
 from service.client.http import Client
 from service.client.many import Outcome, deconvolve_many
 from service.client.operations import Operations
-from service.local import local_service
+from service.local import LocalService, local_service
 from tests.conftest import write_image, write_psf
+from workers.settings import Settings
 
 Run = Callable[..., list[Outcome]]
 
@@ -42,11 +44,12 @@ class AtOnce(Client):
 
 @pytest.fixture(params=["http", "local"])
 def service(request: pytest.FixtureRequest) -> Iterator[Operations]:
-    if request.param == "local":
+    """A service in this process, reached as over HTTP or directly."""
+    if request.param == "http":
+        yield AtOnce(request.getfixturevalue("api"), request.getfixturevalue("run_jobs"))
+    else:
         with local_service() as here:
             yield here
-        return
-    yield AtOnce(request.getfixturevalue("api"), request.getfixturevalue("run_jobs"))
 
 
 @pytest.fixture
@@ -92,6 +95,7 @@ def test_each_image_has_one_product_and_none_is_made_twice(
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == before
 
 
+@pytest.mark.parametrize("service", ["local"], indirect=True)
 def test_a_product_is_known_by_its_header_and_not_by_its_name(
     run: Run, images: list[Path], tmp_path: Path
 ) -> None:
@@ -108,19 +112,15 @@ def test_a_product_is_known_by_its_header_and_not_by_its_name(
     (replaced,) = run(images[0], overwrite=True)
     assert replaced.failure is None and fits.getheader(made.output)["PRODID"]
 
-
-def test_other_parameters_and_cut_files_are_made_anew(run: Run, images: list[Path], tmp_path: Path) -> None:
-    (first,) = run(images[0])
     (other,) = run(images[0], steps=2)
-    assert not other.existed and other.output != first.output
-    assert first.output is not None
-    first.output.write_bytes(first.output.read_bytes()[:-2880])
+    assert not other.existed and other.output != made.output, "other parameters"
+    made.output.write_bytes(made.output.read_bytes()[:-2880])
     (refused,) = run(images[0])
-    assert refused.failure is not None and not refused.existed
-    assert run(images[0], overwrite=True)[0].failure is None
-    assert run(images[0])[0].existed
+    assert refused.failure is not None and not refused.existed, "a file that was cut"
+    assert run(images[0], overwrite=True)[0].failure is None and run(images[0])[0].existed
 
 
+@pytest.mark.parametrize("service", ["http"], indirect=True)
 def test_failures_are_told_and_the_run_goes_on(
     run: Run, service: Operations, images: list[Path], tmp_path: Path
 ) -> None:
@@ -148,29 +148,22 @@ def test_nothing_is_sent_or_kept_twice(
 ) -> None:
     client = AtOnce(api, run_jobs)
     write_psf(tmp_path / "psf.fits")
-    wanted = {"psf_id": client.upload_psf(tmp_path / "psf.fits")["id"], "steps": 1}
-    list(deconvolve_many(client, images, tmp_path / "out", **wanted))
-    assert (client.uploaded, client.submitted) == (2, 2)
-    list(deconvolve_many(client, images, tmp_path / "out", **wanted))
-    assert (client.uploaded, client.submitted) == (2, 2)
-    with local_service() as here:
-        wanted["psf_id"] = here.upload_psf(tmp_path / "psf.fits")["id"]
-        outcomes = list(deconvolve_many(here, images, tmp_path / "other", **wanted))
-        assert [one.failure for one in outcomes] == [None, None, None]
-        assert not [blob for blob in here._store.blobs() if blob.bytes > 50_000], (
+    parameters = {"psf_id": client.upload_psf(tmp_path / "psf.fits")["id"], "steps": 1}
+    for _ in range(2):
+        list(deconvolve_many(client, images, tmp_path / "out", **parameters))
+        assert (client.uploaded, client.submitted) == (2, 2)
+    settings = Settings.apart(tmp_path / "local")
+    with closing(LocalService(settings)) as here:
+        parameters["psf_id"] = here.upload_psf(tmp_path / "psf.fits")["id"]
+        (made,) = deconvolve_many(here, images[:1], tmp_path / "other", **parameters)
+        blobs = [path for path in (settings.data_dir / "blobs").rglob("*") if path.is_file()]
+        assert not [blob for blob in blobs if blob.stat().st_size > 50_000], (
             "products stay in the folder only"
         )
-
-
-def test_a_product_that_the_user_keeps_as_an_input_stays(images: list[Path], tmp_path: Path) -> None:
-    """In this process, the file of the product is then found at the user's path."""
-    write_psf(tmp_path / "psf.fits")
-    with local_service() as here:
-        wanted = {"psf_id": here.upload_psf(tmp_path / "psf.fits")["id"], "steps": 1}
-        (made,) = deconvolve_many(here, images[:1], tmp_path / "out", **wanted)
+        # A product that the user keeps as an input stays: its file is then found at the user's path.
         assert made.output is not None
         here.upload_image(made.output)
-        (again,) = deconvolve_many(here, images[:1], tmp_path / "other", **wanted)
+        (again,) = deconvolve_many(here, images[:1], tmp_path / "third", **parameters)
         assert again.output is not None and again.output.read_bytes() == made.output.read_bytes()
 
 
@@ -216,41 +209,41 @@ def told(api: TestClient, run_jobs: Callable[[], None], tmp_path: Path) -> Told:
 
 
 @pytest.fixture
-def six(tmp_path: Path) -> list[Path]:
-    paths = [tmp_path / f"{number}.fits" for number in range(6)]
+def five(tmp_path: Path) -> list[Path]:
+    paths = [tmp_path / f"{number}.fits" for number in range(5)]
     for seed, path in enumerate(paths):
         write_image(path, seed=seed)
     return paths
 
 
 def test_a_service_has_a_few_jobs_at_a_time_and_a_process_one(
-    told: Told, six: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    told: Told, five: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[tuple[int, int]] = []
-    outcomes = list(told.many(six, tmp_path / "out", progress=lambda *step: seen.append(step)))
-    assert [one.image for one in outcomes] == six and all(one.failure is None for one in outcomes)
+    outcomes = list(told.many(five, tmp_path / "out", progress=lambda *step: seen.append(step)))
+    assert [one.image for one in outcomes] == five and all(one.failure is None for one in outcomes)
     collected = ["wait", "download"]
-    assert told.told == ["submit"] * 4 + [*collected, "submit"] * 2 + collected * 4
-    assert seen == [(number, 6) for number in range(7)]
+    assert told.told == ["submit"] * 4 + [*collected, "submit"] + collected * 4
+    assert seen == [(number, 5) for number in range(6)]
     told.told.clear()
     monkeypatch.setattr(told, "jobs_at_once", 1)  # as that of a service in this process
-    list(told.many(six[:2], tmp_path / "other"))
+    list(told.many(five[:2], tmp_path / "other"))
     assert told.told == ["submit", *collected] * 2
     with local_service() as here:
         assert here.jobs_at_once == 1
 
 
-def test_outcomes_keep_the_order_of_the_images(told: Told, six: list[Path], tmp_path: Path) -> None:
+def test_outcomes_keep_the_order_of_the_images(told: Told, five: list[Path], tmp_path: Path) -> None:
     """A file that is refused, a job that fails, and products that exist, beside jobs in flight."""
-    list(told.many(six[3:5], tmp_path / "out"))
+    list(told.many(five[3:], tmp_path / "out"))
     (tmp_path / "letter.fits").write_text("Dear archive,\n" * 300)
-    with fits.open(six[1], mode="update") as opened:
+    with fits.open(five[1], mode="update") as opened:
         opened[0].data[:] = float("nan")
-    images = [*six[:2], tmp_path / "letter.fits", *six[2:]]
+    images = [*five[:2], tmp_path / "letter.fits", *five[2:]]
     outcomes = list(told.many(images, tmp_path / "out"))
     assert [one.image for one in outcomes] == images
-    assert [one.failure is not None for one in outcomes] == [False, True, True, False, False, False, False]
-    assert [one.existed for one in outcomes] == [False] * 4 + [True, True, False]
+    assert [one.failure is not None for one in outcomes] == [False, True, True, False, False, False]
+    assert [one.existed for one in outcomes] == [False] * 4 + [True, True]
     assert "finite" in str(outcomes[1].failure) and "expected a FITS file" in str(outcomes[2].failure)
 
 
@@ -273,7 +266,7 @@ def test_a_copy_of_an_image_in_flight_waits_for_it_and_follows_where_it_fails(
 
 
 def test_a_full_quota_ends_the_run_after_the_jobs_in_flight(
-    told: Told, six: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    told: Told, five: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     submit = told.submit
 
@@ -285,13 +278,13 @@ def test_a_full_quota_ends_the_run_after_the_jobs_in_flight(
     monkeypatch.setattr(told, "submit", full_after_two)
     outcomes: list[Outcome] = []
     with pytest.raises(ServiceError, match="expected free room"):
-        outcomes.extend(told.many(six, tmp_path / "out"))
+        outcomes.extend(told.many(five, tmp_path / "out"))
     assert [one.output for one in outcomes] == sorted((tmp_path / "out").iterdir())
-    assert [one.image for one in outcomes] == six[:2]
+    assert [one.image for one in outcomes] == five[:2]
 
 
 def test_control_c_names_all_jobs_in_flight(
-    told: Told, six: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    told: Told, five: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waited: list[str] = []
     wait = told.wait
@@ -304,27 +297,24 @@ def test_control_c_names_all_jobs_in_flight(
 
     monkeypatch.setattr(told, "wait", interrupt_the_second)
     with pytest.raises(WaitInterrupted, match=r"jobs .* go on at http://testserver") as stopped:
-        list(told.many(six, tmp_path / "out"))
+        list(told.many(five, tmp_path / "out"))
     named = (stopped.value.identity, *stopped.value.others)
     assert named[0] == waited[1] and len(set(named)) == 4 and waited[0] not in named
 
 
-def test_a_busy_service_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_busy_service_is_asked_again(
+    told: Told, five: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     waited: list[float] = []
     monkeypatch.setattr(many.time, "sleep", waited.append)
-    answers: list[Any] = [
-        ServiceError("later", status=429, retry_after_s=7.0),
-        ServiceError("later", status=503),
-        "done",
-    ]
+    submit = told.submit
+    answers = [ServiceError("later", status=429, retry_after_s=7.0), ServiceError("later", status=503)]
 
-    def ask() -> str:
-        answer = answers.pop(0)
-        if isinstance(answer, ServiceError):
-            raise answer
-        return str(answer)
+    def busy(kind: str, **parameters: Any) -> dict[str, Any]:
+        if answers:
+            raise answers.pop(0)
+        return submit(kind, **parameters)
 
-    assert many._patiently(ask) == "done" and waited == [7.0, 1.0]
-    with pytest.raises(ServiceError):
-        answers.append(ServiceError("no", status=404))
-        many._patiently(ask)
+    monkeypatch.setattr(told, "submit", busy)
+    (outcome,) = told.many(five[:1], tmp_path / "out")
+    assert outcome.failure is None and waited[:2] == [7.0, 1.0]

@@ -183,6 +183,10 @@ def test_a_job_uses_one_s_own_things_alone(
     ):
         answer = bob.post("/v1/jobs", json={"kind": kind, "parameters": parameters})
         assert answer.status_code == 404, (kind, parameters, answer.text)
+    for images, psf_id in (([anns["image_id"]], None), ([own], anns["psf_id"])):
+        body = {"images": images, "psf_id": psf_id, "context": None if psf_id else anns["context"]}
+        answer = bob.post("/v1/bulk", json=body)
+        assert answer.status_code == 404, (body, answer.text)
 
 
 def test_the_same_bytes_and_requests_of_two_owners_are_two(shared_service: Keyed, image_file: Path) -> None:

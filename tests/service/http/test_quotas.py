@@ -14,12 +14,12 @@ import pytest
 from astropy.io import fits
 from click.testing import CliRunner
 from fastapi.testclient import TestClient
-from sqlalchemy import create_engine
+from sqlalchemy import text
 
 from service.cli.main import main
 from service.local import LocalService
 from tests.conftest import write_image
-from tests.service.conftest import refusal, upload
+from tests.service.conftest import execute, refusal, upload
 from tests.service.keyed import keyed
 from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
@@ -284,12 +284,9 @@ def test_what_is_counted_is_what_the_rows_say(
     used = counted(catalogue)
     assert len(rows) == 4 and used == sum(counted_bytes(row) for row in rows)
     assert catalogue.owners.recount() == []
-    database = create_engine(settings.catalogue_url)
     for damage in ("UPDATE owners SET bytes = 7", "DELETE FROM owners"):
-        with database.begin() as connection:
-            connection.exec_driver_sql(damage)
+        execute(catalogue, text(damage))
         assert catalogue.owners.recount() == ["local"] and counted(catalogue) == used
-    database.dispose()
     catalogue.close()
 
 

@@ -10,7 +10,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.cli.operator import doctor
+from tests.service.conftest import refusal
 from workers import checks
+from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
 PAGE_BYTES = 4096
@@ -30,42 +32,34 @@ def halve(file: Path) -> None:
     file.write_bytes(content[: len(content) // 2])
 
 
-@pytest.fixture
-def file(settings: Settings, api: TestClient) -> Path:
-    """The file of the database of a running server, with all changes in it."""
-    found = settings.data_dir / "catalogue.sqlite"
-    connection = sqlite3.connect(found)
-    connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    connection.close()
-    return found
-
-
 @pytest.mark.parametrize("spoil", [zero_a_page, halve])
 def test_a_damaged_database_is_told_of(
-    api: TestClient, settings: Settings, file: Path, spoil: Callable[[Path], None]
+    api: TestClient, settings: Settings, spoil: Callable[[Path], None]
 ) -> None:
+    file = settings.data_dir / "catalogue.sqlite"
+    connection = sqlite3.connect(file)
+    connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # all changes are in the file
+    connection.close()
+    database = {finding.what: finding for finding in doctor.examine(settings)}["database"]
+    assert database.state == "ok"
     spoil(file)
     answer = api.get("/readyz")
     assert answer.status_code == 503 and "damaged" in answer.json()["parts"]["database"]
-    found = {finding.what: finding for finding in doctor.examine(settings)}["database"]
-    assert found.state == "broken" and "damaged" in found.found and "restore a copy" in found.advice
+    database = {finding.what: finding for finding in doctor.examine(settings)}["database"]
+    assert database.state == "broken" and "damaged" in database.found and "restore a copy" in database.advice
 
 
-def test_a_good_database_is_good(api: TestClient, settings: Settings, file: Path) -> None:
+def test_a_request_to_a_damaged_database_is_answered_clearly(api: TestClient, settings: Settings) -> None:
     assert "damaged" not in api.get("/readyz").text
-    found = {finding.what: finding for finding in doctor.examine(settings)}["database"]
-    assert found.state == "ok"
+    api.app.state.heliopsf.catalogue.close()  # pages in memory are still good
+    for file in settings.data_dir.glob("catalogue.sqlite*"):
+        file.write_bytes(b"\0" * 8192)
+    refusal(api.get("/v1/jobs"), 503, "database-damaged")
 
 
-def test_a_request_to_a_damaged_database_is_answered_clearly(api: TestClient, file: Path) -> None:
-    api.app.state.heliopsf.catalogue._engine.dispose()  # type: ignore[attr-defined]  # pages in memory are still good
-    file.write_bytes(b"\0" * file.stat().st_size)
-    answer = api.get("/v1/jobs")
-    assert (answer.status_code, answer.json()["type"]) == (503, "urn:heliopsf:database-damaged")
-
-
-def test_the_check_takes_a_small_share_of_the_time(api: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
+def test_the_check_takes_a_small_share_of_the_time(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now, made = [1000.0], []
     monkeypatch.setattr(checks.time, "monotonic", lambda: now[0])
 

@@ -14,20 +14,21 @@ from astropy.io import fits
 from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
-from psfcore.errors import DataError
 from psfcore.fits import hdus
 from tests.conftest import write_image
-from tests.service.conftest import upload
+from tests.service.conftest import job_after, result_of, upload, work_through_bulks
 from workers import checks
-from workers.bulk import image as bulk_image
-from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow
+from workers.files import beneath
 from workers.files import store as stores
 from workers.files.full_disk import is_disk_full
-from workers.files.store import Store
-from workers.run.runner import Runner
 from workers.settings import Settings
+
+
+@pytest.fixture
+def settings(settings: Settings, tmp_path: Path) -> Settings:
+    return settings.model_copy(update={"bulk_output_roots": str(tmp_path / "out")})
 
 
 def full(number: int = errno.ENOSPC) -> OSError:
@@ -65,41 +66,35 @@ def the_content(patched: pytest.MonkeyPatch) -> None:
     patched.setattr(hdus, "probe", probe)
 
 
-@pytest.mark.parametrize("fill", [the_rename, the_flush, the_content])
 def test_a_job_that_finds_the_disk_full_says_so_and_can_be_submitted_again(
     api: TestClient,
     settings: Settings,
+    catalogue: Catalogue,
     run_jobs: Callable[[], None],
     image_file: Path,
     psf_file: Path,
-    fill: Callable[[pytest.MonkeyPatch], None],
 ) -> None:
     parameters = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
-    body = {
-        "kind": "deconvolve",
-        "parameters": {**parameters, "method": {"name": "richardson-lucy", "steps": 1}},
-    }
-    first = api.post("/v1/jobs", json=body).json()["id"]
-    with pytest.MonkeyPatch.context() as patched:
-        fill(patched)
-        patched.setattr(checks, "free_bytes", lambda _folder: 0)
-        run_jobs()
-        job = api.get(f"/v1/jobs/{first}").json()
+    parameters |= {"method": {"name": "richardson-lucy", "steps": 1}}
+    jobs = set()
+    for fill in (the_rename, the_flush, the_content):
+        with pytest.MonkeyPatch.context() as patched:
+            fill(patched)
+            patched.setattr(checks, "free_bytes", lambda _folder: settings.min_free_mib * 2**20 + 1)
+            job = job_after(api, run_jobs, "deconvolve", **parameters)
+            patched.setattr(checks, "free_bytes", lambda _folder: 0)
+            ready = api.get("/readyz")
+        jobs.add(job["id"])
         assert job["phase"] == "ERROR" and job["attempt"] == 1
         assert (job["error"]["code"], job["error"]["fault"]) == ("storage-full", "transient")
         assert "ask the operator to make room" in job["error"]["message"]
-        ready = api.get("/readyz")
         assert ready.status_code == 503 and "0 MiB of free space" in ready.json()["parts"]["storage"]
-    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
-    assert list((settings.data_dir / "tmp").iterdir()) == []
-    assert catalogue.page(ProductRow, owner="local", limit=1) == [] and catalogue.owners.recount() == []
-    catalogue.check_pages()
-    again = api.post("/v1/jobs", json=body)
-    assert again.status_code == 202 and again.json()["id"] != first
-    run_jobs()
-    done = api.get(f"/v1/jobs/{again.json()['id']}").json()
-    assert done["phase"] == "COMPLETED"
-    assert api.get(f"{done['result']}/file").status_code == 200
+        assert list((settings.data_dir / "tmp").iterdir()) == []
+        assert catalogue.page(ProductRow, owner="local", limit=1) == [] and catalogue.owners.recount() == []
+        catalogue.check_pages()
+    assert len(jobs) == 3
+    product = result_of(api, run_jobs, "deconvolve", **parameters)
+    assert api.get(product["file"]).status_code == 200
 
 
 def test_a_full_disk_of_the_database_is_tried_again_and_then_said(
@@ -127,48 +122,38 @@ def test_a_full_disk_of_the_database_is_tried_again_and_then_said(
 def test_a_bulk_run_that_finds_the_disk_full_stops_and_goes_on_with_room(
     api: TestClient, tmp_path: Path, settings: Settings, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also the disk of its output folder: it is full for every image."""
     images = []
     for seed in range(3):
         write_image(tmp_path / f"{seed}.fits", seed=seed)
         images.append(upload(api, tmp_path / f"{seed}.fits"))
-    method = {"method": {"name": "richardson-lucy", "steps": 1}}
-    body = {"images": images, "psf_id": upload(api, psf_file, "/v1/psfs"), "parameters": method}
+    body = {
+        "images": images,
+        "psf_id": upload(api, psf_file, "/v1/psfs"),
+        "parameters": {"method": {"name": "richardson-lucy", "steps": 1}},
+        "output": {"folder": str(tmp_path / "out")},
+    }
     here = f"/v1/bulk/{api.post('/v1/bulk', json=body).json()['id']}"
-    catalogue: Catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
-    runner = Runner(settings, catalogue, Store(settings.data_dir))
-
-    def work() -> dict[str, Any]:
-        for _ in range(4):
-            keep_turns(catalogue, settings)
-            for turn in catalogue.jobs.of_kind("bulk"):
-                runner.run(turn.id)
-        return dict(api.get(here).json())
-
-    write = bulk_image.product.write
+    put = beneath.put
     written: list[Path] = []
 
-    def write_one(made: Any, path: Path) -> None:
-        written.append(path)
+    def put_one(source: Path, target: Path, *given: Any, **options: Any) -> None:
+        written.append(target)
         if len(written) > 1:
             raise full()
-        write(made, path)
+        put(source, target, *given, **options)
 
     with monkeypatch.context() as patched:
-        patched.setattr(bulk_image.product, "write", write_one)
-        stopped = work()
+        patched.setattr(beneath, "put", put_one)
+        work_through_bulks(settings)
+        stopped = api.get(here).json()
     assert (stopped["phase"], stopped["error"]["code"]) == ("ERROR", "storage-full")
     assert (stopped["images"]["done"], stopped["images"]["failed"]) == (1, 0)
     assert len(written) == 2, "no further image is deconvolved for nothing"
     assert api.post(f"{here}/resume").status_code == 200
-    finished = work()
+    work_through_bulks(settings)
+    finished = api.get(here).json()
     assert (finished["phase"], finished["images"]["done"]) == ("COMPLETED", 3)
-
-
-def test_a_full_output_folder_concerns_every_image_of_a_bulk_run() -> None:
-    with pytest.raises(OSError, match="No space left"), bulk_image._write_errors():
-        raise full()
-    with pytest.raises(DataError, match="Permission denied"), bulk_image._write_errors():
-        raise full(errno.EACCES)
 
 
 def test_a_full_disk_is_known_by_the_error_of_the_system() -> None:

@@ -13,23 +13,24 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
-from sqlalchemy import event, text
+from sqlalchemy import Engine, create_engine, event, text
 from sqlalchemy.exc import OperationalError
 
 from service.app import create_app
 from service.http.state import State
-from tests.service.conftest import upload
+from tests.service.conftest import execute, upload
 from tests.whole.stack import Missing, Redis, free_port
 from workers import logs
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER
 from workers.settings import Settings
 
+Lines = Callable[[], list[dict[str, Any]]]
 AWAY = OperationalError("SELECT 1", None, Exception("no route to s3cret.example"))
 
 
 @pytest.fixture
-def lines() -> Iterator[Callable[[], list[dict[str, Any]]]]:
+def lines() -> Iterator[Lines]:
     """All that is logged, as the JSON that it is written as."""
     written = io.StringIO()
     handler = logging.StreamHandler(written)
@@ -46,7 +47,7 @@ def lines() -> Iterator[Callable[[], list[dict[str, Any]]]]:
 
 def handles(api: TestClient) -> State:
     """The application's own state."""
-    state: State = api.app.state.heliopsf  # type: ignore[attr-defined]
+    state: State = api.app.state.heliopsf
     return state
 
 
@@ -67,59 +68,42 @@ def sample(name: str, **labels: str) -> tuple[str, frozenset[tuple[str, str]]]:
 # Requests and logs ----------------------------------------------------------------------------------
 
 
-def test_a_request_keeps_its_id_and_gets_one_where_it_has_none(api: TestClient) -> None:
-    assert api.get("/v1/jobs", headers={"X-Request-ID": "from-me.1"}).headers["X-Request-ID"] == "from-me.1"
-    made = [api.get("/v1/jobs").headers["X-Request-ID"] for _ in range(2)]
-    assert made[0] != made[1] and all(len(one) == 32 for one in made)
+def test_a_request_keeps_its_id_and_gets_one_where_it_has_no_good_one(shared_api: TestClient) -> None:
+    def id_of(sent: str | None = None) -> str:
+        headers = {} if sent is None else {"X-Request-ID": sent}
+        return str(shared_api.get("/v1/jobs", headers=headers).headers["X-Request-ID"])
 
-
-@pytest.mark.parametrize("sent", ["two words", "x" * 65, 'a"b', ""])
-def test_an_id_that_could_disturb_a_log_is_not_taken(api: TestClient, sent: str) -> None:
-    assert api.get("/v1/jobs", headers={"X-Request-ID": sent}).headers["X-Request-ID"] != sent
+    assert id_of("from-me.1") == "from-me.1"
+    new = [id_of(sent) for sent in (None, None, "two words", "x" * 65, 'a"b', "")]
+    assert len(set(new)) == len(new) and all(len(one) == 32 for one in new)
 
 
 def test_a_line_says_when_who_what_and_for_which_request(
-    api: TestClient, lines: Callable[[], list[dict[str, Any]]]
+    api: TestClient, lines: Lines, image_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def line() -> dict[str, Any]:
+        return [one for one in lines() if one["logger"] == "service.http.observation"][-1]
+
     api.get("/v1/jobs/" + 32 * "0", headers={"X-Request-ID": "r1"})
-    (line,) = (one for one in lines() if one["logger"] == "service.http.observation")
-    assert line["time"].endswith("+00:00") and line["level"] == "INFO" and line["request"] == "r1"
-    assert (line["route"], line["status"]) == ("/v1/jobs/{job_id}", 404)
+    assert line()["time"].endswith("+00:00") and line()["level"] == "INFO" and line()["request"] == "r1"
+    assert (line()["route"], line()["status"]) == ("/v1/jobs/{job_id}", 404)
 
+    api.get("/v1/%0a%7b%22level%22:%22forged%22%7d")
+    assert "forged" in line()["message"] and line()["level"] == "INFO", "it stays on its line"
 
-def test_a_failure_of_ours_has_the_request_s_id_in_answer_and_log(
-    api: TestClient, lines: Callable[[], list[dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    header = {"Authorization": "Bearer s3cret", "Cookie": "s3cret", "Content-Type": "application/fits"}
+    named = {"filename": "s3cret.fits"}
+    api.post("/v1/images", params=named, content=image_file.read_bytes(), headers=header)
+    written = json.dumps(lines())
+    assert "/v1/images" in written and "s3cret" not in written and "SIMPLE" not in written
+
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError("oh")
 
     monkeypatch.setattr(handles(api).catalogue, "page", fail)
     answer = api.get("/v1/jobs", headers={"X-Request-ID": "r2"})
     assert answer.status_code == 500 and answer.headers["X-Request-ID"] == "r2"
-    (line,) = (one for one in lines() if one["logger"] == "service.http.observation")
-    assert line["request"] == "r2" and line["status"] == 500
-
-
-def test_no_header_query_or_file_is_logged(
-    api: TestClient, lines: Callable[[], list[dict[str, Any]]], image_file: Path
-) -> None:
-    header = {"Authorization": "Bearer s3cret", "Cookie": "s3cret"}
-    api.post(
-        "/v1/images",
-        params={"filename": "s3cret.fits"},
-        content=image_file.read_bytes(),
-        headers=header | {"Content-Type": "application/fits"},
-    )
-    written = json.dumps(lines())
-    assert "/v1/images" in written and "s3cret" not in written and "SIMPLE" not in written
-
-
-def test_what_comes_from_outside_stays_on_its_line(
-    api: TestClient, lines: Callable[[], list[dict[str, Any]]]
-) -> None:
-    api.get("/v1/%0a%7b%22level%22:%22forged%22%7d")
-    (line,) = (one for one in lines() if one["logger"] == "service.http.observation")
-    assert "forged" in line["message"] and line["level"] == "INFO"
+    assert line()["request"] == "r2" and line()["status"] == 500
 
 
 def test_text_stays_on_its_line_too() -> None:
@@ -128,17 +112,15 @@ def test_text_stays_on_its_line_too() -> None:
     assert "\x1b" not in logs.TextFormatter().format(record)
 
 
-@pytest.mark.parametrize(("asked", "form"), [("json", logs.JsonFormatter), ("text", logs.TextFormatter)])
-def test_the_setting_decides_the_form(
-    asked: str, form: type[logging.Formatter], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_setting_decides_the_form(monkeypatch: pytest.MonkeyPatch) -> None:
     root = logging.getLogger()
     monkeypatch.setattr(root, "handlers", [])  # the test runner's own come back afterwards
     level = root.level
-    monkeypatch.setenv("HELIOPSF_LOG_FORMAT", asked)
     try:
-        logs.configure(Settings())
-        assert [type(handler.formatter) for handler in root.handlers] == [form]
+        for setting, form in (("json", logs.JsonFormatter), ("text", logs.TextFormatter)):
+            monkeypatch.setenv("HELIOPSF_LOG_FORMAT", setting)
+            logs.configure(Settings())
+            assert [type(handler.formatter) for handler in root.handlers] == [form]
     finally:
         root.setLevel(level)
         logging.captureWarnings(False)
@@ -169,7 +151,7 @@ def test_jobs_are_counted_wherever_they_were_worked_on(api: TestClient, settings
     assert 0.05 <= found[sample("heliopsf_oldest_queued_seconds", queue="interactive")] < 60
 
 
-def test_bytes_that_came_and_bytes_that_are_kept(api: TestClient, image_file: Path) -> None:
+def test_bytes_and_workers_are_counted(api: TestClient, image_file: Path) -> None:
     size = image_file.stat().st_size
     for _ in range(2):  # sent twice, kept once
         upload(api, image_file)
@@ -178,14 +160,12 @@ def test_bytes_that_came_and_bytes_that_are_kept(api: TestClient, image_file: Pa
     assert found[sample("heliopsf_files", kind="image", origin="uploaded")] == 1
     assert found[sample("heliopsf_http_received_bytes_total", route="/v1/images")] == 2 * size
 
-
-def test_workers_that_are_there_and_jobs_that_none_looks_after(api: TestClient, settings: Settings) -> None:
-    catalogue = handles(api).catalogue
-    assert scrape(api)[sample("heliopsf_workers")] == 0
-    catalogue.census.announce("host:1", time.time(), "1")
-    catalogue.census.announce("host:1", time.time(), "1")
-    catalogue.census.announce("host:2", time.time(), "1")
-    catalogue.census.take_leave("host:2")
+    census = handles(api).catalogue.census
+    assert found[sample("heliopsf_workers")] == 0
+    census.announce("host:1", time.time(), "1")
+    census.announce("host:1", time.time(), "1")
+    census.announce("host:2", time.time(), "1")
+    census.take_leave("host:2")
     found = scrape(api)
     assert found[sample("heliopsf_workers")] == 1 and found[sample("heliopsf_jobs_silent")] == 0
 
@@ -206,20 +186,19 @@ def test_requests_are_counted_by_route_and_never_by_path(api: TestClient) -> Non
     assert found[bucket] == 3
 
 
-def test_a_scrape_reads_indexes_alone(api: TestClient) -> None:
+def test_a_scrape_reads_indexes_alone(api: TestClient, settings: Settings) -> None:
     asked: list[tuple[str, Any]] = []
-    engine = handles(api).catalogue._engine
 
     def note(_c: Any, _cursor: Any, statement: str, parameters: Any, *_: Any) -> None:
         asked.append((statement, parameters))
 
-    event.listen(engine, "before_cursor_execute", note)
+    event.listen(Engine, "before_cursor_execute", note)
     scrape(api)
-    event.remove(engine, "before_cursor_execute", note)
+    event.remove(Engine, "before_cursor_execute", note)
     queries = [one for one in asked if one[0].lstrip().startswith("SELECT") and "FROM " in one[0]]
     tables = {"jobs", "images", "transits", "psfs", "products", "reports"}
     seen = set()
-    with engine.connect() as connection:
+    with create_engine(settings.catalogue_url).connect() as connection:
         for statement, parameters in queries:
             plan = connection.exec_driver_sql("EXPLAIN QUERY PLAN " + statement, parameters).all()
             for step in (str(row[-1]) for row in plan):
@@ -256,19 +235,19 @@ def test_ready_once_the_embedded_worker_is_there(api: TestClient) -> None:
         "status": "ready",
         "parts": {"database": "ok", "storage": "ok", "worker": "ok"},
     }
-    with handles(api).catalogue._engine.begin() as connection:  # a worker that was killed falls silent
-        connection.execute(text("UPDATE workers SET heartbeat_at = heartbeat_at - 3000"))
+    silent = text("UPDATE workers SET heartbeat_at = heartbeat_at - 3000")
+    execute(handles(api).catalogue, silent)  # a worker that was killed falls silent
     assert api.get("/readyz").status_code == 503
 
 
-def test_not_ready_where_files_cannot_be_written(api: TestClient, settings: Settings) -> None:
+def test_not_ready_where_files_cannot_be_written_or_the_database_is_away(
+    api: TestClient, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
     settings.data_dir.rename(settings.data_dir.with_name("gone"))
     parts = api.get("/readyz").json()["parts"]
     settings.data_dir.with_name("gone").rename(settings.data_dir)
     assert "cannot be written" in parts["storage"]
 
-
-def test_not_ready_without_a_database(api: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     def away() -> None:
         raise AWAY
 

@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 
 from tests.conftest import write_image
-from tests.service.conftest import upload
+from tests.service.conftest import job_after, upload
 from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.stage_times import KeptStageTimes
@@ -39,29 +39,21 @@ def test_a_deconvolution_s_stages_outlive_it(
     api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
 ) -> None:
     assert told(api, "deconvolve") == {}
-    body = {
-        "kind": "deconvolve",
-        "parameters": {
-            "image_id": upload(api, image_file),
-            "psf_id": upload(api, psf_file, "/v1/psfs"),
-            **FEW,
-        },
-    }
-    job = api.post("/v1/jobs", json=body).json()
-    run_jobs()
+    ids = {"image_id": upload(api, image_file), "psf_id": upload(api, psf_file, "/v1/psfs")}
+    ended = job_after(api, run_jobs, "deconvolve", **ids, **FEW)
     stages = told(api, "deconvolve")
     assert set(stages) == {"starting", "reading", "deconvolving", "saving"}
     assert stages["deconvolving"][1] == 3 and stages["saving"][1] == 1
     assert all(seconds > 0 for seconds, _ in stages.values())
-    ended = api.get(f"/v1/jobs/{job['id']}").json()
     assert sum(seconds for seconds, _ in stages.values()) <= ended["ended_at"] - ended["started_at"] + 0.05
-    assert api.delete(f"/uws/jobs/{job['id']}", follow_redirects=False).status_code == 303
+    assert api.delete(f"/uws/jobs/{ended['id']}", follow_redirects=False).status_code == 303
     assert told(api, "deconvolve") == stages
 
 
 def test_images_of_a_bulk_are_counted_and_written_once_a_turn(
     api: TestClient,
     settings: Settings,
+    catalogue: Catalogue,
     tmp_path: Path,
     psf_file: Path,
     run_jobs: Callable[[], None],
@@ -81,9 +73,7 @@ def test_images_of_a_bulk_are_counted_and_written_once_a_turn(
     monkeypatch.setattr(KeptStageTimes, "add", counted)
     bulk = {"images": images, "psf_id": upload(api, psf_file, "/v1/psfs"), "parameters": FEW}
     assert api.post("/v1/bulk", json=bulk).status_code == 202
-    catalogue = Catalogue(settings.catalogue_url)
     keep_turns(catalogue, settings)
-    catalogue.close()
     run_jobs()
     assert written == ["bulk"]
     stages = told(api, "bulk")

@@ -8,11 +8,13 @@ from typing import Any
 
 from astropy.io.votable import parse
 from fastapi.testclient import TestClient
-from sqlalchemy import create_engine, text
+from sqlalchemy import delete
 
 from service.vo.links import LINKS_TYPE, MOST_IDS
+from tests.service.conftest import execute
 from tests.service.vo.made import add_product
-from workers.settings import Settings
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import ImageRow, PsfRow
 
 
 def links(api: TestClient, *ids: str) -> tuple[list[dict[str, Any]], Any]:
@@ -75,14 +77,11 @@ def test_several_ids_of_both_kinds_and_unknown_ones(api: TestClient, tmp_path: P
 
 
 def test_an_input_and_a_psf_that_are_not_there_are_rows_with_an_error(
-    api: TestClient, settings: Settings, tmp_path: Path
+    api: TestClient, catalogue: Catalogue, tmp_path: Path
 ) -> None:
     ids = add_product(api, tmp_path)
-    database = create_engine(settings.catalogue_url)
-    with database.begin() as connection:
-        for table, identity in (("images", ids["image"]), ("psfs", ids["psf"])):
-            connection.execute(text(f"DELETE FROM {table} WHERE id = :id"), {"id": identity})
-    database.dispose()
+    for row in (ImageRow, PsfRow):
+        execute(catalogue, delete(row))
     rows, _ = links(api, ids["product"])
     faults = {row["local_semantics"]: row["error_message"] for row in rows if row["error_message"]}
     assert set(faults) == {"input", "psf"} and "archive" in faults["input"] and "deleted" in faults["psf"]

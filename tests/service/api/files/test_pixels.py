@@ -1,4 +1,4 @@
-"""Pixels over HTTP are those of the file."""
+"""Pixels and headers over HTTP are those of the file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from httpx import Response
 from psfcore.fits.viewing import decode
 from service.http.state import State
 from tests.conftest import write_image
-from tests.service.conftest import upload
+from tests.service.conftest import refusal, result_of, upload
+from tests.service.vo.made import add_product
 from workers.files.store import Store
 from workers.settings import Settings
 
@@ -43,11 +44,6 @@ def numbers(answer: Response) -> np.ndarray:
     return np.frombuffer(answer.content, "<f4").reshape(shape)
 
 
-def refusal(answer: Response, status: int, code: str) -> str:
-    assert (answer.status_code, answer.json()["type"]) == (status, f"urn:heliopsf:{code}"), answer.text
-    return str(answer.json()["detail"])
-
-
 def test_overview_all_pixels_and_a_window_decode_once(
     api: TestClient, image_file: Path, decodings: list[str]
 ) -> None:
@@ -67,9 +63,7 @@ def test_overview_all_pixels_and_a_window_decode_once(
     np.testing.assert_allclose(numbers(odd)[-1, -1], stored[83:, 121:].astype(float).mean(), rtol=1e-6)
     assert decodings == ["image"]
 
-
-def test_an_answer_is_kept_by_the_client(api: TestClient, image_file: Path, decodings: list[str]) -> None:
-    where = f"/v1/images/{upload(api, image_file)}/pixels"
+    # An answer is kept by the client, and counts as a read.
     first = api.get(where, params={"step": 2})
     tag = first.headers["etag"]
     assert "immutable" in first.headers["cache-control"]
@@ -77,6 +71,8 @@ def test_an_answer_is_kept_by_the_client(api: TestClient, image_file: Path, deco
     assert (again.status_code, again.content) == (304, b"") and again.headers["etag"] == tag
     others = [{}, {"step": 3}, {"step": 2, "x": 1}, {"step": 2, "height": 9}]
     assert len({tag, *(api.get(where, params=one).headers["etag"] for one in others)}) == 5
+    left = [int(api.get(where).headers["ratelimit"].split("r=")[1].split(";")[0]) for _ in range(2)]
+    assert left[0] - left[1] == 1
 
 
 def test_a_compressed_image_with_missing_pixels(api: TestClient, tmp_path: Path) -> None:
@@ -93,24 +89,21 @@ def test_a_compressed_image_with_missing_pixels(api: TestClient, tmp_path: Path)
     np.testing.assert_allclose(overview[2, 2], np.nanmean(pixels[8:12, 8:12].astype(float)), rtol=1e-6)
 
 
-@pytest.fixture
-def product_id(api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]) -> str:
-    parameters = {
-        "image_id": upload(api, image_file),
-        "psf_id": upload(api, psf_file, "/v1/psfs"),
-        "noise": {"photon_gain_dn": 2.0, "read_noise_dn": 1.0},
-        "error_draws": 2,
-    }
-    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()
-    run_jobs()
-    done = api.get(f"/v1/jobs/{job['id']}").json()
-    assert done["phase"] == "COMPLETED", done
-    return str(done["result"].rpartition("/")[2])
-
-
-def test_the_planes_of_a_product(api: TestClient, product_id: str, tmp_path: Path) -> None:
-    (tmp_path / "p.fits").write_bytes(api.get(f"/v1/products/{product_id}/file").content)
-    where = f"/v1/products/{product_id}/pixels"
+def test_the_planes_and_headers_of_a_product(
+    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None], tmp_path: Path
+) -> None:
+    product = result_of(
+        api,
+        run_jobs,
+        "deconvolve",
+        image_id=upload(api, image_file),
+        psf_id=upload(api, psf_file, "/v1/psfs"),
+        noise={"photon_gain_dn": 2.0, "read_noise_dn": 1.0},
+        error_draws=2,
+        method={"name": "richardson-lucy", "steps": 1},
+    )
+    (tmp_path / "p.fits").write_bytes(api.get(product["file"]).content)
+    where = f"/v1/products/{product['id']}/pixels"
     quality = fits.getdata(tmp_path / "p.fits", "QUALITY")
     assert len(np.unique(quality)) > 1
     for plane, stored in (
@@ -123,11 +116,35 @@ def test_the_planes_of_a_product(api: TestClient, product_id: str, tmp_path: Pat
         assert answer.headers.get("x-pixels-unit") == (None if plane == "quality" else "DN/s")
     union = np.bitwise_or.reduce(quality.reshape(24, 4, 32, 4), axis=(1, 3))
     np.testing.assert_array_equal(numbers(api.get(where, params={"plane": "quality", "step": 4})), union)
+    listed = api.get(f"/v1/products/{product['id']}/header").json()
+    names = [(one["index"], one["name"]) for one in listed]
+    assert names == [(0, "PRIMARY"), (1, "QUALITY"), (2, "ERROR")]
+    assert [one["cards"] for one in listed] == cards_of(tmp_path / "p.fits")
 
 
-def test_requests_that_cannot_be_answered(
-    api: TestClient, image_file: Path, psf_file: Path, run_jobs: Callable[[], None]
-) -> None:
+def cards_of(path: Path) -> list[list[list[object]]]:
+    with fits.open(path) as hdus:
+        return [[[c.keyword, c.value, c.comment] for c in hdu.header.cards] for hdu in hdus]
+
+
+def test_the_header_of_an_upload(api: TestClient, tmp_path: Path) -> None:
+    write_image(tmp_path / "i.fits", OBSERVER="who", LONG="x" * 90)
+    with fits.open(tmp_path / "i.fits", mode="update") as hdus:
+        hdus[0].header.add_history("was calibrated")
+        hdus[0].header.add_comment("looks good")
+    where = f"/v1/images/{upload(api, tmp_path / 'i.fits')}/header"
+    answer = api.get(where)
+    (listed,) = answer.json()
+    assert (listed["index"], listed["name"]) == (0, "PRIMARY")
+    assert [listed["cards"]] == cards_of(tmp_path / "i.fits")
+    assert ["HISTORY", "was calibrated", ""] in listed["cards"]
+    again = api.get(where, headers={"If-None-Match": answer.headers["etag"]})
+    assert again.status_code == 304 and "immutable" in again.headers["cache-control"]
+    assert api.get(f"/v1/images/{'f' * 64}/header").status_code == 404
+    assert api.get(f"/v1/products/{'f' * 64}/header").status_code == 404
+
+
+def test_requests_that_cannot_be_answered(api: TestClient, image_file: Path, tmp_path: Path) -> None:
     image_id = upload(api, image_file)
     where = f"/v1/images/{image_id}/pixels"
     detail = refusal(api.get(where, params={"x": 100, "width": 29}), 422, "window-outside")
@@ -138,12 +155,9 @@ def test_requests_that_cannot_be_answered(
         refusal(api.get(where, params=wrong), 422, "invalid-request")
     refusal(api.get(f"/v1/images/{'f' * 64}/pixels"), 404, "no-such-image")
     refusal(api.get(f"/v1/products/{'f' * 64}/pixels"), 404, "no-such-product")
-    parameters = {"image_id": image_id, "psf_id": upload(api, psf_file, "/v1/psfs")}
-    job = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()
-    run_jobs()
-    product = api.get(f"/v1/jobs/{job['id']}").json()["result"]
-    detail = refusal(api.get(f"{product}/pixels", params={"plane": "error"}), 404, "no-such-plane")
-    assert "(image, quality); got error: submit the deconvolution with error_draws" in detail
+    product = f"/v1/products/{add_product(api, tmp_path)['product']}"
+    detail = refusal(api.get(f"{product}/pixels", params={"plane": "other"}), 422, "invalid-request")
+    assert "'quality'" in detail
 
 
 def test_a_file_whose_pixels_cannot_be_decoded(api: TestClient, tmp_path: Path) -> None:
@@ -174,7 +188,7 @@ def test_a_damaged_file_is_not_decoded(api: TestClient, image_file: Path, settin
 def test_clients_at_once_get_the_same_pixels_of_one_decoding(
     api: TestClient, tmp_path: Path, decodings: list[str]
 ) -> None:
-    write_image(tmp_path / "i.fits", shape=(512, 512))
+    write_image(tmp_path / "i.fits", shape=(256, 256))
     plain = (tmp_path / "i.fits").read_bytes()
     (tmp_path / "i.fits.gz").write_bytes(gzip.compress(plain))
     image_id = upload(api, tmp_path / "i.fits.gz")
@@ -183,12 +197,6 @@ def test_clients_at_once_get_the_same_pixels_of_one_decoding(
         for answer in pool.map(lambda _: api.get(f"/v1/images/{image_id}/pixels"), range(8)):
             np.testing.assert_array_equal(numbers(answer), stored)
     assert decodings == ["image"]
-    state: State = api.app.state.heliopsf  # type: ignore[attr-defined]
+    state: State = api.app.state.heliopsf
     assert state.decoding.borrowed_tokens == 0
     assert list((state.settings.data_dir / "tmp").iterdir()) == []
-
-
-def test_pixels_count_as_a_read(api: TestClient, image_file: Path) -> None:
-    where = f"/v1/images/{upload(api, image_file)}/pixels"
-    left = [int(api.get(where).headers["ratelimit"].split("r=")[1].split(";")[0]) for _ in range(2)]
-    assert left[0] - left[1] == 1

@@ -24,15 +24,12 @@ from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from service.app import create_app
 from service.cli.main import main
 from service.client.http import Client, ServiceError
-from service.local import LocalService
+from service.local import local_service
 from tests.conftest import SMALL_INSTRUMENT
 from tests.conftest import write_psf as write_plain_psf
-from tests.service.conftest import upload
-from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import DEFAULT_OWNER, PsfRow
-from workers.files.store import Store
+from tests.service.conftest import job_after, refusal, result_of, settings_in, upload
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow, PsfRow
 from workers.run.runner import Runner
-from workers.settings import Settings
 
 LIMITS = FitsLimits(max_pixels=512 * 512)
 AT = SOFTENED_POWER_LAW.coordinates({"b_px": 5.0, "c": 2.6, "total": 0.4})
@@ -49,33 +46,17 @@ class Served:
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    folder = tmp_path_factory.mktemp("served")
-    settings = Settings(
-        data_dir=folder,
-        database_url=None,
-        broker_url="filesystem://",
-        allowed_hosts="testserver",
-        max_pixels=512 * 512,
-    )
-    body = {"kind": "psf-build", "parameters": {"instrument_file": SMALL_INSTRUMENT, "size": 128}}
+    settings = settings_in(tmp_path_factory.mktemp("served"))
     with TestClient(create_app(settings), raise_server_exceptions=False) as api:
-        job = api.post("/v1/jobs", json=body).json()
-        catalogue, store = Catalogue(settings.catalogue_url), Store(folder)
-        Runner(settings, catalogue, store).run(job["id"])
-        psf = api.get(api.get(f"/v1/jobs/{job['id']}").json()["result"]).json()
-        row = catalogue.get(PsfRow, psf["id"], DEFAULT_OWNER)
-        catalogue.close()
-        assert row is not None
-        yield Served(api, psf, store.path(row.file_sha256))
+        state = api.app.state.heliopsf
 
+        def run_jobs() -> None:
+            for row in state.catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=9):
+                Runner(settings, state.catalogue, state.store).run(row.id)
 
-def tables_made(api: TestClient, run_jobs: Callable[[], None], psf_id: str) -> None:
-    job = api.post("/v1/jobs", json={"kind": "psf-tables", "parameters": {"psf_id": psf_id}})
-    assert job.status_code == 202, job.text
-    run_jobs()
-    done = api.get(job.headers["Location"]).json()
-    assert done["phase"] == "COMPLETED", done["error"]
-    assert done["result"] == f"/v1/psfs/{psf_id}"
+        psf = result_of(api, run_jobs, "psf-build", instrument_file=SMALL_INSTRUMENT, size=128)
+        row = state.catalogue.get(PsfRow, psf["id"], DEFAULT_OWNER)
+        yield Served(api, psf, state.store.path(row.file_sha256))
 
 
 @pytest.fixture
@@ -134,21 +115,15 @@ def test_etags_depend_on_the_question(served: Served) -> None:
     assert api.get(asked[1], headers={"If-None-Match": tags[2]}).status_code == 200
 
 
+QUESTIONS = ("curve", "profile", "encircled?radius=1", "annulus?inner=1&outer=2")
+
+
 def test_an_uploaded_psf_says_which_job_makes_its_tables(
-    api: TestClient, run_jobs: Callable[[], None], psf_file: Path
+    api: TestClient, run_jobs: Callable[[], None], psf_file: Path, tmp_path: Path
 ) -> None:
     psf_id = upload(api, psf_file, "/v1/psfs")
-    for question in (
-        "curve",
-        "profile",
-        "encircled?radius=1",
-        "annulus?inner=1&outer=2",
-        f"compare/{psf_id}",
-    ):
-        answer = api.get(f"/v1/psfs/{psf_id}/{question}")
-        assert answer.status_code == 409
-        assert answer.json()["type"] == "urn:heliopsf:no-tables"
-    hint = answer.json()["detail"]
+    for question in (*QUESTIONS, f"compare/{psf_id}"):
+        hint = refusal(api.get(f"/v1/psfs/{psf_id}/{question}"), 409, "no-tables")
     body = json.loads(hint[hint.index("{") : hint.rindex("}") + 1])
     job = api.post("/v1/jobs", json=body)
     assert job.status_code == 202
@@ -159,21 +134,13 @@ def test_an_uploaded_psf_says_which_job_makes_its_tables(
     curve = api.get(f"/v1/psfs/{psf_id}/curve?radii=1,5").json()
     kernel = read_psf(psf_file, LIMITS).kernel
     assert curve["light_beyond_pct"] == {"TOTAL": pytest.approx(cumulative_curve(kernel, [1, 5]), abs=1e-6)}
-    assert api.post("/v1/jobs", json=body).json()["phase"] == "COMPLETED", (
-        "an equal job is the one that was done"
-    )
+    assert api.post("/v1/jobs", json=body).json()["phase"] == "COMPLETED", "an equal job is that one"
 
-
-def test_invalid_weights_are_a_users_error(
-    api: TestClient, run_jobs: Callable[[], None], tmp_path: Path
-) -> None:
     # Compressed weights are not checked at upload.
     packed = fits.CompImageHDU(np.zeros((32, 32), "i4"))
     fits.HDUList([fits.PrimaryHDU(), packed]).writeto(tmp_path / "dark.fits")
     psf_id = upload(api, tmp_path / "dark.fits", "/v1/psfs")
-    job = api.post("/v1/jobs", json={"kind": "psf-tables", "parameters": {"psf_id": psf_id}}).json()
-    run_jobs()
-    error = api.get(f"/v1/jobs/{job['id']}").json()["error"]
+    error = job_after(api, run_jobs, "psf-tables", psf_id=psf_id)["error"]
     assert error["fault"] == "user" and error["code"] == "psf-sum"
     assert api.get(f"/v1/psfs/{psf_id}/curve").status_code == 409
 
@@ -185,18 +152,12 @@ def test_a_fitted_psf_answers_with_errors(
     point = np.zeros_like(kernel)
     point[64, 64] = 1
     names, covariance = SOFTENED_POWER_LAW.names, ((1e-3, 0, 0), (0, 1e-3, 0), (0, 0, 2e-3))
-    psf = Psf(
-        kernel,
-        "fit",
-        "1",
-        None,
-        "draft",
-        components={"DIFFRACTION": point, "SCATTER": kernel},
-        fitted=FittedShape(SOFTENED_POWER_LAW.name, names, tuple(AT), covariance),
-    )
+    parts = {"DIFFRACTION": point, "SCATTER": kernel}
+    fitted = FittedShape(SOFTENED_POWER_LAW.name, names, tuple(AT), covariance)
+    psf = Psf(kernel, "fit", "1", None, "draft", components=parts, fitted=fitted)
     write_psf(tmp_path / "fit.fits", psf)
     psf_id = upload(api, tmp_path / "fit.fits", "/v1/psfs")
-    tables_made(api, run_jobs, psf_id)
+    assert result_of(api, run_jobs, "psf-tables", psf_id=psf_id)["id"] == psf_id
     here = f"/v1/psfs/{psf_id}"
     curve = api.get(f"{here}/curve?radii=1,10").json()
     assert set(curve["sigma_points"]) == {"TOTAL", "SCATTER"}
@@ -211,7 +172,7 @@ def test_a_fitted_psf_answers_with_errors(
 def test_a_cutout_is_the_middle_of_the_file_byte_for_byte(served: Served) -> None:
     api, built = served.api, served.psf
     whole = fits.getdata(served.file)
-    for size in (1, 2, 31, 64, 128):
+    for size in (1, 2, 31, 128):
         answer = api.get(f"/v1/psfs/{built['id']}/cutout", params={"size": size})
         assert answer.status_code == 200 and answer.headers["content-type"] == "application/fits"
         assert len(answer.content) % 2880 == 0
@@ -240,8 +201,7 @@ def test_a_cutout_of_an_upload(api: TestClient, tmp_path: Path) -> None:
     for name in ("second.fits", "packed.fits.gz", "whole.fits"):
         psf_id = upload(api, tmp_path / name, "/v1/psfs")
         answer = api.get(f"/v1/psfs/{psf_id}/cutout?size=7")
-        assert answer.status_code == 409, name
-        assert answer.json()["type"] == "urn:heliopsf:cutout-not-plain"
+        refusal(answer, 409, "cutout-not-plain")
 
 
 A = "a" * 64
@@ -275,14 +235,12 @@ def test_invalid_parameters_are_refused(served: Served) -> None:
     api, built = served.api, served.psf
     for question, status, code in BAD:
         answer = api.get(f"/v1/psfs/{built['id']}/{question}")
-        assert answer.status_code == status, (question, answer.text)
-        assert answer.headers["content-type"] == "application/problem+json"
-        assert answer.json()["type"] == f"urn:heliopsf:{code}" and answer.json()["detail"]
+        assert refusal(answer, status, code), question
     for question in ("curve", "profile", "encircled?radius=1", "cutout?size=3"):
         assert api.get(f"/v1/psfs/{A}/{question}").status_code == 404
         assert api.get(f"/v1/psfs/short/{question}").status_code == 422
     missing = api.post("/v1/jobs", json={"kind": "psf-tables", "parameters": {"psf_id": A}})
-    assert missing.status_code == 404 and missing.json()["type"].endswith("no-such-psf")
+    refusal(missing, 404, "no-such-psf")
 
 
 def test_psfs_on_other_pixels_are_not_compared(
@@ -294,9 +252,9 @@ def test_psfs_on_other_pixels_are_not_compared(
         write_plain_psf(path)
         fits.setval(path, "CDELT1", value=scale)
         ids.append(upload(api, path, "/v1/psfs"))
-        tables_made(api, run_jobs, ids[-1])
+        result_of(api, run_jobs, "psf-tables", psf_id=ids[-1])
     answer = api.get(f"/v1/psfs/{ids[0]}/compare/{ids[1]}")
-    assert answer.status_code == 409 and answer.json()["type"].endswith("plate-scale-mismatch")
+    refusal(answer, 409, "plate-scale-mismatch")
 
 
 def test_the_client_gets_the_same_answers(served: Served, tmp_path: Path) -> None:
@@ -314,43 +272,33 @@ def test_the_client_gets_the_same_answers(served: Served, tmp_path: Path) -> Non
         assert caught.value.code == "bad-radius"
 
 
-@pytest.fixture
-def local(tmp_path: Path) -> Iterator[LocalService]:
-    service = LocalService(Settings(data_dir=tmp_path / "l", database_url=None, broker_url="filesystem://"))
-    yield service
-    service.close()
-
-
-def test_in_this_process_missing_tables_are_made_automatically(
-    local: LocalService, psf_file: Path, tmp_path: Path
-) -> None:
-    psf_id = local.upload_psf(psf_file)["id"]
-    with pytest.raises(ServiceError) as caught:
-        local.ask(psf_id, "curve")
-    assert caught.value.code == "no-tables"
+def test_in_this_process_missing_tables_are_made_automatically(psf_file: Path, tmp_path: Path) -> None:
     kernel = read_psf(psf_file, LIMITS).kernel
-    assert local.psf_encircled(psf_id, 5)["light_within"]["TOTAL"] == pytest.approx(
-        float(encircled_energy(kernel, 5)), abs=1e-8
-    )
     write_plain_psf(tmp_path / "small.fits", size=32)
-    other = local.upload_psf(tmp_path / "small.fits")["id"]
-    assert local.compare_psfs(psf_id, other)["difference_points"]["TOTAL"][0] < 0
-    local.psf_cutout(psf_id, 9, tmp_path / "cut.fits")
-    assert fits.getdata(tmp_path / "cut.fits").shape == (9, 9)
-    for wrong in (lambda: local.psf_annulus(psf_id, 3, 2), lambda: local.psf_curve(A)):
-        with pytest.raises(ServiceError):
-            wrong()
+    with local_service() as local:
+        psf_id = local.upload_psf(psf_file)["id"]
+        with pytest.raises(ServiceError) as caught:
+            local.ask(psf_id, "curve")
+        assert caught.value.code == "no-tables"
+        light = local.psf_encircled(psf_id, 5)["light_within"]["TOTAL"]
+        assert light == pytest.approx(float(encircled_energy(kernel, 5)), abs=1e-8)
+        other = local.upload_psf(tmp_path / "small.fits")["id"]
+        assert local.compare_psfs(psf_id, other)["difference_points"]["TOTAL"][0] < 0
+        local.psf_cutout(psf_id, 9, tmp_path / "cut.fits")
+        assert fits.getdata(tmp_path / "cut.fits").shape == (9, 9)
+        for wrong in (lambda: local.psf_annulus(psf_id, 3, 2), lambda: local.psf_curve(A)):
+            with pytest.raises(ServiceError):
+                wrong()
 
 
-def run(*arguments: str | Path) -> Result:
+def run(*arguments: str | Path | float) -> Result:
     return CliRunner().invoke(main, ["psf", *[str(argument) for argument in arguments]])
 
 
 def test_the_command_asks_a_file(psf_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.json"
-    result = run(
-        "query", psf_file, "--radius", 1, "--radius", 5, "--annulus", 1, 5, "--profile", "--json", out
-    )
+    questions = ("--radius", 1, "--radius", 5, "--annulus", 1, 5, "--profile")
+    result = run("query", psf_file, *questions, "--json", out)
     assert result.exit_code == 0, result.output
     answers = json.loads(out.read_text())
     kernel = read_psf(psf_file, LIMITS).kernel

@@ -19,7 +19,7 @@ from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from tests.conftest import write_image
 from tests.fitted_psfs import EARLY, LATE, write_fitted
 from tests.psfcore.small_transits import DIFFRACTION
-from tests.service.conftest import upload
+from tests.service.conftest import job_after, refusal, result_of, upload
 
 SEEN = {"TELESCOP": "SOLO/EUI/HRI_EUV", "DETECTOR": "HRI_EUV", "WAVELNTH": 174.0}
 SERIES = "/v1/series/hri_euv/174/total"
@@ -55,52 +55,44 @@ def image_at(api: TestClient, path: Path, date: str, seed: int = 1) -> str:
     return upload(api, path)
 
 
+def product_of(api: TestClient, run_jobs: Callable[[], None], image_id: str, **more: Any) -> dict[str, Any]:
+    return result_of(api, run_jobs, "deconvolve", image_id=image_id, method=QUICK, **more)
+
+
 def deconvolve(api: TestClient, image_id: str, **more: Any) -> Response:
     parameters = {"image_id": image_id, "method": QUICK, **more}
     return api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
-
-
-def problem(answer: Response, status: int, code: str) -> str:
-    assert answer.status_code == status, answer.text
-    assert answer.json()["type"] == f"urn:heliopsf:{code}", answer.text
-    return str(answer.json()["detail"])
 
 
 def test_an_image_between_two_psfs_is_deconvolved_with_a_psf_between_them(
     api: TestClient, run_jobs: Callable[[], None], ends: tuple[str, str], tmp_path: Path
 ) -> None:
     image = image_at(api, tmp_path / "i.fits", "2022-08-30T15:00:00")
-    detail = problem(deconvolve(api, image), 404, "no-psf-fits")
+    detail = refusal(deconvolve(api, image), 404, "no-psf-fits")
     assert "2022-08-30" in detail and "interpolates" not in detail
 
     said = api.put(SERIES, json={"interpolated": True, "reason": "the mirrors age"}).json()
     assert (said["interpolated"], said["history"][0]["reason"]) == (True, "the mirrors age")
     assert api.get("/v1/series").json()["items"] == [{"series": "hri_euv/174/total", "interpolated": True}]
-    asked = api.post(
-        "/v1/estimates", json={"kind": "deconvolve", "parameters": {"image_id": image, "method": QUICK}}
-    ).json()
-    assert asked["psf"]["status"] is None and "the job makes it first" in asked["psf"]["why"]
+    body = {"kind": "deconvolve", "parameters": {"image_id": image, "method": QUICK}}
+    choice = api.post("/v1/estimates", json=body).json()["psf"]
+    assert choice["status"] is None and "the job makes it first" in choice["why"]
 
-    submitted = deconvolve(api, image)
-    assert submitted.status_code == 202, submitted.text
-    run_jobs()
-    job = api.get(submitted.headers["Location"]).json()
-    assert job["phase"] == "COMPLETED", job
-    product = api.get(job["result"]).json()
-    psf = api.get(f"/v1/psfs/{asked['psf']['id']}").json()
+    product = product_of(api, run_jobs, image)
+    psf = api.get(f"/v1/psfs/{choice['id']}").json()
     assert product["psf_id"] == psf["id"]
     assert (psf["origin"], psf["status"], psf["name"]) == ("interpolated", "draft", "hri_euv-interpolated")
-    assert psf["version"] == asked["psf"]["version"] == product["psf_version"]
+    assert psf["version"] == choice["version"] == product["psf_version"]
     with fits.open(_file(api, f"/v1/products/{product['id']}/file", tmp_path)) as hdus:
         header = hdus[0].header
         assert (header["PSFID"], header["PSFVERS"]) == (psf["id"], psf["version"])
         assert header["PSFNAME"] == "hri_euv-interpolated"
 
     # The middle of the year: the truth is that of a steady change of each parameter.
-    found = read_psf(_file(api, psf["file"], tmp_path), FitsLimits(max_pixels=2**20))
+    kernel = read_psf(_file(api, psf["file"], tmp_path), FitsLimits(max_pixels=2**20)).kernel
     truth = ScatterTruth(*(0.5 * (EARLY[name] + LATE[name]) for name in ("b_px", "c", "total")))
     true_curve = cumulative_curve(total_kernel(truth, DIFFRACTION), RADII)
-    np.testing.assert_allclose(cumulative_curve(found.kernel, RADII), true_curve, atol=0.1)
+    np.testing.assert_allclose(cumulative_curve(kernel, RADII), true_curve, atol=0.1)
     fit = psf["details"]["fit"]
     assert fit["parameters"]["total"]["value"] == pytest.approx(truth.total, abs=0.001)
     assert fit["parameters"]["total"]["sigma"] > 0.5 * 0.9 * (LATE["total"] - EARLY["total"])
@@ -112,6 +104,31 @@ def test_an_image_between_two_psfs_is_deconvolved_with_a_psf_between_them(
     run_jobs()
     assert len(api.get("/v1/psfs").json()["items"]) == 3
 
+    # Lineage names both ends; a rerun gives the same PSF and product.
+    told = api.get(f"/v1/products/{product['id']}/lineage").json()
+    assert [one["type"] for one in told["parents"]] == ["image", "psf"]
+    between = told["parents"][1]
+    assert between["made"]["origin"] == "interpolated" and between["made"]["software_version"]
+    assert [(one["type"], one["id"]) for one in between["parents"]] == [("psf", one) for one in ends]
+    weights = [one["weight"] for one in between["parents"]]
+    # The nearest midnight is that of 31 August, 183 of the 365 days after 1 March 2022.
+    assert weights == pytest.approx([182 / 365, 183 / 365]) and between["weight"] is None
+    parameters = between["made"]["parameters"]
+    assert (parameters["before_psf_id"], parameters["time"]) == (ends[0], "2022-08-31T00:00:00Z")
+    hashes = [one["made"]["file_sha256"] for one in between["parents"]]
+    said = psf["details"]["provenance"]["interpolated_between"]
+    assert [one["file_sha256"] for one in said] == hashes == list(ends), "an upload's id is its hash"
+    assert [(one["name"], one["version"]) for one in said] == [("fitted", "1.0.0"), ("fitted", "1.1.0")]
+    for of, identity in (("psfs", psf["id"]), ("products", product["id"])):
+        rerun = api.post(f"/v1/{of}/{identity}/rerun")
+        assert rerun.status_code == 202, rerun.text
+        run_jobs()
+        done = api.get(rerun.headers["Location"]).json()
+        assert done["phase"] == "COMPLETED", done
+        details = api.get(done["result"]).json()["details"]
+        assert details["same"] is True and details["same_file"] is True
+    assert api.get(f"/psfs/{psf['id']}", headers={"Accept": "text/html"}).status_code == 200
+
 
 def _file(api: TestClient, address: str, folder: Path) -> Path:
     answer = api.get(address)
@@ -121,70 +138,33 @@ def _file(api: TestClient, address: str, folder: Path) -> Path:
     return path
 
 
-def test_lineage_names_both_ends_and_a_rerun_gives_the_same_psf(
-    api: TestClient, run_jobs: Callable[[], None], ends: tuple[str, str], tmp_path: Path
-) -> None:
-    api.put(SERIES, json={"interpolated": True})
-    image = image_at(api, tmp_path / "i.fits", "2022-05-13T06:00:00")
-    job = deconvolve(api, image)
-    run_jobs()
-    product = api.get(api.get(job.headers["Location"]).json()["result"]).json()
-    told = api.get(f"/v1/products/{product['id']}/lineage").json()
-    assert [one["type"] for one in told["parents"]] == ["image", "psf"]
-    between = told["parents"][1]
-    assert between["made"]["origin"] == "interpolated" and between["made"]["software_version"]
-    assert [(one["type"], one["id"]) for one in between["parents"]] == [("psf", one) for one in ends]
-    weights = [one["weight"] for one in between["parents"]]
-    assert weights == pytest.approx([292 / 365, 73 / 365]) and between["weight"] is None
-    parameters = between["made"]["parameters"]
-    assert (parameters["before_psf_id"], parameters["time"]) == (ends[0], "2022-05-13T00:00:00Z")
-
-    provenance = api.get(f"/v1/psfs/{between['id']}").json()["details"]["provenance"]
-    hashes = [one["made"]["file_sha256"] for one in between["parents"]]
-    said = provenance["interpolated_between"]
-    assert [one["file_sha256"] for one in said] == hashes == list(ends), (
-        "an upload's id is the hash of its file"
-    )
-    assert [(one["name"], one["version"]) for one in said] == [("fitted", "1.0.0"), ("fitted", "1.1.0")]
-
-    for of, identity in (("psfs", between["id"]), ("products", product["id"])):
-        asked = api.post(f"/v1/{of}/{identity}/rerun")
-        assert asked.status_code == 202, asked.text
-        run_jobs()
-        done = api.get(asked.headers["Location"]).json()
-        assert done["phase"] == "COMPLETED", done
-        details = api.get(done["result"]).json()["details"]
-        assert details["same"] is True and details["same_file"] is True
-    assert api.get(f"/psfs/{between['id']}", headers={"Accept": "text/html"}).status_code == 200
-
-
 def test_when_an_end_is_deprecated_its_interpolated_psfs_are_too(
     api: TestClient, run_jobs: Callable[[], None], ends: tuple[str, str], tmp_path: Path
 ) -> None:
     api.put(SERIES, json={"interpolated": True})
     assert api.post("/v1/contexts", json={"name": "c"}).status_code == 201
     image = image_at(api, tmp_path / "i.fits", "2022-08-30")
-    job = deconvolve(api, image)
-    run_jobs()
-    product = api.get(api.get(job.headers["Location"]).json()["result"]).json()
+    product = product_of(api, run_jobs, image)
     assert api.get("/v1/affected").json()["items"] == []
     api.post(f"/v1/psfs/{ends[1]}/status", json={"status": "deprecated", "reason": "wrong mesh"})
     (item,) = api.get("/v1/affected").json()["items"]
     assert (item["product_id"], item["psf_status"]) == (product["id"], "deprecated")
     warnings = api.get(f"/v1/products/{product['id']}").json()["details"]["warnings"]
     assert any("wrong mesh" in one["message"] for one in warnings)
-    problem(deconvolve(api, image), 404, "no-psf-fits")
+    refusal(deconvolve(api, image), 404, "no-psf-fits")
 
     # The context still uses its pins, also for a PSF that is made only now; the product warns.
     other = image_at(api, tmp_path / "j.fits", "2022-04-01", seed=2)
-    job = deconvolve(api, other, context="c")
-    assert job.status_code == 202, job.text
-    run_jobs()
-    made = api.get(api.get(job.headers["Location"]).json()["result"]).json()
+    made = product_of(api, run_jobs, other, context="c")
     (warning,) = [one for one in made["details"]["warnings"] if one["code"] == "psf-deprecated"]
     assert "interpolated from PSF" in warning["message"] and "wrong mesh" in warning["message"]
     pins = api.get("/v1/contexts/c").json()["pins"]
     assert [pin["interpolated"] for pin in pins] == [True, True]
+
+
+def between(before: str, after: str) -> dict[str, str]:
+    times = {"before_time": "2022-03-01", "after_time": "2023-03-01", "time": "2022-06-01"}
+    return {"before_psf_id": before, "after_psf_id": after, **times}
 
 
 def test_ends_that_do_not_fit_end_the_job_with_the_reason(
@@ -194,53 +174,30 @@ def test_ends_that_do_not_fit_end_the_job_with_the_reason(
     plain = uploaded(api, write_fitted(tmp_path / "plain.fits", LATE, fitted=None))
     cases = ((knee, "shapes-differ", "softened-power-law"), (plain, "psf-not-fitted", "heliopsf psf fit"))
     for other, code, words in cases:
-        job = _interpolate(api, ends[0], other)
-        assert job.status_code == 202, job.text
-        run_jobs()
-        done = api.get(job.headers["Location"]).json()
+        done = job_after(api, run_jobs, "psf-interpolate", **between(ends[0], other))
         assert (done["phase"], done["error"]["fault"], done["error"]["code"]) == ("ERROR", "user", code), done
         assert words in done["error"]["message"]
-    assert _interpolate(api, ends[0], "0" * 64).status_code == 404
-    assert _interpolate(api, *ends, time="2024-01-01").status_code == 422
+    for wrong, status in ((between(ends[0], "0" * 64), 404), (between(*ends) | {"time": "2024-01-01"}, 422)):
+        body = {"kind": "psf-interpolate", "parameters": wrong}
+        assert api.post("/v1/jobs", json=body).status_code == status
 
-
-def _interpolate(api: TestClient, before: str, after: str, time: str = "2022-06-01") -> Response:
-    parameters = {
-        "before_psf_id": before,
-        "before_time": "2022-03-01",
-        "after_psf_id": after,
-        "after_time": "2023-03-01",
-        "time": time,
-    }
-    return api.post("/v1/jobs", json={"kind": "psf-interpolate", "parameters": parameters})
-
-
-def test_a_psf_that_an_interpolated_psf_was_made_from_is_not_deleted(
-    api: TestClient, run_jobs: Callable[[], None], ends: tuple[str, str], tmp_path: Path
-) -> None:
+    # A PSF that an interpolated PSF was made from is not deleted.
     draft = uploaded(api, write_fitted(tmp_path / "draft.fits", LATE | {"c": 2.6}))
-    job = _interpolate(api, ends[0], draft)
-    run_jobs()
-    made = api.get(job.headers["Location"]).json()["result"].rpartition("/")[2]
-    detail = problem(api.delete(f"/v1/psfs/{draft}"), 409, "psf-in-use")
+    made = result_of(api, run_jobs, "psf-interpolate", **between(ends[0], draft))["id"]
+    detail = refusal(api.delete(f"/v1/psfs/{draft}"), 409, "psf-in-use")
     assert made[:12] in detail
     assert api.delete(f"/v1/psfs/{made}").status_code == 200
     assert api.delete(f"/v1/psfs/{draft}").status_code == 200
 
 
-@pytest.mark.parametrize(
-    ("address", "body", "status", "code"),
-    [
+def test_invalid_changes_of_a_series_are_refused(api: TestClient, ends: tuple[str, str]) -> None:
+    for address, body, status, code in (
         ("/v1/series/fsi/174/total", {"interpolated": True}, 404, "no-such-series"),
+        ("/v1/series/HRI/174/total", {"interpolated": True}, 422, "invalid-request"),
         (SERIES, {"interpolated": "perhaps"}, 422, "invalid-request"),
         (SERIES, {}, 422, "invalid-request"),
         (SERIES, {"interpolated": True, "step": 1}, 422, "invalid-request"),
         (SERIES, {"interpolated": True, "reason": "a\x00b"}, 422, "invalid-request"),
-        ("/v1/series/HRI/174/total", {"interpolated": True}, 422, "invalid-request"),
-    ],
-)
-def test_invalid_changes_of_a_series_are_refused(
-    api: TestClient, ends: tuple[str, str], address: str, body: dict[str, Any], status: int, code: str
-) -> None:
-    problem(api.put(address, json=body), status, code)
+    ):
+        refusal(api.put(address, json=body), status, code)
     assert api.get(SERIES).json() == {"series": "hri_euv/174/total", "interpolated": False, "history": []}
