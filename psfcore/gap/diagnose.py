@@ -191,7 +191,7 @@ def diagnose_solution(
     found = verdict_of(
         settled, calibration, images=len(model.evidence.discs), coverage=coverage, failed=failed
     )
-    fits = _fits(model, found)
+    fits = linear_fits(model, found)
     best = next((fit for fit in fits if fit.names == found.best), None)
     corrected = refits.of(found.named) if refit and found.verdict in ("attributed", "tie") else ()
     rng = np.random.default_rng(seed)
@@ -277,7 +277,7 @@ def _limits(
     return found
 
 
-def _fits(model: LinearModel, found: Judgement) -> tuple[EffectFit, ...]:
+def linear_fits(model: LinearModel, found: Judgement) -> tuple[EffectFit, ...]:
     """The linear fits of all single effects, the most probable first; then of the pairs that are the best hypothesis or
     a named hypothesis."""
     effects = {effect.name: effect for effect in model.evidence.effects}

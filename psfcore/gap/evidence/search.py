@@ -155,7 +155,7 @@ class PlaceSearch:
         for n, q in self._fine.items():
             copy = gaussian_filter(self._expected[n], blur_px)
             coarse = _binned(copy, FINE_PX)
-            of_means.append([_along_copy(q, coarse, x // FINE_PX, y // FINE_PX) for x, y in places])
+            of_means.append([along_copy(q, coarse, x // FINE_PX, y // FINE_PX) for x, y in places])
             of_cells.append(self._near.of_copies(n, copy, places))
         means = np.array(of_means) / self._sigma[:, None]
         gain = self._gain(means, np.concatenate(of_cells), least=SEEN)
@@ -243,7 +243,7 @@ def displaced(plane: Any, dx: int, dy: int) -> Any:
     return cut(plane, -dy, -dx, plane.shape)
 
 
-def _along_copy(q: Plane, plane: Plane, dx: int, dy: int) -> float:
+def along_copy(q: Plane, plane: Plane, dx: int, dy: int) -> float:
     """Eq. (1): the sum of q times `displaced(plane, dx, dy)`, without a copy of the plane."""
     (rows, from_rows), (columns, from_columns) = (
         (slice(max(by, 0), max(size + min(by, 0), 0)), slice(max(-by, 0), max(size - max(by, 0), 0)))

@@ -450,14 +450,14 @@ def _odds_of(
         to_score = along @ change[hypothesis.columns]
         spread.append(float(np.log1p(values).sum()))
         cumulants.append(
-            _cumulants(values, to_score) if change.ndim == 1 else _cumulants_of_field(values, to_score)
+            _cumulants(values, to_score) if change.ndim == 1 else cumulants_of_field(values, to_score)
         )
     offsets = hypothesis.offset - np.array(spread) / 2
 
     def odds(strengths: Vector) -> Vector:
         powers = strengths[:, None] ** (2 * np.arange(4))
         found = [
-            offset + gained(_quantile_of_sum(powers @ c.T, 1 - FOUND))
+            offset + gained(quantile_of_sum(powers @ c.T, 1 - FOUND))
             for offset, c in zip(offsets, cumulants, strict=True)
         ]
         return np.asarray(np.logaddexp.reduce(found) - math.log(len(found)))
@@ -474,7 +474,7 @@ def _cumulants(values: Vector, score: Vector) -> Matrix:
     return out
 
 
-def _cumulants_of_field(values: Vector, score: Matrix) -> Matrix:
+def cumulants_of_field(values: Vector, score: Matrix) -> Matrix:
     """The same for a random field. score: (eigenvectors, columns of the field)."""
     shrink = 1 / (1 + values)
     noise = np.diag(values * shrink)
@@ -489,7 +489,7 @@ def _cumulants_of_field(values: Vector, score: Matrix) -> Matrix:
     return out
 
 
-def _quantile_of_sum(cumulants: Matrix, probability: float) -> Vector:
+def quantile_of_sum(cumulants: Matrix, probability: float) -> Vector:
     """The quantile of a weighted sum of noncentral chi2 variables, at least 0. cumulants: (strengths, 3)."""
     first, second, third = np.maximum(cumulants, 1e-300).T
     freedom = second * (second / third) ** 2

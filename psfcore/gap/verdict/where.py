@@ -78,7 +78,7 @@ def where(
         for size in range(len(names) + 1)
         for chosen in itertools.combinations(names, size)
     }
-    shares = _shapley(names, subset)
+    shares = shapley(names, subset)
     total = max(sum(max(share, 0.0) for share in shares.values()), 1e-300)
     flips = _sign_flipped_scores(model, cells, rng)
     out = []
@@ -259,7 +259,7 @@ def _p_of_unocculted(unocculted: _Normal, columns: list[int], axes: int) -> floa
     return min(1.0, axes * float(chdtrc(len(columns), _fall_of(unocculted, columns) + len(columns))))
 
 
-def _shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:
+def shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:
     """The Shapley value of each name. worth: the decrease of chi2 by each subset of the names."""
     count = len(names)
     out = dict.fromkeys(names, 0.0)

@@ -28,32 +28,29 @@ def ideal(**left: float | tuple[float, float]) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize(
-    ("among", "lam", "probability"),
-    [(1, 3.84, 0.5), (1, 10.5, 0.9), (1, 18.4, 0.99), (18, 8.9, 0.5), (18, 18.3, 0.9), (18, 28.2, 0.99)],
-)
-def test_a_test_finds_an_effect_with_the_power_of_the_textbook(
-    among: int, lam: float, probability: float
-) -> None:
-    assert excluded(lam, among) == pytest.approx(probability, abs=0.005)
-
-
-def test_the_power_is_that_of_simulated_tests() -> None:
+def test_a_test_finds_an_effect_with_the_power_of_the_textbook_and_of_simulated_tests() -> None:
+    textbook = [
+        (1, 3.84, 0.5),
+        (1, 10.5, 0.9),
+        (1, 18.4, 0.99),
+        (18, 8.9, 0.5),
+        (18, 18.3, 0.9),
+        (18, 28.2, 0.99),
+    ]
+    for among, lam, probability in textbook:
+        assert excluded(lam, among) == pytest.approx(probability, abs=0.005), (among, lam)
     rng = np.random.default_rng(3)
     score = np.sqrt(12.0) + rng.standard_normal(200_000)
     threshold = -np.quantile(rng.standard_normal(2_000_000), LEVEL / (2 * 5))
     assert excluded(12.0, 5) == pytest.approx(float(np.mean(score > threshold)), abs=0.01)
 
 
-def test_one_rival_is_a_decision_between_two_gaussians() -> None:
+def test_a_decision_among_rivals() -> None:
+    """Between two Gaussians; a guess; and among orthogonal templates of equal energy, whose squared distance is twice the energy."""
     for lam in (0.0, 1.0, 7.0, 40.0):
         assert best_of([lam]) == pytest.approx(float(ndtr(np.sqrt(lam) / 2)), abs=1e-6)
     assert best_of([]) == 1.0
     assert best_of([0.0] * 9) == pytest.approx(0.1)  # a guess among ten
-
-
-def test_several_rivals_are_a_choice_among_orthogonal_templates() -> None:
-    """Templates of equal energy without overlap: the squared distance between two of them is twice the energy."""
     rng = np.random.default_rng(4)
     energy, rivals = 3.0, 5
     scores = rng.standard_normal((200_000, rivals + 1))
@@ -96,7 +93,5 @@ def test_an_effect_that_adapts_to_the_data_pays_for_it() -> None:
     assert known(left, ["a"], ["a"], in_library=True).rival == pytest.approx(17.0)
     # The truth pays too: without an effect, nothing is to be paid.
     assert known(left, ["field"], ["field"], in_library=True).rival == 0.0
-
-
-def test_clean_data_are_called_clean_but_for_the_level_of_the_test() -> None:
+    # Clean data are called clean but for the level of the test.
     assert (CLEAN.noncentrality, CLEAN.rival, CLEAN.alone) == (0.0, None, 1 - LEVEL)

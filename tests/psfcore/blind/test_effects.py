@@ -60,21 +60,18 @@ def test_there_are_eighteen_known_effects_and_at_least_eight_unknown() -> None:
         effect_named("gremlins")
 
 
-@pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_an_effect_changes_images_unless_its_strength_is_0(
-    name: str, plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
+    plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
 ) -> None:
-    effect = EFFECTS[name].drawn(EFFECTS[name].nominal, plan, np.random.default_rng(8))
-    still, changed = Chain(effect_free, (effect.at(0.0),)), Chain(effect_free, (effect,))
-    for before, after in zip(clean, still.all_expected(), strict=True):
-        np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
-    for before, after in zip(
-        Chain(effect_free, ()).read_out(clean, 5), still.read_out(clean, 5), strict=True
-    ):
-        np.testing.assert_array_equal(after, before)
-    moved = changed.mean_rate(changed.all_expected(), 5)
-    assert max(np.abs(after / before - 1).max() for before, after in zip(clean, moved, strict=True)) > 1e-3
-    assert all(np.isfinite(image).all() for image in moved)
+    dn = Chain(effect_free, ()).read_out(clean, 5)
+    for name, kind in EFFECTS.items():
+        effect = kind.drawn(kind.nominal, plan, np.random.default_rng(8))
+        still, changed = Chain(effect_free, (effect.at(0.0),)), Chain(effect_free, (effect,))
+        np.testing.assert_allclose(still.all_expected(), clean, rtol=1e-6, atol=1e-6, err_msg=name)
+        np.testing.assert_array_equal(still.read_out(clean, 5), dn, err_msg=name)
+        moved = np.array(changed.mean_rate(changed.all_expected(), 5))
+        assert np.isfinite(moved).all(), name
+        assert np.abs(moved / np.array(clean) - 1).max() > 1e-3, name
 
 
 def test_equal_seeds_give_equal_effects_and_other_seeds_others(plan: Plan) -> None:
@@ -117,12 +114,17 @@ def test_the_known_psf_sums_to_1_and_its_orders_rotate() -> None:
     assert np.abs(GLASS.fine(turn_deg=5.0) - straight).sum() > 0.01
 
 
-@pytest.mark.parametrize("name", ["anisotropic_scatter", "one_sided_scatter", "core_blur", "focus_drift"])
-def test_effects_of_the_optics_conserve_light(name: str, plan: Plan, optics: FineOptics) -> None:
-    effect = EFFECTS[name].drawn(EFFECTS[name].nominal, plan, np.random.default_rng(2))
-    changed = effect.optics(optics, Moment(plan, len(plan.shots) - 1))
-    assert changed.scatter.sum() == pytest.approx(optics.scatter.sum(), abs=2e-3)
-    assert changed.diffraction.sum() == pytest.approx(1.0, abs=3e-3)
+def test_effects_of_the_optics_and_charge_that_repels_conserve_light(
+    plan: Plan, optics: FineOptics, clean: list[np.ndarray]
+) -> None:
+    for name in ("anisotropic_scatter", "one_sided_scatter", "core_blur", "focus_drift"):
+        effect = EFFECTS[name].drawn(EFFECTS[name].nominal, plan, np.random.default_rng(2))
+        changed = effect.optics(optics, Moment(plan, len(plan.shots) - 1))
+        assert changed.scatter.sum() == pytest.approx(optics.scatter.sum(), abs=2e-3), name
+        assert changed.diffraction.sum() == pytest.approx(1.0, abs=3e-3), name
+    spread = EFFECTS["brighter_fatter"](0.05).expected(clean[2], Moment(plan, 2))
+    assert spread.sum() == pytest.approx(clean[2].sum(), rel=1e-12)
+    assert spread.std() < clean[2].std()
 
 
 def test_scatter_that_depends_on_the_field_moves_light_between_pixels(plan: Plan, optics: FineOptics) -> None:
@@ -146,20 +148,21 @@ def test_a_moving_disc_uncovers_light_only_at_its_ends(
     assert ends.min() > 5 * np.abs(sides).max()
 
 
-def test_persistence_adds_a_decaying_share_of_earlier_images(plan: Plan) -> None:
-    effect = EFFECTS["persistence"](0.1)
-    dn, before = np.zeros((4, 4)), Earlier(np.full((4, 4), 100.0), plan.shots[0].time_s)
-    assert np.all(effect.read_out(dn, Moment(plan, 0), []) == 0)
-    left = effect.read_out(dn, Moment(plan, 1), [before])
-    wait = plan.shots[1].time_s - plan.shots[0].time_s
-    np.testing.assert_allclose(left, 10.0 * np.exp(-wait / 300.0))
-
-
-def test_a_gain_mismatch_changes_only_combined_images(plan: Plan) -> None:
-    effect, dn = EFFECTS["gain_mismatch"](0.1), np.full((4, 4), 50.0)
+def test_effects_of_the_readout_change_dn_as_defined(plan: Plan) -> None:
+    """Persistence decays, a gain mismatch changes combined images only, a nonlinearity reduces faint signals only."""
+    nothing, earlier = np.zeros((4, 4)), Earlier(np.full((4, 4), 100.0), plan.shots[0].time_s)
+    persistence = EFFECTS["persistence"](0.1)
+    assert np.all(persistence.read_out(nothing, Moment(plan, 0), []) == 0)
+    wait_s = plan.shots[1].time_s - plan.shots[0].time_s
+    left = persistence.read_out(nothing, Moment(plan, 1), [earlier])
+    np.testing.assert_allclose(left, 10.0 * np.exp(-wait_s / 300.0))
+    mismatch, dn = EFFECTS["gain_mismatch"](0.1), np.full((4, 4), 50.0)
     for index, shot in enumerate(plan.shots):
         factor = {COMBINED: 1.1, HIGH: 1.0}[shot.gain_mode]
-        np.testing.assert_allclose(effect.read_out(dn, Moment(plan, index), []), factor * dn)
+        np.testing.assert_allclose(mismatch.read_out(dn, Moment(plan, index), []), factor * dn)
+    faint = dataclasses.replace(EFFECTS["nonlinearity"](0.2), knee_dn=100.0)
+    dn = np.array([[5.0, 100.0, 1000.0]])
+    np.testing.assert_allclose(faint.read_out(dn, Moment(plan, 0), []), [[4.0, 100.0, 1000.0]])
 
 
 def test_saturation_loses_the_share_of_light_given_by_its_strength(
@@ -172,15 +175,3 @@ def test_saturation_loses_the_share_of_light_given_by_its_strength(
         [dn.ravel() for dn, shot in zip(exposures, plan.shots, strict=True) if shot.gain_mode == HIGH]
     )
     assert np.maximum(high - level, 0).sum() / high.sum() == pytest.approx(0.03, abs=0.002)
-
-
-def test_a_nonlinearity_reduces_only_faint_signals(plan: Plan) -> None:
-    effect = dataclasses.replace(EFFECTS["nonlinearity"](0.2), knee_dn=100.0)
-    dn = np.array([[5.0, 100.0, 1000.0]])
-    np.testing.assert_allclose(effect.read_out(dn, Moment(plan, 0), []), [[4.0, 100.0, 1000.0]])
-
-
-def test_charge_that_repels_is_kept(plan: Plan, clean: list[np.ndarray]) -> None:
-    out = EFFECTS["brighter_fatter"](0.05).expected(clean[2], Moment(plan, 2))
-    assert out.sum() == pytest.approx(clean[2].sum(), rel=1e-12)
-    assert out.std() < clean[2].std()

@@ -12,23 +12,34 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.blind.case_set import BlindSet, Plane, SetPlan, _end_cut_line, alone_in, make_set
+from psfcore.blind.case_set import BlindSet, Plane, SetPlan, alone_in, make_set
 from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE, Case, case_scenes, draw_case
 from psfcore.blind.effects.registry import EFFECTS, KNOWN
 from psfcore.blind.make_case import Made, make
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
+from psfcore.gap import ideal_observer
 from psfcore.transit.folder import read_transit
+from tests.psfcore.gap.small_transits import effect
 
 SIZE_PX, IMAGES = 128, 9
+LIMITS = FitsLimits(max_pixels=SIZE_PX**2)
+TWO = SetPlan(2, 3, SIZE_PX, IMAGES, only=("intensity_gradient", "saturation_fill"), built_diffraction=False)
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> BlindSet:
-    plan = SetPlan(
-        2, 3, SIZE_PX, IMAGES, only=("intensity_gradient", "saturation_fill"), built_diffraction=False
-    )
-    return make_set(tmp_path_factory.mktemp("blind") / "set", plan)[0]
+    return make_set(tmp_path_factory.mktemp("blind") / "set", TWO)[0]
+
+
+@pytest.fixture(scope="module")
+def clean_case() -> Case:
+    return draw_case(4, 0, SIZE_PX, IMAGES, clean_only=True, built_diffraction=False)
+
+
+@pytest.fixture(scope="module")
+def clean(clean_case: Case) -> Made:
+    return make(clean_case)
 
 
 def test_kinds_have_their_shares_and_effects_occur_in_turn() -> None:
@@ -38,6 +49,15 @@ def test_kinds_have_their_shares_and_effects_occur_in_turn() -> None:
     assert set(names) == set(KNOWN)
     assert max(names.values()) - min(names.values()) <= 1
     assert all(len({effect.name for effect in case.effects}) == 2 for case in cases if case.kind == PAIR)
+    # A case is the same for its seed and number.
+    assert draw_case(1, 5, SIZE_PX, IMAGES) == cases[5] != draw_case(2, 5, SIZE_PX, IMAGES)
+    with pytest.raises(DataError, match="unknown-effect"):
+        draw_case(1, 0, SIZE_PX, IMAGES, only=("gremlins",))
+    # Each target is used in turn for every effect.
+    only, left_pct = ("ghost", "wide_halo"), (2.0, 4.0, 8.0)
+    cases = [draw_case(1, n, SIZE_PX, IMAGES, only=only, left_pct=left_pct) for n in range(7)]
+    targets = [(case.effects[0].name, *case.target_pct) for case in cases]
+    assert targets == [(name, pct) for pct in (*left_pct, 2.0) for name in only][:7]
 
 
 def test_strong_effects_occur_alone_in_pairs_and_beside_a_changing_sun() -> None:
@@ -66,34 +86,11 @@ def test_the_sun_beside_a_strong_effect_keeps_the_strength_that_was_drawn() -> N
     assert truth["target_pct"][1] is None
 
 
-def test_a_set_of_an_earlier_draw_is_not_continued(tmp_path: Path) -> None:
-    plan = SetPlan(1, 3, SIZE_PX, IMAGES)
-    older = dataclasses.asdict(plan) | {"scenes": []}  # written before sets stated their draw
-    (tmp_path / "set.json").write_text(json.dumps(older))
-    with pytest.raises(DataError, match="other-set"):
-        make_set(tmp_path, plan)
-
-
-def test_a_case_is_the_same_for_its_seed_and_number() -> None:
-    assert draw_case(1, 5, SIZE_PX, IMAGES) == draw_case(1, 5, SIZE_PX, IMAGES)
-    assert draw_case(1, 5, SIZE_PX, IMAGES) != draw_case(2, 5, SIZE_PX, IMAGES)
-    with pytest.raises(DataError, match="unknown-effect"):
-        draw_case(1, 0, SIZE_PX, IMAGES, only=("gremlins",))
-
-
-def test_each_target_is_used_in_turn_for_every_effect() -> None:
-    names, left_pct = ("ghost", "wide_halo"), (2.0, 4.0, 8.0)
-    cases = [draw_case(1, n, SIZE_PX, IMAGES, only=names, left_pct=left_pct) for n in range(7)]
-    found = [(case.effects[0].name, *case.target_pct) for case in cases]
-    assert found == [(name, pct) for pct in (*left_pct, 2.0) for name in names][:7]
-
-
 def test_the_transit_of_a_case_can_be_read(made: BlindSet) -> None:
-    transit = read_transit(made.transit(0), FitsLimits(max_pixels=SIZE_PX**2))
+    transit = read_transit(made.transit(0), LIMITS)
     assert (len(transit.frames), transit.shape) == (IMAGES, (SIZE_PX, SIZE_PX))
-    truth = made.truth(0)
     places = np.array([[frame.place.x_px, frame.place.y_px] for frame in transit.frames])
-    exact = np.array([[at["x"], at["y"]] for at in truth["exact"]])
+    exact = np.array([[at["x"], at["y"]] for at in made.truth(0)["exact"]])
     assert 0.05 < np.abs(places - exact).max() < 3
     for frame, at in zip(transit.frames, exact, strict=True):
         row, column = np.rint(at[::-1]).astype(int)
@@ -107,8 +104,7 @@ def test_saturated_images_give_their_level_in_the_header(made: BlindSet) -> None
         with fits.open(file) as hdus:
             pixels, header = hdus[0].data, hdus[0].header
         if header["GAINCOMB"] == "high-only":
-            assert header["SATURATE"] == level
-            assert pixels.max() <= level
+            assert header["SATURATE"] == level and pixels.max() <= level
             clipped += int((pixels == level).sum())
     assert clipped > 0
 
@@ -120,74 +116,73 @@ def test_the_transit_contains_nothing_of_the_truth(made: BlindSet) -> None:
         names = sorted(path.name for path in folder.iterdir())
         assert names == [f"{n:03d}.fits" for n in range(IMAGES)] + ["diffraction.fits", "transit.json"]
         told = (folder / "transit.json").read_text()
+        assert set(json.loads(told)["images"][0]) == {"file", "fov", "x", "y", "r"}
         for file in folder.glob("*.fits"):
             with fits.open(file) as hdus:
                 assert len(hdus) == 1
                 told += repr(hdus[0].header)
         assert [word for word in words if word in told.lower()] == []
-        assert set(json.loads((folder / "transit.json").read_text())["images"][0]) == {
-            "file",
-            "fov",
-            "x",
-            "y",
-            "r",
-        }
 
 
 def test_the_images_without_noise_are_kept_apart_from_the_transit(made: BlindSet) -> None:
-    limits = FitsLimits(max_pixels=SIZE_PX**2)
-    seen = read_transit(made.transit(0), limits)
+    seen = read_transit(made.transit(0), LIMITS)
     with_effects, without = (
-        read_transit(made.expected(0) / name, limits) for name in ("with_effects", "without_effects")
+        read_transit(made.expected(0) / name, LIMITS) for name in ("with_effects", "without_effects")
     )
     assert with_effects.noise == seen.noise
     noisy, mean, clean = (np.array([f.pixels for f in t.frames]) for t in (seen, with_effects, without))
-    exposure = np.array([frame.exposure_s for frame in seen.frames])[:, None, None]
-    variance = np.array(
-        [seen.noise.variance(m, t) for m, t in zip(mean.astype(float), exposure.ravel(), strict=True)]
-    )
-    rounded = 1 / 12 / exposure**2  # the transit is in whole DN
-    chi2 = float(np.mean((noisy - mean) ** 2 / (variance + rounded)))
+    exposure_s = [frame.exposure_s for frame in seen.frames]
+    variance = [seen.noise.variance(m, t) for m, t in zip(mean.astype(float), exposure_s, strict=True)]
+    rounded = 1 / 12 / np.array(exposure_s)[:, None, None] ** 2  # the transit is in whole DN
+    chi2 = float(np.mean((noisy - mean) ** 2 / (np.array(variance) + rounded)))
     assert chi2 == pytest.approx(1.0, abs=0.02)
     change = mean - clean  # a plane, the same in all images
     np.testing.assert_allclose(change, np.broadcast_to(change[0], change.shape), atol=2e-3)
     assert np.abs(change).max() > 0.01
 
 
-def test_the_truth_contains_what_an_effect_leaves(made: BlindSet) -> None:
+def test_the_truth_contains_what_an_effect_leaves_and_a_clean_case_has_none(
+    made: BlindSet, clean: Made
+) -> None:
     truth = made.truth(0)
+    (target_pct,) = truth["target_pct"]
     assert truth["effects"][0]["name"] == "intensity_gradient"
-    assert truth["left_after_refit_pct"] == pytest.approx(truth["target_pct"][0], rel=0.6)
-    assert truth["effects"][0]["left_alone_pct"] == pytest.approx(truth["target_pct"][0], rel=0.45)
+    assert truth["left_after_refit_pct"] == pytest.approx(target_pct, rel=0.6)
+    assert truth["effects"][0]["left_alone_pct"] == pytest.approx(target_pct, rel=0.45)
     assert 0 < truth["clean_left_pct"] < 0.8
     assert len(truth["refitted"]["residual_pct"]) == IMAGES
+    assert (clean.truth["effects"], clean.truth["left_after_refit_pct"]) == ([], 0.0)
+    assert clean.truth["clean_left_pct"] < 0.8
+    assert clean.expected == {}, "an ideal observer of clean data needs no images"
+    assert all(np.array_equal(dn, np.rint(dn)) for dn in clean.exposures)
 
 
-def test_a_clean_case_has_no_effect() -> None:
-    case = draw_case(4, 0, SIZE_PX, IMAGES, clean_only=True, built_diffraction=False)
-    result = make(case)
-    assert result.truth["effects"] == []
-    assert result.truth["left_after_refit_pct"] == 0.0
-    assert result.truth["clean_left_pct"] < 0.8
-    assert result.expected == {}, "an ideal observer of clean data needs no images"
-    assert all(np.array_equal(dn, np.rint(dn)) for dn in result.exposures)
+def test_the_ideal_observer_measures_what_the_maker_of_a_case_measured(
+    made: BlindSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With few effects, which is quicker. Bad arguments and folders are said."""
+    monkeypatch.setattr(ideal_observer, "LIBRARY", [effect("intensity_gradient"), effect("dark_offset")])
+    file = tmp_path / "ideal.json"
+    assert ideal_observer.main([str(tmp_path)]) == 2
+    assert "expected two arguments" in capsys.readouterr().err
+    assert ideal_observer.main([str(tmp_path), str(file)]) == 1
+    assert "no-manifest" in capsys.readouterr().err and not file.exists()
+    assert ideal_observer.main([str(made.expected(0)), str(file)]) == 0
+    ideal = json.loads(file.read_text())
+    assert ideal["left_after_refit_pct"] == pytest.approx(made.truth(0)["left_after_refit_pct"], rel=0.15)
+    left = {tuple(one["effects"]): one["chi2"] for one in ideal["hypotheses"]}
+    assert left[()] == ideal["noncentrality"] > 1
+    assert left[("intensity_gradient",)] < 0.2 * left[()]
 
 
-def test_scenes_can_be_taken_from_images() -> None:
-    case = draw_case(4, 0, SIZE_PX, IMAGES, clean_only=True, built_diffraction=False)
-    rng = np.random.default_rng(1)
-    image = 100 + 20 * rng.standard_normal((300, 300))
+def test_scenes_can_be_taken_from_images(clean_case: Case) -> None:
+    image = 100 + 20 * np.random.default_rng(1).standard_normal((300, 300))
     image[5, 5] = np.nan
-    scenes = case_scenes(case, [image])
+    scenes = case_scenes(clean_case, [image])
     assert all(scene.shape == (2 * SIZE_PX, 2 * SIZE_PX) and scene.min() >= 0 for scene in scenes.values())
     np.testing.assert_array_equal(scenes[1][:, ::-1], scenes[3])
     with pytest.raises(DataError, match="bad-scene"):
-        case_scenes(case, [np.zeros((300, 300))])
-
-
-def test_a_folder_of_another_set_is_refused(made: BlindSet) -> None:
-    with pytest.raises(DataError, match="other-set"):
-        make_set(made.folder, SetPlan(2, 4, SIZE_PX, IMAGES))
+        case_scenes(clean_case, [np.zeros((300, 300))])
 
 
 def test_seals_catch_a_changed_truth(made: BlindSet, tmp_path: Path) -> None:
@@ -199,57 +194,44 @@ def test_seals_catch_a_changed_truth(made: BlindSet, tmp_path: Path) -> None:
     assert copy.truth(0) == made.truth(0)
     kept["truth"]["effects"][0]["name"] = "dark_offset"
     copy.truth_file(0).write_text(json.dumps(kept))
-    with pytest.raises(DataError, match="broken-seal"):
-        copy.truth(0)
-    with pytest.raises(DataError, match="broken-seal"):
-        copy.truth(1)  # none there
+    for number in (0, 1):  # of case 1 there is none
+        with pytest.raises(DataError, match="broken-seal"):
+            copy.truth(number)
     copy.seals_file.write_text(made.seals_file.read_text() + '{"case": 0, "sha256": "00"}\n')
     with pytest.raises(DataError, match="bad-seals"):
         copy.seals()
 
 
-def test_an_incomplete_last_seal_is_ignored_and_removed(tmp_path: Path) -> None:
-    made = BlindSet(tmp_path)
-    whole = json.dumps({"case": 0, "sha256": "ab"}) + "\n"
-    for cut in ("", '{"case": 1, "sha', '{"case": 1, "sha256": "cd"}'):
-        made.seals_file.write_text(whole + cut)
-        assert made.seals() == {0: "ab"}
-        _end_cut_line(made.seals_file)
-        assert made.seals_file.read_text() == whole
-    made.seals_file.write_text('{"case"')
-    _end_cut_line(made.seals_file)
-    assert made.seals_file.read_text() == ""
-
-
-def test_only_one_run_at_a_time_uses_a_set(tmp_path: Path) -> None:
-    with (
-        alone_in(tmp_path / "set"),
-        pytest.raises(DataError, match="set-in-use: expected a folder that no other run uses"),
-        alone_in(tmp_path / "set"),
-    ):
-        pass
-    with alone_in(tmp_path / "set"):
-        pass
-
-
-def test_made_cases_are_not_made_again(made: BlindSet) -> None:
+def test_a_set_is_continued_only_with_its_own_plan_and_by_one_run(made: BlindSet, tmp_path: Path) -> None:
     before = made.truth_file(0).read_bytes(), made.seals_file.read_bytes()
-    plan = SetPlan(
-        2, 3, SIZE_PX, IMAGES, only=("intensity_gradient", "saturation_fill"), built_diffraction=False
-    )
-    make_set(made.folder, plan)
+    make_set(made.folder, TWO)
     assert (made.truth_file(0).read_bytes(), made.seals_file.read_bytes()) == before
+    older = dataclasses.asdict(TWO) | {"scenes": []}  # written before sets stated their draw
+    (tmp_path / "older").mkdir()
+    (tmp_path / "older" / "set.json").write_text(json.dumps(older))
+    other_seed = SetPlan(2, 4, SIZE_PX, IMAGES)
+    for folder, plan in ((tmp_path / "older", TWO), (made.folder, other_seed)):
+        with pytest.raises(DataError, match="other-set"):
+            make_set(folder, plan)
+    for _ in range(2):  # free again after the first run
+        with (
+            alone_in(tmp_path / "set"),
+            pytest.raises(DataError, match="set-in-use"),
+            alone_in(tmp_path / "set"),
+        ):
+            pass
 
 
 def test_a_case_that_fails_is_named_and_the_others_are_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clean: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = SetPlan(3, 3, SIZE_PX, IMAGES, clean_only=True, built_diffraction=False)
+    failing = {1}
 
     def make_but_one(case: Case, scenes: Sequence[Plane]) -> Made:
-        if case.number == 1:
+        if case.number in failing:
             raise DataError("bad-scene", "expected light in the scene")
-        return make(case, scenes)
+        return clean
 
     monkeypatch.setattr("psfcore.blind.case_set.make", make_but_one)
     said: list[str] = []
@@ -257,6 +239,14 @@ def test_a_case_that_fails_is_named_and_the_others_are_made(
     assert not_made == {1: "bad-scene: expected light in the scene"}
     assert [made.is_made(number) for number in plan.numbers] == [True, False, True]
     assert sum("could not make case 0001" in line for line in said) == 1
-    monkeypatch.undo()
-    assert make_set(tmp_path, plan)[1] == {}, "the next run tries again"
-    assert made.is_made(1)
+    failing.clear()
+    # The next run tries again. A last seal that a power failure cut is ignored and removed.
+    whole = made.seals_file.read_text()
+    for cut in ('{"case": 1, "sha', '{"case": 1, "sha256": "cd"}'):
+        made.seals_file.write_text(whole + cut)
+        assert set(made.seals()) == {0, 2}
+    assert make_set(tmp_path, plan)[1] == {} and made.is_made(1)
+    assert made.seals_file.read_text().startswith(whole) and set(made.seals()) == {0, 1, 2}
+    made.seals_file.write_text('{"case"')
+    make_set(tmp_path, plan)
+    assert set(made.seals()) == {0, 1, 2}

@@ -41,8 +41,21 @@ def blind(tmp_path: Path) -> BlindSet:
     return made
 
 
+IDEAL = """
+import json, pathlib, sys
+expected, ideal, log = map(pathlib.Path, sys.argv[1:4])
+with open(log, "a") as lines:
+    lines.write(f"ideal of {expected.parent.name}\\n")
+ideal.write_text(json.dumps({"schema": "gap-ideal/1", "found": sorted(p.name for p in expected.iterdir())}))
+"""
+
+
 def command(log: Path, code: str = DIAGNOSIS) -> list[str]:
     return [sys.executable, "-c", code, "{transit}", "{report}", str(log)]
+
+
+def ideal(log: Path, code: str = IDEAL) -> list[str]:
+    return [sys.executable, "-c", code, "{expected}", "{ideal}", str(log)]
 
 
 def test_a_diagnosis_sees_only_a_copy_of_the_transit(blind: BlindSet, tmp_path: Path) -> None:
@@ -85,19 +98,6 @@ def test_failures_are_kept_apart_and_tried_again(blind: BlindSet, tmp_path: Path
     assert ([case.number for case in judged], list(failures)) == ([0], [1])
 
 
-IDEAL = """
-import json, pathlib, sys
-expected, ideal, log = map(pathlib.Path, sys.argv[1:4])
-with open(log, "a") as lines:
-    lines.write(f"ideal of {expected.parent.name}\\n")
-ideal.write_text(json.dumps({"schema": "gap-ideal/1", "found": sorted(p.name for p in expected.iterdir())}))
-"""
-
-
-def ideal(log: Path, code: str = IDEAL) -> list[str]:
-    return [sys.executable, "-c", code, "{expected}", "{ideal}", str(log)]
-
-
 def test_the_ideal_observer_sees_the_images_without_noise_once(blind: BlindSet, tmp_path: Path) -> None:
     log = tmp_path / "log"
     (blind.expected(1) / "with_effects").mkdir()
@@ -109,12 +109,9 @@ def test_the_ideal_observer_sees_the_images_without_noise_once(blind: BlindSet, 
     assert log.read_text().splitlines() == ["case 1", "ideal of 0001"]
     judged, _ = judged_cases(blind, [1])
     assert judged[0].ideal == ideal_of(blind, 1)
-
-
-def test_an_ideal_observer_that_fails_is_tried_again_without_a_new_diagnosis(
-    blind: BlindSet, tmp_path: Path
-) -> None:
-    log, said = tmp_path / "log", list[str]()
+    # An ideal observer that fails is tried again without a new diagnosis.
+    log.write_text("")
+    said: list[str] = []
     run_set(blind, [0], command(log), ideal=ideal(log, "import sys; sys.exit('dark')"), progress=said.append)
     assert said[-1] == "case 0000 has no ideal observer: dark"
     assert ideal_of(blind, 0) is None
@@ -125,14 +122,6 @@ def test_an_ideal_observer_that_fails_is_tried_again_without_a_new_diagnosis(
     assert log.read_text().splitlines() == ["case 0", "ideal of 0000"]
 
 
-def test_reports_with_a_set_are_accepted_and_others_refused(blind: BlindSet, tmp_path: Path) -> None:
-    log = tmp_path / "log"
-    run_set(blind, [0], command(log, DIAGNOSIS.replace("gap/1", "gap/2")))
-    assert report_of(blind, 0)["schema"] == "gap/2"
-    (other,) = run_set(blind, [1], command(log, DIAGNOSIS.replace("gap/1", "gap/9")))
-    assert "expected schema gap/1 or gap/2" in other.error
-
-
 def test_a_diagnosis_that_takes_too_long_is_killed(blind: BlindSet, tmp_path: Path) -> None:
     (late,) = run_set(blind, [0], command(tmp_path / "log", "import time; time.sleep(60)"), longest_s=0.5)
     assert late.failed
@@ -140,17 +129,21 @@ def test_a_diagnosis_that_takes_too_long_is_killed(blind: BlindSet, tmp_path: Pa
     assert late.wall_s < 20
 
 
-def test_bad_commands_and_unsealed_cases_are_refused(blind: BlindSet, tmp_path: Path) -> None:
+def test_other_reports_bad_commands_and_changed_or_missing_truths_are_refused(
+    blind: BlindSet, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    run_set(blind, [0], command(log, DIAGNOSIS.replace("gap/1", "gap/2")))
+    assert report_of(blind, 0)["schema"] == "gap/2"
+    (other,) = run_set(blind, [1], command(log, DIAGNOSIS.replace("gap/1", "gap/9")))
+    assert "expected schema gap/1 or gap/2" in other.error
     with pytest.raises(DataError, match="bad-command"):
         run_set(blind, [0], ["heliopsf", "gap", "{transit}"])
     with pytest.raises(DataError, match="bad-command"):
-        run_set(blind, [0], command(tmp_path / "log"), ideal=["observe", "{expected}"])
+        run_set(blind, [0], command(log), ideal=["observe", "{expected}"])
     with pytest.raises(DataError, match="not-sealed"):
-        run_set(blind, [7], command(tmp_path / "log"))
-
-
-def test_a_truth_changed_after_its_diagnosis_is_not_scored(blind: BlindSet, tmp_path: Path) -> None:
-    run_set(blind, [0], command(tmp_path / "log"))
+        run_set(blind, [7], command(log))
+    # A truth that was changed after its diagnosis is not scored.
     kept = json.loads(blind.truth_file(0).read_text())
     kept["truth"]["kind"] = "single"
     blind.truth_file(0).write_text(json.dumps(kept))

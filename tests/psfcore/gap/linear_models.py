@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
+from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.library.detector import EFFECTS
 
 FEW = tuple(effect for effect in EFFECTS if effect.name in ("dark_offset", "column_smear"))
+
+
+def discs_only(evidence: Evidence) -> Evidence:
+    """The evidence without the unocculted field."""
+    nothing = np.zeros(len(evidence.image_info), dtype=bool)
+    return replace(evidence, unocculted=replace(evidence.unocculted, part=nothing))
+
+
+def with_left(model: LinearModel, residual: Callable[[DiscCells], np.ndarray]) -> LinearModel:
+    """The model whose discs have these residuals, DN/s."""
+    discs = tuple(replace(disc, residual=residual(disc)) for disc in model.evidence.discs)
+    return replace(model, evidence=replace(model.evidence, discs=discs))
 
 
 def with_residuals(evidence: Evidence, values: dict[str, float], noise: float = 0.0) -> LinearModel:
@@ -19,39 +34,37 @@ def with_residuals(evidence: Evidence, values: dict[str, float], noise: float = 
     theta = np.zeros(evidence.size)
     for name, value in values.items():
         theta[evidence.columns[name][0]] = value
-    discs = tuple(
-        replace(
-            disc,
-            residual=disc.jacobian.T @ theta
-            + noise
-            * rng.multivariate_normal(np.zeros(disc.expected.size), disc.covariance, check_valid="ignore"),
-        )
-        for disc in evidence.discs
-    )
-    unocculted = replace(evidence.unocculted, part=np.zeros(len(evidence.image_info), dtype=bool))
-    return LinearModel(replace(evidence, discs=discs, unocculted=unocculted), FLOOR)
+
+    def residual(disc: DiscCells) -> np.ndarray:
+        return np.asarray(disc.jacobian.T @ theta + noise * noise_of(disc, rng))
+
+    return with_left(LinearModel(discs_only(evidence), FLOOR), residual)
 
 
-def about_fit_with(name: str, model: LinearModel, *, left: float) -> LinearModel:
-    """The model of a full refit with an effect: this fraction of the residuals is left, and the effect changes them no more."""
-    evidence = model.evidence
-    first = len(evidence.base)
-    here = [*evidence.base, *evidence.columns[name]]
-    discs = tuple(
-        replace(
-            disc,
-            residual=disc.residual * left,
-            jacobian=disc.jacobian[here] * (np.arange(len(here)) < first)[:, None],
-        )
-        for disc in evidence.discs
-    )
-    unocculted = replace(evidence.unocculted, errors=evidence.unocculted.errors[here])
-    effects = tuple(effect for effect in evidence.effects if effect.name == name)
-    columns = {name: tuple(range(first, len(here)))}
-    return replace(
-        model,
-        evidence=replace(evidence, discs=discs, unocculted=unocculted, effects=effects, columns=columns),
-    )
+def noise_of(disc: DiscCells, rng: np.random.Generator) -> np.ndarray:
+    """Noise of the cells of a disc, DN/s."""
+    return rng.multivariate_normal(0 * disc.expected, disc.covariance, check_valid="ignore")
+
+
+def effect_of(evidence: Evidence, name: str) -> Effect:
+    return next(effect for effect in evidence.effects if effect.name == name)
+
+
+def sigma_of(evidence: Evidence, name: str) -> float:
+    """The error of the first parameter of an effect."""
+    plain = with_residuals(evidence, {})
+    return float(np.sqrt(plain.fit([evidence.columns[name][0]]).covariance[-1, -1]))
+
+
+def dense(model: LinearModel) -> tuple[np.ndarray, np.ndarray]:
+    """The Jacobian (cells, columns) and the residuals (cells,) of all discs in units of their noise, computed without the model."""
+    jacobians, residuals = [], []
+    for disc in model.evidence.discs:
+        covariance = disc.covariance + model.floor**2 * np.outer(disc.expected, disc.expected)
+        white = np.linalg.inv(np.linalg.cholesky(covariance))
+        jacobians.append(white @ disc.jacobian.T)
+        residuals.append(white @ disc.residual)
+    return np.concatenate(jacobians), np.concatenate(residuals)
 
 
 def drawn(model: LinearModel, values: dict[tuple[str, int], float], seed: int) -> LinearModel:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from unittest.mock import patch
@@ -13,7 +14,7 @@ from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict import where
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
-from psfcore.transit.transit import Transit
+from psfcore.transit.transit import Frame, Transit
 from tests.transit_files import TRUTH, diffraction
 
 OFFSET_DN = 6.0
@@ -33,14 +34,19 @@ def clean() -> Transit:
     return simulate(plan, TRUTH, diffraction(), seed=8).transit
 
 
+def changed(transit: Transit, change: Callable[[int, Frame], np.ndarray]) -> Transit:
+    """The transit with every image changed."""
+    frames = tuple(
+        replace(frame, pixels=change(n, frame).astype(np.float32)) for n, frame in enumerate(transit.frames)
+    )
+    return replace(transit, frames=frames)
+
+
 @cache
 def with_offset() -> Transit:
     """The same images with OFFSET_DN added to every readout."""
-    frames = tuple(
-        replace(frame, pixels=(frame.pixels + OFFSET_DN / frame.exposure_s).astype(np.float32))
-        for frame in clean().frames
-    )
-    return replace(clean(), frames=frames, sha256={"000.fits": "ab" * 32, "transit.json": "cd" * 32})
+    transit = changed(clean(), lambda n, frame: frame.pixels + OFFSET_DN / frame.exposure_s)
+    return replace(transit, sha256={"000.fits": "ab" * 32, "transit.json": "cd" * 32})
 
 
 @cache

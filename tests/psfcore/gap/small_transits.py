@@ -1,10 +1,12 @@
-"""A small clean transit, its solution, and effects by name, for several tests."""
+"""A small clean transit, its solution and view, and effects by name, for several tests."""
 
 from __future__ import annotations
 
 from functools import cache
 
+from psfcore.gap.effect import Effect
 from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.view import View
 from psfcore.scatter.inversion import Solution, invert
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
@@ -23,5 +25,10 @@ def solution() -> Solution:
     return invert(clean())
 
 
-def effect(name: str):  # type: ignore[no-untyped-def]
+@cache
+def view() -> View:
+    return View(solution())
+
+
+def effect(name: str) -> Effect:
     return next(one for one in LIBRARY if one.name == name)

@@ -8,20 +8,21 @@ from functools import cache
 import numpy as np
 import pytest
 
+from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.ideal import IdealObserver, Left, ideal_observer, left_by_hypotheses
 from psfcore.gap.evidence.linear_model import UNLIKELY
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Transit
-from tests.psfcore.gap.linear_models import FEW, with_residuals
+from tests.psfcore.gap.linear_models import FEW, dense, effect_of, with_left, with_residuals
 from tests.transit_files import TRUTH, diffraction
 
 
 @cache
 def expected(offset_dn: float = 0.0) -> Transit:
     """A transit without noise, with an offset of every readout."""
-    made = simulate(default_plan(9, 128, oversampling=1, brightness=4.0), TRUTH, diffraction(), seed=5)
+    made = simulate(default_plan(9, 96, oversampling=1, brightness=4.0), TRUTH, diffraction(), seed=5)
     frames = tuple(
         replace(frame, pixels=(rate + offset_dn / frame.exposure_s).astype(np.float32))
         for frame, rate in zip(made.transit.frames, made.sky.noise_free, strict=True)
@@ -39,38 +40,34 @@ def left_of(found: tuple[Left, ...], *names: str) -> Left:
 
 
 def test_the_true_effect_leaves_nothing_and_its_rival_much() -> None:
-    found = observed(1.0)
-    assert found.noncentrality > 10
-    assert left_of(found.left, "dark_offset").chi2 < 0.02 * found.noncentrality
-    assert left_of(found.left, "column_smear").chi2 > 0.1 * found.noncentrality
-    assert left_of(found.left, "dark_offset", "column_smear").chi2 <= left_of(found.left, "dark_offset").chi2
-
-
-def test_the_noncentrality_grows_with_the_square_of_the_strength() -> None:
-    once, twice = observed(1.0), observed(2.0)
+    once, twice, nothing = observed(2.0), observed(4.0), observed(0.0)
+    assert once.noncentrality > 10
+    assert left_of(once.left, "dark_offset").chi2 < 0.02 * once.noncentrality
+    assert left_of(once.left, "column_smear").chi2 > 0.1 * once.noncentrality
+    assert left_of(once.left, "dark_offset", "column_smear").chi2 <= left_of(once.left, "dark_offset").chi2
+    # The noncentrality grows with the square of the strength.
     assert twice.noncentrality == pytest.approx(4 * once.noncentrality, rel=0.15)
     assert twice.left_after_refit_pct == pytest.approx(2 * once.left_after_refit_pct, rel=0.15)
-
-
-def test_without_an_effect_nothing_is_left_and_the_sampling_leaves_little() -> None:
-    found = observed(0.0)
-    assert found.noncentrality == pytest.approx(0.0, abs=1e-3)
-    assert found.left_after_refit_pct == pytest.approx(0.0, abs=1e-3)
-    assert found.sampling_chi2 < 1
+    # Without an effect nothing is left, and the sampling leaves little.
+    assert (nothing.noncentrality, nothing.left_after_refit_pct) == pytest.approx((0.0, 0.0), abs=1e-3)
+    assert nothing.sampling_chi2 < 1
+    # The report holds every hypothesis once.
+    told = once.to_json()
+    assert told["schema"] == "gap-ideal/1"
+    assert told["noncentrality"] == told["hypotheses"][0]["chi2"]
+    names = [tuple(one["effects"]) for one in told["hypotheses"]]
+    assert len(set(names)) == len(names) == 4
 
 
 def test_every_hypothesis_leaves_what_dense_least_squares_leave(evidence: Evidence) -> None:
     model = with_residuals(evidence, {"dark_offset": 0.3}, noise=1.0)
-    white = np.concatenate([disc.residual for disc in model.discs])
-    jacobian = np.concatenate([disc.jacobian.T for disc in model.discs])
-    likely = {e.name: e.parameters[0].likely for e in evidence.effects}
-    for names in ((), ("dark_offset",)):
-        here = [*evidence.base, *(evidence.columns[name][0] for name in names)]
-        prior = np.zeros((len(names), len(here)))
-        for k, name in enumerate(names):
-            prior[k, len(evidence.base) + k] = 1 / (UNLIKELY * likely[name])
-        design = np.vstack([jacobian[:, here], prior])
-        data = np.concatenate([white, np.zeros(len(names))])
+    jacobian, residual = dense(model)
+    base, (column,) = list(evidence.base), evidence.columns["dark_offset"]
+    prior = np.zeros((1, len(base) + 1))
+    prior[0, -1] = 1 / (UNLIKELY * effect_of(evidence, "dark_offset").parameters[0].likely)
+    designs = {(): jacobian[:, base], ("dark_offset",): np.vstack([jacobian[:, [*base, column]], prior])}
+    for names, design in designs.items():
+        data = np.append(residual, np.zeros(len(names)))
         rest = data - design @ np.linalg.lstsq(design, data, rcond=None)[0]
         assert left_of(left_by_hypotheses(model), *names).chi2 == pytest.approx(float(rest @ rest), rel=1e-6)
 
@@ -81,17 +78,14 @@ def test_what_a_rival_leaves_is_what_noisy_data_hold_against_it(evidence: Eviden
     lam = left_of(left_by_hypotheses(exact)).chi2
     assert 10 < lam < 100
     rng = np.random.default_rng(6)
+    white = {disc.index: disc.white for disc in exact.discs}
+
+    def noisy(disc: DiscCells) -> np.ndarray:
+        return disc.residual + np.linalg.solve(white[disc.index], rng.standard_normal(disc.residual.size))
+
     falls = []
     for _ in range(300):
-        discs = tuple(
-            replace(
-                disc,
-                residual=disc.residual + np.linalg.solve(seen.white, rng.standard_normal(seen.residual.size)),
-            )
-            for disc, seen in zip(exact.evidence.discs, exact.discs, strict=True)
-        )
-        noisy = replace(exact, evidence=replace(exact.evidence, discs=discs))
-        left = left_by_hypotheses(noisy)
+        left = left_by_hypotheses(with_left(exact, noisy))
         falls.append(left_of(left).chi2 - left_of(left, "dark_offset").chi2)
     error = 2 * np.sqrt(lam / len(falls))
     # One parameter gains 1 from noise alone.
@@ -102,15 +96,7 @@ def test_what_a_rival_leaves_is_what_noisy_data_hold_against_it(evidence: Eviden
 def test_a_negative_share_of_light_is_no_rival(evidence: Evidence) -> None:
     smear = evidence.columns["column_smear"]
     model = with_residuals(evidence, {"column_smear": -0.01})
-    found = left_by_hypotheses(model)
-    assert left_of(found).chi2 > 1
+    left = left_by_hypotheses(model)
+    assert left_of(left).chi2 > 1
     assert model.fit(smear).values[-len(smear)] < 0
-    assert left_of(found, "column_smear").chi2 > 0.5 * left_of(found).chi2
-
-
-def test_the_report_holds_every_hypothesis_once() -> None:
-    told = observed(1.0).to_json()
-    assert told["schema"] == "gap-ideal/1"
-    assert told["noncentrality"] == told["hypotheses"][0]["chi2"]
-    names = [tuple(one["effects"]) for one in told["hypotheses"]]
-    assert len(set(names)) == len(names) == 4
+    assert left_of(left, "column_smear").chi2 > 0.5 * left_of(left).chi2

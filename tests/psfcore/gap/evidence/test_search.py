@@ -1,40 +1,25 @@
-"""Searches before a fit: changes of the PSF, rotated meshes, blurs, halos, copies, and a changing Sun."""
+"""Searches before a fit: changes of the PSF, rotated meshes, blurs, halos, copies, and a changing Sun; patches around the discs."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, rotate
 
-from psfcore.gap.evidence.cells import sensitivities
+from psfcore.convolution.convolver import correlations
+from psfcore.gap.evidence.cells import cells_of, sensitivities, whitening
 from psfcore.gap.evidence.effect_fits import fit_effects
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
-from psfcore.gap.evidence.search import (
-    STEP_PX,
-    PlaceSearch,
-    _along_copy,
-    coarse_kernel,
-    displaced,
-    distinguished,
-    place_search,
-)
-from psfcore.gap.library.optics import (
-    ANGLES_DEG,
-    BETWEEN_THEM,
-    BLURS,
-    DIRECTIONS,
-    HALOS,
-    Halo,
-    _amount,
-    _blurred,
-    _halo,
-    _turned,
-)
+from psfcore.gap.evidence.near_discs import NearDiscs, cut
+from psfcore.gap.evidence.search import along_copy, displaced, distinguished, place_search
+from psfcore.gap.library.optics import ANGLES_DEG, BETWEEN_THEM, BLURS, DIRECTIONS, HALOS, blur_as
 from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
 from psfcore.scatter.inversion import invert
@@ -43,90 +28,127 @@ from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.occulter import coverage
 from psfcore.transit.transit import Transit
-from tests.psfcore.gap.small_transits import clean, effect, solution
+from tests.psfcore.gap.small_transits import clean, effect, solution, view
 from tests.transit_files import TRUTH, diffraction
 
 Plane = NDArray[np.float64]
+LINE = ((1, -1),)
 
 
-def test_the_sum_over_displacements_predicts_the_effect_of_a_psf_change_on_the_discs() -> None:
-    view, rng = View(solution()), np.random.default_rng(1)
-    kernel = rng.normal(size=(31, 31))
-    search, blur = place_search(view), Blur(kernel, solution().transit.shape)
-    half = search._to_displacements.shape[1] // 2
-    window = search._to_displacements[:, half - 15 : half + 16, half - 15 : half + 16]
-    for k, n in enumerate(solution().part[:4]):
-        dark = solution().sky.dark[n]
-        (plane,) = sensitivities(solution().optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
-        moved = float(np.vdot(plane, view.blurred(n, blur)))
-        assert float(np.vdot(window[k], kernel)) == pytest.approx(moved, rel=2e-3, abs=1e-4)
-    assert place_search(view) is search
+def along_line(plane: np.ndarray) -> np.ndarray:
+    """The plane, blurred by 1.5 px along LINE: nine steps of a random walk, each of variance 1/4 px2."""
+    for _ in range(9):
+        forth, back = (np.roll(plane, (step, -step), (0, 1)) for step in (1, -1))
+        plane = (forth + 14 * plane + back) / 16
+    return plane
 
 
-@pytest.mark.parametrize("by", [(0, 0), (3, -4), (-31, 2), (29, 19), (-29, -19), (5, 25), (40, 1), (-7, 6)])
-def test_the_response_to_a_copy_equals_the_sum_over_the_displaced_plane(by: tuple[int, int]) -> None:
-    q, plane = np.random.default_rng(1).normal(size=(2, 20, 30))
-    assert _along_copy(q, plane, *by) == pytest.approx(float(np.vdot(q, displaced(plane, *by))), abs=1e-12)
-
-
-def test_a_blur_is_not_negative_and_has_its_nominal_width() -> None:
-    point = np.zeros((63, 63))
-    point[31, 31] = 1.0
-    y, x = np.indices(point.shape) - 31
-    for width, steps in BLURS:
-        seen = _blurred(point, width, steps)
-        assert seen.min() > -1e-12 and seen.sum() == pytest.approx(1.0)
-        # Along its own direction; an even one along any.
-        dy, dx = steps[0]
-        along = (y * dy + x * dx) / np.hypot(dy, dx)
-        assert float((seen * along**2).sum()) == pytest.approx(width**2, rel=1e-6)
-    assert {steps for _, steps in BLURS} == {*DIRECTIONS, *BETWEEN_THEM}
+def near_of(view: View, *images: int) -> NearDiscs:
+    """The patches around the discs of these images."""
+    near = NearDiscs(view)
+    for n in images:
+        near.add(n, view.solution.optics.field(view.occulted_scene(n)))
+    return near
 
 
 @cache
-def cross() -> Plane:
-    """A core with orders along a cross from 3 to 45 px, 127 px wide, sum 1."""
-    plane = np.zeros((127, 127))
-    for r in range(3, 46, 3):
-        plane[63, 63 + r] = plane[63, 63 - r] = plane[63 + r, 63] = plane[63 - r, 63] = 1 / r
-    plane *= 0.3 / plane.sum()
-    plane[63, 63] = 0.7
-    return plane
+def near() -> NearDiscs:
+    return near_of(view(), *solution().part)
+
+
+def response(n: int, change: Plane) -> float:
+    """The response of the mean of disc n to a change of the PSF, from its sensitivities in the whole field."""
+    dark = solution().sky.dark[n]
+    (plane,) = sensitivities(solution().optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
+    return float(np.vdot(plane, view().blurred(n, Blur(change, solution().transit.shape))))
+
+
+def gain_by_hand(change: Plane, with_cells: bool) -> float:
+    """Eq. (2) of `search` for a change of the PSF."""
+    frames = solution().inversion.frames
+    sigma = np.array([np.hypot(f.noise, FLOOR * f.expected) for f in frames])
+    means = np.array([response(n, change) for n in solution().part]) / sigma
+    residual = np.array([f.observed - f.expected for f in frames]) / sigma
+    absorbed = np.array([f.mean_jacobian for f in frames]) / sigma[:, None]
+    if with_cells:
+        means = np.append(means, near().of_kernel(change))
+        residual = np.append(residual, near().residual)
+        of_cells = np.array([near().of_kernel(slope) for slope in view().slope_kernels]).T
+        absorbed = np.vstack([absorbed, of_cells])
+    basis = np.linalg.qr(absorbed)[0]
+    left, seen = (one - basis @ (basis.T @ one) for one in (residual, means))
+    along = float(left @ seen)
+    return max(along, 0.0) ** 2 / float(seen @ seen)
+
+
+def test_the_gain_of_a_change_of_the_psf_is_that_of_the_whole_field() -> None:
+    search = place_search(view())
+    assert place_search(view()) is search
+    kernel = np.random.default_rng(1).normal(size=(31, 31))
+    for change in (kernel, -kernel):
+        assert search.kernels([change])[0] == pytest.approx(gain_by_hand(change, True), rel=0.02, abs=1e-3)
+    wide = HALOS[2](255)
+    for change in (wide, -wide):
+        assert search.wide_kernels([change])[0] == pytest.approx(
+            gain_by_hand(change, False), rel=0.1, abs=0.1
+        )
+    assert search.kernels([kernel, -kernel]).max() > 0.01
+
+
+def test_the_response_to_a_copy_equals_the_sum_over_the_displaced_plane() -> None:
+    q, plane = np.random.default_rng(1).normal(size=(2, 20, 30))
+    for by in [(0, 0), (3, -4), (-31, 2), (29, 19), (-29, -19), (5, 25), (40, 1), (-7, 6)]:
+        assert along_copy(q, plane, *by) == pytest.approx(float(np.vdot(q, displaced(plane, *by))), abs=1e-12)
+
+
+def test_a_blur_is_not_negative_and_has_its_nominal_width() -> None:
+    """The change by a blur, per unit of its variance, of a point that is seen with a PSF that is a point."""
+    point = np.zeros((63, 63))
+    point[31, 31] = 1.0
+    size = SimpleNamespace(transit=SimpleNamespace(shape=point.shape), threads=1)
+    sharp = SimpleNamespace(
+        kernel=point,
+        solution=size,
+        blurred=lambda n, blur, weight: blur.field(blur.convolve(blur.lanes(point))),
+    )
+    y, x = np.indices(point.shape) - 31
+    for width, steps in BLURS:
+        (change,) = blur_as(cast(View, sharp), width, steps)
+        seen = point + width**2 * change.change(0, [])
+        assert seen.min() > -1e-5 and seen.sum() == pytest.approx(1.0, abs=1e-5)
+        # Along its own direction; an even one along any.
+        dy, dx = steps[0]
+        along = (y * dy + x * dx) / np.hypot(dy, dx)
+        assert float((seen * along**2).sum()) == pytest.approx(width**2, rel=1e-3), (width, steps)
+    assert {steps for _, steps in BLURS} == {*DIRECTIONS, *BETWEEN_THEM}
 
 
 def test_a_turned_mesh_is_found_at_its_angle() -> None:
     """The rotation is larger than the width of the orders, so a derivative could not find it."""
+    cross = np.zeros((127, 127))  # a core with orders from 3 to 45 px
+    for r in range(3, 46, 3):
+        cross[63, 63 + r] = cross[63, 63 - r] = cross[63 + r, 63] = cross[63 - r, 63] = 1 / r
+    cross *= 0.3 / cross.sum()
+    cross[63, 63] = 0.7
+    turned = np.maximum(rotate(cross, 12.0, reshape=False, order=1), 0.0)
     plan = default_plan(12, 128, oversampling=1, brightness=8.0)
-    turned = np.maximum(rotate(cross(), 12.0, reshape=False, order=1), 0.0)
     transit = simulate(plan, TRUTH, turned / turned.sum(), seed=4).transit
-    view = View(invert(replace(transit, diffraction=cross())))
-    found = _amount(view, _turned, ANGLES_DEG)
-    assert found.best == pytest.approx(12.0, abs=2.0)
-    assert 1 <= found.distinguished <= 2 * len(ANGLES_DEG)
+    fit = invert(replace(transit, diffraction=cross))
+    mesh, seen = effect("mesh_rotation"), View(fit)
+    model = LinearModel(gather(fit, [mesh], view=seen), FLOOR)
+    angle_deg, sigma_deg, unit = fit_effects(model, [mesh]).values["angle"]
+    assert unit == "deg" and angle_deg == pytest.approx(12.0, abs=2.0) and sigma_deg < 2.0
+    assert mesh.distinguished is not None
+    assert 1 <= mesh.distinguished(seen) <= 2 * len(ANGLES_DEG)
 
 
-def test_the_coarse_sum_predicts_the_effect_of_a_wide_psf_change_on_the_discs() -> None:
-    view = View(solution())
-    search, blur = place_search(view), Blur(HALOS[2](255), solution().transit.shape)
-    coarse = coarse_kernel(HALOS[2](255), STEP_PX)
-    half, reach = search._to_far.shape[1] // 2, coarse.shape[0] // 2
-    least = min(half, reach)
-    window = search._to_far[:, half - least : half + least + 1, half - least : half + least + 1]
-    kernel = coarse[reach - least : reach + least + 1, reach - least : reach + least + 1]
-    for k, n in enumerate(solution().part[:4]):
-        dark = solution().sky.dark[n]
-        (plane,) = sensitivities(solution().optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
-        moved = float(np.vdot(plane, view.blurred(n, blur)))
-        assert float(np.vdot(window[k], kernel)) == pytest.approx(moved, rel=0.05)
-
-
-@pytest.mark.parametrize("halo", HALOS[:6])
-def test_a_halo_of_share_one_holds_all_light(halo: Halo) -> None:
-    kernel = halo(2047)
-    assert kernel.min() >= 0 and kernel.shape == (2047, 2047)
-    assert kernel[1023, 1023] == kernel.max()
-    beyond = 0.08  # one thirteenth of a Moffat of 80 px lies outside the plane
-    assert float(kernel.sum()) == pytest.approx(1.0, abs=beyond)
+def test_a_halo_of_share_one_holds_all_light() -> None:
+    for halo in HALOS[:4]:
+        kernel = halo(1023)
+        assert kernel.min() >= 0 and kernel.shape == (1023, 1023)
+        assert kernel[511, 511] == kernel.max()
+        # One thirteenth of a Moffat of 40 px lies outside the plane.
+        assert float(kernel.sum()) == pytest.approx(1.0, abs=0.08)
 
 
 def test_a_wide_halo_is_found_at_about_its_width() -> None:
@@ -136,17 +158,17 @@ def test_a_wide_halo_is_found_at_about_its_width() -> None:
     y, x = np.indices(kernel.shape) - 127
     wide = np.exp(-np.hypot(x, y) / 30.0)
     transit = simulate(plan, TRUTH, 0.8 * kernel + 0.2 * wide / wide.sum(), seed=4).transit
-    found = invert(replace(transit, diffraction=kernel))
-    view = View(found)
-    assert _halo(view).best in HALOS[2:6]
-    halo = effect("wide_halo")
+    fit = invert(replace(transit, diffraction=kernel))
+    seen, halo, size = View(fit), effect("wide_halo"), fit.total.size
+    gains = place_search(seen).wide_kernels([one(size) for one in HALOS])
+    assert 2 <= int(np.argmax(gains)) < 6
     assert halo.distinguished is not None and halo.held is not None
-    held = halo.held(view).distinguished
-    assert held is not None and held(View(solution())) == halo.distinguished(view), (
-        "of the search, not of the refit"
-    )
-    library = [effect("wide_halo"), effect("dark_offset")]
-    model = LinearModel(gather(found, library), FLOOR)
+    held = halo.held(seen).distinguished
+    assert held is not None
+    # Of the search, not of the refit.
+    assert held(view()) == halo.distinguished(seen) == pytest.approx(distinguished(gains))
+    library = [halo, effect("dark_offset")]
+    model = LinearModel(gather(fit, library, view=seen), FLOOR)
     share, sigma, _ = fit_effects(model, library[:1]).values["share"]
     assert share > 5 * sigma
 
@@ -166,38 +188,118 @@ def brightening(share: float) -> Transit:
     return replace(transit, frames=tuple(frames))
 
 
-@pytest.mark.parametrize(("share", "seen"), [(0.0, False), (1.0, True)])
-def test_a_changing_sun_shows_only_in_the_unocculted_field(share: float, seen: bool) -> None:
-    evidence = gather(invert(brightening(share)), [effect("scene_evolution")])
-    columns = evidence.columns["scene_evolution"]
-    assert all((disc.jacobian[list(columns)] == 0).all() for disc in evidence.discs)
-    model = LinearModel(evidence, FLOOR)
-    fit = fit_effects(model, evidence.effects)
-    # It pays for every number measured in the unocculted field, but for no more than that field has.
-    assert 10 < evidence.numbers_of(columns) < evidence.all_unocculted.freedom
-    assert (fit.p_value < 1e-6) == seen
-    # The change is linear in time, so the uneven part is left out.
-    assert set(fit.values) == ({"rms"} if seen else set())
+def test_a_changing_sun_shows_only_in_the_unocculted_field() -> None:
+    for share in (0.0, 1.0):
+        fit = solution() if share == 0 else invert(brightening(share))
+        evidence = gather(fit, [effect("scene_evolution")])
+        columns = evidence.columns["scene_evolution"]
+        assert all((disc.jacobian[list(columns)] == 0).all() for disc in evidence.discs)
+        seen = fit_effects(LinearModel(evidence, FLOOR), evidence.effects)
+        # It pays for every number measured in the unocculted field, but for no more than that field has.
+        assert 10 < evidence.numbers_of(columns) < evidence.all_unocculted.freedom
+        assert (seen.p_value < 1e-6) == (share > 0)
+        # The change is linear in time, so the uneven part is left out.
+        assert set(seen.values) == ({"rms"} if share > 0 else set())
 
 
-@pytest.mark.parametrize(
-    ("gains", "wanted"),
-    [([3.0, 3.0, 3.0], 1.0), ([80.0, 0.0, 0.0, 0.0], 4.0), ([80.0, 80.0, 0.0, 0.0], 2.0), ([7.0], 1.0)],
-)
-def test_templates_that_explain_the_data_equally_well_are_not_distinguished(
-    gains: list[float], wanted: float
-) -> None:
-    assert distinguished(np.array(gains)) == pytest.approx(wanted)
+def test_templates_that_explain_the_data_equally_well_are_not_distinguished() -> None:
+    assert distinguished(np.array([3.0, 3.0, 3.0])) == pytest.approx(1.0)
+    assert distinguished(np.array([80.0, 0.0, 0.0, 0.0])) == pytest.approx(4.0)
+    assert distinguished(np.array([80.0, 80.0, 0.0, 0.0])) == pytest.approx(2.0)
+    assert distinguished(np.array([7.0])) == pytest.approx(1.0)
 
 
-def test_a_copy_is_found_at_its_place() -> None:
-    dx, dy = 66, -30
-    transit = simulate(
-        default_plan(9, 160, oversampling=1, brightness=4.0), TRUTH, diffraction(), seed=5
-    ).transit
+def test_a_copy_is_found_at_its_place_with_its_blur() -> None:
+    dx, dy = 24, 16
     frames = tuple(
-        replace(f, pixels=f.pixels + 0.05 * displaced(gaussian_filter(f.pixels, 4.0), dx, dy))
-        for f in transit.frames
+        replace(f, pixels=f.pixels + 0.06 * displaced(gaussian_filter(f.pixels, 8.0), dx, dy))
+        for f in clean(12).frames
     )
-    blur, x, y = PlaceSearch(View(invert(replace(transit, frames=frames)))).copy
-    assert (x, y) == pytest.approx((dx, dy), abs=6) and blur in (2.0, 4.0, 8.0)
+    blur_px, x, y = place_search(View(invert(replace(clean(12), frames=frames)))).copy
+    assert (x, y) == pytest.approx((dx, dy), abs=4) and blur_px in (4.0, 8.0)
+
+
+def test_the_direction_of_a_directional_blur_is_found() -> None:
+    """The discs' means hardly show it, but their outermost cells do."""
+    frames = tuple(
+        replace(f, pixels=along_line(f.pixels.astype(np.float64)).astype(np.float32))
+        for f in clean(12).frames
+    )
+    seen = View(invert(replace(clean(12), frames=frames)))
+    (found,) = effect("core_blur").changes(seen)
+    first = found.change(0, seen.expected)
+    (same,) = [
+        (width, steps)
+        for width, steps in BLURS
+        if np.allclose(blur_as(seen, width, steps)[0].change(0, seen.expected), first)
+    ]
+    assert same[1] == LINE and same[0] <= 1.5
+
+
+# --- patches around the discs -----------------------------------------------------------------------------
+
+
+def by_whole_field(image: np.ndarray, n: int) -> np.ndarray:
+    """The response of the cells of disc n to an image, by sensitivities of the whole field, without the disc's brightness."""
+    place, dark = solution().sky.found[n].place, solution().sky.dark[n]
+    cells = cells_of(dark, place.x_px, place.y_px)
+    planes = sensitivities(solution().optics, dark, cells.weights)
+    frame = solution().transit.frames[n]
+    variance = solution().transit.noise.variance(frame.pixels.astype(np.float64), frame.exposure_s)
+    flat = planes.reshape(planes.shape[0], -1).astype(np.float64)
+    white = whitening((flat * variance.ravel()) @ flat.T)
+    level = white @ (cells.weights @ solution().residual(n)[1])
+    moved = white @ (flat @ image.ravel())
+    return np.asarray(moved - level * float(level @ moved) / float(level @ level))
+
+
+def test_sums_over_displacements_match_the_definition() -> None:
+    rng = np.random.default_rng(1)
+    planes, scene, reach = rng.normal(size=(2, 6, 7)), rng.normal(size=(12, 13)), 3
+    sums = correlations(planes, scene, reach)
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
+            there = scene[reach - dy : reach - dy + 6, reach - dx : reach - dx + 7]
+            by_hand = (planes * there).sum(axis=(1, 2))
+            assert sums[:, reach + dy, reach + dx] == pytest.approx(by_hand)
+
+
+def test_a_patch_is_zero_outside_the_field() -> None:
+    plane = np.arange(20.0).reshape(4, 5)
+    assert cut(plane, -1, 3, (3, 3)).tolist() == [[0, 0, 0], [3, 4, 0], [8, 9, 0]]
+    assert cut(plane, 2, -1, (2, 3)).tolist() == [[0, 10, 11], [0, 15, 16]]
+    assert not cut(plane, 7, 0, (3, 3)).any() and not cut(plane, 0, -9, (3, 3)).any()
+
+
+def test_a_patch_gives_the_same_response_as_the_whole_field() -> None:
+    kernel = crop_or_pad(view().kernel, 129)
+    change = along_line(kernel) - kernel
+    shape, places = solution().transit.shape, [(20, -12), (-30, 6)]
+    for n in (solution().part[5], solution().part[9]):
+        near = near_of(view(), n)
+        whole = by_whole_field(view().blurred(n, Blur(change, shape)).astype(np.float64), n)
+        assert np.linalg.norm(near.of_kernel(change) - whole) < 0.05 * np.linalg.norm(whole)
+        copy = gaussian_filter(view().expected[n], 3.0)
+        for (dx, dy), column in zip(places, near.of_copies(n, copy, places).T, strict=True):
+            whole = by_whole_field(displaced(copy, dx, dy).astype(np.float64), n)
+            # A copy is light all over the field, and what scatters in from beyond the patch is left out.
+            assert np.linalg.norm(column - whole) < 0.5 * np.linalg.norm(whole)
+
+
+def test_a_field_smaller_than_a_patch_is_used_whole() -> None:
+    plan = default_plan(12, 76, oversampling=1, brightness=8.0)
+    small = View(invert(simulate(plan, TRUTH, diffraction(), seed=3).transit))
+    shape, n = small.solution.transit.shape, small.solution.part[0]
+    near = near_of(small, n)
+    change = along_line(small.kernel) - small.kernel
+    moved = near.of_copies(n, small.blurred(n, Blur(change, shape)), [(0, 0)])[:, 0]
+    assert near.residual.shape == moved.shape
+    assert np.linalg.norm(near.of_kernel(change) - moved) < 0.05 * np.linalg.norm(moved)
+
+
+def test_whitening_handles_cells_without_independent_noise() -> None:
+    assert not whitening(np.zeros((3, 3))).any()
+    row = np.array([1.0, 2.0, -1.0])
+    white = whitening(np.outer(row, row))
+    assert np.isfinite(white).all()
+    assert np.linalg.norm(white @ row) == pytest.approx(1.0)

@@ -37,7 +37,7 @@ def with_shares(shares: Mapping[Names, float], images: int = 12) -> Diagnosis:
         {"seed": 5, "version": "1.2.3", "command": "python -m made", "holds_for": HOLDS_FOR},
     )
     judgement = verdict_of(Posterior(logs, {}, ORDERS), calibration, images=images)
-    fits = diagnose._fits(found().model, judgement)
+    fits = diagnose.linear_fits(found().model, judgement)
     shrinking = {fit.label: found().shrinking.get(fit.label, Shrinking(None, None, None)) for fit in fits}
     changed = replace(found(), judgement=judgement, calibration=calibration, fits=fits, shrinking=shrinking)
     answered = judgement.verdict in ("attributed", "tie")

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from psfcore.drawing.page import with_error
 from psfcore.gap.diagnose import Diagnosis
-from psfcore.gap.report import bars
 from psfcore.gap.report import plot as gap_plot
 from psfcore.gap.report.bars import draw_effects
 from psfcore.gap.report.page import gap_page, interval_words, unit_words
@@ -22,10 +22,11 @@ from psfcore.gap.report.report import gap_report, hypothesis_words, percent_word
 from psfcore.gap.verdict.limits import Alike
 from psfcore.gap.verdict.posterior import UNKNOWN
 from tests.blank_figures import blank_figures
-from tests.html_page import Tag, check_stands_alone, read_page
+from tests.html_page import check_stands_alone, read_page
 from tests.psfcore.gap.report.judged import (
     HOLDS_FOR,
     LEAST,
+    OFFSET,
     OFFSET_BLUR,
     OFFSET_GAIN,
     SHARES,
@@ -35,8 +36,15 @@ from tests.psfcore.gap.report.judged import (
 from tests.psfcore.gap.small_gaps import OFFSET_DN, found
 
 MADE_BY = {"software_version": "1.2.3", "seed": 5, "libraries": {"numpy": "9.9"}, "started_from_psf": None}
-
 EFFECT_COLUMNS = 7  # of the table of effects; the other tables that begin with an effect have fewer columns
+# What the page of each verdict says about it.
+TOLD = {
+    "none": "Most probably there is no gap",
+    "attributed": "To confirm the named effects, take a dark exposure",
+    "unknown": "No effect of the library, alone or together with others, is in the answer set",
+    "inconclusive": "do not decide between the hypotheses of the answer set",
+    "tie": "Tied: dark offset or gain mismatch.",
+}
 
 
 def report_of(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -48,13 +56,10 @@ def report_of(diagnosis: Diagnosis) -> dict[str, Any]:
 
 @cache
 def html() -> str:
-    return gap_page(found(), report_of(found())).html()
-
-
-@pytest.fixture
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small figures, which are quicker to draw."""
-    monkeypatch.setattr(gap_plot, "PLOT_DPI", 40)
+    """The page of the small diagnosis, with small figures, which are quicker to draw."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(gap_plot, "PLOT_DPI", 40)
+        return gap_page(found(), report_of(found())).html()
 
 
 @pytest.fixture
@@ -64,9 +69,18 @@ def blank() -> Iterator[None]:
         yield
 
 
+def page_of(diagnosis: Diagnosis) -> str:
+    return gap_page(diagnosis, report_of(diagnosis)).html()
+
+
+def texts(page: str, tag: str) -> list[str]:
+    """The texts of all tags of this name, with plain spaces."""
+    return [one.text.replace("\N{NO-BREAK SPACE}", " ") for one in read_page(page) if one.name == tag]
+
+
 def text_of(page: str) -> str:
-    body = next(tag for tag in read_page(page) if tag.name == "body")
-    return body.text.replace("\N{NO-BREAK SPACE}", " ")
+    (body,) = texts(page, "body")
+    return body
 
 
 def rows_of(page: str) -> list[list[str]]:
@@ -78,45 +92,40 @@ def rows_of(page: str) -> list[list[str]]:
     return list(rows.values())
 
 
-def pictures(tags: list[Tag]) -> list[str]:
-    return [tag.attributes["alt"] for tag in tags if tag.name == "img"]
+def pictures(page: str) -> list[str]:
+    return [tag.attributes["alt"] for tag in read_page(page) if tag.name == "img"]
 
 
-def values(tags: list[Tag]) -> dict[str, str]:
+def values(page: str) -> dict[str, str]:
     """Names and values of the lists."""
+    tags = read_page(page)
     smalls = {t.within[-1]: t.text for t in tags if t.name == "small"}
     names = [t.text.removesuffix(smalls.get(t, "")) for t in tags if t.name == "dt"]
-    return dict(zip(names, (t.text.replace("\xa0", " ") for t in tags if t.name == "dd"), strict=True))
+    return dict(zip(names, texts(page, "dd"), strict=True))
 
 
 def test_the_page_needs_no_other_file_and_begins_with_the_summary() -> None:
     check_stands_alone(html())
-    tags = read_page(html())
-    lead = next(t for t in tags if t.attributes.get("class") == "lead")
-    assert lead.text.replace("\xa0", " ") == report_of(found())["sentence"]
-    assert len(html()) < 1.5e6  # small enough for an e-mail
-
-
-def test_verdict_gap_and_noise_are_at_the_top() -> None:
-    gap, said = report_of(found())["gap"], values(read_page(html()))
+    report, said = report_of(found()), values(html())
+    (lead,) = (t.text for t in read_page(html()) if t.attributes.get("class") == "lead")
+    assert lead.replace("\xa0", " ") == report["sentence"]
     assert said["verdict"] == "attributed" and said["named effects"] == "dark offset"
-    assert said["gap before the refit"] == f"{interval_words(gap['before_refit_pct'])} %"
-    assert said["gap, PSF refitted"] == f"{interval_words(gap['rms_pct'])} %"
-    assert said["gap with the named effects in the model"] == f"{interval_words(gap['after_pct'])} %"
+    gap = report["gap"]
+    for name, key in (
+        ("gap before the refit", "before_refit_pct"),
+        ("gap, PSF refitted", "rms_pct"),
+        ("gap with the named effects in the model", "after_pct"),
+    ):
+        assert said[name] == f"{interval_words(gap[key])} %"
     assert float(said["noise"].split()[0]) == pytest.approx(gap["noise_pct"], rel=0.05)
-    assert "To confirm the named effects, take a dark exposure" in text_of(html())
+    names = [name.split()[0] for name in pictures(html())]
+    assert names == ["Map", "Residuals", "Bars", "Map", "Bars", "Observed"]
 
 
-def test_the_page_has_all_figures_and_one_picture_combines_them() -> None:
-    names = pictures(read_page(html()))
-    assert [name.split()[0] for name in names] == ["Map", "Residuals", "Bars", "Map", "Bars", "Observed"]
-    assert gap_png(found(), report_of(found())).startswith(b"\x89PNG")
-
-
-def test_the_tables_list_all_effects_with_closure_and_those_not_tested() -> None:
-    rows = rows_of(html())
+def test_the_tables_list_effects_limits_psf_images_and_inputs() -> None:
+    report, rows = report_of(found()), rows_of(html())
     tested = {row[0]: row for row in rows if len(row) == EFFECT_COLUMNS}
-    for effect in report_of(found())["effects"]:
+    for effect in report["effects"]:
         row = tested[effect["name"].replace("_", " ")]
         assert row[1] == percent_words(effect["probability"])
         for name, p in effect["parameters"].items():
@@ -124,137 +133,103 @@ def test_the_tables_list_all_effects_with_closure_and_those_not_tested() -> None
         low, high = (round(100 * one) for one in effect["closure"]["ci90"])
         assert row[5] == f"{low + 0} to {high + 0}"
     assert ["saturation fill", "no pixel was filled in"] in rows
-
-
-def test_the_psf_is_shown_before_and_with_the_answer() -> None:
-    cells = [t.text.replace("\xa0", " ") for t in read_page(html()) if t.name == "td"]
-    at = cells.index("total")
-    psf = report_of(found())["psf"]
-    assert cells[at + 1] == with_error(*(psf["refitted"]["total"][k] for k in ("value", "sigma")))
-    assert cells[at + 2] == with_error(*(psf["with_answer"]["total"][k] for k in ("value", "sigma")))
-    moved = psf["with_answer"]["total"]["value"] - psf["refitted"]["total"]["value"]
-    assert float(cells[at + 3]) == pytest.approx(moved / psf["refitted"]["total"]["sigma"], abs=0.06)
-
-
-def test_images_inputs_and_provenance_are_listed() -> None:
-    cells = [t.text.replace("\xa0", " ") for t in read_page(html()) if t.name == "td"]
-    for image in report_of(found())["images"]:
-        at = cells.index(image["file"])
-        assert cells[at + 7] == with_error(image["residual_pct"], image["noise_pct"])
-        assert cells[at + 8] == with_error(image["residual_after_pct"], image["noise_after_pct"])
-    assert {"ab" * 32, "cd" * 32} <= set(cells)
-    said = values(read_page(html()))
-    assert said["libraries: numpy"] == "9.9" and said["seed"] == "5"
-    assert text_of(html()).rstrip().endswith("heliopsf 1.2.3")
-
-
-@pytest.mark.parametrize(
-    ("verdict", "told"),
-    [
-        (
-            "none",
-            "Most probably there is no gap. An effect that is in the answer set or in the table may still act",
-        ),
-        ("attributed", "To confirm the named effects, take a dark exposure"),
-        ("unknown", "No effect of the library, alone or together with others, is in the answer set"),
-        ("inconclusive", "These data do not decide between the hypotheses of the answer set"),
-        ("tie", "Tied: dark offset or gain mismatch."),
-    ],
-)
-def test_every_verdict_is_explained_on_its_page(verdict: str, told: str, blank: None) -> None:
-    diagnosis = judged(verdict)
-    page = gap_page(diagnosis, report_of(diagnosis)).html()
-    check_stands_alone(page)
-    text, answered = text_of(page), verdict in ("attributed", "tie")
-    assert told in text and values(read_page(page))["verdict"] == verdict
-    assert ("No effect was added to the model" in text) is not answered
-    # Slices are shown only if an effect was added to the model.
-    assert any(name.startswith("Observed") for name in pictures(read_page(page))) is answered
-    # Bars of closure are shown only if there is a gap.
-    assert ("Bars of held-out closure by effect" in pictures(read_page(page))) is (verdict != "none")
-    assert ("To separate the tied effects, take a dark exposure" in text) is (verdict == "tie")
-    assert ("with the named effects” means with the best of the tied effects: dark offset" in text) is (
-        verdict == "tie"
-    )
-    unknown = UNKNOWN in diagnosis.judgement.members
-    assert ("If the cause is not in the library: the patterns that the gap resembles" in text) is unknown
-    assert ("a change that varies with the position along detector x and the pointing" in text) is unknown
-
-
-@pytest.mark.parametrize("verdict", list(SHARES))
-def test_the_page_shows_the_hypotheses_and_for_which_data_the_coverage_holds(
-    verdict: str, blank: None
-) -> None:
-    diagnosis = judged(verdict)
-    page = gap_page(diagnosis, report_of(diagnosis)).html()
-    text = text_of(page)
-    assert HOLDS_FOR in text and "19 simulated transits of known cause" in text
-    assert "the stated coverage is not guaranteed" in text
-    rows = rows_of(page)
-    for names, share in SHARES[verdict].items():
-        assert [hypothesis_words(names), percent_words(share), "yes" if share >= LEAST else ""] in rows
-    said = values(read_page(page))
-    assert said["answer set"] == "; ".join(map(hypothesis_words, diagnosis.judgement.members))
-    assert said["probability of no gap"] == percent_words(SHARES[verdict][()])
-    assert "in 90 % of the cases" in text
-    name = "most probable effects" if verdict == "inconclusive" else "named effects"
-    assert said[name] == (", ".join(diagnosis.judgement.answer).replace("_", " ") or "none")
-
-
-def test_the_page_shows_what_the_data_could_have_shown_and_what_they_cannot_tell_apart(blank: None) -> None:
-    rows = rows_of(html())
     for limit in found().limits.effects.values():
         one = limit.leading
         shown = [f"{one.found_90:.3g}", f"{one.excluded_95:.3g}", one.unit]
         assert [limit.effect.replace("_", " "), one.name, *shown] in rows
+    # The PSF before and with the answer.
+    before, after = (report["psf"][name]["total"] for name in ("refitted", "with_answer"))
+    (total,) = (row for row in rows if row[0] == "total")
+    assert total[1:3] == [with_error(one["value"], one["sigma"]) for one in (before, after)]
+    assert float(total[3]) == pytest.approx((after["value"] - before["value"]) / before["sigma"], abs=0.06)
+    for image in report["images"]:
+        (row,) = (row for row in rows if row[0] == image["file"] and len(row) > 8)
+        assert row[7] == with_error(image["residual_pct"], image["noise_pct"])
+        assert row[8] == with_error(image["residual_after_pct"], image["noise_after_pct"])
+    assert {"ab" * 32, "cd" * 32} <= {cell for row in rows for cell in row}
+    said = values(html())
+    assert said["libraries: numpy"] == "9.9" and said["seed"] == "5"
+    assert text_of(html()).rstrip().endswith("heliopsf 1.2.3")
+
+
+@pytest.mark.parametrize("verdict", list(SHARES))
+def test_every_verdict_is_explained_on_its_page(verdict: str, blank: None) -> None:
+    diagnosis = judged(verdict)
+    page = page_of(diagnosis)
+    check_stands_alone(page)
+    text, said, answered = text_of(page), values(page), verdict in ("attributed", "tie")
+    assert TOLD[verdict] in text and said["verdict"] == verdict
+    assert ("No effect was added to the model" in text) is not answered
+    # Slices are shown only if an effect was added to the model, bars of closure only if there is a gap.
+    assert any(name.startswith("Observed") for name in pictures(page)) is answered
+    assert ("Bars of held-out closure by effect" in pictures(page)) is (verdict != "none")
+    assert ("To separate the tied effects, take a dark exposure" in text) is (verdict == "tie")
+    assert ("the best of the tied effects: dark offset" in text) is (verdict == "tie")
+    unknown = UNKNOWN in diagnosis.judgement.members
+    assert ("varies with the position along detector x and the pointing" in text) is unknown
+    # The hypotheses, and for which data the coverage holds.
+    assert HOLDS_FOR in text and "19 simulated transits" in text and "in 90 % of the cases" in text
+    rows = rows_of(page)
+    for names, share in SHARES[verdict].items():
+        assert [hypothesis_words(names), percent_words(share), "yes" if share >= LEAST else ""] in rows
+    assert said["answer set"] == "; ".join(map(hypothesis_words, diagnosis.judgement.members))
+    assert said["probability of no gap"] == percent_words(SHARES[verdict][()])
+    name = "most probable effects" if verdict == "inconclusive" else "named effects"
+    assert said[name] == (", ".join(diagnosis.judgement.answer).replace("_", " ") or "none")
+
+
+def test_effects_that_the_data_cannot_tell_apart_are_listed(blank: None) -> None:
     assert "No two effects are closer than 3 sigma" in text_of(html())
-    pair = Alike(("dark_offset", "core_blur"), 1.4, "a series of exposure times")
-    close = replace(found(), limits=replace(found().limits, alike=(pair,)))
-    page = gap_page(close, report_of(close)).html()
+    pair = Alike(OFFSET_BLUR, 1.4, "a series of exposure times")
+    page = page_of(replace(found(), limits=replace(found().limits, alike=(pair,))))
     assert ["dark offset and core blur", "1.40", "a series of exposure times"] in rows_of(page)
     assert "No two effects are closer" not in text_of(page)
 
 
-def test_a_tie_names_the_certain_and_the_tied_effects(coarse: None) -> None:
-    both = with_shares({OFFSET_BLUR: 0.5, OFFSET_GAIN: 0.45, UNKNOWN: 0.03, (): 0.02})
-    report = report_of(both)
+def test_the_bars_mark_the_named_and_the_tied_effects(blank: None) -> None:
+    """Of two pairs both, of an effect and a pair with it both; effects of a pair come before single effects."""
+    marked = {
+        "tie of pairs": (
+            {OFFSET_BLUR: 0.5, OFFSET_GAIN: 0.45, UNKNOWN: 0.03, (): 0.02},
+            [OFFSET_BLUR, OFFSET_GAIN],
+        ),
+        "tie with a pair": ({OFFSET: 0.4, OFFSET_BLUR: 0.55, UNKNOWN: 0.03, (): 0.02}, [OFFSET_BLUR, OFFSET]),
+        "pair": ({OFFSET_BLUR: 0.93, UNKNOWN: 0.04, (): 0.03}, [OFFSET_BLUR]),
+    }
+    for name, (shares, chosen) in marked.items():
+        report = report_of(with_shares(shares))
+        axes = Figure().subplots()
+        draw_effects(axes, report)
+        mark = "  (tied)" if report["verdict"] == "tie" else "  (named)"
+        labels = [label.get_text() for label in axes.get_yticklabels()]
+        words = [" + ".join(one).replace("_", " ") for one in chosen]
+        assert [label.removesuffix(mark) for label in labels if label.endswith(mark)] == words, name
+        assert sum("(" in label for label in labels) == len(chosen), name
+    report = report_of(with_shares(marked["tie of pairs"][0]))
     assert report["ties"] == [["core_blur", "gain_mismatch"]]
-    assert "Tied: dark offset, together with core blur or gain mismatch." in text_of(
-        gap_page(both, report).html()
-    )
-    rows = [
-        {"name": name}
-        for name in ("dark_offset", "core_blur", "dark_offset + core_blur", "dark_offset + persistence")
-    ]
-    assert [bars._chosen(row, report) for row in rows] == [False, False, True, False]
-
-
-def test_a_tie_of_an_effect_and_a_pair_with_it_marks_both(coarse: None) -> None:
-    report = report_of(with_shares({("dark_offset",): 0.4, OFFSET_BLUR: 0.55, UNKNOWN: 0.03, (): 0.02}))
-    assert report["verdict"] == "tie"
-    rows = [{"name": name} for name in ("dark_offset", "core_blur", "dark_offset + core_blur")]
-    assert [bars._chosen(row, report) for row in rows] == [True, False, True]
-
-
-def test_effects_of_a_pair_come_before_single_effects(blank: None) -> None:
-    both = with_shares({OFFSET_BLUR: 0.93, UNKNOWN: 0.04, (): 0.03})
-    report = report_of(both)
-    (label,) = (fit["name"] for fit in report["together"])
-    effects = [row[0] for row in rows_of(gap_page(both, report).html()) if len(row) == EFFECT_COLUMNS]
-    at = [effects.index(name.replace("_", " ")) for name in (label, "dark_offset", "gain_mismatch")]
+    tie = gap_page(with_shares(marked["tie of pairs"][0]), report).html()
+    assert "Tied: dark offset, together with core blur or gain mismatch." in text_of(tie)
+    pair = page_of(with_shares(marked["pair"][0]))
+    effects = [row[0] for row in rows_of(pair) if len(row) == EFFECT_COLUMNS]
+    at = [effects.index(name) for name in ("dark offset + core blur", "dark offset", "gain mismatch")]
     assert at == sorted(at)
 
 
-def test_without_held_out_images_the_page_shows_no_residuals(coarse: None) -> None:
+def test_without_held_out_images_the_page_shows_no_residuals(blank: None) -> None:
     few = replace(judged("none"), residual=None)
-    page = gap_page(few, report_of(few)).html()
+    page = page_of(few)
     check_stands_alone(page)
     assert "No image could be held out" in text_of(page)
-    assert len(pictures(read_page(page))) == 2
-    assert gap_png(few, report_of(few)).startswith(b"\x89PNG")
+    assert len(pictures(page)) == 2
 
 
-def test_a_malicious_file_name_is_shown_as_text(coarse: None) -> None:
+def test_one_picture_combines_the_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gap_plot, "PLOT_DPI", 40)
+    for diagnosis in (found(), replace(judged("none"), residual=None)):
+        assert gap_png(diagnosis, report_of(diagnosis)).startswith(b"\x89PNG")
+
+
+def test_a_malicious_file_name_is_shown_as_text(blank: None) -> None:
     report = report_of(found())
     name = "<script>alert(1)</script>.fits"
     report["images"][0]["file"] = name
@@ -262,14 +237,11 @@ def test_a_malicious_file_name_is_shown_as_text(coarse: None) -> None:
     report["provenance"] = {"file": name}
     page = gap_page(found(), report).html()
     check_stands_alone(page)
-    assert [t.text for t in read_page(page) if t.name == "td"].count(name) == 1
+    assert texts(page, "td").count(name) == 1
 
 
 def test_the_map_shows_every_disc_at_its_place() -> None:
-    from matplotlib.figure import Figure
-
-    report = report_of(found())
-    figure = Figure()
+    report, figure = report_of(found()), Figure()
     charts = figure.subplots(1, 2)
     draw_map(figure, list(charts), report)
     for axes, column in zip(charts, ("residual_pct", "residual_after_pct"), strict=True):
@@ -278,14 +250,12 @@ def test_the_map_shows_every_disc_at_its_place() -> None:
             for points in axes.collections
             for (x, y), value in zip(points.get_offsets(), points.get_array(), strict=True)
         }
-        wanted = {(round(i["x_px"], 3), round(i["y_px"], 3)): i[column] for i in report["images"]}
-        assert drawn == pytest.approx(wanted)
+        discs = {(round(i["x_px"], 3), round(i["y_px"], 3)): i[column] for i in report["images"]}
+        assert drawn == pytest.approx(discs)
     assert charts[0].collections[0].get_clim() == charts[1].collections[0].get_clim()
 
 
 def test_bars_show_closure_and_mark_values_outside_the_chart() -> None:
-    from matplotlib.figure import Figure
-
     report = report_of(found())
     report["effects"][1]["closure"] = {"value": -4.0, "ci90": [-9.0, 0.5]}
     axes = Figure().subplots()
@@ -299,8 +269,6 @@ def test_bars_show_closure_and_mark_values_outside_the_chart() -> None:
 
 
 def test_cells_show_means_of_all_discs_and_noise_has_no_strong_colour() -> None:
-    from matplotlib.figure import Figure
-
     discs = found().evidence.discs
     means, errors = cell_means(discs)
     middle = [
@@ -313,13 +281,10 @@ def test_cells_show_means_of_all_discs_and_noise_has_no_strong_colour() -> None:
         replace(d, residual=0.3 * np.sqrt(np.diag(d.covariance)) / np.sqrt(len(discs)) * (-1) ** k)
         for k, d in enumerate(discs)
     ]
+    evidence = replace(found().evidence, discs=tuple(quiet))
     figure = Figure()
-    silent = replace(
-        judged("none"),
-        model=replace(found().model, evidence=replace(found().evidence, discs=tuple(quiet))),
-    )
     axes = figure.subplots()
-    draw_cells(figure, [axes], silent)
+    draw_cells(figure, [axes], replace(judged("none"), model=replace(found().model, evidence=evidence)))
     colours = np.array([patch.get_facecolor()[:3] for patch in axes.patches[:-1]])
     assert colours.min() > 0.75  # near white
 

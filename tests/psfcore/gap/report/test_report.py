@@ -21,6 +21,8 @@ from psfcore.gap.report.report import (
 from psfcore.gap.verdict.limits import Alike
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN
 from tests.psfcore.gap.report.judged import (
+    BLUR,
+    GAIN,
     HOLDS_FOR,
     OFFSET,
     OFFSET_BLUR,
@@ -31,36 +33,37 @@ from tests.psfcore.gap.report.judged import (
 )
 from tests.psfcore.gap.small_gaps import found
 
-VERDICTS = tuple(SHARES)
 # What a reader of schema gap/1 finds, with the types of the values.
-GAP_1 = {
-    "schema": str,
-    "sentence": str,
-    "gap": dict,
-    "where": list,
-    "verdict": str,
-    "answer": list,
-    "effects": list,
-    "ties": list,
-    "would_separate": str,
-    "untestable": list,
-}
+GAP_1 = {"schema": str, "sentence": str, "verdict": str, "would_separate": str, "gap": dict} | dict.fromkeys(
+    ("where", "answer", "effects", "ties", "untestable"), list
+)
 GAP_2 = {"set": dict, "probabilities": dict, "limits": dict, "alike": list, "calibration": dict}
-
-
-def reported(verdict: str) -> dict[str, Any]:
-    """The report as a reader gets it. NaN and infinity are no JSON."""
-    back: dict[str, Any] = json.loads(json.dumps(gap_report(judged(verdict)), allow_nan=False))
-    return back
+# Parts of the summary sentence of each verdict.
+SAID = {
+    "none": (
+        "No gap ",
+        " 70 %",
+        "do not exclude dark offset (15 %), a cause outside the library (8 %) or gain ",
+    ),
+    "attributed": ("There is a gap of ", "dark offset (offset ", " 93 %", "falls from "),
+    "tie": ("There is a gap of ", ": dark offset or gain mismatch.", "To separate these effects, take "),
+    "unknown": ("There is a gap of ", "not in the library", "varies with the position along detector x"),
+    "inconclusive": (
+        "There may be a gap.",
+        "dark offset (50 %), a cause outside the library (30 %), no gap (12 %) ",
+    ),
+}
 
 
 def is_interval(value: Any) -> bool:
     return isinstance(value["value"], float) and len(value["ci90"]) == 2
 
 
-@pytest.mark.parametrize("verdict", VERDICTS)
-def test_the_report_has_every_field_of_its_schema_and_of_the_earlier_one(verdict: str) -> None:
-    report = reported(verdict)
+@pytest.mark.parametrize("verdict", list(SHARES))
+def test_the_report_of_every_verdict(verdict: str) -> None:
+    """It has every field of its schema and of the earlier one; its set, hypotheses, effects and sentence agree."""
+    diagnosis = judged(verdict)
+    report = json.loads(json.dumps(gap_report(diagnosis), allow_nan=False))  # NaN and infinity are no JSON
     assert report["schema"] == "gap/2" and report["verdict"] == verdict
     for name, kind in (GAP_1 | GAP_2).items():
         assert isinstance(report[name], kind), name
@@ -71,41 +74,45 @@ def test_the_report_has_every_field_of_its_schema_and_of_the_earlier_one(verdict
     for axis in report["where"]:
         assert axis["axis"] in AXIS_WORDS and {"share", "p_value", "at"} <= set(axis)
     assert len({axis["axis"] for axis in report["where"]}) == len(report["where"]) > 1
-    for effect in report["effects"]:
+    # Every effect of the library is tested or not testable.
+    effects, untestable = report["effects"], report["untestable"]
+    assert sorted(one["name"] for one in effects) == sorted(e.name for e in found().evidence.effects)
+    for effect in effects:
         assert {"name", "parameters", "p_value", "delta_chi2_held_out", "closure"} <= set(effect)
         assert all(set(one) == {"value", "sigma", "unit"} for one in effect["parameters"].values())
         assert effect["closure"] is None or is_interval(effect["closure"])
-    assert report["untestable"] and all(set(one) == {"name", "why"} for one in report["untestable"])
-
-
-@pytest.mark.parametrize("verdict", VERDICTS)
-def test_every_effect_of_the_library_is_tested_or_not_testable(verdict: str) -> None:
-    report = reported(verdict)
-    tested = [effect["name"] for effect in report["effects"]]
-    assert sorted(tested) == sorted(effect.name for effect in found().evidence.effects)
-    assert not set(tested) & {one["name"] for one in report["untestable"]}
-    probabilities = [effect["probability"] for effect in report["effects"]]
-    assert probabilities == sorted(probabilities, reverse=True)
-
-
-@pytest.mark.parametrize("verdict", VERDICTS)
-def test_the_set_its_hypotheses_and_the_probabilities_agree(verdict: str) -> None:
-    report, judgement = reported(verdict), judged(verdict).judgement
+    assert untestable and all(set(one) == {"name", "why"} for one in untestable)
+    assert not {one["name"] for one in effects} & {one["name"] for one in untestable}
+    shares = [one["probability"] for one in effects]
+    assert shares == sorted(shares, reverse=True)
+    # The set, its hypotheses and the probabilities agree.
     members = report["set"]["members"]
-    assert report["set"]["coverage"] == judgement.coverage == 0.9
+    assert report["set"]["coverage"] == diagnosis.judgement.coverage == 0.9
     listed = {tuple(one["effects"]): one["probability"] for one in report["hypotheses"]}
     assert members and all(tuple(names) in listed for names in members)
     assert members[0] == report["hypotheses"][0]["effects"]
     assert list(listed.values()) == sorted(listed.values(), reverse=True)
     assert {"none", "unknown"} <= set(report["probabilities"])
     assert all(0 <= share <= 1 for share in report["probabilities"].values())
-    # The answer and the set name the same effects.
     if verdict in ("attributed", "tie"):
         assert set(report["answer"]) == {name for names in members for name in names}
     else:
         assert members[:1] == [[]] or ["unknown"] in members
     assert report["ties"] == ([report["answer"]] if verdict == "tie" else [])
     assert bool(report["would_separate"]) is (verdict == "tie")
+    # What the gap looks like is said only if its cause may be unknown; the third pattern is too improbable.
+    like = [(one["form"].split(" the ", 1)[1], one["probability"]) for one in report["looks_like"]]
+    patterns = [
+        ("position along detector x and the pointing", pytest.approx(0.8)),
+        ("time", pytest.approx(0.15)),
+    ]
+    assert like == (patterns if ["unknown"] in members else [])
+    # The summary is one to four plain sentences.
+    sentence = report["sentence"]
+    assert all(part in sentence for part in SAID[verdict]), sentence
+    assert sentence[0].isupper() and sentence.endswith(".") and "  " not in sentence and "_" not in sentence
+    assert 1 <= len(re.findall(r"\.(?= [A-Z]|$)", sentence)) <= 4
+    assert ("It varies most " in sentence) is (verdict not in ("none", "inconclusive"))
 
 
 def test_hypotheses_that_are_hardly_possible_are_not_listed_unless_the_set_has_them() -> None:
@@ -117,125 +124,54 @@ def test_hypotheses_that_are_hardly_possible_are_not_listed_unless_the_set_has_t
 
 
 def test_limits_alike_and_calibration_are_stated() -> None:
-    report = reported("attributed")
-    tested = {effect["name"] for effect in report["effects"]}
-    assert set(report["limits"]) == tested
+    pair = Alike(OFFSET_BLUR, 1.4, "a series of exposure times")
+    attributed = judged("attributed")
+    report = gap_report(replace(attributed, limits=replace(attributed.limits, alike=(pair,))))
+    assert set(report["limits"]) == {effect["name"] for effect in report["effects"]}
     for limit in report["limits"].values():
-        assert {"parameter", "unit", "found_90", "excluded_95"} <= set(limit)
-        assert limit["excluded_95"] > 0
+        assert {"parameter", "unit", "found_90", "excluded_95"} <= set(limit) and limit["excluded_95"] > 0
     # The fitted offset is below its own limit, and above what would be found.
     offset = report["effects"][0]["parameters"]["offset"]
     limit = report["limits"]["dark_offset"]
     assert limit["found_90"] < offset["value"] < limit["excluded_95"]
-    for one in report["alike"]:
-        assert set(one) == {"pair", "distance", "would_separate"} and set(one["pair"]) <= tested
-    assert report["calibration"] == {
-        "cases": 19,
-        "temperature": 1.0,
-        "seed": 5,
-        "version": "1.2.3",
-        "command": "python -m made",
-        "holds_for": HOLDS_FOR,
-    }
+    assert report["alike"] == [
+        {"pair": [*OFFSET_BLUR], "distance": 1.4, "would_separate": pair.would_separate}
+    ]
+    about = {"seed": 5, "version": "1.2.3", "command": "python -m made", "holds_for": HOLDS_FOR}
+    assert report["calibration"] == {"cases": 19, "temperature": 1.0} | about
 
 
-def test_alike_effects_are_listed_with_what_would_separate_them() -> None:
-    pair = Alike(("dark_offset", "core_blur"), 1.4, "a series of exposure times")
-    report = gap_report(replace(found(), limits=replace(found().limits, alike=(pair,))))
-    (listed,) = report["alike"]
-    assert listed["pair"] == ["dark_offset", "core_blur"] and listed["distance"] == 1.4
-    assert listed["would_separate"] == "a series of exposure times"
-
-
-@pytest.mark.parametrize("verdict", VERDICTS)
-def test_what_the_gap_looks_like_is_said_only_if_its_cause_may_be_unknown(verdict: str) -> None:
-    report = reported(verdict)
-    assert bool(report["looks_like"]) is (["unknown"] in report["set"]["members"])
-    if report["looks_like"]:
-        first, second = report["looks_like"]  # the third pattern is too improbable
-        assert first["form"] == "a change that varies with the position along detector x and the pointing"
-        assert (first["probability"], second["probability"]) == pytest.approx((0.8, 0.15))
-
-
-SAID = {
-    "none": (
-        "No gap beyond noise and the error of the fit was found: with a probability of 70 % there is none",
-        "These data do not exclude dark offset (15 %), a cause outside the library (8 %) or gain mismatch (7 %).",
-    ),
-    "attributed": (
-        "There is a gap of ",
-        "The gap is explained by dark offset (offset ",
-        "with a probability of 93 %: on held-out images the gap in the discs falls from ",
-    ),
-    "tie": (
-        "There is a gap of ",
-        "These data cannot show which effect causes the gap: dark offset or gain mismatch.",
-        "To separate these effects, take ",
-    ),
-    "unknown": (
-        "There is a gap of ",
-        "Its cause is not in the library; it most resembles a change that varies with the position along detector x",
-    ),
-    "inconclusive": (
-        "There may be a gap.",
-        "These data do not decide its cause: dark offset (50 %), a cause outside the library (30 %), no gap (12 %) or "
-        "gain mismatch (8 %).",
-    ),
-}
-
-
-@pytest.mark.parametrize("verdict", VERDICTS)
-def test_the_summary_is_two_to_four_plain_sentences(verdict: str) -> None:
-    sentence = reported(verdict)["sentence"]
-    for part in SAID[verdict]:
-        assert part in sentence
-    assert sentence[0].isupper() and sentence.endswith(".") and "  " not in sentence and "_" not in sentence
-    assert 1 <= len(re.findall(r"\.(?= [A-Z]|$)", sentence)) <= 4
-    assert ("It varies most " in sentence) is (verdict not in ("none", "inconclusive"))
-
-
-def test_few_images_are_said_to_exclude_only_a_large_gap() -> None:
-    few = replace(with_shares(SHARES["none"], images=5), residual=None)
-    report = gap_report(few)
-    assert report["verdict"] == "inconclusive" and report["answer"] == []
-    assert "No gap is visible in these" in report["sentence"] and "only a large gap" in report["sentence"]
-
-
-def test_a_gap_is_said_to_exist_if_no_gap_is_not_in_the_set() -> None:
-    unsure = with_shares({OFFSET: 0.6, UNKNOWN: 0.38, NONE: 0.02})
-    sentence = gap_report(unsure)["sentence"]
-    assert sentence.startswith("There is a gap of ") and "There may be" not in sentence
-    assert "do not decide its cause: dark offset (60 %) or a cause outside the library (38 %)." in sentence
-
-
-def test_more_hypotheses_than_a_sentence_can_hold_are_counted() -> None:
-    many = with_shares(
-        {OFFSET: 0.3, UNKNOWN: 0.2, NONE: 0.18, ("gain_mismatch",): 0.16, ("core_blur",): 0.16}
-    )
+def test_the_sentence_says_how_sure_a_gap_is() -> None:
+    few = gap_report(replace(with_shares(SHARES["none"], images=5), residual=None))
+    assert few["verdict"] == "inconclusive" and few["answer"] == []
+    assert "No gap is visible" in few["sentence"] and "only a large gap" in few["sentence"]
+    # A gap is said to exist if "no gap" is not in the set.
+    unsure = gap_report(with_shares({OFFSET: 0.6, UNKNOWN: 0.38, NONE: 0.02}))["sentence"]
+    assert unsure.startswith("There is a gap of ") and "There may be" not in unsure
+    assert "dark offset (60 %) or a cause outside the library (38 %)." in unsure
+    # More hypotheses than a sentence can hold are counted.
+    many = with_shares({OFFSET: 0.3, UNKNOWN: 0.2, NONE: 0.18, GAIN: 0.16, BLUR: 0.16})
     assert gap_report(many)["sentence"].endswith(" or 1 other of smaller probability.")
 
 
-def test_a_pair_is_reported_with_its_own_fit() -> None:
+def test_pairs_and_ties_name_what_is_certain_and_what_is_tied() -> None:
     report = gap_report(with_shares({OFFSET_BLUR: 0.93, UNKNOWN: 0.04, NONE: 0.03}))
-    assert report["answer"] == ["dark_offset", "core_blur"]
+    assert report["answer"] == [*OFFSET_BLUR]
     (pair,) = report["together"]
     assert pair["name"] == "dark_offset + core_blur" and pair["probability"] == pytest.approx(0.93)
     assert all(name.split(".")[0] in report["answer"] for name in pair["parameters"])
     assert report["probabilities"]["dark_offset"] == pytest.approx(0.93)
-    assert {effect["name"] for effect in report["effects"]} >= {"dark_offset", "core_blur"}
+    assert {effect["name"] for effect in report["effects"]} >= {*OFFSET_BLUR}
 
+    tied = gap_report(with_shares({OFFSET_BLUR: 0.5, OFFSET_GAIN: 0.45, UNKNOWN: 0.05}))
+    assert tied["ties"] == [["core_blur", "gain_mismatch"]]
+    assert "dark offset, together with core blur or gain mismatch." in tied["sentence"]
+    assert "a dark exposure" not in tied["would_separate"] and "both gain modes" in tied["would_separate"]
 
-def test_a_tie_of_pairs_names_what_is_certain_and_what_is_tied() -> None:
-    report = gap_report(with_shares({OFFSET_BLUR: 0.5, OFFSET_GAIN: 0.45, UNKNOWN: 0.05}))
-    assert report["ties"] == [["core_blur", "gain_mismatch"]]
-    assert "dark offset, together with core blur or gain mismatch." in report["sentence"]
-    assert "a dark exposure" not in report["would_separate"] and "both gain modes" in report["would_separate"]
-
-
-def test_a_tie_of_an_effect_and_its_pair_does_not_claim_the_second_effect() -> None:
-    report = gap_report(with_shares({OFFSET_BLUR: 0.55, OFFSET: 0.4, UNKNOWN: 0.05}))
-    assert (report["verdict"], report["ties"]) == ("tie", [["core_blur"]])
-    assert "dark offset, alone or together with core blur." in report["sentence"]
+    # A tie of an effect and its pair does not claim the second effect.
+    single = gap_report(with_shares({OFFSET_BLUR: 0.55, OFFSET: 0.4, UNKNOWN: 0.05}))
+    assert (single["verdict"], single["ties"]) == ("tie", [["core_blur"]])
+    assert "dark offset, alone or together with core blur." in single["sentence"]
 
 
 def test_a_gap_of_the_unocculted_field_alone_is_not_said_of_the_discs() -> None:
@@ -245,24 +181,17 @@ def test_a_gap_of_the_unocculted_field_alone_is_not_said_of_the_discs() -> None:
     images, across = np.indices(blocks.levels.shape)
     levels = blocks.levels * (1 + 0.2 * (-1.0) ** images * (across % 2))
     evidence = replace(model.evidence, discs=quiet, unocculted=replace(blocks, levels=levels))
-    alone = replace(
-        judged("unknown"), model=replace(model, evidence=evidence), rms=replace(found().rms, value=0.1)
-    )
+    small = replace(found().rms, value=0.1)
+    alone = replace(judged("unknown"), model=replace(model, evidence=evidence), rms=small)
     sentence = gap_report(alone)["sentence"]
     assert sentence.startswith("There is a gap in the unocculted field")
     assert "The discs do not show it (the gap in the discs is 0.1 %" in sentence
 
 
 def test_words_for_probabilities_orders_and_hypotheses() -> None:
-    assert [percent_words(share) for share in (1.0, 0.9949, 0.5, 0.006, 0.004, 0.0)] == [
-        "> 99 %",
-        "99 %",
-        "50 %",
-        "1 %",
-        "< 1 %",
-        "< 1 %",
-    ]
+    percents = {1.0: "> 99 %", 0.9949: "99 %", 0.5: "50 %", 0.006: "1 %", 0.004: "< 1 %", 0.0: "< 1 %"}
+    assert {share: percent_words(share) for share in percents} == percents
     assert order_words(("time",)) == "a change that varies with the time"
-    assert order_words(("x", "y", "time", "pointing")) == "a change along many orders of the data"
-    assert hypothesis_words(NONE) == "no gap" and hypothesis_words(UNKNOWN) == "a cause outside the library"
-    assert hypothesis_words(("dark_offset", "core_blur")) == "dark offset together with core blur"
+    assert "many orders" in order_words(("x", "y", "time", "pointing"))
+    assert (hypothesis_words(NONE), hypothesis_words(UNKNOWN)) == ("no gap", "a cause outside the library")
+    assert hypothesis_words(OFFSET_BLUR) == "dark offset together with core blur"

@@ -1,4 +1,4 @@
-"""Closure, gap and deviance, compared with calculations by hand."""
+"""Closure, gap, deviance and the shares of axes, compared with calculations by hand."""
 
 from __future__ import annotations
 
@@ -10,112 +10,110 @@ from scipy.stats import multivariate_normal
 
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
-from psfcore.gap.verdict.closure import (
-    FORM_ERROR,
-    HeldOut,
-    _along_errors,
-    _deviance,
-    _spread,
-    closure,
-    fall,
-    gap,
-    hold_out,
-    time_blocks,
-)
-from psfcore.gap.verdict.correction import _with_noise_of
+from psfcore.gap.verdict.closure import FORM_ERROR, HeldOut, closure, fall, gap, hold_out, time_blocks
+from psfcore.gap.verdict.where import shapley, where
+from tests.psfcore.gap.linear_models import discs_only, with_left, with_residuals
 
 
-def test_percentages_refer_to_the_observed_light_after_a_subtraction(evidence: Evidence) -> None:
+def test_percentages_refer_to_the_observed_light_before_a_subtraction(evidence: Evidence) -> None:
     """After the subtraction of an effect a disc may have a negative mean."""
-    taken_out = replace(
-        evidence, discs=tuple(replace(disc, residual=-1.5 * disc.expected) for disc in evidence.discs)
+    plain = LinearModel(evidence, FLOOR)
+    after = with_left(plain, lambda disc: -1.5 * disc.expected)
+    assert all(disc.observed < 0 for disc in after.evidence.discs)
+    levels = {disc.index: disc.level for disc in evidence.discs}
+    discs = tuple(replace(disc, level_before=levels[disc.index]) for disc in after.evidence.discs)
+    of_before = replace(after, evidence=replace(after.evidence, discs=discs))
+    pct = [hold_out(model, (), time_blocks(model)) for model in (after, of_before)]
+    assert pct[0] is not None and pct[1] is not None and pct[0].noise_pct.min() > 0
+    ratio = [abs(disc.observed) / levels[disc.index] for disc in after.evidence.discs]
+    at = [disc.index for disc in discs]
+    assert pct[1].residual_pct / pct[0].residual_pct == pytest.approx(
+        [ratio[at.index(n)] for n in pct[0].images]
     )
-    assert all(disc.observed < 0 for disc in taken_out.discs)
-    before, after = evidence, _with_noise_of(evidence, taken_out)
-    assert [disc.level for disc in after.discs] == [disc.level for disc in before.discs]
-    for one in (after, taken_out):
-        model = LinearModel(one, FLOOR)
-        held_out = hold_out(model, (), time_blocks(model))
-        assert held_out is not None and held_out.noise_pct.min() > 0
 
 
-def test_closure_and_gap_by_hand() -> None:
+def test_a_fold_is_predicted_by_a_fit_to_the_other_images(evidence: Evidence) -> None:
+    """chi2, its expected value, deviance and spread of one fold, from the whitened residuals of its images."""
+    model = LinearModel(discs_only(evidence), FLOOR)
+    columns = evidence.columns["dark_offset"]
+    fold = time_blocks(model)[0]
+    held_out = hold_out(model, columns, [fold])
+    assert held_out is not None
+    step = model.fit(columns, model.equations(fold.fitted))
+    discs = {disc.index: disc for disc in model.discs}
+    here = list(step.columns)
+    left = [discs[n].residual - discs[n].jacobian[here].T @ step.values for n in held_out.images]
+    jacobians = [discs[n].jacobian[here] for n in held_out.images]
+    errors = [np.trace(j.T @ step.covariance @ j) for j in jacobians]
+    assert held_out.chi2 == pytest.approx([one @ one for one in left])
+    assert held_out.expected == pytest.approx([one.size + e for one, e in zip(left, errors, strict=True)])
+    whole, jacobian = np.concatenate(left), np.concatenate(jacobians, axis=1)
+    covariance = np.eye(whole.size) + jacobian.T @ step.covariance @ jacobian
+    ((images, deviance),) = held_out.deviance.items()
+    assert images == held_out.images
+    ln_l = multivariate_normal(cov=covariance).logpdf(whole)
+    assert deviance == pytest.approx(-2 * ln_l - whole.size * np.log(2 * np.pi))
+    of_discs, of_all = held_out.spread[images]
+    assert of_discs.sum() == pytest.approx(sum(errors)) and of_all == pytest.approx(of_discs)
+    # chi2 that errors of the parameters add: its variance is that of independent parts.
+    rng = np.random.default_rng(3)
+    drawn = rng.multivariate_normal(np.zeros(len(here)), step.covariance, 20_000) @ jacobian
+    assert np.var(np.sum(drawn**2, axis=1)) == pytest.approx(2 * np.sum(of_discs**2), rel=0.1)
+
+
+def of_images(chi2: float, expected: float, blocks: float = 0.0, residual_pct: float = 0.0) -> HeldOut:
+    """The results of six held-out images that are all equal."""
+    ones = np.ones(6)
+    return HeldOut(
+        tuple(range(6)), chi2 * ones, expected * ones, blocks * ones, 0 * ones, residual_pct * ones, ones
+    )
+
+
+def test_closure_gap_and_fall_by_hand() -> None:
     rng = np.random.default_rng(1)
-    ones = np.ones(4)
-
-    def held_out(chi2: list[float], residual: list[float]) -> HeldOut:
-        return HeldOut((0, 1, 2, 3), np.array(chi2), 10 * ones, 0 * ones, 0 * ones, np.array(residual), ones)
-
-    before, after = held_out([110.0] * 4, [5.0] * 4), held_out([20.0] * 4, [1.0] * 4)
+    before, after = of_images(110.0, 10.0, residual_pct=5.0), of_images(20.0, 10.0, residual_pct=1.0)
     found = closure(before, after, rng)
     assert found is not None and found.value == pytest.approx(0.9)  # 1 - 10 / 100
     assert gap(before, rng).value == pytest.approx(np.sqrt(24.0))
     assert gap(after, rng).value == 0.0
-    assert closure(held_out([9.0] * 4, [0.0] * 4), after, rng) is None
-
-
-def test_the_spread_is_the_chi2_that_errors_of_the_parameters_add() -> None:
-    rng = np.random.default_rng(3)
-    root = rng.standard_normal((3, 3))
-    covariance, jacobian = root @ root.T, rng.standard_normal((3, 40))
-    spread = _spread(_along_errors(jacobian, covariance))
-    assert spread.sum() == pytest.approx(np.trace(jacobian.T @ covariance @ jacobian))
-    drawn = rng.multivariate_normal(np.zeros(3), covariance, 20_000) @ jacobian
-    assert np.var(np.sum(drawn**2, axis=1)) == pytest.approx(2 * np.sum(spread**2), rel=0.1)
+    assert closure(of_images(9.0, 10.0), after, rng) is None
+    # A decrease of deviance uses the common folds.
+    first = replace(before, deviance={(0,): 30.0, (1,): 20.0})
+    assert fall(first, replace(after, deviance={(0,): 12.0, (2,): 1.0})) == 18.0
 
 
 def test_the_interval_of_closure_contains_its_known_errors() -> None:
-    ones = np.ones(6)
+    def found(after: HeldOut, scale_error: float = 0.0, blocks: float = 0.0) -> tuple[float, float, float]:
+        interval = closure(of_images(110.0, 10.0, blocks), after, np.random.default_rng(1), scale_error)
+        assert interval is not None
+        return interval.low, interval.value, interval.high
 
-    def held_out(chi2: float, expected: float, unocculted: float = 0.0) -> HeldOut:
-        return HeldOut(
-            tuple(range(6)), chi2 * ones, expected * ones, unocculted * ones, 0 * ones, 0 * ones, ones
-        )
-
-    before, after = held_out(110.0, 10.0), held_out(30.0, 10.0)
     # All images are equal, so the interval contains only the error of form.
-    same = closure(before, after, np.random.default_rng(1))
-    assert same is not None
-    assert (same.low, same.value, same.high) == pytest.approx((0.80, 0.80, 0.80 + FORM_ERROR**2))
+    same = found(of_images(30.0, 10.0))
+    assert same == pytest.approx((0.80, 0.80, 0.80 + FORM_ERROR**2))
     # Of the remaining 20, 15 come from errors of the parameters.
-    unsure = closure(before, held_out(30.0, 25.0), np.random.default_rng(1))
-    assert unsure is not None and (unsure.value, unsure.high) == pytest.approx((0.80, 1.0))
+    assert found(of_images(30.0, 25.0))[1:] == pytest.approx((0.80, 1.0))
     # If all of it comes from one direction, it is often more than its mean: up to 3.8 times.
     one_direction = {tuple(range(6)): (np.array([30.0]), np.array([30.0]))}  # the sum over six images is 30
-    drawn = closure(before, replace(held_out(60.0, 15.0), spread=one_direction), np.random.default_rng(1))
-    assert drawn is not None and drawn.value == pytest.approx(0.50)
-    assert drawn.high == pytest.approx(0.50 + 3.84 * 30 / 600 + FORM_ERROR**2, abs=0.02)
+    low, value, high = found(replace(of_images(60.0, 15.0), spread=one_direction))
+    assert value == pytest.approx(0.50)
+    assert high == pytest.approx(0.50 + 3.84 * 30 / 600 + FORM_ERROR**2, abs=0.02)
     # A noise scale with an error of 20 % widens the interval on both sides.
-    wide = closure(before, after, np.random.default_rng(1), 0.2)
-    assert wide is not None and wide.low < same.low - 0.02 and same.high + 0.02 < wide.high <= 1
+    low, _, high = found(of_images(30.0, 10.0), 0.2)
+    assert low < same[0] - 0.02 and same[2] + 0.02 < high <= 1
     # The unocculted blocks count if they show more of the gap and the effect explains them.
-    for unocculted_before, unocculted_after, closed in (
-        (900.0, 0.0, 0.9),
-        (90.0, 0.0, 0.0),
-        (900.0, 800.0, 0.0),
-    ):
-        found = closure(
-            held_out(110.0, 10.0, unocculted_before),
-            held_out(110.0, 10.0, unocculted_after),
-            np.random.default_rng(1),
-        )
-        assert found is not None and found.value == pytest.approx(closed)
+    for before, after, closed in ((900.0, 0.0, 0.9), (90.0, 0.0, 0.0), (900.0, 800.0, 0.0)):
+        assert found(of_images(110.0, 10.0, after), blocks=before)[1] == pytest.approx(closed), before
 
 
-def test_deviance_is_the_log_likelihood_of_a_fold() -> None:
-    rng = np.random.default_rng(2)
-    left, jacobian, root = rng.normal(size=7), rng.normal(size=(3, 7)), rng.normal(size=(3, 3))
-    covariance = root @ root.T
-    spread = np.eye(7) + jacobian.T @ covariance @ jacobian
-    expected = -2 * multivariate_normal(cov=spread).logpdf(left) - 7 * np.log(2 * np.pi)
-    assert _deviance(left, _along_errors(jacobian, covariance)) == pytest.approx(expected)
-    assert _deviance(left, _along_errors(jacobian[:0], covariance[:0, :0])) == pytest.approx(left @ left)
-
-
-def test_a_decrease_of_deviance_uses_the_common_folds() -> None:
-    ones = np.ones(2)
-    before, after = (
-        HeldOut((0, 1), ones, ones, ones, ones, ones, ones, of_folds)
-        for of_folds in ({(0,): 30.0, (1,): 20.0}, {(0,): 12.0, (2,): 1.0})
-    )
-    assert fall(before, after) == 18.0
+def test_shares_of_axes_are_averages_over_orders_and_the_axis_of_a_gap_is_first(evidence: Evidence) -> None:
+    worth = {(): 0.0, ("a",): 1.0, ("b",): 2.0, ("a", "b"): 2.5}
+    shares = shapley(["a", "b"], worth)
+    assert shares == pytest.approx({"a": 0.75, "b": 1.75})  # (1 + 0.5) / 2 and (2 + 1.5) / 2
+    noise = with_residuals(evidence, {}, noise=1.0)
+    rings = with_left(noise, lambda disc: disc.residual + 0.5 * disc.expected * (disc.radius - 0.6))
+    axes, of_noise = (where(model, np.random.default_rng(1)) for model in (rings, noise))
+    assert axes[0].name == "radius_in_disc" and axes[0].share > 0.4
+    assert sum(axis.share for axis in axes) == pytest.approx(1.0)
+    # Of nine discs, few sign flips differ.
+    assert axes[0].p_value < 0.1 < min(axis.p_value for axis in of_noise)

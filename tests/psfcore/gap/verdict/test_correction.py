@@ -12,30 +12,31 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from psfcore.errors import DataError
-from psfcore.gap.effect import Effect
+from psfcore.gap.effect import Change, Effect
 from psfcore.gap.evidence.effect_fits import fit_effects
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.search import displaced
-from psfcore.gap.library.optics import (
-    _copy,
-)
 from psfcore.gap.verdict import correction
-from psfcore.gap.verdict.correction import Corrected, _with_noise_of, add_to_model, images_without
+from psfcore.gap.verdict.correction import Corrected, add_to_model, images_without
+from psfcore.gap.verdict.same_data import with_same_data
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import invert
-from psfcore.transit.transit import Transit
+from psfcore.scatter.inversion import Solution, invert
+from psfcore.transit.transit import Frame, Transit
+from tests.psfcore.gap.small_gaps import changed
 from tests.psfcore.gap.small_transits import clean, effect
+
+
+def fit_of(change: Any, effects: Sequence[Effect]) -> tuple[Solution, LinearModel]:
+    """The fit to twelve images that were changed, and its linear model."""
+    fit = invert(changed(clean(12), change))
+    return fit, LinearModel(gather(fit, effects), FLOOR)
 
 
 def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     """An offset of 1 DN; the second round also subtracts light that was never added."""
     offset = effect("dark_offset")
-    frames = tuple(
-        replace(frame, pixels=frame.pixels + np.float32(1.0 / frame.exposure_s)) for frame in clean().frames
-    )
-    found = invert(replace(clean(), frames=frames))
-    model = LinearModel(gather(found, [offset]), FLOOR)
+    fit, model = fit_of(lambda n, frame: frame.pixels + 1.0 / frame.exposure_s, [offset])
     taken_out: list[float] = []
     as_it_is = correction.images_without
 
@@ -46,28 +47,29 @@ def test_a_round_that_leaves_more_than_the_previous_one_is_rejected(monkeypatch:
         again = as_it_is(transit, view, effects, theta)
         if len(taken_out) == 1:
             return again
-        light = np.linspace(0.0, 40.0, again.shape[1], dtype=np.float32)
-        return replace(again, frames=tuple(replace(f, pixels=f.pixels + light) for f in again.frames))
+        light = np.linspace(0.0, 40.0, again.shape[1])
+        return changed(again, lambda n, frame: frame.pixels + light)
 
     monkeypatch.setattr(correction, "images_without", spoiled)
     monkeypatch.setattr(correction, "SETTLED", 0.0)
-    added = add_to_model(found, [offset], fit_effects(model, [offset]), model)
+    added = add_to_model(fit, [offset], fit_effects(model, [offset]), model)
     value, sigma, _ = added.values["offset"]
     assert len(taken_out) == 2 and added.rounds == 1
     assert value == pytest.approx(1.0, abs=4 * sigma)
     assert added.parameters("dark_offset") == {"offset": (value, sigma)}
     assert added.subtracted["dark_offset"] == pytest.approx((1.0,), abs=4 * sigma)
+    # Noise and reference level are those of the images before the subtraction.
+    for before, after in zip(model.evidence.discs, added.evidence.discs, strict=True):
+        assert after.level == before.level
+        np.testing.assert_array_equal(after.covariance, before.covariance)
+    np.testing.assert_array_equal(added.evidence.unocculted.variance, model.evidence.unocculted.variance)
 
 
 def test_a_refit_of_several_rounds_computes_the_jacobian_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plane of light; the model at the refit is that of a new linear model of the images without this plane."""
     plane = effect("intensity_gradient")
-    x = np.indices(clean().shape)[1] / clean().shape[1] - 0.5
-    frames = tuple(
-        replace(frame, pixels=(frame.pixels + 4.0 + 8.0 * x).astype(np.float32)) for frame in clean().frames
-    )
-    found = invert(replace(clean(), frames=frames))
-    model = LinearModel(gather(found, [plane]), FLOOR)
+    x = np.indices(clean(12).shape)[1] / clean(12).shape[1] - 0.5
+    fit, model = fit_of(lambda n, frame: frame.pixels + 4.0 + 8.0 * x, [plane])
     gathered: list[Evidence] = []
 
     def counted(*given: Any, **named: Any) -> Evidence:
@@ -77,11 +79,11 @@ def test_a_refit_of_several_rounds_computes_the_jacobian_once(monkeypatch: pytes
     monkeypatch.setattr(correction, "gather", counted)
     monkeypatch.setattr(correction, "SETTLED", 0.0)
     offset = effect("dark_offset")
-    added = add_to_model(found, [plane], fit_effects(model, [plane]), model, beside=[offset])
+    added = add_to_model(fit, [plane], fit_effects(model, [plane]), model, beside=[offset])
     assert added.rounds > 1 and len(gathered) == 1
     for name, true in (("level", 4.0), ("slope_x", 8.0), ("slope_y", 0.0)):
         value, sigma, _ = added.values[name]
-        assert value == pytest.approx(true, abs=4 * sigma)
+        assert value == pytest.approx(true, abs=4 * sigma), name
     assert added.beside is not None
     assert [e.name for e in added.beside.evidence.effects] == ["intensity_gradient", "dark_offset"]
     alone = gather(added.solution, added.effects)
@@ -113,35 +115,55 @@ def test_a_refit_gives_the_parameters_of_each_effect() -> None:
 def test_a_share_of_light_cannot_be_negative() -> None:
     """Images that lost a share of their columns' light: a smear that adds light must not explain them."""
     smear = effect("column_smear")
-    frames = tuple(
-        replace(frame, pixels=frame.pixels - np.float32(0.03) * frame.pixels.mean(axis=0))
-        for frame in clean().frames
-    )
-    found = invert(replace(clean(), frames=frames))
-    model = LinearModel(gather(found, [smear]), FLOOR)
+    fit, model = fit_of(lambda n, frame: frame.pixels - 0.03 * frame.pixels.mean(axis=0), [smear])
     below = fit_effects(model, [smear], any_sign=True)
     assert all(value < 0 for value, _, _ in below.values.values())
-    with pytest.raises(DataError, match="expected column_smear to add light") as caught:
-        add_to_model(found, [smear], below, model)
-    assert caught.value.code == "effect-unseen"
+    with pytest.raises(DataError, match="expected column_smear to add light") as refusal:
+        add_to_model(fit, [smear], below, model)
+    assert refusal.value.code == "effect-unseen"
 
 
 def test_a_subtracted_effect_scales_with_the_brightness_of_the_image() -> None:
     """A copy in every image, and brightness that varies by 2 %: after subtraction the images of a pointing agree as well."""
     rng = np.random.default_rng(4)
-    frames = tuple(
-        replace(
-            frame,
-            pixels=(
-                (frame.pixels + 0.4 * displaced(gaussian_filter(frame.pixels, 12.0), 40, -30))
-                * (1 + 0.02 * rng.standard_normal())
-            ).astype(np.float32),
-        )
-        for frame in clean().frames
+
+    def copied(n: int, images: Sequence[Any]) -> Any:
+        return displaced(gaussian_filter(images[n], 12.0), 40, -30)
+
+    def with_copy(n: int, frame: Frame) -> np.ndarray:
+        return (frame.pixels + 0.4 * copied(0, [frame.pixels])) * (1 + 0.02 * rng.standard_normal())
+
+    copy = replace(effect("ghost"), changes=lambda view: [Change(copied, unocculted=False)], held=None)
+    fit = invert(changed(clean(12), with_copy))
+    view = View(fit)
+    before = gather(fit, [copy], view=view)
+    after = gather(invert(images_without(fit.transit, view, [copy], np.array([0.4]))), [copy])
+    blocks = replace(after.unocculted, variance=before.unocculted.variance)
+    assert replace(after, unocculted=blocks).all_unocculted.chi2 < before.all_unocculted.chi2 * 1.02
+
+
+def test_a_refit_is_judged_by_the_data_from_before_it(evidence: Evidence) -> None:
+    """The refit has other blocks, its own order of columns, and lost the first disc; the fit before it could not use the last."""
+    (offset,), smear = evidence.columns["dark_offset"], evidence.columns["column_smear"]
+    own = {"column_smear": (offset, smear[0]), "dark_offset": (smear[1],)}
+    first, *rest = evidence.discs
+    before = replace(evidence, discs=(first, *rest[:-1]))
+    after = replace(
+        evidence,
+        effects=evidence.effects[::-1],
+        columns=own,
+        discs=tuple(rest),
+        unocculted=replace(evidence.unocculted, levels=0.5 * evidence.unocculted.levels),
     )
-    found = invert(replace(clean(), frames=frames))
-    view, copy = View(found), replace(effect("ghost"), changes=lambda view: _copy(12.0, 40, -30), held=None)
-    before = gather(found, [copy], view=view)
-    without = invert(images_without(found.transit, view, [copy], np.array([0.4])))
-    after = _with_noise_of(before, gather(without, [copy]))
-    assert after.all_unocculted.chi2 < before.all_unocculted.chi2 * 1.02
+    moved = np.arange(1.0, 1.0 + len(evidence.base))
+    same = with_same_data(before, after, {"dark_offset": (2.0,)}, moved)
+    blocks, change = same.unocculted, evidence.unocculted.errors[offset]
+    np.testing.assert_allclose(blocks.levels, evidence.unocculted.levels - 2.0 * change)
+    np.testing.assert_array_equal(blocks.errors[smear[1]], change)
+    np.testing.assert_array_equal(blocks.variance, evidence.unocculted.variance)
+    assert same.images == before.images
+    change = moved @ first.jacobian[list(evidence.base)] + 2.0 * first.jacobian[offset]
+    np.testing.assert_allclose(same.discs[0].residual, first.residual - change)
+    np.testing.assert_array_equal(same.discs[0].jacobian[smear[1]], first.jacobian[offset])
+    np.testing.assert_array_equal(same.discs[0].jacobian[offset], first.jacobian[smear[0]])
+    assert same.discs[1:] == before.discs[1:]

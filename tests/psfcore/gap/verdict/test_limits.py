@@ -19,13 +19,13 @@ from psfcore.gap.verdict.limits import (
     EffectLimits,
     Limits,
     ParameterLimits,
-    _cumulants_of_field,
-    _quantile_of_sum,
+    cumulants_of_field,
     limits,
+    quantile_of_sum,
     upper_limit,
 )
 from psfcore.gap.verdict.posterior import NONE, PRIOR, posterior, without_idle
-from tests.psfcore.gap.linear_models import drawn
+from tests.psfcore.gap.linear_models import drawn, effect_of
 
 THRESHOLD = 0.05
 DRAWS = 150  # with 60, noise alone leaves the tested range once in thirty times
@@ -43,29 +43,35 @@ def model(evidence: Evidence) -> LinearModel:
     return LinearModel(evidence, FLOOR, scale_error=0.1)
 
 
-@pytest.mark.slow  # the strength of a noncentral chi2 below is the fast case
-@pytest.mark.parametrize(("name", "k"), [("dark_offset", 0), ("column_smear", 0)])
-def test_an_effect_of_this_strength_is_found_nine_times_in_ten(model: LinearModel, name: str, k: int) -> None:
-    """With noise drawn anew each time, by the answer that the posterior itself gives."""
-    strength = limits_of(model).effects[name].parameters[k].found_90
+def strength_of(found: Limits, name: str) -> float:
+    strength = found.effects[name].parameters[0].found_90
     assert strength is not None
-    found = 0
-    for seed in range(DRAWS):
-        shares = without_idle(posterior(drawn(model, {(name, k): strength}, seed)).probabilities())
-        answer = ANSWER.answer(shares)
-        found += NONE not in answer and (name,) in answer
-    assert 0.82 <= found / DRAWS <= 0.97
+    return strength
+
+
+def names_it(model: LinearModel, name: str) -> bool:
+    """Whether the answer that the posterior gives contains the effect and not "no gap"."""
+    answer = ANSWER.answer(without_idle(posterior(model).probabilities()))
+    return NONE not in answer and (name,) in answer
+
+
+@pytest.mark.slow  # the strength of a noncentral chi2 below is the fast case
+def test_an_effect_of_this_strength_is_found_nine_times_in_ten(model: LinearModel) -> None:
+    """With noise drawn anew each time, by the answer that the posterior itself gives."""
+    for name in ("dark_offset", "column_smear"):
+        values = {(name, 0): strength_of(limits_of(model), name)}
+        found = sum(names_it(drawn(model, values, seed), name) for seed in range(DRAWS))
+        assert 0.82 <= found / DRAWS <= 0.97, name
 
 
 @pytest.mark.slow
 def test_the_rms_of_a_random_field_is_found_and_bounded(model: LinearModel) -> None:
     """The smear as a random field: its two coefficients are drawn anew each time, with the standard deviation that should be found."""
-    smear = next(e for e in model.evidence.effects if e.name == "column_smear")
+    smear, offset = (effect_of(model.evidence, name) for name in ("column_smear", "dark_offset"))
     # A likely size that these data can show; of a field that is far stronger than its prior, the cause would be "unknown".
     parameters = tuple(replace(one, positive=False, likely=0.1) for one in smear.parameters)
     field = replace(smear, field=True, parameters=parameters)
-    others = tuple(e for e in model.evidence.effects if e.name != "column_smear")
-    random = replace(model, evidence=replace(model.evidence, effects=(*others, field)))
+    random = replace(model, evidence=replace(model.evidence, effects=(offset, field)))
     (limit,) = limits_of(random).effects["column_smear"].parameters
     assert limit.name == "rms" and limit.found_90 is not None
     rng = np.random.default_rng(6)
@@ -73,8 +79,7 @@ def test_the_rms_of_a_random_field_is_found_and_bounded(model: LinearModel) -> N
     for seed in range(DRAWS):
         values = limit.found_90 * rng.normal(size=2)
         seen = drawn(random, {("column_smear", k): float(values[k]) for k in (0, 1)}, seed)
-        answer = ANSWER.answer(without_idle(posterior(seen).probabilities()))
-        found += NONE not in answer and ("column_smear",) in answer
+        found += names_it(seen, "column_smear")
         (after,) = limits_of(seen).effects["column_smear"].parameters
         assert after.excluded_95 is not None
         above += limit.found_90 > after.excluded_95
@@ -82,36 +87,29 @@ def test_the_rms_of_a_random_field_is_found_and_bounded(model: LinearModel) -> N
     assert above / DRAWS <= 0.05 + 2 * math.sqrt(0.05 * 0.95 / DRAWS)
 
 
-@pytest.mark.parametrize(("share", "name"), [(1.0, "dark_offset"), (0.5, "column_smear")])
-def test_the_truth_is_rarely_above_the_excluded_strength(model: LinearModel, share: float, name: str) -> None:
-    """share: of the strength that would be found."""
-    found = limits_of(model).effects[name].parameters[0].found_90
-    assert found is not None
-    above = []
-    for seed in range(FEWER_DRAWS):
-        seen = limits_of(drawn(model, {(name, 0): share * found}, seed)).effects[name].parameters[0]
-        assert seen.excluded_95 is not None and seen.excluded_95 > 0
-        above.append(share * found > seen.excluded_95)
-    assert np.mean(above) <= 0.05 + 2 * math.sqrt(0.05 * 0.95 / FEWER_DRAWS)
+def test_the_truth_is_rarely_above_the_excluded_strength(model: LinearModel) -> None:
+    """For the strength that would be found, and half of it."""
+    plain = limits_of(model)
+    for share, name in ((1.0, "dark_offset"), (0.5, "column_smear")):
+        true, above = share * strength_of(plain, name), 0
+        for seed in range(FEWER_DRAWS):
+            seen = limits_of(drawn(model, {(name, 0): true}, seed)).effects[name].parameters[0]
+            assert seen.excluded_95 is not None and seen.excluded_95 > 0
+            above += true > seen.excluded_95
+        assert above / FEWER_DRAWS <= 0.05 + 2 * math.sqrt(0.05 * 0.95 / FEWER_DRAWS), name
 
 
 def test_the_found_strength_of_one_parameter_is_that_of_a_noncentral_chi2(model: LinearModel) -> None:
     """With one effect in the library, and against "no effect" alone, the strength follows from one noncentral chi2 variable."""
-    (column,) = model.evidence.columns["dark_offset"]
-    offset = next(e for e in model.evidence.effects if e.name == "dark_offset")
-    alone = replace(
-        model, evidence=replace(model.evidence, effects=(offset,), columns={"dark_offset": (column,)})
-    )
-    alone = replace(alone, scale_error=1e-3)
+    (column,), base = model.evidence.columns["dark_offset"], list(model.evidence.base)
+    offset = effect_of(model.evidence, "dark_offset")
+    evidence = replace(model.evidence, effects=(offset,), columns={"dark_offset": (column,)})
+    alone = replace(model, evidence=evidence, scale_error=1e-3)
     prior = dict(PRIOR) | {"unknown": 1e-12}
-    strength = limits_of(alone, prior=prior).effects["dark_offset"].parameters[0].found_90
-    assert strength is not None
-    base = list(model.evidence.base)
+    strength = strength_of(limits_of(alone, prior=prior), "dark_offset")
     normal = alone.equations()[0]
-    information = float(
-        normal[column, column]
-        - normal[column, base] @ np.linalg.solve(normal[np.ix_(base, base)], normal[base, column])
-    )
+    absorbed = normal[column, base] @ np.linalg.solve(normal[np.ix_(base, base)], normal[base, column])
+    information = float(normal[column, column] - absorbed)
 
     def log_odds(z2: float) -> float:
         grown = [information * (scale * offset.parameters[0].likely) ** 2 for scale in SCALES]
@@ -119,18 +117,15 @@ def test_the_found_strength_of_one_parameter_is_that_of_a_noncentral_chi2(model:
         return math.log(prior["single"] / prior["none"] * sum(weights) / len(weights))
 
     least = next(z2 for z2 in np.arange(0.0, 60.0, 0.01) if log_odds(z2) > math.log(1 / THRESHOLD - 1))
-    found = float(ncx2.sf(least, 1, information * strength**2))
-    assert found == pytest.approx(0.9, abs=0.02)
+    assert float(ncx2.sf(least, 1, information * strength**2)) == pytest.approx(0.9, abs=0.02)
 
 
 def test_a_stricter_answer_needs_a_stronger_effect(model: LinearModel) -> None:
-    def found(**changes: float) -> float:
-        strength = limits_of(model, **changes).effects["dark_offset"].leading.found_90
-        assert strength is not None
-        return strength
-
-    assert found(threshold=0.01) > found() > found(threshold=0.2)
-    assert found(temperature=3.0) > found()
+    usual, strict, lax, warm = (
+        strength_of(limits_of(model, **changes), "dark_offset")
+        for changes in ({}, {"threshold": 0.01}, {"threshold": 0.2}, {"temperature": 3.0})
+    )
+    assert strict > usual > lax and warm > usual
 
 
 def test_the_quantile_of_a_sum_of_noncentral_variables() -> None:
@@ -138,23 +133,19 @@ def test_the_quantile_of_a_sum_of_noncentral_variables() -> None:
         w, d = np.array(weights), np.array(d2)
         cumulants = np.array([[np.sum(w**r * (1 + r * d)) for r in (1, 2, 3)]])
         rng = np.random.default_rng(1)
-        drawn_sums = ((rng.normal(size=(200_000, w.size)) + np.sqrt(d)) ** 2) @ w
-        exact = np.quantile(drawn_sums, 0.1)
-        assert _quantile_of_sum(cumulants, 0.1)[0] == pytest.approx(exact, rel=0.04, abs=0.05)
+        sums = ((rng.normal(size=(200_000, w.size)) + np.sqrt(d)) ** 2) @ w
+        exact = np.quantile(sums, 0.1)
+        assert quantile_of_sum(cumulants, 0.1)[0] == pytest.approx(exact, rel=0.04, abs=0.05), weights
     plain = np.array([[5.0, 5.0, 5.0]])  # chi2 with five degrees of freedom
-    assert _quantile_of_sum(plain, 0.1)[0] == pytest.approx(chi2.ppf(0.1, 5), rel=0.01)
-
-
-def test_the_cumulants_of_a_random_field() -> None:
-    """Compared with sums drawn with random coefficients; the cumulants leave out the factors 1, 2 and 8."""
+    assert quantile_of_sum(plain, 0.1)[0] == pytest.approx(chi2.ppf(0.1, 5), rel=0.01)
+    # The cumulants of a random field, from sums drawn with random coefficients; they leave out the factors 1, 2 and 8.
     rng = np.random.default_rng(3)
-    values, score = np.array([6.0, 2.0, 0.5]), rng.normal(size=(3, 4))
-    strength = 1.7
-    noise = rng.normal(size=(400_000, 3)) * np.sqrt(values)
-    changed = noise + strength * rng.normal(size=(400_000, 4)) @ score.T
+    values, score, strength = np.array([6.0, 2.0, 0.5]), rng.normal(size=(3, 4)), 1.7
+    changed = rng.normal(size=(400_000, 3)) * np.sqrt(values)
+    changed += strength * rng.normal(size=(400_000, 4)) @ score.T
     sums = (changed**2) @ (1 / (1 + values))
     third = float(np.mean((sums - sums.mean()) ** 3))
-    found = _cumulants_of_field(values, score) @ strength ** (2 * np.arange(4))
+    found = cumulants_of_field(values, score) @ strength ** (2 * np.arange(4))
     assert found == pytest.approx([sums.mean(), sums.var() / 2, third / 8], rel=0.05)
 
 
@@ -168,13 +159,10 @@ def test_the_quantile_of_a_strength() -> None:
 
 def test_two_effects_with_one_form_are_alike_and_others_are_not(model: LinearModel) -> None:
     evidence = model.evidence
-    offset = next(e for e in evidence.effects if e.name == "dark_offset")
+    offset = effect_of(evidence, "dark_offset")
     twin = replace(offset, name="twin", settled_by="a twin's observation")
-    same = replace(
-        evidence,
-        effects=(*evidence.effects, twin),
-        columns=evidence.columns | {"twin": evidence.columns["dark_offset"]},
-    )
+    columns = evidence.columns | {"twin": evidence.columns["dark_offset"]}
+    same = replace(evidence, effects=(*evidence.effects, twin), columns=columns)
     found = limits_of(replace(model, evidence=same))
     assert found.distances["dark_offset", "twin"] == pytest.approx(0.0, abs=0.5)
     first = found.alike[0]
@@ -189,40 +177,34 @@ def test_the_limits_as_json(model: LinearModel) -> None:
     evidence = replace(model.evidence, untestable={"ghost": "the mirror is missing"})
     found = limits_of(replace(model, evidence=evidence)).as_json()
     offset = found["limits"]["dark_offset"]
-    assert offset["parameter"] == "offset" and offset["unit"] == "DN"
+    assert (offset["parameter"], offset["unit"]) == ("offset", "DN")
     assert 0 < offset["excluded_95"] < offset["found_90"]
     assert set(found["limits"]["column_smear"]["parameters"]) == {"share_below", "share_above"}
     assert found["untestable"] == [{"name": "ghost", "why": "the mirror is missing"}]
-    before = limits_of(model, observed=False).as_json()["limits"]
-    assert before["dark_offset"]["excluded_95"] is None
-    assert before["dark_offset"]["found_90"] == offset["found_90"]
-
-
-def test_an_effect_of_any_size_has_no_limit(model: LinearModel) -> None:
-    effects = tuple(
-        replace(e, parameters=tuple(replace(p, likely=math.inf) for p in e.parameters))
-        if e.name == "dark_offset"
-        else e
-        for e in model.evidence.effects
-    )
-    found = limits_of(replace(model, evidence=replace(model.evidence, effects=effects)))
-    assert set(found.effects) == {"column_smear"}
-    assert "is infinite" in found.untestable["dark_offset"]
+    before = limits_of(model, observed=False).as_json()["limits"]["dark_offset"]
+    assert before["excluded_95"] is None and before["found_90"] == offset["found_90"]
+    # An effect of any size has no limit.
+    dark, smear = (effect_of(evidence, name) for name in ("dark_offset", "column_smear"))
+    dark = replace(dark, parameters=tuple(replace(p, likely=math.inf) for p in dark.parameters))
+    of_any_size = limits_of(replace(model, evidence=replace(evidence, effects=(dark, smear))))
+    assert set(of_any_size.effects) == {"column_smear"}
+    assert "is infinite" in of_any_size.untestable["dark_offset"]
 
 
 def test_the_leading_parameter_is_the_first_that_would_be_found_at_its_likely_size() -> None:
-    def one(name: str, found: float | None) -> ParameterLimits:
-        return ParameterLimits(name, "", 2.0, found, None)
+    def leading(**strengths: float | None) -> ParameterLimits:
+        parameters = (ParameterLimits(name, "", 2.0, found, None) for name, found in strengths.items())
+        return EffectLimits("e", tuple(parameters)).leading
 
-    assert EffectLimits("e", (one("a", 5.0), one("b", 1.9), one("c", 0.1))).leading.name == "b"
-    assert EffectLimits("e", (one("a", None), one("b", 9.0), one("c", 3.0))).leading.name == "c"
-    assert EffectLimits("e", (one("a", None),)).leading.found_90 is None
+    assert leading(a=5.0, b=1.9, c=0.1).name == "b"
+    assert leading(a=None, b=9.0, c=3.0).name == "c"
+    assert leading(a=None).found_90 is None
 
 
 def test_after_a_refit_the_excluded_strength_is_that_of_the_refit(model: LinearModel) -> None:
     """Only of the parameters that the refit fitted; the strengths that would be found stay."""
     before = limits_of(model)
-    smear = next(e for e in model.evidence.effects if e.name == "column_smear")
+    smear = effect_of(model.evidence, "column_smear")
     after = before.after_refit(smear, {"share_below": (0.02, 0.001)})
     below, above = after.effects["column_smear"].parameters
     assert below.excluded_95 == pytest.approx(0.02 + 0.001 * norm.ppf(0.95), rel=1e-6)

@@ -1,14 +1,16 @@
-"""The verdict: each row of its table, from posteriors made by hand; few images; probabilities of effects; a temperature."""
+"""The verdict: each row of its table, from posteriors made by hand; few images; a temperature; the calibration of the answer set."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 
+import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.gap.verdict.calibration import Calibration
+from psfcore.gap.verdict.calibration import COVERAGE, Calibration, shipped_calibration, true_share
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior
 from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement, of_effects, verdict_of
 
@@ -21,47 +23,39 @@ def posterior_of(shares: Mapping[Names, float]) -> Posterior:
 
 
 def judged(
-    shares: Mapping[Names, float],
-    *,
-    least: float = 0.1,
-    temperature: float = 1.0,
-    images: int = 12,
-    coverage: float = 0.9,
+    shares: Mapping[Names, float], *, least: float = 0.1, temperature: float = 1.0, images: int = 12
 ) -> Judgement:
     """The verdict of a posterior. least: the probability that a hypothesis of the answer set needs."""
-    calibration = Calibration(temperature, (least,) * 9, {})
-    return verdict_of(posterior_of(shares), calibration, images=images, coverage=coverage)
+    return verdict_of(posterior_of(shares), Calibration(temperature, (least,) * 9, {}), images=images)
 
 
-def test_no_gap_as_the_most_probable_hypothesis_is_the_verdict_none() -> None:
-    for shares in ({NONE: 0.95, A: 0.05}, {NONE: 0.5, A: 0.3, UNKNOWN: 0.2}):
+def test_the_verdict_of_every_kind_of_posterior() -> None:
+    rows: list[tuple[dict[Names, float], str, Names, tuple[Names, ...]]] = [
+        ({NONE: 0.95, A: 0.05}, "none", (), (NONE,)),
+        # The set still says what is not excluded.
+        ({NONE: 0.5, A: 0.3, UNKNOWN: 0.2}, "none", (), (NONE, A, UNKNOWN)),
+        ({UNKNOWN: 0.93, A: 0.05, NONE: 0.02}, "unknown", (), (UNKNOWN,)),
+        ({A: 0.93, UNKNOWN: 0.04, NONE: 0.03}, "attributed", A, (A,)),
+        ({AB: 0.93, UNKNOWN: 0.04, NONE: 0.03}, "attributed", AB, (AB,)),
+        ({B: 0.5, A: 0.45, UNKNOWN: 0.05}, "tie", ("b", "a"), (B, A)),
+        ({AB: 0.5, AC: 0.45, UNKNOWN: 0.05}, "tie", ("a", "b", "c"), (AB, AC)),
+        ({A: 0.6, NONE: 0.35, UNKNOWN: 0.05}, "inconclusive", A, (A, NONE)),
+        ({A: 0.6, UNKNOWN: 0.35, NONE: 0.05}, "inconclusive", A, (A, UNKNOWN)),
+        ({UNKNOWN: 0.6, B: 0.2, A: 0.15, NONE: 0.05}, "inconclusive", B, (UNKNOWN, B, A)),
+        # The most probable hypothesis that names effects is stated, although it is not in the set.
+        ({UNKNOWN: 0.6, NONE: 0.35, A: 0.05}, "inconclusive", A, (UNKNOWN, NONE)),
+        ({UNKNOWN: 0.6, NONE: 0.4}, "inconclusive", (), (UNKNOWN, NONE)),
+    ]
+    # An effect in every member of a tie is certain.
+    tied: dict[Names, tuple[Names, Names]] = {B: (("b", "a"), ()), AB: (("b", "c"), A)}
+    for shares, verdict, answer, members in rows:
         found = judged(shares)
-        assert (found.verdict, found.answer) == ("none", ())
-        assert found.members[0] == NONE
-    assert found.members == (NONE, A, UNKNOWN) and found.named == (
-        A,
-    )  # the set still says what is not excluded
-
-
-def test_an_unknown_cause_alone_is_the_verdict_unknown() -> None:
-    found = judged({UNKNOWN: 0.93, A: 0.05, NONE: 0.02})
-    assert (found.verdict, found.answer, found.members) == ("unknown", (), (UNKNOWN,))
-    assert found.best == A and found.named == ()
-    assert found.orders == ORDERS
-
-
-@pytest.mark.parametrize("names", [A, AB])
-def test_one_hypothesis_that_names_effects_is_attributed(names: Names) -> None:
-    found = judged({names: 0.93, UNKNOWN: 0.04, NONE: 0.03})
-    assert (found.verdict, found.answer, found.members) == ("attributed", names, (names,))
-    assert found.best == names
-    assert found.tied == found.certain == ()
-
-
-def test_several_hypotheses_that_name_effects_are_a_tie() -> None:
-    found = judged({B: 0.5, A: 0.45, UNKNOWN: 0.05})
-    assert (found.verdict, found.answer) == ("tie", ("b", "a"))
-    assert found.tied == ("b", "a") and found.certain == ()
+        assert (found.verdict, found.answer, found.members) == (verdict, answer, members), shares
+        assert (found.tied, found.certain) == (tied[members[0]] if verdict == "tie" else ((), ())), shares
+        assert list(found.hypotheses) == sorted(shares, key=lambda names: -shares[names])
+        named = [names for names in members if names not in (NONE, UNKNOWN)]
+        assert list(found.named) == named and found.orders == ORDERS
+        assert found.best == next((n for n in found.hypotheses if n not in (NONE, UNKNOWN)), None)
 
 
 def test_improbable_members_of_the_set_do_not_change_the_verdict() -> None:
@@ -70,31 +64,6 @@ def test_improbable_members_of_the_set_do_not_change_the_verdict() -> None:
     assert (found.verdict, found.answer) == ("attributed", A)
     found = judged({A: 0.6, B: 0.35, UNKNOWN: 0.05}, least=0.005)
     assert found.deciding == (A, B) and found.verdict == "tie"
-
-
-def test_an_effect_in_every_member_of_a_tie_is_certain() -> None:
-    found = judged({AB: 0.5, AC: 0.45, UNKNOWN: 0.05})
-    assert (found.verdict, found.answer) == ("tie", ("a", "b", "c"))
-    assert found.certain == ("a",) and found.tied == ("b", "c")
-
-
-@pytest.mark.parametrize(
-    ("shares", "members", "answer"),
-    [
-        ({A: 0.6, NONE: 0.35, UNKNOWN: 0.05}, (A, NONE), A),
-        ({A: 0.6, UNKNOWN: 0.35, NONE: 0.05}, (A, UNKNOWN), A),
-        ({UNKNOWN: 0.6, B: 0.2, A: 0.15, NONE: 0.05}, (UNKNOWN, B, A), B),
-        # The most probable hypothesis that names effects is stated, although it is not in the set.
-        ({UNKNOWN: 0.6, NONE: 0.35, A: 0.05}, (UNKNOWN, NONE), A),
-        ({UNKNOWN: 0.6, NONE: 0.4}, (UNKNOWN, NONE), ()),
-    ],
-)
-def test_anything_else_is_inconclusive(
-    shares: dict[Names, float], members: tuple[Names, ...], answer: Names
-) -> None:
-    found = judged(shares)
-    assert (found.verdict, found.members, found.answer) == ("inconclusive", members, answer)
-    assert found.tied == found.certain == ()
 
 
 def test_few_images_cannot_exclude_a_gap_but_may_show_one() -> None:
@@ -107,19 +76,14 @@ def test_few_images_cannot_exclude_a_gap_but_may_show_one() -> None:
 
 def test_the_probability_of_an_effect_is_the_sum_over_the_hypotheses_that_contain_it() -> None:
     shares = {NONE: 0.1, UNKNOWN: 0.05, A: 0.52, B: 0.15, C: 0.02, AB: 0.09, AC: 0.07}
-    wanted = {"none": 0.1, "unknown": 0.05, "a": 0.68, "b": 0.24, "c": 0.09}
-    assert of_effects(shares) == pytest.approx(wanted)
+    sums = {"none": 0.1, "unknown": 0.05, "a": 0.68, "b": 0.24, "c": 0.09}
+    assert of_effects(shares) == pytest.approx(sums)
     assert list(of_effects(shares))[:2] == ["none", "unknown"]
     # An effect that the data do not show beside another one keeps its probability, although its pair is counted to the other.
     found = judged(shares)
-    assert found.effects == pytest.approx(wanted)
+    assert found.effects == pytest.approx(sums)
     assert AB not in found.hypotheses and AC not in found.hypotheses
     assert found.hypotheses[A] == pytest.approx(0.68) and sum(found.hypotheses.values()) == pytest.approx(1)
-
-
-def test_the_hypotheses_are_in_the_order_of_their_probability() -> None:
-    found = judged({NONE: 0.1, A: 0.5, UNKNOWN: 0.15, B: 0.25})
-    assert list(found.hypotheses) == [A, B, UNKNOWN, NONE] and found.members == (A, B, UNKNOWN, NONE)
 
 
 def test_a_temperature_makes_the_set_larger() -> None:
@@ -131,26 +95,70 @@ def test_a_temperature_makes_the_set_larger() -> None:
 
 
 def test_the_set_has_the_coverage_that_was_asked_for() -> None:
-    shares = {A: 0.6, B: 0.3, NONE: 0.1}
+    shares = posterior_of({A: 0.6, B: 0.3, NONE: 0.1})
     calibration = Calibration(1.0, (0.05, *(0.25,) * 4, *(0.5,) * 4), {})
-    members = {
-        coverage: verdict_of(posterior_of(shares), calibration, images=12, coverage=coverage)
-        for coverage in (0.3, 0.6, 0.9)
-    }
-    assert {coverage: one.members for coverage, one in members.items()} == {
-        0.3: (A,),
-        0.6: (A, B),
-        0.9: (A, B, NONE),
-    }
-    assert all(one.coverage == coverage for coverage, one in members.items())
-    with pytest.raises(DataError) as raised:
-        verdict_of(posterior_of(shares), calibration, images=12, coverage=0.95)
-    assert raised.value.code == "bad-coverage"
+    for coverage, members in ((0.3, (A,)), (0.6, (A, B)), (0.9, (A, B, NONE))):
+        found = verdict_of(shares, calibration, images=12, coverage=coverage)
+        assert (found.coverage, found.members) == (coverage, members)
+    with pytest.raises(DataError) as refusal:
+        verdict_of(shares, calibration, images=12, coverage=0.95)
+    assert refusal.value.code == "bad-coverage"
+    # The refits of all hypotheses that name effects failed.
+    nothing = posterior_of({NONE: 0.3, UNKNOWN: 0.7})
+    found = verdict_of(nothing, calibration, images=12, failed=(A, B))
+    assert (found.best, found.answer, found.failed) == (None, (), (A, B))
 
 
-def test_without_a_hypothesis_that_names_effects_there_is_no_best() -> None:
-    """The refits of all of them failed."""
-    found = verdict_of(
-        posterior_of({NONE: 0.3, UNKNOWN: 0.7}), Calibration(1.0, (0.1,) * 9, {}), images=12, failed=(A, B)
-    )
-    assert found.best is None and found.answer == () and found.failed == (A, B)
+def test_further_cases_are_covered_as_stated() -> None:
+    """Split-conformal coverage over many calibrations: at least as stated, and above it by 1 / (n + 1) at most."""
+    for coverage in (0.5, 0.9):
+        rng = np.random.default_rng(7)
+        held = []
+        for _ in range(400):
+            shares = rng.beta(2, 1, 49 + 20)
+            least = Calibration(1.0, tuple(shares[:49]), {}).threshold(coverage)
+            held.append(np.mean(shares[49:] >= least))
+        assert coverage - 0.01 < np.mean(held) < coverage + 1 / 50 + 0.01
+
+
+def test_the_answer_holds_the_hypotheses_above_the_threshold() -> None:
+    calibration = Calibration(1.0, tuple(0.05 * n for n in range(1, 20)), {})
+    shares = {A: 0.5, NONE: 0.3, AB: 0.15, UNKNOWN: 0.05}
+    assert calibration.answer(shares, 0.9) == (A, NONE, AB)
+    assert calibration.answer(shares, 0.5) == (A,)
+    assert calibration.answer({A: 0.1, NONE: 0.08}, 0.05) == (A,)
+    for coverage in (0.0, 1.0, 0.96, -1.0):
+        with pytest.raises(DataError, match=r"at most 0\.950, for which 19 ") as refusal:
+            calibration.threshold(coverage)
+        assert refusal.value.code == "bad-coverage"
+    # At least the most probable hypothesis, also if every one is less probable than the threshold.
+    sure = Calibration(1.0, (0.99,) * 19, {})
+    for shares in ({A: 0.4, NONE: 0.35, UNKNOWN: 0.25}, {NONE: 0.98, A: 0.02}):
+        assert sure.answer(shares, 0.9) == (next(iter(shares)),)
+    # A larger coverage gives no smaller answer.
+    rng = np.random.default_rng(3)
+    calibration = Calibration(1.0, tuple(rng.beta(2, 1, 59)), {})
+    shares = dict(zip((NONE, UNKNOWN, A, B, AB), rng.dirichlet(np.ones(5)).tolist(), strict=True))
+    answers = [set(calibration.answer(shares, c)) for c in (1e-12, 0.5, 0.7, 0.9, 0.95, 0.98)]
+    assert all(small <= large for small, large in itertools.pairwise(answers))
+    assert len(answers[-1]) > 1
+
+
+def test_the_true_cause_is_in_a_hypothesis_with_all_its_effects() -> None:
+    shares = {A: 0.5, AB: 0.2, ("b", "c"): 0.1, UNKNOWN: 0.2}
+    for true, share in ((A, 0.5), (B, 0.2), (AC, 0.0), (UNKNOWN, 0.2)):
+        assert true_share(shares, true) == share
+
+
+def test_the_calibration_says_how_it_was_made_and_has_enough_cases() -> None:
+    about = {"seed": 3, "holds_for": "transits like these"}
+    assert Calibration(1.5, (0.2, 0.4), about).to_json() == {"cases": 2, "temperature": 1.5} | about
+    shipped = shipped_calibration()
+    assert shipped.about["command"].startswith("python -m studies.gap_calibration ")
+    assert f"--seed {shipped.about['seed']} " in shipped.about["command"]
+    assert shipped.about["version"] and shipped.about["holds_for"].endswith(".")
+    assert 0.5 <= shipped.temperature <= 10.0
+    assert all(0.0 <= share <= 1.0 + 1e-9 for share in shipped.true_shares)  # sums of rounded probabilities
+    # Cases that could not be made are missing; a threshold from fewer than fifty is rough.
+    assert len(shipped.true_shares) >= 50
+    assert shipped.threshold(0.95) <= shipped.threshold(COVERAGE) <= shipped.threshold(0.5)

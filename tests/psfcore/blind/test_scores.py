@@ -1,0 +1,307 @@
+"""The tables of the blind set: hand-made truths, reports, sets and ideal observers; figures computed by hand."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from matplotlib.image import imread
+
+from psfcore.blind.bounds import LEVEL
+from psfcore.blind.plot import score_png
+from psfcore.blind.rows import share_of_expected, wilson
+from psfcore.blind.score_table import score, table
+from psfcore.blind.scoring import (
+    Judged,
+    covers,
+    is_right_and_alone,
+    shown_chi2,
+    true_closure,
+    verdict_is_right,
+)
+from psfcore.blind.set_rows import set_rows
+
+
+def truth(kind: str, *names: str, left: float = 0.0, **more: Any) -> dict[str, Any]:
+    effects = [{"name": name, "strength": 1.0} for name in names]
+    measured = {"left_before_refit_pct": 2 * left, "left_after_refit_pct": left}
+    return {"kind": kind, "effects": effects, **measured, **more}
+
+
+def report(
+    verdict: str, *answer: str, axis: str = "time", **closures: tuple[float, float, float]
+) -> dict[str, Any]:
+    """A report. closures: value and interval of the closure by an effect."""
+    entries = [
+        {"name": name, "closure": {"value": value, "ci90": [low, high]}}
+        for name, (value, low, high) in closures.items()
+    ]
+    said = {"schema": "gap/2", "verdict": verdict, "answer": list(answer)}
+    return said | {"effects": entries, "where": [{"axis": axis}]}
+
+
+# Residuals of two images, noise 1 %: 3 and 4 with the effect, 0 and 1 of the sampling: closure 1 - 1 / 25.
+MEASURED = {
+    "refitted": {"residual_pct": {"0": 3.0, "1": 4.0}, "noise_pct": {"0": 1.0, "1": 1.0}},
+    "clean_by_image_pct": {"0": 0.0, "1": 1.0},
+}
+OFFSET = report(
+    "attributed", "dark_offset", axis="exposure", dark_offset=(0.9, 0.85, 0.97), ghost=(0.5, 0.4, 0.6)
+)
+SMEAR = report("attributed", "column_smear", column_smear=(0.6, 0.5, 0.7), ghost=(0.8, 0.7, 0.9))
+HALO = report("tie", "dark_offset", "wide_halo", axis="pointing", wide_halo=(0.97, 0.9, 1.0))
+CASES = [
+    (truth("clean"), report("none")),
+    (truth("clean"), report("none")),
+    (truth("clean"), report("inconclusive")),
+    (truth("clean"), report("attributed", "ghost")),
+    (truth("single", "dark_offset", left=5.0, **MEASURED), OFFSET),
+    (truth("single", "ghost", left=3.0, **MEASURED), SMEAR),
+    (truth("single", "wide_halo", left=2.0, **MEASURED), HALO),
+    (truth("single", "core_blur", left=1.5), report("inconclusive")),
+    (truth("single", "persistence", left=0.6), report("none")),
+    (truth("pair", "ghost", "dark_offset", left=9.0), report("attributed", "dark_offset", "ghost")),
+    (truth("unknown", "stripes", left=4.0), report("unknown")),
+    (truth("unknown", "glow", left=4.0), report("attributed", "intensity_gradient")),
+    (truth("unknown", "glow", left=0.3), report("none")),
+]
+JUDGED = [Judged(n, true, said, 10.0 + n) for n, (true, said) in enumerate(CASES)]
+BY_DISCS = "the same, >= 2 % left, shown by the discs"
+# Figure: cases, value, whether its goal is met.
+FIGURES = {
+    "false alarms on clean data": (4, 2 / 4, False),
+    "inconclusive on clean data": (4, 1 / 4, None),
+    "answer contains the truth, >= 2 % left": (4, 3 / 4, False),
+    "the same, >= 1 % left, inconclusive = 1/2": (5, 3.5 / 5, False),
+    # Two means of chi2 3^2 + 3^2 = 18 are below 30: none of these cases counts.
+    BY_DISCS: (0, None, None),
+    "first effect is the true one": (3, 2 / 3, False),
+    "one wrong effect named with confidence": (13, 3 / 13, False),
+    "mean number of named effects": (4, (1 + 1 + 2 + 2) / 4, True),
+    "unknown effects called unknown or inconclusive": (2, 1 / 2, False),
+    "closure by the first effect / by the true effect": (3, 1.0, True),  # of 1, 0.6 / 0.8, 1
+    "90 % interval contains the true closure": (3, 2 / 3, False),
+    "strongest axis is right": (3, 2 / 3, False),
+    "time of the slowest case, s": (13, 22.0, True),
+}
+
+
+def test_wilson_agrees_with_the_textbook() -> None:
+    assert wilson(0, 0) == (0.0, 1.0)
+    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
+    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
+    assert wilson(10, 10)[1] == pytest.approx(1.0)
+
+
+def test_every_figure_of_the_answers_equals_the_one_computed_by_hand() -> None:
+    rows = {row.figure: row for row in score(JUDGED).rows}
+    assert set(rows) == set(FIGURES)
+    for figure, (cases, value, met) in FIGURES.items():
+        assert (rows[figure].cases, rows[figure].met) == (cases, met), figure
+        assert rows[figure].value == (value if value is None else pytest.approx(value)), figure
+    interval = rows["one wrong effect named with confidence"].interval95
+    assert interval == pytest.approx(wilson(3, 13))
+    # The true closure excludes what the sampling leaves.
+    assert true_closure(MEASURED) == pytest.approx(1 - 1 / 25)
+    assert true_closure(truth("clean")) is None
+
+
+def test_what_the_discs_show_is_what_exceeds_their_noise() -> None:
+    shown = MEASURED | {"refitted": {"residual_pct": {"0": 3.0, "1": 4.0}, "noise_pct": {"0": 0.5, "1": 1.0}}}
+    assert shown_chi2(shown) == pytest.approx(36 + 9)
+    assert shown_chi2({}) is None
+    case = Judged(0, truth("single", "ghost", left=3.0, **shown), report("attributed", "ghost"), 1.0)
+    row = score([case]).rows[4]
+    assert (row.figure, row.cases, row.value) == (BY_DISCS, 1, 1.0)
+
+
+def test_of_a_pair_only_the_effects_that_show_must_be_named() -> None:
+    said = report("attributed", "ghost")
+    pair = truth("pair", "ghost", "scene_evolution", left=4.0)
+    pair["effects"][0]["left_alone_pct"], pair["effects"][1]["left_alone_pct"] = 4.0, 0.1
+    contains = score([Judged(0, pair, said, 1.0)]).rows[2]
+    assert (contains.cases, contains.value) == (1, 1.0)
+    pair["effects"][1]["left_alone_pct"] = 1.2
+    assert score([Judged(0, pair, said, 1.0)]).rows[2].value == 0.0
+    # A pair is shown by the discs if each required effect alone is.
+    shown = MEASURED | {"refitted": {"residual_pct": {"0": 3.0, "1": 4.0}, "noise_pct": {"0": 0.5, "1": 0.5}}}
+    pair = truth("pair", "ghost", "scene_evolution", left=4.0, **shown)
+    strong, weak = pair["effects"]
+    strong["left_alone_chi2"] = 90.0
+    for more, cases in (({"left_alone_chi2": 29.0}, 0), ({"left_alone_chi2": 31.0}, 1)):
+        weak |= more
+        assert score([Judged(0, pair, said, 1.0)]).rows[4].cases == cases, more
+    weak |= {"left_alone_chi2": 29.0, "left_alone_pct": 0.5}  # too weak: it need not be named
+    assert score([Judged(0, pair, said, 1.0)]).rows[4].cases == 1
+
+
+def test_confusion_power_and_table_count_every_case_once() -> None:
+    found = score(JUDGED)
+    assert found.confusion["clean"] == {"none": 2, "inconclusive": 1, "ghost": 1}
+    assert found.confusion["wide_halo"] == {"wide_halo": 1}
+    assert found.confusion["pair"] == {"dark_offset": 1}
+    assert sum(sum(row.values()) for row in found.confusion.values()) == len(JUDGED)
+    assert sum(bin_of["n"] for bin_of in found.power) == 9
+    two_to_four = next(b for b in found.power if b["left_after_refit_pct"] == [2.0, 4.0])
+    assert (two_to_four["n"], two_to_four["noticed"], two_to_four["contains_truth"]) == (2, 2, 1)
+    top = found.power[-1]
+    assert (top["left_after_refit_pct"], top["n"], top["contains_truth"]) == ([8.0, None], 1, 1)
+    clean = [case for case in JUDGED if case.kind == "clean" and case.verdict == "none"] * 5
+    text = table(score(clean, {7: "exit status 1: no light"}))
+    assert "no false alarm in 10 clean cases: the rate is below 0.300" in text
+    assert "0007: exit status 1: no light" in text
+    assert score([]).rows[0].value is None
+
+
+def test_the_picture_is_drawn_with_and_without_cases(tmp_path: Path) -> None:
+    for name, cases in (("full", JUDGED), ("empty", [])):
+        score_png(score(cases), tmp_path / f"{name}.png")
+        pixels = imread(tmp_path / f"{name}.png")
+        assert pixels.shape[0] > 400 and pixels[..., :3].std() > 0.02, name
+
+
+def with_set(
+    kind: str,
+    names: list[str],
+    members: list[list[str]] | None,
+    *,
+    left: float = 5.0,
+    rival: float | None = None,
+) -> Judged:
+    """A case. rival: what none, and every effect but the true ones, leave; None: no ideal observer."""
+    true = truth(kind, *names) | {"left_after_refit_pct": 0.0 if kind == "clean" else left}
+    said: dict[str, Any] = {"schema": "gap/1" if members is None else "gap/2", "verdict": "unknown"}
+    if members is not None:
+        said["set"] = {"coverage": 0.9, "members": members}
+    ideal = None
+    if rival is not None:
+        chi2 = {(): rival, ("ghost",): rival, ("wide_halo",): rival}
+        chi2 |= {} if kind == "unknown" else {tuple(names): 0.0}
+        hypotheses = [{"effects": list(h), "chi2": value, "cost": 0.0} for h, value in chi2.items()]
+        ideal = {"noncentrality": rival, "left_after_refit_pct": 2.5, "hypotheses": hypotheses}
+    return Judged(0, true, said, 1.0, ideal)
+
+
+SETS = [
+    with_set("clean", [], [[]]),
+    with_set("clean", [], [[], ["ghost"]]),
+    with_set("clean", [], [["ghost"]]),
+    with_set("single", ["ghost"], [["ghost"]], rival=400.0),
+    with_set("single", ["ghost"], [["ghost", "persistence"]], rival=400.0, left=12.0),
+    with_set("single", ["ghost"], [["wide_halo"]], rival=0.0),
+    with_set("single", ["ghost"], [["wide_halo"], ["ghost"], ["unknown"]]),
+    with_set("pair", ["ghost", "core_blur"], [["core_blur", "ghost"]], rival=400.0),
+    with_set("pair", ["ghost", "core_blur"], [["ghost"], ["unknown"]], left=15.0, rival=400.0),
+    with_set("unknown", ["stripes"], [["unknown"]], rival=400.0),
+    with_set("unknown", ["stripes"], [["ghost"]], rival=1.0),
+]
+# Figure: cases, value.
+FIGURES_OF_SETS = {
+    "set covers the truth": (11, 7 / 11),
+    "the same, clean": (3, 2 / 3),
+    "the same, one effect": (4, 3 / 4),
+    "the same, two effects": (2, 1 / 2),
+    "the same, not in the library": (2, 1 / 2),
+    "mean number of members of the set": (11, (1 + 2 + 1 + 1 + 1 + 1 + 3 + 1 + 2 + 1 + 1) / 11),
+    "the same, noncentrality >= 30": (5, (1 + 1 + 1 + 2 + 1) / 5),
+    "clean data: set without []": (3, 1 / 3),
+    # A ghost in clean data, a halo for a ghost, and a ghost for stripes.
+    "one wrong effect alone in the set": (11, 3 / 11),
+    "not in the library, noncentrality >= 30: unknown in set": (1, 1.0),
+    "the same, nearest rival >= 30": (1, 1.0),
+    "set covers the truth, >= 10 % left": (2, 1 / 2),
+}
+COMPARED = (
+    "right and alone / ideal observer",
+    "the same, without clean data",
+    "right verdict / ideal observer",
+)
+
+
+def test_every_figure_of_the_sets_equals_the_one_computed_by_hand() -> None:
+    rows = {row.figure: row for row in set_rows(SETS)}
+    for figure, (cases, value) in FIGURES_OF_SETS.items():
+        assert (rows[figure].cases, rows[figure].value) == (cases, pytest.approx(value)), figure
+    assert rows["set covers the truth"].interval95 == pytest.approx(wilson(7, 11))
+    assert set(rows) - set(FIGURES_OF_SETS) == set(COMPARED)
+    old = [with_set("clean", [], None)]  # a report without a set has no such rows
+    assert set_rows(old) == ()
+    assert "set covers the truth" not in {row.figure for row in score(old).rows}
+
+
+def test_what_is_right_is_compared_with_what_could_be_known() -> None:
+    rows = {row.figure: row for row in set_rows(SETS)}
+    alone = [one.known.alone for one in SETS if one.known is not None]
+    assert alone[:3] == [1 - LEVEL] * 3
+    assert alone[3] > 0.999 > 0.5 > alone[5]
+    # Right and alone: one clean case, the first ghost, the pair, and the stripes. The verdict of every case is `unknown`,
+    # which is right for both stripes.
+    for figure, cases, right, known in (
+        (COMPARED[0], 10, 4, alone),
+        (COMPARED[1], 7, 3, alone[3:]),
+        (COMPARED[2], 10, 2, alone),
+    ):
+        assert (rows[figure].cases, rows[figure].value) == (cases, pytest.approx(right / math.fsum(known))), (
+            figure
+        )
+    low, high = wilson(3, 7)
+    mean = math.fsum(alone[3:]) / 7
+    assert rows[COMPARED[1]].interval95 == pytest.approx((low / mean, high / mean))
+    # Nothing is compared where nothing could be known.
+    row = share_of_expected("nothing", SETS[:1], is_right_and_alone, lambda one: 0.0)
+    assert (row.cases, row.value, row.interval95) == (1, None, None)
+
+
+def test_a_pair_whose_second_effect_is_not_seen_is_covered_by_the_first() -> None:
+    pair = with_set("pair", ["ghost", "core_blur"], [["ghost"]], rival=400.0)
+    assert not covers(pair, ("ghost",))
+    for effect, left in zip(pair.truth["effects"], (4.0, 0.9), strict=True):
+        effect["left_alone_pct"] = left
+    assert covers(pair, ("ghost",)) and is_right_and_alone(pair)
+    assert covers(pair, ("ghost", "core_blur"))
+    assert not covers(pair, ("core_blur",))
+    pair.truth["effects"][0]["left_alone_pct"] = 0.9  # nothing is seen: both are required
+    assert not covers(pair, ("ghost",))
+    # Further effects cover the truth, but are not right.
+    extra = with_set("single", ["ghost"], [["ghost", "persistence"]])
+    assert covers(extra, ("ghost", "persistence")) and not is_right_and_alone(extra)
+    assert not is_right_and_alone(with_set("clean", [], None))
+
+
+def test_the_score_tells_the_set_and_what_could_be_known() -> None:
+    found = score(SETS)
+    told = found.to_json()["cases"]
+    assert told[8]["set"] == [["ghost"], ["unknown"]]
+    assert (told[8]["noncentrality"], told[8]["rival"]) == (400.0, 400.0)
+    assert told[6]["ideal_alone"] is None
+    assert COMPARED[0] in table(found)
+
+
+def test_a_truth_without_a_residual_takes_that_of_the_ideal_observer() -> None:
+    one = with_set("single", ["ghost"], [["ghost"]], rival=9.0)
+    del one.truth["left_after_refit_pct"]
+    assert one.left_pct == 2.5
+    unmeasured = with_set("single", ["ghost"], [["ghost"]])
+    del unmeasured.truth["left_after_refit_pct"]
+    assert math.isnan(unmeasured.left_pct)
+    assert score([unmeasured]).to_json()["cases"][0]["left_after_refit_pct"] is None
+
+
+def test_a_verdict_is_right_if_it_states_the_truth_and_nothing_else() -> None:
+    verdicts: list[tuple[str, list[str], str, list[str], bool]] = [
+        ("clean", [], "none", [], True),
+        ("clean", [], "inconclusive", [], False),
+        ("unknown", ["stripes"], "unknown", [], True),
+        ("unknown", ["stripes"], "attributed", ["ghost"], False),
+        ("single", ["ghost"], "attributed", ["ghost"], True),
+        ("single", ["ghost"], "attributed", ["ghost", "core_blur"], False),
+        ("single", ["ghost"], "tie", ["ghost"], False),
+        ("pair", ["ghost", "core_blur"], "attributed", ["ghost"], False),
+        ("pair", ["ghost", "core_blur"], "attributed", ["core_blur", "ghost"], True),
+    ]
+    for kind, names, verdict, answer, right in verdicts:
+        case = with_set(kind, names, [[]])
+        case.report.update(verdict=verdict, answer=answer)
+        assert verdict_is_right(case) is right, (kind, verdict, answer)
