@@ -39,8 +39,7 @@ from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.instruments.model import load_instrument
 from psfcore.simulate.observe import demo_image
 from tests.whole import stack as stacks
-from tests.whole.stack import Missing, Stack, wait_for
-from tests.whole.test_bulk import items, kill_everything
+from tests.whole.stack import Missing, Stack, items, wait_for
 from workers.settings import Settings
 
 LIMITS = FitsLimits(max_pixels=2**24)
@@ -193,7 +192,7 @@ def killed(folder: Path, archive: Path, psf: Path, steps: int) -> None:
                 timeout_s=3600.0,
             )
             kept |= {row.position: row.ended_at for row in items(stack) if row.state == "done"}
-            kill_everything(stack)
+            stack.kill_everything()
             stack.start_server()
             stack.workers.clear()
             for _ in range(own_workers):

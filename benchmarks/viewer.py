@@ -18,8 +18,6 @@ printed.
 from __future__ import annotations
 
 import argparse
-import os
-import shutil
 import statistics
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,7 +28,8 @@ from playwright.sync_api import Page, sync_playwright
 
 from benchmarks.figures import tell
 from benchmarks.timing import reference
-from tests.service.pages.browser.conftest import CANDIDATES, SOFTWARE_GL, VARIABLE
+from tests.chromium import VARIABLE, chromium
+from tests.service.pages.browser.conftest import SOFTWARE_GL
 from tests.service.pages.browser.products import made
 from tests.whole import stack as stacks
 
@@ -75,23 +74,23 @@ def subfolder(folder: str, name: str) -> Path:
 
 def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
-    chromium = os.environ.get(VARIABLE) or next(filter(None, map(shutil.which, CANDIDATES)), None)
-    if chromium is None:
+    program = chromium()
+    if program is None:
         raise SystemExit(
             f"expected Chromium on this machine; found none: install it, or set {VARIABLE} to the path of its program"
         )
     f_s = reference()
     with TemporaryDirectory(prefix="heliopsf-viewer-") as folder, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=list(SOFTWARE_GL))
+        browser = playwright.chromium.launch(executable_path=program, args=list(SOFTWARE_GL))
         large: dict[str, Any] = {"viewport": {"width": 1280, "height": 900}}
         small: dict[str, Any] = {"viewport": {"width": 390, "height": 844}}
         with stacks.embedded(Path(folder)) as site:
-            earlier = made(site, subfolder(folder, "earlier"), (2048, 2048))
+            earlier = made(site.client, subfolder(folder, "earlier"), (2048, 2048))
             page = browser.new_page(**large)
             page.goto(f"{site.client.server}{earlier.page}#mode=blink")
             print(f"{FIRST:<24} {moment(page, 'overview'):6.3f} s (no goal)", flush=True)
             page.close()
-            product = made(site, subfolder(folder, "2048"), (2048, 2048), OBJECT="second")
+            product = made(site.client, subfolder(folder, "2048"), (2048, 2048), OBJECT="second")
             page = browser.new_page(**large)
             page.goto("about:blank")
             page.goto(f"{site.client.server}{product.page}#mode=blink")
@@ -106,7 +105,7 @@ def main() -> None:
                 tell(f"viewer: {what}", took_s, f_s)
             print(f"{'the slowest blink':<24} {max(blinks):6.3f} s of {BLINKS}", flush=True)
             page.close()
-            product = made(site, subfolder(folder, "4096"), (4096, 4096))
+            product = made(site.client, subfolder(folder, "4096"), (4096, 4096))
             page = browser.new_page(**small)
             page.goto(f"{site.client.server}{product.page}")
             moment(page, "overview")

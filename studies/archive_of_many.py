@@ -41,8 +41,7 @@ from psfcore.whole_files import write_whole
 from service.client.http import Client
 from tests.conftest import write_image, write_psf
 from tests.whole import stack as stacks
-from tests.whole.stack import Stack, wait_for
-from tests.whole.test_bulk import items, kill_everything
+from tests.whole.stack import Stack, items, wait_for
 
 MIB = 2**20
 IN_FOLDER = 500
@@ -234,7 +233,7 @@ def ended(stack: Stack) -> dict[int, float]:
 
 def kill_and_start(stack: Stack, workers: int) -> None:
     """Kill the server and all workers, as a power failure does, and start them again."""
-    kill_everything(stack)
+    stack.kill_everything()
     stack.start_server()
     stack.workers.clear()
     for _ in range(workers):

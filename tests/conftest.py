@@ -14,6 +14,7 @@ import pytest
 from astropy.io import fits
 
 REPOSITORY = Path(__file__).parents[1]
+pytest_plugins = ("tests.chromium", "tests.shared_stack")
 
 # The files that take longest, so that they are begun first: begun last, one of them would leave a core idle.
 LONGEST_FIRST = (

@@ -107,9 +107,10 @@ def catalogue_rows(quick: bool, most: float) -> Iterator[Point]:
     for rows in _upto(most, (1_000, 10_000) if quick else (1_000, 10_000, 100_000, 1_000_000)):
         with TemporaryDirectory(prefix="heliopsf-growth-") as folder:
             file = Path(folder) / "catalogue.sqlite"
-            catalogue = Catalogue(f"sqlite:///{file}")
+            url = f"sqlite:///{file}"
+            catalogue = Catalogue(url)
             catalogue.upgrade()
-            archive = fill(catalogue, Size(psfs=max(100, rows // 10), products=rows))
+            archive = fill(catalogue, url, Size(psfs=max(100, rows // 10), products=rows))
             took = []
             for number in range(-3, QUESTION_ROUNDS):  # the first ones fill caches
                 for ask in QUESTIONS.values():

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import event, text
+from sqlalchemy import Engine, create_engine, event, text
 
 from workers.catalogue.affected import Place
 from workers.catalogue.catalogue import Catalogue
@@ -47,6 +47,7 @@ class Archive:
     """A catalogue that was filled, and what is in it."""
 
     catalogue: Catalogue
+    engine: Engine  # of the same database
     size: Size
 
     def psf_id(self, n: int) -> str:
@@ -58,10 +59,10 @@ class Archive:
         return f"{(n % self.size.products) * 2654435761 % 4294967296:064x}"
 
 
-def fill(catalogue: Catalogue, size: Size) -> Archive:
+def fill(catalogue: Catalogue, url: str, size: Size) -> Archive:
     """Rows in series, with statuses and ranges, products by the handful a PSF and a great many of one; by statements."""
-    archive = Archive(catalogue, size)
-    sqlite = catalogue._engine.dialect.name == "sqlite"
+    archive = Archive(catalogue, create_engine(url), size)
+    sqlite = archive.engine.dialect.name == "sqlite"
     hexed = "printf('%064x', {})" if sqlite else "lpad(to_hex(cast({} as bigint)), 64, '0')"
     numbers = (
         "WITH RECURSIVE n(n) AS (SELECT 0 UNION ALL SELECT n + 1 FROM n WHERE n < {} - 1)"
@@ -107,7 +108,7 @@ def fill(catalogue: Catalogue, size: Size) -> Archive:
         INSERT INTO psf_changes (owner, psf_id, at, by, status_before, status, version_before, version, reason)
         SELECT '{OWNER}', {key("n")}, 1e9 + n, 'x', 'draft', 'certified', '0.1.0', '1.0.0', '' FROM n""",
     ]
-    with catalogue._engine.begin() as connection:
+    with archive.engine.begin() as connection:
         for statement in statements:
             connection.execute(text(statement))
     for name in catalogue.series.all(OWNER):
@@ -115,7 +116,7 @@ def fill(catalogue: Catalogue, size: Size) -> Archive:
             catalogue.series.set_interpolated(name, OWNER, True, "x")
     catalogue.contexts.create("all", OWNER, "x")
     if not sqlite:  # as its autovacuum does by itself, in time
-        with catalogue._engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        with archive.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             connection.execute(text("VACUUM ANALYZE"))
     return archive
 
@@ -292,23 +293,23 @@ QUESTIONS: dict[str, Question] = {
 
 
 @contextmanager
-def statements(catalogue: Catalogue) -> Iterator[list[tuple[str, Any]]]:
-    """What is sent to the database while the block runs."""
+def statements() -> Iterator[list[tuple[str, Any]]]:
+    """What is sent to databases while the block runs."""
     sent: list[tuple[str, Any]] = []
 
     def note(_connection: Any, _cursor: Any, statement: str, parameters: Any, *_: Any) -> None:
         sent.append((statement, parameters))
 
-    event.listen(catalogue._engine, "before_cursor_execute", note)
+    event.listen(Engine, "before_cursor_execute", note)
     try:
         yield sent
     finally:
-        event.remove(catalogue._engine, "before_cursor_execute", note)
+        event.remove(Engine, "before_cursor_execute", note)
 
 
-def plan(catalogue: Catalogue, statement: str, parameters: Any, *, forced: bool) -> list[str]:
+def plan(archive: Archive, statement: str, parameters: Any, *, forced: bool) -> list[str]:
     """The steps of a statement; forced: as if few rows were many."""
-    with catalogue._engine.connect() as connection:
+    with archive.engine.connect() as connection:
         if connection.dialect.name == "sqlite":
             rows = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters).all()
             return [row[3] for row in rows]

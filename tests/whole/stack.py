@@ -11,15 +11,20 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
-from sqlalchemy import create_engine, make_url, text
+from sqlalchemy import create_engine, make_url, select, text
 from sqlalchemy.exc import OperationalError
 
 from service.client.http import Client
+from workers.catalogue.access.keys import Scope
+from workers.catalogue.bulk_tables import BulkItemRow
+from workers.catalogue.catalogue import Catalogue
+from workers.settings import Settings
 
 POSTGRES = os.environ.get("HELIOPSF_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")
 # A lost worker is noticed soon, so that tests need not wait as long as an operator would.
@@ -49,22 +54,51 @@ class Stack:
         self.client = Client()
 
     def start_server(self, port: int = 0) -> None:
-        """Start the service at a port; 0: any free one."""
+        """Start the service at a port; 0: any free one. What it says is in ``server.out``, and its errors in ``server.log``."""
+        folder = self.data.parent
         self.server = subprocess.Popen(
             [sys.executable, "-m", "service.cli", "serve", "--port", str(port)],
             env=self.environment,
-            stdout=subprocess.PIPE,
-            stderr=(self.data.parent / "server.log").open("a"),
+            stdout=(folder / "server.out").open("w"),
+            stderr=(folder / "server.log").open("a"),
             text=True,
             start_new_session=True,
         )
-        assert self.server.stdout is not None
-        line = self.server.stdout.readline()
-        assert " serves " in line, (self.data.parent / "server.log").read_text()
-        self.client = Client(line.split(" serves ")[1].split()[0])
+        created = psutil.Process(self.server.pid).create_time()
+        (folder / "server.pid").write_text(f"{self.server.pid} {created}")
+        wait_for(lambda: self.said().count("\n") == 2 or self._ended(), "the service listens")
+        assert not self._ended(), (folder / "server.log").read_text()
+        self.attach()
+
+    def attach(self) -> None:
+        """Ask the service of this folder, which another process may have started."""
+        self.client = Client(self.said().split(" serves ")[1].split()[0])
         self.client.wait_until_up()
 
+    def said(self) -> str:
+        """What the service has written for its operator since its start."""
+        return (self.data.parent / "server.out").read_text()
+
+    def key(self, owner: str, *scopes: Scope) -> str:
+        """A new key of an owner; with all scopes but the administrator's where none is named."""
+        catalogue = self.catalogue()
+        try:
+            return catalogue.keys.make(owner, set(scopes) or set(Scope) - {Scope.ADMIN})
+        finally:
+            catalogue.close()
+
+    def catalogue(self) -> Catalogue:
+        """The catalogue of the service; whoever asks for it closes it."""
+        return Catalogue(self.catalogue_url)
+
+    @property
+    def catalogue_url(self) -> str:
+        """The URL of the database of the service."""
+        url = self.environment.get("HELIOPSF_DATABASE_URL")
+        return Settings(data_dir=self.data, database_url=url).catalogue_url
+
     def start_worker(self) -> subprocess.Popen[str]:
+        """Start a worker of the test's own."""
         worker = subprocess.Popen(
             [sys.executable, "-m", "service.cli", "worker"],
             env=self.environment,
@@ -91,6 +125,16 @@ class Stack:
             process.kill()
         psutil.wait_procs(processes, timeout=10)
 
+    def kill_everything(self) -> None:
+        """SIGKILL to workers and server at once."""
+        assert self.server is not None
+        processes = {*self._all_processes(), *self.worker_processes()}
+        for process in processes:
+            process.kill()
+        psutil.wait_procs(processes, timeout=10)
+        self.server.wait()
+        self.workers.clear()
+
     def stop(self) -> None:
         """Stop everything by its process id; nothing may be left running."""
         started = self._all_processes()
@@ -109,6 +153,9 @@ class Stack:
             process.kill()
         assert not left, f"still running after the stop: {left}"
 
+    def _ended(self) -> bool:
+        return self.server is None or self.server.poll() is not None
+
     def _all_processes(self) -> list[psutil.Process]:
         running = [p for p in [*self.workers, self.server] if p is not None and p.poll() is None]
         return [
@@ -119,17 +166,19 @@ class Stack:
 
 
 @contextmanager
-def embedded(folder: Path) -> Iterator[Stack]:
-    """A service with its worker beside it, in one folder."""
-    with _running(Stack(folder / "data", {"HELIOPSF_BROKER_URL": "filesystem://"})) as stack:
+def embedded(folder: Path, changes: dict[str, str] | None = None) -> Iterator[Stack]:
+    """A service with its worker beside it, in one folder. changes: further environment variables."""
+    with _running(
+        Stack(folder / "data", {"HELIOPSF_BROKER_URL": "filesystem://"} | (changes or {}))
+    ) as stack:
         yield stack
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[Stack]:
-    """A service that nobody works for: its broker is not there."""
-    broker = f"redis://127.0.0.1:{free_port()}/0"
-    with _running(Stack(folder / "data", {"HELIOPSF_BROKER_URL": broker})) as stack:
+def alone(folder: Path, changes: dict[str, str] | None = None) -> Iterator[Stack]:
+    """A service that nobody works for: its broker is not there. changes: further environment variables."""
+    broker = {"HELIOPSF_BROKER_URL": f"redis://127.0.0.1:{free_port()}/0"}
+    with _running(Stack(folder / "data", broker | (changes or {}))) as stack:
         yield stack
 
 
@@ -151,10 +200,24 @@ def served(folder: Path, workers: int = 1, changes: dict[str, str] | None = None
         yield stack
 
 
-MODES = {"embedded": embedded, "redis and postgresql": served}
-# For tests of which `make test` runs one of the two: the other takes minutes for little more.
+MODES: dict[str, Callable[..., AbstractContextManager[Stack]]] = {
+    "embedded": embedded,
+    "redis and postgresql": served,
+}
+# For tests of which `make test` runs the first alone: the other takes minutes for little more.
 EMBEDDED_FIRST = ["embedded", pytest.param("redis and postgresql", marks=pytest.mark.slow)]
-SERVED_FIRST = [pytest.param("embedded", marks=pytest.mark.slow), "redis and postgresql"]
+
+
+@contextmanager
+def running(
+    mode: str, folder: Path, changes: dict[str, str] | None = None, **options: int
+) -> Iterator[Stack]:
+    """A service of this mode; skips the test where one of its servers is missing. options: of ``served``."""
+    with ExitStack() as resources:
+        try:
+            yield resources.enter_context(MODES[mode](folder, changes=changes, **options))
+        except Missing as missing:
+            pytest.skip(str(missing))
 
 
 @contextmanager
@@ -224,6 +287,15 @@ def postgres_database(template: str | None = None) -> Iterator[str]:
         with admin.connect() as connection:
             connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
         admin.dispose()
+
+
+def items(stack: Stack) -> list[Any]:
+    """The images of the only bulk run, as rows."""
+    engine = create_engine(stack.catalogue_url)
+    with engine.connect() as connection:
+        rows = connection.execute(select(BulkItemRow.__table__).order_by("position")).all()
+    engine.dispose()
+    return list(rows)
 
 
 def free_port() -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
@@ -11,9 +10,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from tests.conftest import write_image
-from tests.whole.stack import MODES, Missing, Stack, wait_for
-from workers.catalogue.catalogue import Catalogue
-from workers.settings import Settings
+from tests.whole.stack import MODES, Stack, running, wait_for
 
 pytestmark = pytest.mark.slow
 STAGE = {"kind": "deconvolve", "stage": "deconvolving"}
@@ -30,14 +27,9 @@ def steps_ended(stack: Stack) -> int | None:
 
 
 @pytest.fixture(params=MODES)
-def stack(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stack]:
-    # A step then takes longer than the time in which steps are reported together, so each is seen by itself.
-    monkeypatch.setenv("HELIOPSF_WORKER_THREADS", "1")
-    with ExitStack() as resources:
-        try:
-            yield resources.enter_context(MODES[request.param](tmp_path))
-        except Missing as missing:
-            pytest.skip(str(missing))
+def stack(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Stack]:
+    with running(request.param, tmp_path) as stack:
+        yield stack
 
 
 def test_no_step_is_begun_after_the_one_at_work(stack: Stack, tmp_path: Path, psf_file: Path) -> None:
@@ -64,8 +56,7 @@ def test_no_step_is_begun_after_the_one_at_work(stack: Stack, tmp_path: Path, ps
     assert list(client.products()) == []
     assert {path for path in (stack.data / "blobs").rglob("*") if path.is_file()} == blobs
     wait_for(lambda: not list((stack.data / "tmp").iterdir()), "half-written files are gone", 10)
-    url = stack.environment.get("HELIOPSF_DATABASE_URL")
-    catalogue = Catalogue(Settings(data_dir=stack.data, database_url=url).catalogue_url)
+    catalogue = stack.catalogue()
     row = catalogue.jobs.get(job["id"])
     catalogue.close()
     assert row is not None and row.lease is None and row.attempt == 1

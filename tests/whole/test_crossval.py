@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from contextlib import ExitStack
 from pathlib import Path
 
 import psutil
@@ -11,9 +10,7 @@ import pytest
 from sqlalchemy import create_engine, func, select
 
 from tests.transit_files import write_simulated
-from tests.whole import stack as stacks
-from tests.whole.stack import Missing, Stack, wait_for
-from workers.catalogue.catalogue import Catalogue
+from tests.whole.stack import Stack, running, wait_for
 from workers.catalogue.tables import PartRow
 
 RUNS, BLOCKS = 12, 3
@@ -23,7 +20,7 @@ class Parts:
     """The folds of the only job in a stack's database: how many are done, and how many are being done."""
 
     def __init__(self, stack: Stack) -> None:
-        self._engine = create_engine(stack.environment["HELIOPSF_DATABASE_URL"])
+        self._engine = create_engine(stack.catalogue_url)
 
     def done(self) -> int:
         return self._count(PartRow.result.is_not(None))
@@ -41,7 +38,7 @@ class Parts:
 
 def kill_worker_of(stack: Stack, job_id: str, *, own: bool) -> None:
     """SIGKILL to the worker that runs the job, or to the one that helps it, with all its processes."""
-    catalogue = Catalogue(stack.environment["HELIOPSF_DATABASE_URL"])
+    catalogue = stack.catalogue()
     row = catalogue.jobs.get(job_id)
     catalogue.close()
     assert row is not None and row.worker is not None
@@ -58,14 +55,9 @@ def kill_worker_of(stack: Stack, job_id: str, *, own: bool) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("own", [True, False], ids=["the worker of the job", "the one that helps"])
 def test_one_of_two_workers_killed_half_way_loses_no_fold(tmp_path: Path, own: bool) -> None:
-    with ExitStack() as resources:
-        try:
-            stack = resources.enter_context(stacks.served(tmp_path, workers=2))
-        except Missing as missing:
-            pytest.skip(str(missing))
+    with running("redis and postgresql", tmp_path, workers=2) as stack:
         transit_id = stack.client.upload_transit(write_simulated(tmp_path / "transit"))["id"]
         parts = Parts(stack)
-        resources.callback(parts.close)
         job = stack.client.submit("cross-validate", transit_id=transit_id, scheme="exact", runs=RUNS)
         wait_for(lambda: parts.done() >= 6 and parts.taken() == 2, "two workers share the folds", 120)
         kill_worker_of(stack, job["id"], own=own)
@@ -78,3 +70,4 @@ def test_one_of_two_workers_killed_half_way_loses_no_fold(tmp_path: Path, own: b
         folds = [(fold["run"], fold["fold"]) for fold in json.loads(report.read_text())["folds"]]
         assert folds == [(run, fold) for run in range(RUNS) for fold in range(BLOCKS)]
         assert parts.done() == RUNS * BLOCKS
+        parts.close()

@@ -6,7 +6,6 @@ import json
 import os
 import pty
 import re
-import shlex
 import shutil
 import signal
 import subprocess
@@ -15,11 +14,9 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import pytest
 from astropy.io import fits
 
-from service.cli import demo
 from service.client.http import Client
 from tests.conftest import REPOSITORY, write_image, write_psf
 from tests.whole import stack as stacks
@@ -28,47 +25,8 @@ from tests.whole.stack import Stack, wait_for
 COMMAND = (sys.executable, "-m", "service.cli")
 
 
-@pytest.fixture(scope="module")
-def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
-    with stacks.embedded(tmp_path_factory.mktemp("first")) as running:
-        yield running
-
-
-def test_the_service_says_what_to_open_in_a_browser(stack: Stack) -> None:
-    assert stack.server is not None and stack.server.stdout is not None
-    told = stack.server.stdout.readline()
-    assert told == f"Open {stack.client.server} in a browser.\n"
-
-
-def test_the_command_that_the_demo_tells_shows_its_product(tmp_path: Path) -> None:
-    output = tmp_path / "a demo"
-    output.mkdir()
-    with stacks.embedded(output) as running:
-        write_image(tmp_path / "image.fits")
-        write_psf(tmp_path / "psf.fits")
-        client, files = running.client, (tmp_path / "product.fits", tmp_path / "picture.png")
-        psf = client.upload_psf(tmp_path / "psf.fits")["id"]
-        product = client.deconvolve(tmp_path / "image.fits", files[0], psf_id=psf, preview=files[1])
-    told = demo.said(output, tmp_path / "image.fits", *files, product)
-    (command,) = [line for line in told if " serve " in line]
-    (path,) = re.findall(r"this path: (/products/\w+)$", "\n".join(told))
-    server = subprocess.Popen(
-        [*COMMAND, *shlex.split(command)[1:], "--port", "0"],
-        env=running.environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert server.stdout is not None
-    try:
-        _, line = server.stdout.readline(), server.stdout.readline()
-        (address,) = re.findall(r"^Open (\S+) in a browser\.$", line)
-        with Client(address) as client:
-            client.wait_until_up()
-        answer = httpx.get(address + path, headers={"Accept": "text/html"}, timeout=60)
-        assert answer.status_code == 200 and "image.fits" in answer.text
-    finally:
-        server.terminate()
-        server.wait(60)
+def test_the_service_says_what_to_open_in_a_browser(open_stack: Stack) -> None:
+    assert open_stack.said().splitlines()[1] == f"Open {open_stack.client.server} in a browser."
 
 
 def rest_of(terminal: int) -> Iterator[str]:
@@ -83,31 +41,34 @@ def rest_of(terminal: int) -> Iterator[str]:
 
 def started(stack: Stack, folder: Path) -> str:
     """A job that takes so long that something can happen meanwhile, at work."""
-    write_image(folder / "large.fits", shape=(2048, 2048), seed=len(list(stack.client.jobs())))
+    write_image(folder / "large.fits", shape=(1024, 1024), OBSERVER=folder.name)
     write_psf(folder / "large-psf.fits")
     image = stack.client.upload_image(folder / "large.fits")["id"]
     psf = stack.client.upload_psf(folder / "large-psf.fits")["id"]
-    method = {"name": "richardson-lucy", "steps": 150}
+    method = {"name": "richardson-lucy", "steps": 200}
     job: str = stack.client.submit("deconvolve", image_id=image, psf_id=psf, method=method)["id"]
     wait_for(lambda: stack.client.job(job)["progress"]["step"] > 1, "the job is at work")
     return job
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is missing")
-def test_the_curl_lines_of_the_readme_work(stack: Stack, tmp_path: Path) -> None:
+def test_the_curl_lines_of_the_readme_work(open_stack: Stack, tmp_path: Path) -> None:
     [lines] = re.findall(r"```sh\n(.+?)```", (REPOSITORY / "README.md").read_text("utf-8"), flags=re.S)
     assert lines.count("curl ") == 6 and lines.startswith("S=http://127.0.0.1:8765 ")
     write_psf(tmp_path / "psf.fits", size=256)
-    psf = stack.client.upload_psf(tmp_path / "psf.fits", instrument="hri_euv", channel="174", kind="total")
-    stack.client.certify_psf(psf["id"], "1.0.0")
-    stack.client.psf_curve(
+    psf = open_stack.client.upload_psf(
+        tmp_path / "psf.fits", instrument="hri_euv", channel="174", kind="total"
+    )
+    times = {"valid_from": "2020-01-01", "valid_to": "2021-01-01"}  # not those of other tests' images
+    open_stack.client.certify_psf(psf["id"], "1.0.0", **times)
+    open_stack.client.psf_curve(
         psf["id"]
     )  # makes the tables, which a PSF that the service builds has from the start
     write_image(
         tmp_path / "IMAGE.fits", DETECTOR="HRI_EUV", TELESCOP="SOLO/EUI/HRI_EUV", WAVELNTH=174.0,
         **{"DATE-BEG": "2020-05-05"},
     )  # fmt: skip
-    script = lines.replace("http://127.0.0.1:8765", stack.client.server)
+    script = lines.replace("http://127.0.0.1:8765", open_stack.client.server)
     done = subprocess.run(
         ["bash", "-eu", "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
     )
@@ -118,9 +79,11 @@ def test_the_curl_lines_of_the_readme_work(stack: Stack, tmp_path: Path) -> None
     assert "event: end" in (tmp_path / "events.txt").read_text()
 
 
-def test_control_c_leaves_the_job_and_the_commands_that_it_names_work(stack: Stack, tmp_path: Path) -> None:
-    job = started(stack, tmp_path)
-    address = stack.client.server.removeprefix("http://")
+def test_control_c_leaves_the_job_and_the_commands_that_it_names_work(
+    open_stack: Stack, tmp_path: Path
+) -> None:
+    job = started(open_stack, tmp_path)
+    address = open_stack.client.server.removeprefix("http://")
     terminal, other_end = pty.openpty()
     waiting = subprocess.Popen(
         [*COMMAND, "job", "wait", job[:12], "--server", address],
@@ -137,9 +100,9 @@ def test_control_c_leaves_the_job_and_the_commands_that_it_names_work(stack: Sta
     told = "".join(rest_of(terminal)).replace("\r\n", "\n")
     assert waiting.wait(60) == 130, told
     assert f"interrupted; job {job[:12]} goes on" in told and "Traceback" not in told
-    assert stack.client.job(job)["phase"] == "EXECUTING"
+    assert open_stack.client.job(job)["phase"] == "EXECUTING"
     cancel = re.findall(r"cancel it: +heliopsf (.+)", told)[0].split()
-    assert cancel == ["job", "cancel", job[:12], "--server", stack.client.server]
+    assert cancel == ["job", "cancel", job[:12], "--server", open_stack.client.server]
     assert subprocess.run([*COMMAND, *cancel], timeout=60, check=False).returncode == 0
     rejoin = re.findall(r"again: +heliopsf (.+)", told)[0].split()
     ended = subprocess.run([*COMMAND, *rejoin], capture_output=True, text=True, timeout=60, check=False)
@@ -147,32 +110,26 @@ def test_control_c_leaves_the_job_and_the_commands_that_it_names_work(stack: Sta
 
 
 @pytest.mark.slow
-def test_a_wait_survives_a_restart_of_the_service(stack: Stack, tmp_path: Path) -> None:
-    job = stack.client.job(started(stack, tmp_path))
-    said: list[str] = []
-    ended: list[str] = []
+def test_a_wait_survives_a_restart_of_the_service(tmp_path: Path) -> None:
+    with stacks.embedded(tmp_path) as stack:
+        job = stack.client.job(started(stack, tmp_path))
+        said: list[str] = []
+        ended: list[str] = []
 
-    def wait() -> None:
-        with Client(stack.client.server, say=said.append) as client:
-            ended.append(client.wait(job, timeout_s=170)["phase"])
+        def wait() -> None:
+            with Client(stack.client.server, say=said.append) as client:
+                ended.append(client.wait(job, timeout_s=170)["phase"])
 
-    waiter = threading.Thread(target=wait)
-    waiter.start()
-    assert stack.server is not None
-    port = stack.client.server.rpartition(":")[2]
-    stack.server.send_signal(signal.SIGTERM)
-    # The client may also say that the job waits in its queue.
-    wait_for(lambda: any("no answer" in line for line in said), "the client has noticed")
-    stack.server.wait(60)
-    stack.server = subprocess.Popen(
-        [*COMMAND, "serve", "--port", port],
-        env=stack.environment,
-        stdout=subprocess.DEVNULL,
-        stderr=(tmp_path / "server.log").open("a"),
-        start_new_session=True,
-        text=True,
-    )
-    waiter.join(170)
-    assert ended == ["COMPLETED"]
-    lost = next(n for n, line in enumerate(said) if "no answer" in line)
-    assert "the service answers again" in said[lost:]
+        waiter = threading.Thread(target=wait)
+        waiter.start()
+        assert stack.server is not None
+        port = stack.client.server.rpartition(":")[2]
+        stack.server.send_signal(signal.SIGTERM)
+        # The client may also say that the job waits in its queue.
+        wait_for(lambda: any("no answer" in line for line in said), "the client has noticed")
+        stack.server.wait(60)
+        stack.start_server(int(port))
+        waiter.join(170)
+        assert ended == ["COMPLETED"]
+        lost = next(n for n, line in enumerate(said) if "no answer" in line)
+        assert "the service answers again" in said[lost:]

@@ -14,12 +14,12 @@ GROWTH = Path(__file__).parents[2] / "docs" / "growth"
 PAGE = (GROWTH.parent / "speed.md").read_text("utf-8")
 
 
-@pytest.mark.parametrize("power", [0.0, 1.0, 2.3])
-def test_the_exponent_of_a_power_law_is_found(power: float) -> None:
+def test_the_exponent_of_a_power_law_is_found() -> None:
     n = [1.0, 10.0, 100.0, 1000.0]
-    assert exponent(n, [5 * one**power for one in n]) == pytest.approx(power, abs=1e-9)
-    constant = [1e9, *(5 * one**power for one in n[-FITTED_POINTS:])]
-    assert exponent(n, constant) == pytest.approx(power, abs=1e-9), "only the largest points are fitted"
+    for power in (0.0, 2.3):
+        assert exponent(n, [5 * one**power for one in n]) == pytest.approx(power, abs=1e-9)
+        constant = [1e9, *(5 * one**power for one in n[-FITTED_POINTS:])]
+        assert exponent(n, constant) == pytest.approx(power, abs=1e-9), "only the largest points are fitted"
     assert exponent([1.0], [1.0]) is None
 
 

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from sqlalchemy import create_engine, func, select
 
 from tests.conftest import write_image
-from tests.whole.stack import MODES, Missing, Stack, wait_for
-from workers.catalogue.catalogue import Catalogue
+from tests.whole.stack import MODES, Stack, running, wait_for
 from workers.catalogue.tables import JobRow
 from workers.contract.phases import Phase
 from workers.contract.queues import Queue
-from workers.settings import Settings
 
 WAITING = 1000
 
@@ -24,23 +21,18 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(params=MODES)
-def stack(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stack]:
-    monkeypatch.setenv("HELIOPSF_STOP_S", "0.5")  # of a thousand jobs one is at work in the end
-    with ExitStack() as resources:
-        try:
-            yield resources.enter_context(MODES[request.param](tmp_path))
-        except Missing as missing:
-            pytest.skip(str(missing))
+def stack(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Stack]:
+    # Of a thousand jobs one is at work in the end.
+    with running(request.param, tmp_path, {"HELIOPSF_STOP_S": "0.5"}) as stack:
+        yield stack
 
 
 class Rows:
     """The jobs of a stack, as its database has them."""
 
     def __init__(self, stack: Stack) -> None:
-        given = {name: stack.environment.get(f"HELIOPSF_{name.upper()}") for name in ("database_url",)}
-        url = Settings(data_dir=stack.data, **given).catalogue_url  # type: ignore[arg-type]
-        self.catalogue = Catalogue(url)
-        self._engine = create_engine(url)
+        self.catalogue = stack.catalogue()
+        self._engine = create_engine(stack.catalogue_url)
 
     def close(self) -> None:
         self.catalogue.close()

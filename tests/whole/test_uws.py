@@ -1,11 +1,12 @@
-"""The UWS interface of a real service, used by the client that astronomers use: pyvo."""
+"""The UWS interface of a real service that asks for keys, used by the client that astronomers use: pyvo."""
 
 from __future__ import annotations
 
 import io
-import threading
 import time
+import uuid
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -16,49 +17,66 @@ from pyvo.dal import DALQueryError, DALServiceError
 from pyvo.dal.tap import AsyncTAPJob
 from pyvo.io.uws import parse_job_list
 
-from service.client.http import ServiceError
+from service.client.http import Client, ServiceError
 from tests.conftest import SMALL_INSTRUMENT, write_image
-from tests.whole import stack as stacks
 from tests.whole.stack import Stack, wait_for
+from workers.catalogue.access.keys import Scope
 
 BUILD = {"KIND": "psf-build", "instrument_file": SMALL_INSTRUMENT, "size": "128", "RUNID": "<small> & quick"}
 
 
-@pytest.fixture(scope="module")
-def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
-    with stacks.embedded(tmp_path_factory.mktemp("uws")) as running:
-        yield running
+@dataclass(frozen=True)
+class Astronomer:
+    """An owner of the shared service, with a key, a session of pyvo that sends it, and a client of the JSON interface."""
+
+    name: str
+    key: str
+    session: requests.Session
+    client: Client
+
+    def created(self, **fields: str) -> AsyncTAPJob:
+        """A job as pyvo holds it: at the address that the creation led to."""
+        answer = self.session.post(f"{self.client.server}/uws/jobs", data=fields, timeout=60)
+        assert answer.history and answer.history[0].status_code == 303, answer.text
+        return AsyncTAPJob(answer.url, session=self.session, delete=False)
 
 
-def created(stack: Stack, **fields: str) -> AsyncTAPJob:
-    """A job as pyvo holds it: at the address that the creation led to."""
-    answer = requests.post(f"{stack.client.server}/uws/jobs", data=fields, timeout=60)
-    answer.raise_for_status()
-    assert answer.history[0].status_code == 303
-    return AsyncTAPJob(answer.url, delete=False)
+@pytest.fixture
+def astronomer(keyed_stack: Stack) -> Iterator[Astronomer]:
+    name = f"astronomer-{uuid.uuid4().hex[:8]}"
+    key = keyed_stack.key(name, Scope.READ, Scope.SUBMIT)
+    with Client(keyed_stack.client.server, key=key) as client:
+        yield Astronomer(name, key, session_with(key), client)
 
 
-def listed(stack: Stack, **filters: object) -> list[str]:
-    answer = requests.get(f"{stack.client.server}/uws/jobs", params=filters, timeout=60)
+def session_with(key: str) -> requests.Session:
+    session = requests.Session()
+    session.headers["Authorization"] = f"Bearer {key}"
+    return session
+
+
+def listed(astronomer: Astronomer, **filters: object) -> list[str]:
+    address = f"{astronomer.client.server}/uws/jobs"
+    answer = astronomer.session.get(address, params=filters, timeout=60)
     return [job.jobid for job in parse_job_list(io.BytesIO(answer.content))]
 
 
-def long_job(stack: Stack, folder: Path, psf_file: Path, **more: str) -> AsyncTAPJob:
+def long_job(astronomer: Astronomer, folder: Path, psf_file: Path, **more: str) -> AsyncTAPJob:
     """A job that takes long enough for something to happen to it, at work."""
-    write_image(folder / "image.fits", shape=(1024, 1024), seed=int(more.pop("seed", "1")))
-    image_id = stack.client.upload_image(folder / "image.fits")["id"]
-    psf_id = stack.client.upload_psf(psf_file)["id"]
+    write_image(folder / "image.fits", shape=(1024, 1024))
+    image_id = astronomer.client.upload_image(folder / "image.fits")["id"]
+    psf_id = astronomer.client.upload_psf(psf_file)["id"]
     method = '{"name": "richardson-lucy", "steps": 200}'
-    job = created(stack, KIND="deconvolve", image_id=image_id, psf_id=psf_id, method=method, **more)
+    job = astronomer.created(KIND="deconvolve", image_id=image_id, psf_id=psf_id, method=method, **more)
     job.run()
-    wait_for(lambda: stack.client.job(job.job_id)["progress"]["step"] > 2, "the job is at work")
+    wait_for(lambda: astronomer.client.job(job.job_id)["progress"]["step"] > 2, "the job is at work")
     return job
 
 
-def test_create_run_wait_results_delete(stack: Stack) -> None:
+def test_create_run_wait_results_delete(astronomer: Astronomer) -> None:
     before = Time.now()
-    job = created(stack, **BUILD)
-    assert (job.phase, job.uws_version, job.owner) == ("PENDING", "1.1", "local")
+    job = astronomer.created(**BUILD)
+    assert (job.phase, job.uws_version, job.owner) == ("PENDING", "1.1", astronomer.name)
     assert job.job.runid == BUILD["RUNID"]
     assert {p.id_: p.content for p in job.job.parameters}[
         "instrument_file"
@@ -71,76 +89,89 @@ def test_create_run_wait_results_delete(stack: Stack) -> None:
     assert job.destruction.datetime.year < 2999, "clipped"
 
     with pytest.raises(ServiceError, match="not started"):
-        stack.client.wait(stack.client.job(job.job_id))
+        astronomer.client.wait(astronomer.client.job(job.job_id))
     assert job.run().wait(timeout=120).phase == "COMPLETED"
     job.raise_if_error()
     assert job.job.starttime <= job.job.endtime
     assert job.result.mimetype == "application/fits"
     for address in (job.result_uri, f"{job.url}/results/result"):
-        with fits.open(io.BytesIO(requests.get(address, timeout=60).content), checksum=True) as hdus:
+        with fits.open(
+            io.BytesIO(astronomer.session.get(address, timeout=60).content), checksum=True
+        ) as hdus:
             assert hdus[0].data.shape == (128, 128)
-    assert stack.client.job(job.job_id)["phase"] == "COMPLETED", "the JSON interface has the same job"
+    assert astronomer.client.job(job.job_id)["phase"] == "COMPLETED", "the JSON interface has the same job"
 
-    assert listed(stack, LAST=1) == [job.job_id] and job.job_id in listed(stack, PHASE=["COMPLETED", "ERROR"])
-    assert listed(stack, AFTER=job.job.creationtime.isot + "Z") == []
+    assert listed(astronomer, LAST=1) == [job.job_id] and job.job_id in listed(
+        astronomer, PHASE=["COMPLETED", "ERROR"]
+    )
+    assert listed(astronomer, AFTER=job.job.creationtime.isot + "Z") == []
+    assert requests.get(job.result_uri, timeout=60).status_code == 401, "the file needs the key too"
     url = job.url
     job.delete()
-    assert requests.get(url, timeout=60).status_code == 404
-    assert listed(stack) == []
-    assert len(list(stack.client.psfs())) == 1, "what it made stays"
+    assert astronomer.session.get(url, timeout=60).status_code == 404
+    assert listed(astronomer) == []
+    assert len(list(astronomer.client.psfs())) == 1, "what it made stays"
 
 
-def test_a_failed_job_says_why(stack: Stack) -> None:
+def test_a_failed_job_says_why(astronomer: Astronomer) -> None:
     masked = (
         SMALL_INSTRUMENT + '[mount]\nbasis = "drawing"\nmask_image = { file = "a.png", width_mm = 4.0 }\n'
     )
-    job = created(stack, KIND="psf-build", instrument_file=masked, size="128", PHASE="RUN")
+    job = astronomer.created(KIND="psf-build", instrument_file=masked, size="128", PHASE="RUN")
     assert job.wait(timeout=120).phase == "ERROR"
     with pytest.raises(DALQueryError, match=r"a\.png"):
         job.raise_if_error()
-    assert "(mask-missing, fault: user)" in requests.get(f"{job.url}/error", timeout=60).text
+    assert "(mask-missing, fault: user)" in astronomer.session.get(f"{job.url}/error", timeout=60).text
 
 
-def test_abort_at_work(stack: Stack, tmp_path: Path, psf_file: Path) -> None:
-    job = long_job(stack, tmp_path, psf_file)
+def test_abort_at_work(astronomer: Astronomer, tmp_path: Path, psf_file: Path) -> None:
+    job = long_job(astronomer, tmp_path, psf_file)
     job.abort()
     with pytest.raises(DALServiceError, match="not active"):  # how pyvo says that it was aborted
         job.wait(timeout=60)
     assert job.phase == "ABORTED" and job.result is None
     job.abort()
     assert job.phase == "ABORTED"
+    assert list(astronomer.client.products()) == []
 
 
-def test_delete_at_work_stops_the_worker(stack: Stack, tmp_path: Path, psf_file: Path) -> None:
-    job = long_job(stack, tmp_path, psf_file, seed="2")
+def test_delete_at_work_stops_the_worker(astronomer: Astronomer, tmp_path: Path, psf_file: Path) -> None:
+    job = long_job(astronomer, tmp_path, psf_file)
     job.delete()
-    after = created(stack, **BUILD, PHASE="RUN")
+    after = astronomer.created(**BUILD, PHASE="RUN")
     assert after.wait(timeout=60).phase == "COMPLETED", "the worker is free again"
-    assert list(stack.client.products()) == []
+    assert list(astronomer.client.products()) == []
 
 
 def test_a_job_that_executes_too_long_is_aborted_and_one_that_is_due_is_destroyed(
-    stack: Stack, tmp_path: Path, psf_file: Path
+    astronomer: Astronomer, tmp_path: Path, psf_file: Path
 ) -> None:
     soon = Time(time.time() + 1.5, format="unix").isot + "Z"
-    due = created(stack, **BUILD, DESTRUCTION=soon)
-    job = long_job(stack, tmp_path, psf_file, seed="3", EXECUTIONDURATION="1")
+    due = astronomer.created(**BUILD, DESTRUCTION=soon)
+    job = long_job(astronomer, tmp_path, psf_file, EXECUTIONDURATION="1")
     wait_for(lambda: job.phase == "ABORTED", "the job is aborted", 60)
-    wait_for(lambda: due.job_id not in listed(stack), "the job is destroyed", 60)
+    wait_for(lambda: due.job_id not in listed(astronomer), "the job is destroyed", 60)
 
 
-def test_who_waits_does_not_keep_the_service_from_stopping(tmp_path: Path) -> None:
-    with stacks.alone(tmp_path) as stack:
-        job = created(stack, **BUILD)
-        assert stack.server is not None
-        answers: list[requests.Response] = []
-        waiting = threading.Thread(
-            target=lambda: answers.append(requests.get(job.url, params={"WAIT": "-1"}, timeout=60))
-        )
-        waiting.start()
-        time.sleep(1.5)  # until the request is surely there
-        started = time.monotonic()
-        stack.server.terminate()
-        waiting.join()
-        assert time.monotonic() - started < 30  # the request itself would wait for 60 s
-        assert answers[0].status_code == 200 and b"PENDING" in answers[0].content
+def test_without_a_good_key_pyvo_gets_nothing(keyed_stack: Stack, astronomer: Astronomer) -> None:
+    job = astronomer.created(**BUILD)
+    for session, status, said in (
+        (requests.Session(), 401, "expected a key"),
+        (session_with("hpsf_" + 16 * "0" + "_" + 43 * "A"), 401, "key"),
+        (session_with(keyed_stack.key("other")), 404, "expected the id of one of your jobs"),
+    ):
+        with pytest.raises(DALServiceError, match=said) as refused:
+            AsyncTAPJob(job.url, session=session, delete=False)
+        assert refused.value.code == status
+    reads = session_with(keyed_stack.key(astronomer.name, Scope.READ))
+    seen = AsyncTAPJob(job.url, session=reads, delete=False)
+    assert seen.phase == "PENDING"
+    basic = requests.Session()
+    basic.auth = ("anybody", astronomer.key)  # as TOPCAT sends it
+    assert AsyncTAPJob(job.url, session=basic, delete=False).phase == "PENDING"
+    for act in (seen.run, seen.abort, seen.delete):
+        with pytest.raises(DALServiceError, match="'submit'") as refused:
+            act()
+        assert refused.value.code == 403
+    assert job.phase == "PENDING"
+    job.delete()

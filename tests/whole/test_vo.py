@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 
 import numpy as np
 import prov
@@ -18,41 +17,32 @@ from pyvo.io.vosi import parse_availability, parse_capabilities, parse_tables
 from service.client.http import Client
 from tests.conftest import write_image, write_psf
 from tests.service.vo.made import OBSERVED, WCS_CARDS
-from tests.whole import stack as stacks
 from tests.whole.stack import Stack, wait_for
-from tests.whole.test_uws_keys import key_of, session_with
 from workers.catalogue.access.keys import Scope
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("HELIOPSF_ACCESS", "keys")
-        patched.delenv("HELIOPSF_KEY", raising=False)
-        with stacks.embedded(tmp_path_factory.mktemp("vo")) as running:
-            yield running
-
-
-@pytest.fixture(scope="module")
-def session(stack: Stack, tmp_path_factory: pytest.TempPathFactory) -> requests.Session:
-    """A session with a key, whose owner has one product."""
+def session(keyed_stack: Stack, tmp_path_factory: pytest.TempPathFactory) -> requests.Session:
+    """A session that sends a key as a password, as TOPCAT does, whose owner has one product."""
     folder = tmp_path_factory.mktemp("images")
-    key = key_of(stack, "astronomer", Scope.READ, Scope.SUBMIT)
+    key = keyed_stack.key("astronomer of products", Scope.READ, Scope.SUBMIT)
     write_image(folder / "image.fits", **OBSERVED, **WCS_CARDS)
     write_psf(folder / "psf.fits")
-    with Client(stack.client.server, key=key) as client:
+    with Client(keyed_stack.client.server, key=key) as client:
         psf = client.upload_psf(folder / "psf.fits")
         # The test's PSF names no instrument; only the request connects it with the image.
         client.deconvolve(
             folder / "image.fits", folder / "sharp.fits", psf_id=psf["id"], method="linear", steps=2
         )
-    return session_with(key, "basic")
+    session = requests.Session()
+    session.auth = ("anybody", key)
+    return session
 
 
-def test_vosi_says_where_everything_is(stack: Stack) -> None:
-    base = f"{stack.client.server}/vo"
+def test_vosi_says_where_everything_is(keyed_stack: Stack) -> None:
+    base = f"{keyed_stack.client.server}/vo"
     get = lambda name: io.BytesIO(requests.get(f"{base}/{name}", timeout=60).content)  # noqa: E731
     wait_for(lambda: parse_availability(get("availability")).available, "the worker announces itself", 120)
     found = {one.standardid: one for one in parse_capabilities(get("capabilities"))}
@@ -64,9 +54,9 @@ def test_vosi_says_where_everything_is(stack: Stack) -> None:
 
 
 def test_from_the_list_to_the_file_its_input_its_psf_and_its_provenance(
-    stack: Stack, session: requests.Session
+    keyed_stack: Stack, session: requests.Session
 ) -> None:
-    products = DALResults.from_result_url(f"{stack.client.server}/vo/products", session=session)
+    products = DALResults.from_result_url(f"{keyed_stack.client.server}/vo/products", session=session)
     [product] = products
     assert product["instrument_name"] == "HRI_EUV" and product["method"] == "linear"
     table = DatalinkResults.from_result_url(str(product["access_url"]), session=session)
@@ -91,9 +81,9 @@ def test_from_the_list_to_the_file_its_input_its_psf_and_its_provenance(
         assert hdus[0].shape == (17, 17) and np.isfinite(hdus[0].data).all()
 
 
-def test_errors_reach_the_user(stack: Stack, session: requests.Session) -> None:
-    query = DALQuery(f"{stack.client.server}/vo/products", session=session, MAXREC="many")
+def test_errors_reach_the_user(keyed_stack: Stack, session: requests.Session) -> None:
+    query = DALQuery(f"{keyed_stack.client.server}/vo/products", session=session, MAXREC="many")
     with pytest.raises(DALQueryError, match="expected MAXREC, a whole number"):
         query.execute()
-    anonymous = requests.get(f"{stack.client.server}/vo/products", timeout=60)
+    anonymous = requests.get(f"{keyed_stack.client.server}/vo/products", timeout=60)
     assert anonymous.status_code == 401 and "Basic" in anonymous.headers["WWW-Authenticate"]

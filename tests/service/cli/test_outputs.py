@@ -170,19 +170,6 @@ def test_every_command_that_writes_files_has_the_option() -> None:
         assert has == (path in writing), path
 
 
-def test_a_demo_replaces_only_the_files_of_a_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.cli.demo.run", lambda image, output, report: ["done"])
-    own = tmp_path / "own"
-    own.mkdir()
-    (own / "psf.fits").write_text("mine")
-    refused = run("demo", "-o", own)
-    assert refused.exit_code == 1 and "not empty" in refused.output
-    (tmp_path / "demo").mkdir()
-    (tmp_path / "demo" / "server.log").write_text("of an earlier demo")
-    for folder in (tmp_path / "demo", tmp_path / "new"):
-        assert run("demo", "-o", folder).exit_code == 0
-
-
 def test_a_blind_set_takes_no_folder_with_other_files(tmp_path: Path) -> None:
     case = tmp_path / "cases" / "0001"
     case.mkdir(parents=True)

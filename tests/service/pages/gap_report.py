@@ -22,15 +22,15 @@ from workers.tasks.data.reports import keep_report, write_json
 GAP_ID = "9a" * 32
 
 
-def keep_gap_report(settings: Settings) -> dict[str, Any]:
-    """Add the report GAP_ID to the catalogue, as the job gap-diagnose does; returns its JSON."""
+def keep_gap_report(settings: Settings, owner: str = DEFAULT_OWNER) -> dict[str, Any]:
+    """Add the report GAP_ID of an owner to the catalogue, as the job gap-diagnose does; returns its JSON."""
     found = small_gaps.found()
     said = gap_report(found)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(plot, "PLOT_DPI", 40)  # quicker to draw
         html = gap_page(found, said).html()
     catalogue, store = Catalogue(settings.catalogue_url), Store(settings.data_dir)
-    context = cast(Context, SimpleNamespace(owner=DEFAULT_OWNER, store=store, add=catalogue.add))
+    context = cast(Context, SimpleNamespace(owner=owner, store=store, add=catalogue.add))
     with store.temporary() as text, store.temporary() as page:
         write_json(text, said)
         page.write_text(html, "utf-8")

@@ -10,8 +10,8 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from service.client.http import Client
 from tests.conftest import write_psf
-from tests.whole.stack import Stack
 
 # A rotated field beside the centre of the Sun, as instruments write it.
 COORDINATES = {
@@ -57,16 +57,16 @@ def write_sun(path: Path, shape: tuple[int, int], *, nan: bool = True, **cards: 
     fits.PrimaryHDU(pixels, header).writeto(path, overwrite=True)
 
 
-def made(site: Stack, folder: Path, shape: tuple[int, int], *, errors: bool = False, **image: Any) -> Looked:
+def made(
+    client: Client, folder: Path, shape: tuple[int, int], *, errors: bool = False, **image: Any
+) -> Looked:
     """Deconvolve a simulated image with the service."""
     write_sun(folder / "sun.fits", shape, **image)
     write_psf(folder / "psf.fits")
-    psf_id = site.client.upload_psf(folder / "psf.fits")["id"]
+    psf_id = client.upload_psf(folder / "psf.fits")["id"]
     output = folder / "product.fits"
     noise: dict[str, Any] = {"noise": (4.0, 1.0), "error_draws": 4} if errors else {}
-    product = site.client.deconvolve(
-        folder / "sun.fits", output, psf_id=psf_id, steps=5, overwrite=True, **noise
-    )
+    product = client.deconvolve(folder / "sun.fits", output, psf_id=psf_id, steps=5, overwrite=True, **noise)
     return Looked(
         product["id"],
         product["image_id"],
