@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import tracemalloc
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
+from psfcore.fits.cutout import cutout
 from psfcore.fits.header import FitsLimits, read_summary
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.instruments.files import instrument_path
@@ -91,3 +95,51 @@ def test_a_real_psf_of_another_program(real: Find, limits: FitsLimits) -> None:
     assert psf.kernel.shape == (4096, 4096)
     assert psf.total == pytest.approx(1, abs=1e-6)
     assert psf.wavelength_angstrom == 171
+
+
+# --- cut-outs: the pixels of the centre, byte by byte, and no more memory than a piece of them ---
+
+
+def random_psf(path: Path, shape: tuple[int, int], kind: str) -> np.ndarray:
+    weights = np.random.default_rng(1).random(shape).astype(kind)
+    fits.PrimaryHDU(weights).writeto(path, overwrite=True)
+    return weights
+
+
+def test_the_pixels_are_those_of_the_centre(tmp_path: Path, limits: FitsLimits) -> None:
+    path = tmp_path / "psf.fits"
+    for (ny, nx), kind, size in product([(64, 64), (63, 65), (7, 5)], ["f4", "f8"], [1, 2, 5]):
+        weights = random_psf(path, (ny, nx), kind)
+        part = cutout(path, size, limits)
+        content = b"".join(part.pieces())
+        assert len(content) == part.length and part.length % 2880 == 0
+        top, left = ny // 2 - size // 2, nx // 2 - size // 2
+        expected = weights[top : top + size, left : left + size]
+        with fits.open(io.BytesIO(content)) as hdus:
+            hdus.verify("exception")
+            np.testing.assert_array_equal(hdus[0].data, expected)
+            assert hdus[0].header["PSFSUM"] == pytest.approx(float(expected.astype("f8").sum()), rel=1e-12)
+
+
+def test_a_whole_psf_is_cut_out_in_pieces(tmp_path: Path, limits: FitsLimits) -> None:
+    """Sixteen mebibytes of pixels take less than two of memory."""
+    random_psf(tmp_path / "psf.fits", (2048, 2048), "f4")
+    cutout(tmp_path / "psf.fits", 8, limits)  # what is imported now does not count
+    tracemalloc.start()
+    try:
+        part = cutout(tmp_path / "psf.fits", 2048, limits)
+        length = sum(map(len, part.pieces()))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert length == part.length == (tmp_path / "psf.fits").stat().st_size
+    assert peak < 2 * 2**20
+
+
+def test_a_psf_that_was_cut_short_is_not_padded(tmp_path: Path, limits: FitsLimits) -> None:
+    random_psf(tmp_path / "psf.fits", (64, 64), "f4")
+    part = cutout(tmp_path / "psf.fits", 64, limits)
+    content = (tmp_path / "psf.fits").read_bytes()
+    (tmp_path / "psf.fits").write_bytes(content[:8000])
+    with pytest.raises(EOFError, match="of row"):
+        list(part.pieces())

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gzip
 import tracemalloc
+from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +60,19 @@ def test_a_stream_that_is_too_long_for_its_tile_is_refused(tmp_path: Path) -> No
         assert peak_mib_of_refusal(tmp_path / "bomb.fits", "tile-too-large") < 10
 
 
+def first_row(path: Path) -> int:
+    """Where the table of the tiles begins."""
+    with fits.open(path, disable_image_compression=True) as hdus:
+        return int(hdus[1].fileinfo()["datLoc"])
+
+
+def with_first_length(path: Path, change: Callable[[int], int]) -> None:
+    """Change the length that the first descriptor gives for its tile."""
+    at, content = first_row(path), bytearray(path.read_bytes())
+    content[at : at + 4] = change(int.from_bytes(content[at : at + 4], "big")).to_bytes(4, "big")
+    path.write_bytes(content)
+
+
 def test_a_stream_of_rice_that_ends_too_early_is_refused(tmp_path: Path) -> None:
     """Cut anywhere, for each width of a pixel: astropy's encoder writes no byte that the decoder does not read."""
     rows = {
@@ -67,35 +82,33 @@ def test_a_stream_of_rice_that_ends_too_early_is_refused(tmp_path: Path) -> None
         "spikes": np.where(np.arange(100) % 41 == 0, 120, 0),
         "short": RNG.integers(0, 120, 5),
     }
-    for name, row in rows.items():
-        for dtype in ("u1", "i2", "i4"):
-            path = written(
-                tmp_path / "t.fits", np.tile(row, (20, 1)).astype(dtype), compression_type="RICE_1"
-            )
-            with fits.open(path, disable_image_compression=True) as hdus:
-                first_row = hdus[1].fileinfo()["datLoc"]
-            content = bytearray(path.read_bytes())
-            length = int.from_bytes(content[first_row : first_row + 4], "big")
-            for kept in {1, length // 2, length - 5, length - 1} & set(range(length)):
-                content[first_row : first_row + 4] = kept.to_bytes(4, "big")
-                path.write_bytes(content)
-                with pytest.raises(DataError, match=r"^bad-tile: .*ends too early"):
-                    read_image(path, LIMITS)
-                assert kept < length, (name, dtype)
+    cuts: list[Callable[[int], int]] = [lambda n: 1, lambda n: n // 2, lambda n: n - 5, lambda n: n - 1]
+    for name, dtype, cut in product(rows, ("u1", "i2", "i4"), cuts):
+        pixels = np.tile(rows[name], (20, 1)).astype(dtype)
+        path = written(tmp_path / "t.fits", pixels, compression_type="RICE_1")
+        with_first_length(path, lambda length, cut=cut: max(cut(length), 1))
+        with pytest.raises(DataError, match=r"bad-tile: .*ends too early"):
+            read_image(path, LIMITS)
 
 
 def test_zeros_to_the_end_of_a_stream_of_rice_are_not_followed_past_it(tmp_path: Path) -> None:
     """The code of the first block is 1: a difference is a number of zeros and a one. There is no one."""
-    path = written(
-        tmp_path / "t.fits", RNG.integers(0, 9999, (20, 100)).astype("i2"), compression_type="RICE_1"
-    )
-    with fits.open(path, disable_image_compression=True) as hdus:
-        first_row, rows = hdus[1].fileinfo()["datLoc"], hdus[1].header["NAXIS1"] * hdus[1].header["NAXIS2"]
-    content = bytearray(path.read_bytes())
-    length = int.from_bytes(content[first_row : first_row + 4], "big")
-    content[first_row + rows : first_row + rows + length] = (bytes(2) + b"\x20").ljust(length, b"\0")
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=r"^bad-tile: .*ends too early"):
+    pixels = RNG.integers(0, 9999, (20, 100)).astype("i2")
+    path = written(tmp_path / "t.fits", pixels, compression_type="RICE_1", tile_shape=(20, 100))
+    heap, content = first_row(path) + 8, path.read_bytes()
+    path.write_bytes(content[:heap] + (bytes(2) + b"\x20").ljust(len(content) - heap, b"\0"))
+    with pytest.raises(DataError, match=r"bad-tile: .*ends too early"):
+        read_image(path, LIMITS)
+
+
+def test_scaled_pixels_of_8_bytes_are_refused(tmp_path: Path) -> None:
+    """astropy would return memory that it has not written. The first tile is said to be as long as two."""
+    pixels = RNG.normal(100, 1, (40, 50))
+    options = {"tile_shape": (1, 50), "quantize_level": 4.0, "quantize_method": 1}
+    path = written(tmp_path / "t.fits", pixels, compression_type="NOCOMPRESS", **options)
+    assert np.allclose(read_image(path, LIMITS).pixels, pixels, atol=1)
+    with_first_length(path, lambda length: 2 * length)
+    with pytest.raises(DataError, match="bad-tile"):
         read_image(path, LIMITS)
 
 
