@@ -18,16 +18,9 @@ import heliopsf
 from heliopsf.images import DataError
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.psf_sampling import rebinned_kernel
-from tests.conftest import SMALL_INSTRUMENT
 
 SHAPE = (96, 128)
 SCALE = 2.0
-
-
-@pytest.fixture
-def psf(tmp_path: Path) -> heliopsf.Psf:
-    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
-    return heliopsf.build_psf(tmp_path / "small.toml", size=64)
 
 
 def pixels(seed: int = 1) -> np.ndarray:
@@ -37,29 +30,22 @@ def pixels(seed: int = 1) -> np.ndarray:
 
 
 def cards(**more: Any) -> dict[str, Any]:
-    return {
-        "telescop": "SMALL",
-        "instrume": "SMALL_1",
-        "wavelnth": 171,
-        "waveunit": "angstrom",
-        "bunit": "DN",
-        "exptime": 2.0,
-        "date-obs": "2024-03-01T12:00:00",
-        "cdelt1": SCALE,
-        "cdelt2": SCALE,
-        "cunit1": "arcsec",
-        "cunit2": "arcsec",
-        "crpix1": 64.5,
-        "crpix2": 48.5,
-        "crval1": 0.0,
-        "crval2": 0.0,
+    telescope = {"telescop": "SMALL", "instrume": "SMALL_1", "wavelnth": 171, "waveunit": "angstrom"}
+    exposure = {"bunit": "DN", "exptime": 2.0, "date-obs": "2024-03-01T12:00:00"}
+    axes = {"cdelt1": SCALE, "cdelt2": SCALE, "cunit1": "arcsec", "cunit2": "arcsec"}
+    axes |= {"crpix1": 64.5, "crpix2": 48.5, "crval1": 0.0, "crval2": 0.0}
+    place = {
         "ctype1": "HPLN-TAN",
         "ctype2": "HPLT-TAN",
         "hgln_obs": 0.0,
         "hglt_obs": 0.0,
         "dsun_obs": 1.496e11,
-        **more,
     }
+    return telescope | exposure | axes | place | more
+
+
+def header(**more: Any) -> fits.Header:
+    return fits.Header({key.upper(): value for key, value in cards(**more).items()})
 
 
 def a_map(data: np.ndarray | None = None, **more: Any) -> Any:
@@ -86,25 +72,22 @@ def test_a_map_comes_back_as_a_map_with_its_metadata(psf: heliopsf.Psf) -> None:
 def test_a_saved_map_is_a_product_with_the_same_cards(psf: heliopsf.Psf, tmp_path: Path) -> None:
     result = heliopsf.deconvolve(a_map(), psf)
     result.save(tmp_path / "product.fits")
-    header = fits.getheader(tmp_path / "product.fits")
-    assert header["PSFID"] == psf.provenance["psf_id"]
+    assert fits.getheader(tmp_path / "product.fits")["PSFID"] == psf.provenance["psf_id"]
     for again in (result, tmp_path / "product.fits", sunpy.map.Map(tmp_path / "product.fits")):
-        with pytest.raises(DataError) as caught:
+        with pytest.raises(DataError, match="already-deconvolved"):
             heliopsf.deconvolve(again, psf)
-        assert caught.value.code == "already-deconvolved"
     assert heliopsf.deconvolve(result, psf, again=True).meta["dcnvpass"] == 2
 
 
 def test_every_form_gives_the_same_pixels(psf: heliopsf.Psf, tmp_path: Path) -> None:
     data = pixels()
     a_map().save(tmp_path / "image.fits")
-    header = fits.Header({key.upper(): value for key, value in cards().items()})
     wanted = heliopsf.deconvolve(tmp_path / "image.fits", psf)
     assert isinstance(wanted, heliopsf.Deconvolution)
     forms: list[Any] = [
         a_map(),
         NDData(data, unit="DN", meta=cards()),
-        CCDData(data, unit="adu", meta=header, wcs=WCS(header)),
+        CCDData(data, unit="adu", meta=header(), wcs=WCS(header())),
         data,
         data.astype(">i4"),
     ]
@@ -119,20 +102,15 @@ def test_every_form_gives_the_same_pixels(psf: heliopsf.Psf, tmp_path: Path) -> 
 
 
 def test_ccd_data_keeps_unit_wcs_and_header(psf: heliopsf.Psf) -> None:
-    header = fits.Header({key.upper(): value for key, value in cards().items()})
-    image = CCDData(pixels(), unit="DN / s", meta=header, wcs=WCS(header))
+    image = CCDData(pixels(), unit="DN / s", meta=header(), wcs=WCS(header()))
     result = heliopsf.deconvolve(image, psf)
     assert result.unit == image.unit and result.wcs is image.wcs
     assert result.header["PSFVERS"] == psf.version and "PSFVERS" not in image.header
     assert "steps" in str(result.header["HISTORY"])
-
-
-def test_the_plate_scale_of_a_ccd_data_without_cards_is_that_of_its_wcs(psf: heliopsf.Psf) -> None:
-    header = fits.Header({key.upper(): value for key, value in cards(cdelt1=3.0, cdelt2=3.0).items()})
-    image = CCDData(pixels(), unit="DN", wcs=WCS(header))
-    with pytest.raises(DataError) as caught, pytest.warns(UserWarning, match="not compared"):
+    # Without cards, the plate scale is that of the WCS.
+    image = CCDData(pixels(), unit="DN", wcs=WCS(header(cdelt1=3.0, cdelt2=3.0)))
+    with pytest.raises(DataError, match="plate-scale-mismatch"), pytest.warns(match="not compared"):
         heliopsf.deconvolve(image, psf)
-    assert caught.value.code == "plate-scale-mismatch"
 
 
 def test_pixels_without_a_value_stay_without_one_and_are_masked(psf: heliopsf.Psf) -> None:
@@ -158,7 +136,7 @@ def test_an_uncertainty_is_added_where_asked(psf: heliopsf.Psf) -> None:
     assert result.meta["dcnvampl"] == pytest.approx(np.median(sigma) / np.sqrt(2 * 50 + 1), rel=0.15)
     with pytest.raises(DataError, match="no-noise-figures"):
         heliopsf.deconvolve(a_map(), psf, error_draws=4)
-    with pytest.raises(DataError, match="expected 0, or 2 to 64; got 1"):
+    with pytest.raises(DataError, match="2 to 64; got 1"):
         heliopsf.deconvolve(a_map(), psf, noise=noise, error_draws=1)
 
 
@@ -177,21 +155,15 @@ def test_a_rebinned_map_gets_the_rebinned_psf(psf: heliopsf.Psf) -> None:
     binned = a_map().superpixel([2, 2] * u.pix, func=np.mean)
     unnamed = heliopsf.deconvolve(binned, psf.kernel)  # weights alone have no plate scale
     assert unnamed.data.shape == (48, 64)
-    with pytest.raises(DataError) as caught:  # the instrument of the image is not known to be that of the PSF
-        heliopsf.deconvolve(binned, anonymous)
-    assert caught.value.code == "plate-scale-mismatch"
+    with pytest.raises(DataError, match="plate-scale-mismatch"):
+        heliopsf.deconvolve(binned, anonymous)  # the image is not known to be of the instrument of the PSF
     rebinned = psf.rebinned(2)
     assert isinstance(rebinned, heliopsf.Psf) and rebinned.plate_scale_arcsec == 2 * SCALE
     np.testing.assert_array_equal(rebinned.kernel, rebinned_kernel(psf.kernel, 2))
     result = heliopsf.deconvolve(binned, rebinned)
     assert result.meta["psfvers"].endswith("+bin2")
-
-
-def test_a_map_resampled_by_a_fraction_is_refused(psf: heliopsf.Psf) -> None:
-    image = a_map().resample([100, 75] * u.pix)
-    with pytest.raises(DataError) as caught:
-        heliopsf.deconvolve(image, psf)
-    assert caught.value.code == "plate-scale-mismatch" and "2.56" in caught.value.message
+    with pytest.raises(DataError, match=r"plate-scale-mismatch: .*2\.56"):
+        heliopsf.deconvolve(a_map().resample([100, 75] * u.pix), psf)
 
 
 @pytest.mark.filterwarnings("ignore:Missing metadata", "ignore:.*not found", "ignore::UserWarning:sunpy")
@@ -207,14 +179,12 @@ def test_another_unit_keeps_the_unit_and_ignores_levels_in_dn(psf: heliopsf.Psf)
     result = heliopsf.deconvolve(a_map(bunit="ph"), psf)
     assert result.unit == u.ph
     np.testing.assert_array_equal(result.data, heliopsf.deconvolve(a_map(), psf).data)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match="saturation-unit"):
         heliopsf.deconvolve(a_map(bunit="ph"), psf, saturation_dn=100.0)
-    assert caught.value.code == "saturation-unit"
     bright = heliopsf.deconvolve(a_map(), psf, saturation_dn=100.0)
     assert bright.mask.any() and np.isfinite(bright.data).all()
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match="bad-unit"):
         heliopsf.deconvolve(NDData(pixels(), unit=u.mag), psf)
-    assert caught.value.code == "bad-unit"
 
 
 def test_a_list_gives_a_list_and_an_error_names_the_image(psf: heliopsf.Psf) -> None:
@@ -222,16 +192,12 @@ def test_a_list_gives_a_list_and_an_error_names_the_image(psf: heliopsf.Psf) -> 
     results = heliopsf.deconvolve(images, psf)
     for image, result in zip(images, results, strict=True):
         np.testing.assert_array_equal(result.data, heliopsf.deconvolve(image, psf).data)
-    mixed = [a_map(), a_map(wavelnth=304)]
-    with pytest.raises(DataError) as caught:
-        heliopsf.deconvolve(mixed, psf)
-    assert caught.value.code == "channel-mismatch"
-    assert caught.value.message.startswith("image 2 of 2:") and "304" in caught.value.message
+    with pytest.raises(DataError, match=r"channel-mismatch: image 2 of 2: .*304"):
+        heliopsf.deconvolve([a_map(), a_map(wavelnth=304)], psf)
 
 
-@pytest.mark.parametrize(
-    ("image", "code"),
-    [
+def test_what_is_no_image_is_refused(psf: heliopsf.Psf) -> None:
+    for image, code in (
         (None, "bad-input"),
         ({"a": 1}, "bad-input"),
         (np.ones((4, 40, 40)), "not-2d"),
@@ -239,12 +205,9 @@ def test_a_list_gives_a_list_and_an_error_names_the_image(psf: heliopsf.Psf) -> 
         (np.full((40, 40), np.nan), "all-nan"),
         (np.zeros((40, 40)), "no-signal"),
         (np.ones((4, 4)), "too-small"),
-    ],
-)
-def test_what_is_no_image_is_refused(image: Any, code: str, psf: heliopsf.Psf) -> None:
-    with pytest.raises(DataError) as caught:
-        heliopsf.deconvolve(image, psf)
-    assert caught.value.code == code
+    ):
+        with pytest.raises(DataError, match=code):
+            heliopsf.deconvolve(image, psf)
 
 
 def test_a_psf_may_be_an_object_a_file_or_weights(psf: heliopsf.Psf, tmp_path: Path) -> None:
@@ -255,7 +218,7 @@ def test_a_psf_may_be_an_object_a_file_or_weights(psf: heliopsf.Psf, tmp_path: P
     assert len(from_file.meta["psfid"]) == 64
     weights = heliopsf.deconvolve(a_map(), psf.kernel)
     np.testing.assert_array_equal(weights.data, wanted)
-    with pytest.raises(DataError, match=r"psf-not-centred"):
+    with pytest.raises(DataError, match="psf-not-centred"):
         heliopsf.deconvolve(a_map(), np.fft.ifftshift(psf.kernel))
     with pytest.raises(DataError, match=r"psf: expected a Psf.*got dict"):
         heliopsf.deconvolve(a_map(), {"psf": 1})  # type: ignore[call-overload]
@@ -270,9 +233,8 @@ def test_calls_of_aiapy_work_unchanged(psf: heliopsf.Psf) -> None:
     called = heliopsf.deconvolve(a_map(data), psf=psf.kernel, iterations=25, clip_negative=True, use_gpu=True)
     assert called.meta["dcnviter"] == 25
     np.testing.assert_array_equal(called.data, heliopsf.deconvolve(a_map(data), psf, steps=25).data)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match="negative-pixels"):
         heliopsf.deconvolve(a_map(data), psf, clip_negative=False)
-    assert caught.value.code == "negative-pixels"
     kept = heliopsf.deconvolve(a_map(data), psf, clip_negative=False, method="linear")
     clipped = heliopsf.deconvolve(a_map(data), psf, clip_negative=True, method="linear")
     assert kept.data[0, 0] < clipped.data[0, 0]
@@ -288,11 +250,6 @@ def test_progress_is_told_to_a_function_or_on_the_terminal(
     assert told[-1] == (3, 3) and capsys.readouterr().err == ""
     heliopsf.deconvolve(a_map(), psf, iterations=3, progress=True)
     assert "deconvolving: step 3 of 3\n" in capsys.readouterr().err
-
-
-def test_the_number_of_threads_does_not_change_the_result(psf: heliopsf.Psf) -> None:
-    one, two = (heliopsf.deconvolve(a_map(), psf, threads=threads).data for threads in (1, 2))
-    np.testing.assert_array_equal(one, two)
 
 
 REGION = "32:64,32:64"
@@ -316,7 +273,6 @@ def test_a_region_of_a_map_is_its_submap_deconvolved(psf: heliopsf.Psf) -> None:
 
 def test_a_region_has_the_form_of_its_image(psf: heliopsf.Psf, tmp_path: Path) -> None:
     a_map().save(tmp_path / "image.fits")
-    header = fits.Header({key.upper(): value for key, value in cards().items()})
     options: dict[str, Any] = {"region": REGION, "region_error": 0.9, "other_channel": True}
     wanted = heliopsf.deconvolve(tmp_path / "image.fits", psf, **options)
     assert wanted.pixels.shape == wanted.quality.shape == wanted.image.pixels.shape == (32, 32)
@@ -324,7 +280,7 @@ def test_a_region_has_the_form_of_its_image(psf: heliopsf.Psf, tmp_path: Path) -
     np.testing.assert_array_equal(wanted.image.pixels, pixels()[32:64, 32:64])
     for image in (
         NDData(pixels(), unit="DN", meta=cards()),
-        CCDData(pixels(), unit="adu", meta=header, wcs=WCS(header)),
+        CCDData(pixels(), unit="adu", meta=header(), wcs=WCS(header())),
         pixels(),
     ):
         result = heliopsf.deconvolve(image, psf, **options)
@@ -337,25 +293,19 @@ def test_a_region_has_the_form_of_its_image(psf: heliopsf.Psf, tmp_path: Path) -
     assert [one.shape for one in several] == [(32, 32), (32, 32)]
 
 
-@pytest.mark.parametrize(
-    ("region", "code"),
-    [
+def test_a_region_that_cannot_be_used_is_refused(psf: heliopsf.Psf) -> None:
+    regions: list[tuple[Any, str]] = [
         ("1:2", "bad-region"),
         ((1, 2), "bad-region"),
         (np.s_[0:40:2, 0:40], "bad-region"),
         (np.s_[0:40], "bad-region"),
         ("0:20,80:97", "region-outside"),
         (np.s_[0:10, 0:40], "region-too-small"),
-    ],
-)
-def test_a_region_of_another_form_is_refused(psf: heliopsf.Psf, region: Any, code: str) -> None:
-    for image in (pixels(), a_map()):
-        with pytest.raises(DataError) as refused:
-            heliopsf.deconvolve(image, psf, region=region)
-        assert refused.value.code == code
-
-
-def test_a_region_with_errors_is_refused(psf: heliopsf.Psf) -> None:
+    ]
+    for region, code in regions:
+        for image in (pixels(), a_map()):
+            with pytest.raises(DataError, match=code):
+                heliopsf.deconvolve(image, psf, region=region)
     with pytest.raises(DataError, match="region-errors"):
         heliopsf.deconvolve(pixels(), psf, region=REGION, error_draws=4, noise=(1.0, 1.0))
 
@@ -368,8 +318,6 @@ def test_an_image_that_does_not_fit_into_the_memory_is_refused_before_it_is_read
     read: list[Any] = []
     monkeypatch.setattr("heliopsf.images.image_of", lambda *given, **more: read.append(given))
     for image in (a_map(), pixels(), tmp_path / "image.fits"):
-        with pytest.raises(DataError) as refused:
+        with pytest.raises(DataError, match=r"too-much-memory: .*128 x 96 px"):
             heliopsf.deconvolve(image, psf)
-        assert refused.value.code == "too-much-memory"
-        assert "128 x 96 px" in refused.value.message and "free memory" in refused.value.message
     assert not read

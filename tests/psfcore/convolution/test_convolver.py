@@ -1,3 +1,5 @@
+"""The convolution agrees with a sum term by term and with the padding of the paper, and keeps sums and centres."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -52,36 +54,23 @@ def test_equals_the_sum_and_its_adjoint_for_any_shapes(ny: int, nx: int, ky: int
     assert abs(seen - sent) <= 1e-12 * scale
 
 
-@pytest.mark.parametrize("shape", [(64, 64), (65, 65), (64, 81), (51, 40)])
-def test_equals_padding_by_half_an_edge_on_all_sides(shape: tuple[int, int]) -> None:
+def test_equals_padding_by_half_an_edge_on_all_sides() -> None:
     rng = np.random.default_rng(5)
-    x, kernel = rng.random(shape), rng.random(shape)
-    kernel /= kernel.sum()
-    expected = padded_by_half_on_all_sides(x, kernel)
-    np.testing.assert_allclose(Convolver(kernel, shape, dtype=np.float64).apply(x), expected, atol=1e-13)
+    for shape in ((64, 64), (65, 65), (64, 81), (51, 40)):
+        x, kernel = rng.random(shape), rng.random(shape)
+        kernel /= kernel.sum()
+        expected = padded_by_half_on_all_sides(x, kernel)
+        np.testing.assert_allclose(Convolver(kernel, shape, dtype=np.float64).apply(x), expected, atol=1e-13)
 
 
-def test_a_delta_changes_nothing() -> None:
-    x = np.random.default_rng(1).random((40, 33))
-    for size in (1, 8, 9, 120):
-        convolver = Convolver(delta(size), x.shape, dtype=np.float64)
-        np.testing.assert_allclose(convolver.apply(x), x, atol=1e-15)
-        np.testing.assert_allclose(convolver.adjoint(x), x, atol=1e-15)
-
-
-def test_a_shifted_delta_shifts_towards_its_offset_and_adjoint_shifts_back() -> None:
-    kernel = np.zeros((9, 9))
-    kernel[4 + 1, 4 + 3] = 1
+def test_a_delta_shifts_towards_its_offset_and_adjoint_shifts_back() -> None:
     x = np.zeros((20, 20))
     x[10, 10] = 1
+    kernel = np.zeros((9, 9))
+    kernel[4 + 1, 4 + 3] = 1
     convolver = Convolver(kernel, x.shape, dtype=np.float64)
     assert np.unravel_index(convolver.apply(x).argmax(), x.shape) == (11, 13)
     assert np.unravel_index(convolver.adjoint(x).argmax(), x.shape) == (9, 7)
-
-
-def test_gaussian_widths_add_in_quadrature() -> None:
-    blurred = Convolver(gaussian(61, 4.0), (101, 101), dtype=np.float64).apply(gaussian(101, 3.0))
-    np.testing.assert_allclose(blurred, gaussian(101, 5.0), atol=1e-9)
 
 
 def test_convolving_kernels_keeps_their_sum_and_centre() -> None:

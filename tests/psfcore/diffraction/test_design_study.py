@@ -57,20 +57,14 @@ def test_a_thinner_wire_diffracts_less_but_farther(study: DesignStudy) -> None:
 
 
 def test_orders_of_a_flare_as_wide_as_their_spacing_overlap() -> None:
-    hri = load_instrument("hri_euv")
+    """Without scatter there is no ratio to it."""
+    hri = replace(load_instrument("hri_euv"), scatter=None)
     small, large = (design_study(hri, [1270.0], [40.0], flare_px=n).rows[0] for n in (2, 5))
-    assert small.peak_visibility == 1
+    assert small.peak_visibility == 1 and small.peak_over_scatter is None
     assert 0.3 < large.peak_visibility < 0.8
 
 
-def test_without_scatter_there_is_no_ratio_to_it() -> None:
-    hri = replace(load_instrument("hri_euv"), scatter=None)
-    assert design_study(hri, [1270.0], [40.0]).rows[0].peak_over_scatter is None
-
-
 def test_the_study_is_plotted_and_written_as_json(study: DesignStudy, tmp_path: Path) -> None:
-    larger = design_study(load_instrument("hri_euv"), [300.0 + 300 * i for i in range(8)], [20, 30, 40, 50])
-    assert len(larger.rows) == 32
     content = json.loads(study.as_json())
     assert content["flown"]["pitch_um"] == 1270
     assert len(content["rows"]) == 8
@@ -78,11 +72,14 @@ def test_the_study_is_plotted_and_written_as_json(study: DesignStudy, tmp_path: 
     assert matplotlib.image.imread(tmp_path / "design.png").std() > 0.05
 
 
-@pytest.mark.parametrize(
-    ("pitches", "wires", "flare_px"),
-    [([], [40.0], 5), ([100.0], [100.0], 5), ([100.0], [-1.0], 5), ([float("inf")], [40.0], 5), ([100.0], [4.0], 0)],
-)  # fmt: skip
-def test_impossible_meshes_are_refused(pitches: list[float], wires: list[float], flare_px: int) -> None:
-    with pytest.raises(DataError, match=r"expected .*; got") as caught:
-        design_study(load_instrument("hri_euv"), pitches, wires, flare_px=flare_px)
-    assert caught.value.code == "bad-design"
+def test_impossible_meshes_are_refused() -> None:
+    hri = load_instrument("hri_euv")
+    for pitches, wires, flare_px in (
+        ([], [40.0], 5),
+        ([100.0], [100.0], 5),
+        ([100.0], [-1.0], 5),
+        ([float("inf")], [40.0], 5),
+        ([100.0], [4.0], 0),
+    ):
+        with pytest.raises(DataError, match=r"bad-design: expected .*; got"):
+            design_study(hri, pitches, wires, flare_px=flare_px)

@@ -42,20 +42,14 @@ def by_points(pupil_inside: object, cells: int, cell_mm: float, points: int = 30
     return inside.reshape(cells, points, cells, points).mean(axis=(1, 3))
 
 
-@pytest.mark.parametrize("cell_mm", [0.05, 0.0371, 0.3])
-def test_a_disc_and_a_ring_have_the_right_area(cell_mm: float) -> None:
-    assert area_mm2(entrance_pupil(APERTURE), cell_mm) == pytest.approx(DISC_MM2, rel=1e-6)
+def test_discs_rings_bars_and_hubs_have_their_area() -> None:
     ring = Aperture(diameter_mm=10.0, obscuration_diameter_mm=4.0)
-    assert area_mm2(entrance_pupil(ring), cell_mm) == pytest.approx(DISC_MM2 * (1 - 0.16), rel=1e-6)
-
-
-@pytest.mark.parametrize("angle_deg", [0.0, 17.0, 45.0, 90.0, 133.0])
-def test_a_bar_blocks_its_area(angle_deg: float) -> None:
-    square = Pupil((bar(-5, 5, 10, 0.0),), ((bar(-3, 2, 0.8, angle_deg),),))
-    assert area_mm2(square) == pytest.approx(100 - 4.0, rel=1e-6)
-
-
-def test_rings_and_hub_block_their_area() -> None:
+    for cell_mm in (0.05, 0.0371, 0.3):
+        assert area_mm2(entrance_pupil(APERTURE), cell_mm) == pytest.approx(DISC_MM2, rel=1e-6)
+        assert area_mm2(entrance_pupil(ring), cell_mm) == pytest.approx(DISC_MM2 * (1 - 0.16), rel=1e-6)
+    for angle_deg in (0.0, 17.0, 45.0, 90.0, 133.0):
+        square = Pupil((bar(-5, 5, 10, 0.0),), ((bar(-3, 2, 0.8, angle_deg),),))
+        assert area_mm2(square) == pytest.approx(100 - 4.0, rel=1e-6), angle_deg
     mount = Mount(basis="assumed", rings=(Ring(radius_mm=3.0, width_mm=0.4),), hub_diameter_mm=2.0)
     wanted = DISC_MM2 - 2 * math.pi * 3.0 * 0.4 - math.pi
     assert area_mm2(entrance_pupil(APERTURE, mount=mount)) == pytest.approx(wanted, rel=1e-6)
@@ -124,42 +118,38 @@ def test_strips_are_parts_of_the_whole() -> None:
     np.testing.assert_array_equal(grid.rows(40, 90, out=out), whole[40:90])
 
 
-@pytest.mark.parametrize("pixels", [37, 200, 1000])
-def test_a_mask_image_keeps_its_area_and_position(pixels: int) -> None:
+def test_a_mask_image_keeps_its_area_and_position() -> None:
     """The upper left quarter (y high, x low) is opaque; pixels are wider or narrower than cells."""
-    share = np.ones((pixels, pixels))
-    share[pixels // 2 :, : pixels // 2] = 0
-    square = Pupil((bar(-5, 5, 10.0, 0.0),), picture=MaskPicture(share, 10.0))
-    found = mask(square)
-    centre = len(found) // 2
-    assert found[centre + 40, centre - 40] == 0
-    assert found[centre - 40, centre - 40] == found[centre + 40, centre + 40] == pytest.approx(1)
-    assert found.sum() * CELL_MM**2 == pytest.approx(100 * share.mean(), rel=1e-5)
+    for pixels in (37, 200, 1000):
+        share = np.ones((pixels, pixels))
+        share[pixels // 2 :, : pixels // 2] = 0
+        found = mask(Pupil((bar(-5, 5, 10.0, 0.0),), picture=MaskPicture(share, 10.0)))
+        centre = len(found) // 2
+        assert found[centre + 40, centre - 40] == 0
+        assert found[centre - 40, centre - 40] == found[centre + 40, centre + 40] == pytest.approx(1)
+        assert found.sum() * CELL_MM**2 == pytest.approx(100 * share.mean(), rel=1e-5)
 
 
 def image_mount(width_mm: float = 10.0) -> Mount:
     return Mount(basis="drawing", mask_image=MaskImage(file="mask.png", width_mm=width_mm))
 
 
-@pytest.mark.parametrize(
-    ("mount", "image", "key"),
-    [
-        (image_mount(), None, "mask_image"),
-        (image_mount(), np.ones((4, 5)), "mask_image"),
-        (image_mount(), np.ones(16), "mask_image"),
-        (image_mount(), np.ones((3, 3, 3)), "mask_image"),
-        (image_mount(), np.zeros((4, 4)), "mask_image"),
-        (image_mount(), np.full((4, 4), np.nan), "mask_image"),
-        (image_mount(9.0), np.ones((4, 4)), "mask_image.width_mm"),
-        (Mount(basis="assumed", rings=(Ring(radius_mm=4.9, width_mm=0.4),)), None, "rings.0"),
-        (Mount(basis="assumed", rings=(Ring(radius_mm=0.1, width_mm=0.4),)), None, "rings.0"),
-        (Mount(basis="assumed", hub_diameter_mm=11.0), None, "hub_diameter_mm"),
-        (Mount(basis="assumed", rays=(Rays(count=2, width_mm=10.0),)), None, "rays.0.width_mm"),
-    ],
-)
-def test_the_error_of_an_unfit_mount_names_the_key(
-    mount: Mount, image: NDArray[np.float64] | None, key: str
-) -> None:
-    with pytest.raises(DataError, match=rf"mount\.{key}: expected") as caught:
-        entrance_pupil(APERTURE, mount=mount, mount_image=image)
-    assert caught.value.code == "bad-mount"
+UNFIT = [
+    (image_mount(), None, "mask_image"),
+    (image_mount(), np.ones((4, 5)), "mask_image"),
+    (image_mount(), np.ones(16), "mask_image"),
+    (image_mount(), np.ones((3, 3, 3)), "mask_image"),
+    (image_mount(), np.zeros((4, 4)), "mask_image"),
+    (image_mount(), np.full((4, 4), np.nan), "mask_image"),
+    (image_mount(9.0), np.ones((4, 4)), "mask_image.width_mm"),
+    (Mount(basis="assumed", rings=(Ring(radius_mm=4.9, width_mm=0.4),)), None, "rings.0"),
+    (Mount(basis="assumed", rings=(Ring(radius_mm=0.1, width_mm=0.4),)), None, "rings.0"),
+    (Mount(basis="assumed", hub_diameter_mm=11.0), None, "hub_diameter_mm"),
+    (Mount(basis="assumed", rays=(Rays(count=2, width_mm=10.0),)), None, "rays.0.width_mm"),
+]
+
+
+def test_the_error_of_an_unfit_mount_names_the_key(subtests: pytest.Subtests) -> None:
+    for mount, image, key in UNFIT:
+        with subtests.test(key), pytest.raises(DataError, match=rf"bad-mount: mount\.{key}: expected"):
+            entrance_pupil(APERTURE, mount=mount, mount_image=image)

@@ -30,27 +30,16 @@ def spacing_px(channel: int, mesh: Mesh) -> float:
     )
 
 
-@pytest.mark.parametrize("channel", MEASURED)
-def test_the_arms_have_the_measured_angles(channel: int) -> None:
-    """A square mesh has two arms, 90 degrees apart."""
-    meshes = [mesh for mesh in load_instrument(f"aia_{channel}").meshes if mesh.place == "entrance"]
-    arms = sorted(angle for mesh in meshes for angle in (mesh.angle_deg, mesh.angle_deg - 90))
-    assert arms == pytest.approx(sorted(MEASURED[channel][0]), abs=0.065)
-    assert sum(mesh.share for mesh in meshes) == 1
-
-
-@pytest.mark.parametrize("channel", MEASURED)
-def test_the_orders_have_the_measured_spacing(channel: int) -> None:
-    _, entrance_px, focal_px = MEASURED[channel]
-    *entrance, focal = load_instrument(f"aia_{channel}").meshes
-    assert [spacing_px(channel, mesh) for mesh in entrance] == pytest.approx([entrance_px] * 2, abs=0.005)
-    assert spacing_px(channel, focal) == pytest.approx(focal_px, abs=0.001)
-    assert (focal.place, focal.angle_deg) == ("filter_wheel", 45.0)
-
-
-@pytest.mark.parametrize("channel", MEASURED)
-def test_the_pitch_is_that_of_70_lines_an_inch(channel: int) -> None:
-    """The measured spacing gives a pitch within 1 % of the nominal one."""
-    for mesh in load_instrument(f"aia_{channel}").meshes:
-        assert mesh.pitch_um == pytest.approx(25_400 / 70, rel=0.01)
-        assert mesh.wire_um == 34.0
+def test_the_meshes_have_the_measured_arms_and_orders() -> None:
+    """A square mesh has two arms, 90 degrees apart. The measured spacing gives a pitch within 1 % of the nominal one."""
+    for channel, (arms_deg, entrance_px, focal_px) in MEASURED.items():
+        *entrance, focal = meshes = load_instrument(f"aia_{channel}").meshes
+        assert all(mesh.place == "entrance" for mesh in entrance), channel
+        arms = sorted(angle for mesh in entrance for angle in (mesh.angle_deg, mesh.angle_deg - 90))
+        assert arms == pytest.approx(sorted(arms_deg), abs=0.065), channel
+        assert sum(mesh.share for mesh in entrance) == 1, channel
+        assert [spacing_px(channel, mesh) for mesh in entrance] == pytest.approx([entrance_px] * 2, abs=0.005)
+        assert spacing_px(channel, focal) == pytest.approx(focal_px, abs=0.001), channel
+        assert (focal.place, focal.angle_deg) == ("filter_wheel", 45.0), channel
+        for mesh in meshes:
+            assert mesh.pitch_um == pytest.approx(25_400 / 70, rel=0.01) and mesh.wire_um == 34.0, channel

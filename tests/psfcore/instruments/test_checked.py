@@ -60,53 +60,49 @@ def test_values_are_converted_to_their_types() -> None:
     assert Whole(name="ab").modes == {} and Whole(name="ab").corner is None
 
 
-@pytest.mark.parametrize(
-    ("table", "key", "expected"),
-    [
-        ({"name": "ab\n"}, "name", "expected a text of the form"),
-        ({"name": "abcdef"}, "name", "expected at most 5 characters"),
-        ({"name": 3}, "name", "expected a text"),
-        ({"count": 0}, "count", "expected a number of at least 1"),
-        ({"count": 10}, "count", "expected a number of at most 9"),
-        ({"count": 1.5}, "count", "expected a whole number"),
-        ({"count": True}, "count", "expected a whole number"),
-        ({"count": float("inf")}, "count", "expected a whole number"),
-        ({"kind": "flat"}, "kind", "expected one of 'round', 'square'"),
-        ({"parts": {"length": 1}}, "parts", "expected a list"),
-        ({"parts": [{"length": 2}] * 3}, "parts", "expected at most 2 entries"),
-        ({"parts": [2]}, "parts.0", "expected a table"),
-        ({"parts": [{"length": "2"}]}, "parts.0.length", "expected a finite number"),
-        ({"parts": [{"length": float("nan")}]}, "parts.0.length", "expected a finite number"),
-        ({"parts": [{"length": 0}]}, "parts.0.length", "expected a number above 0"),
-        ({"parts": [{"length": 0.5}]}, "parts.0", "expected length above width; got 0.5"),
-        ({"parts": [{}]}, "parts.0.length", "expected this key"),
-        ({"corner": [1]}, "corner", "expected 2 entries"),
-        (
-            {"modes": {"A": {"depth": 1, "length": 2}}},
-            "modes.A.depth",
-            "expected one of the keys length, width",
-        ),
-        ({"modes": [1]}, "modes", "expected a table"),
-        ({"match": {"COLOUR": "red"}}, "match.COLOUR", "expected one of 'NAME', 'SIZE'"),
-        ({"match": {"NAME": "abcd"}}, "match.NAME", "expected at most 3 characters"),
-        ({"match": {"SIZE": 0}}, "match.SIZE", "expected a number above 0"),
-        ({"match": {"SIZE": float("inf")}}, "match.SIZE", "expected a finite number"),
-        ({"match": {"SIZE": True}}, "match.SIZE", "expected a text or a number"),
-        ({"match": {"SIZE": [1]}}, "match.SIZE", "expected a text or a number"),
-    ],
-)
-def test_the_fault_names_the_key_and_what_was_expected(
-    table: dict[str, Any], key: str, expected: str
-) -> None:
-    ((found, said),) = faults(**table)
-    assert found == key and said.startswith(expected)
+FAULTS = [
+    ({"name": "ab\n"}, "name", "expected a text of the form"),
+    ({"name": "abcdef"}, "name", "expected at most 5 characters"),
+    ({"name": 3}, "name", "expected a text"),
+    ({"count": 0}, "count", "expected a number of at least 1"),
+    ({"count": 10}, "count", "expected a number of at most 9"),
+    ({"count": 1.5}, "count", "expected a whole number"),
+    ({"count": True}, "count", "expected a whole number"),
+    ({"count": float("inf")}, "count", "expected a whole number"),
+    ({"kind": "flat"}, "kind", "expected one of 'round', 'square'"),
+    ({"parts": {"length": 1}}, "parts", "expected a list"),
+    ({"parts": [{"length": 2}] * 3}, "parts", "expected at most 2 entries"),
+    ({"parts": [2]}, "parts.0", "expected a table"),
+    ({"parts": [{"length": "2"}]}, "parts.0.length", "expected a finite number"),
+    ({"parts": [{"length": float("nan")}]}, "parts.0.length", "expected a finite number"),
+    ({"parts": [{"length": 0}]}, "parts.0.length", "expected a number above 0"),
+    ({"parts": [{"length": 0.5}]}, "parts.0", "expected length above width; got 0.5"),
+    ({"parts": [{}]}, "parts.0.length", "expected this key"),
+    ({"corner": [1]}, "corner", "expected 2 entries"),
+    (
+        {"modes": {"A": {"depth": 1, "length": 2}}},
+        "modes.A.depth",
+        "expected one of the keys length, width",
+    ),
+    ({"modes": [1]}, "modes", "expected a table"),
+    ({"match": {"COLOUR": "red"}}, "match.COLOUR", "expected one of 'NAME', 'SIZE'"),
+    ({"match": {"NAME": "abcd"}}, "match.NAME", "expected at most 3 characters"),
+    ({"match": {"SIZE": 0}}, "match.SIZE", "expected a number above 0"),
+    ({"match": {"SIZE": float("inf")}}, "match.SIZE", "expected a finite number"),
+    ({"match": {"SIZE": True}}, "match.SIZE", "expected a text or a number"),
+    ({"match": {"SIZE": [1]}}, "match.SIZE", "expected a text or a number"),
+]
+
+
+def test_the_fault_names_the_key_and_what_was_expected() -> None:
+    for values, key, expected in FAULTS:
+        ((found, said),) = faults(**values)
+        assert found == key and said.startswith(expected), values
 
 
 def test_all_faults_are_told_unknown_keys_first_then_in_the_order_of_the_keys() -> None:
     assert [key for key, _ in faults(other=1, kind="flat", count=0)] == ["other", "count", "kind"]
-
-
-def test_a_misspelt_key_is_told_before_the_key_that_is_missing() -> None:
+    # A misspelt key is told before the key that is missing.
     assert [key for key, _ in faults(parts=[{"lenght": 1.0}])] == ["parts.0.lenght", "parts.0.length"]
 
 

@@ -58,32 +58,32 @@ TOO_LARGE = {
 }
 
 
-@pytest.mark.parametrize("name", TOO_MANY)
-def test_too_many_parts_are_refused_when_the_file_is_read(name: str) -> None:
-    with pytest.raises(DataError) as caught:
-        parse_instrument(TOO_MANY[name], "greedy.toml")
-    assert (
-        caught.value.code == "bad-instrument-file" and "at most" in caught.value.message
-    ) or "less than" in caught.value.message
+def test_too_many_parts_are_refused_when_the_file_is_read(subtests: pytest.Subtests) -> None:
+    for name, text in TOO_MANY.items():
+        with (
+            subtests.test(name),
+            pytest.raises(DataError, match=r"bad-instrument-file: .*(at most|less than)"),
+        ):
+            parse_instrument(text, "greedy.toml")
 
 
-@pytest.mark.parametrize("name", TOO_LARGE)
-def test_too_large_arrays_are_refused_before_they_exist(name: str) -> None:
-    instrument = parse_instrument(TOO_LARGE[name], "greedy.toml")
-    tracemalloc.start()
-    with pytest.raises(DataError, match=r"expected .*; got") as caught:
-        build_psf(instrument)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert caught.value.code == "bad-instrument-file" and peak < MIB
+def test_too_large_arrays_are_refused_before_they_exist() -> None:
+    for name, text in TOO_LARGE.items():
+        instrument = parse_instrument(text, "greedy.toml")
+        tracemalloc.start()
+        with pytest.raises(DataError, match=r"bad-instrument-file: .*expected .*; got"):
+            build_psf(instrument)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < MIB, name
 
 
-@pytest.mark.parametrize("name", instrument_names())
-def test_shipped_instruments_are_far_from_the_limits(name: str) -> None:
-    instrument = load_instrument(name)
-    check_workload(instrument, name)
-    work = workload(instrument, 4096)
-    assert max(work.cells, default=0) < MOST_CELLS / 5 and work.samples < MOST_SAMPLES / 2
+def test_shipped_instruments_are_far_from_the_limits() -> None:
+    for name in instrument_names():
+        instrument = load_instrument(name)
+        check_workload(instrument, name)
+        work = workload(instrument, 4096)
+        assert max(work.cells, default=0) < MOST_CELLS / 5 and work.samples < MOST_SAMPLES / 2, name
 
 
 def test_the_sizes_are_those_of_the_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,6 +135,7 @@ def test_the_mask_and_its_edges_are_not_larger_than_said() -> None:
     assert len(grid._entries) <= work.mount_entries + 8 * work.mask_cells
 
 
+SIZE_PX = 1024
 GREEDY = small(MESH + "windows = 400\nangle_deg = 45.0\n", focal_length_mm="200.0", diameter_mm="20.0")
 
 
@@ -142,20 +143,20 @@ def test_a_greedy_file_within_the_limits_keeps_to_its_estimate() -> None:
     """The mesh is computed on the full grid, in a process that may use 1.5 times the estimate."""
     instrument = parse_instrument(GREEDY, "greedy.toml")
     check_workload(instrument, "greedy.toml")
-    assert max(workload(instrument, 2048).cells) > 400_000
-    estimate_mib = round(COSTS.worker_mib + _build({"instrument_file": GREEDY, "size": 2048})[1])
+    assert max(workload(instrument, SIZE_PX).cells) > 200_000
+    estimate_mib = round(COSTS.worker_mib + _build({"instrument_file": GREEDY, "size": SIZE_PX})[1])
     code = (
         "import sys\nfrom psfcore.build import build_psf\nfrom psfcore.instruments.model import parse_instrument\n"
         "from workers.run.child import Child\n"
         "with Child(1).limited(int(sys.argv[1])):\n"
-        "    print(build_psf(parse_instrument(sys.stdin.read(), 'greedy.toml')).kernel.shape)\n"
+        "    print(build_psf(parse_instrument(sys.stdin.read(), 'greedy.toml'), size=int(sys.argv[2])).kernel.shape)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, str(estimate_mib)],
+        [sys.executable, "-c", code, str(estimate_mib), str(SIZE_PX)],
         input=GREEDY,
         cwd=REPOSITORY,
         capture_output=True,
         text=True,
         timeout=170,
     )
-    assert done.stdout == "(2048, 2048)\n", done.stderr
+    assert done.stdout == f"({SIZE_PX}, {SIZE_PX})\n", done.stderr
