@@ -14,6 +14,7 @@ from sqlalchemy import update
 
 from service.cli.main import main
 from tests.workers.databases import change
+from tests.workers.jobs import claimed, job_row
 from workers.broker import app as queue
 from workers.broker.order import FolderTransport, MostUrgentFirst
 from workers.broker.reconciler import AT_ONCE, reconcile
@@ -74,11 +75,10 @@ def test_an_equal_job_that_somebody_wants_at_once_goes_up_and_never_down(catalog
     (waiting,) = catalogue.jobs.unsubmitted(60.0)
     assert waiting.queue == Queue.INTERACTIVE, "it is submitted again, to the other queue"
     assert catalogue.jobs.submit("deconvolve", {}, "k", "o", queue=Queue.BULK)[0].queue == Queue.INTERACTIVE
-    lease = catalogue.jobs.claim(row.id, "w")
-    assert lease is not None
+    claimed(catalogue, row.id)
     catalogue.jobs.submit("deconvolve", {}, "k", "o")
-    found = catalogue.jobs.get(row.id)
-    assert found is not None and found.phase == "EXECUTING"
+    found = job_row(catalogue, row.id)
+    assert found.phase == "EXECUTING"
 
 
 def test_the_wait_of_a_job_that_is_submitted_over_and_over_doubles_and_ends_growing(

@@ -12,6 +12,7 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from tests.s3 import s3_bucket, shared_server
 from tests.service.conftest import upload
+from tests.workers.jobs import claimed
 from workers.bulk import image as bulk_image
 from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
@@ -36,8 +37,7 @@ def test_a_local_copy_removed_during_a_wait_is_downloaded_again(
             request = {"images": [image_id], "psf_id": psf_id, "parameters": few}
             bulk = api.post("/v1/bulk", json=request).json()
         catalogue = Catalogue(settings.catalogue_url)
-        lease = catalogue.jobs.claim(job["id"], worker="another")
-        assert lease is not None
+        lease = claimed(catalogue, job["id"], "another")
         (copy,) = (path for path in tmp_path.rglob(image_id) if path.is_file())
 
         def rest(_seconds: float) -> None:

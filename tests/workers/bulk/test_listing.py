@@ -17,6 +17,7 @@ from service.app import create_app
 from tests.conftest import write_image
 from tests.service.conftest import upload
 from tests.workers.databases import rows
+from tests.workers.jobs import claimed
 from workers.bulk import listing, task
 from workers.bulk.matching import Place
 from workers.bulk.turns import keep_turns
@@ -176,18 +177,6 @@ def test_first_images_are_added_after_a_moment_even_if_they_are_few(
     run.check_all_done_once()
 
 
-def test_a_turn_that_ends_leaves_the_rest_of_the_listing_to_the_next_one(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Turns of no length: each takes one step of the search, so that even a long search comes to its end."""
-    run.start()
-    monkeypatch.setattr(task, "TURN_S", -1.0)
-    real = listing.list_files
-    monkeypatch.setattr(task, "list_files", lambda *given: real(*given[:4], lambda: True))
-    assert run.turns() > FOLDERS
-    run.check_all_done_once()
-
-
 def test_a_search_that_was_stopped_at_every_step_finds_each_file_once(run: Run) -> None:
     """The paths that several patterns match are known again after an interruption."""
     run.start("0/*.fits", "**/*.fits", "*/*.fits")
@@ -236,21 +225,6 @@ def test_a_run_that_was_paused_while_it_lists_continues_where_it_was(
     run.turns()
     assert looked[before:] == ["archive", "1", "2"], "a folder that was listed is not read again"
     run.check_all_done_once()
-
-
-def test_a_run_that_is_cancelled_while_it_lists_keeps_its_products(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run.start()
-    monkeypatch.setattr(listing, "LIST_AT_ONCE", 1)
-    cancelled = after_the_first_image(monkeypatch, lambda: run.change("cancel"))
-    looked = at_folder(monkeypatch, run.archive, "1", lambda: _must_be_set(cancelled))
-    run.turn()
-    now = run.now()
-    assert (now["phase"], now["listed"], now["images"]["total"]) == ("CANCELLED", False, IN_FOLDER)
-    assert "2" not in looked
-    assert len(run.api.get("/v1/products").json()["items"]) >= 1
-    assert run.catalogue.owners.recount() == []
 
 
 def test_a_listing_that_fails_midway_keeps_what_is_done_and_continues_when_resumed(
@@ -337,8 +311,7 @@ def _must_be_set(event: threading.Event) -> None:
 def _lease(run: Run) -> Lease:
     keep_turns(run.catalogue, run.settings)
     (job,) = run.catalogue.jobs.of_kind("bulk")
-    lease = run.catalogue.jobs.claim(job.id, "w")
-    assert lease is not None
+    lease = claimed(run.catalogue, job.id)
     return lease
 
 

@@ -17,6 +17,7 @@ from psfcore.errors import DataError
 from tests.conftest import write_image
 from tests.whole.many_rows import plan, statements
 from tests.workers.databases import BOTH, change, database, rows
+from tests.workers.jobs import claimed, job_row
 from tests.workers.psf_examples import product
 from workers.bulk import listing, matching
 from workers.catalogue import bulk_progress
@@ -53,8 +54,7 @@ def made(catalogue: Catalogue, images: int, *, key: str = "k", listed: bool = Tr
 def turn(catalogue: Catalogue) -> Lease:
     """A worker's lease of a turn."""
     job, _ = catalogue.jobs.submit("bulk", {}, new_id(), "o")
-    lease = catalogue.jobs.claim(job.id, "w")
-    assert lease is not None
+    lease = claimed(catalogue, job.id)
     return lease
 
 
@@ -178,8 +178,7 @@ def used(catalogue: Catalogue) -> int:
 
 def turn_bytes(catalogue: Catalogue, lease: Lease) -> int:
     """What the job of a turn counts."""
-    job = catalogue.jobs.get(lease.job_id)
-    assert job is not None
+    job = job_row(catalogue, lease.job_id)
     return counted_bytes(job)
 
 

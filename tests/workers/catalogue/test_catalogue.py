@@ -11,6 +11,7 @@ from sqlalchemy import Double, literal_column, update
 
 from service.views.jobs import time_left_s
 from tests.workers.databases import BOTH, change, database
+from tests.workers.jobs import claimed, job_row
 from tests.workers.psf_examples import product
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.database import Database
@@ -25,23 +26,15 @@ def submitted(catalogue: Catalogue, key: str = "k") -> JobRow:
     return catalogue.jobs.submit("psf-build", {"instrument": "hri_euv"}, key, DEFAULT_OWNER)[0]
 
 
-def claimed(catalogue: Catalogue, key: str = "k") -> tuple[JobRow, Lease]:
+def at_work(catalogue: Catalogue, key: str = "k") -> tuple[JobRow, Lease]:
     job = submitted(catalogue, key)
-    lease = catalogue.jobs.claim(job.id, "me")
-    assert lease is not None
-    return job, lease
-
-
-def phase(catalogue: Catalogue, job: JobRow) -> Phase:
-    row = catalogue.jobs.get(job.id)
-    assert row is not None
-    return Phase(row.phase)
+    return job, claimed(catalogue, job.id)
 
 
 def test_an_equal_request_shares_the_live_job_and_after_a_failure_makes_a_new_one(
     catalogue: Catalogue,
 ) -> None:
-    job, lease = claimed(catalogue)
+    job, lease = at_work(catalogue)
     second, new = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     assert second.id == job.id and not new
     assert catalogue.jobs.fail(lease, BROKEN)
@@ -63,57 +56,56 @@ def test_of_many_that_claim_one_succeeds(catalogue: Catalogue) -> None:
     with ThreadPoolExecutor(8) as pool:
         leases = list(pool.map(lambda n: catalogue.jobs.claim(job.id, str(n)), range(16)))
     assert sum(lease is not None for lease in leases) == 1
-    row = catalogue.jobs.get(job.id)
-    assert row is not None and row.attempt == 1
+    row = job_row(catalogue, job.id)
+    assert row.attempt == 1
 
 
 def test_a_lost_lease_changes_nothing(catalogue: Catalogue) -> None:
-    job, lease = claimed(catalogue)
+    job, lease = at_work(catalogue)
     stranger = Lease(job.id, "0" * 32)
     assert not catalogue.jobs.complete(stranger, "r")
     assert not catalogue.jobs.progress(stranger, "s", 1, 2)
     assert not catalogue.jobs.fail(stranger, BROKEN)
     assert not catalogue.jobs.requeue(stranger)
-    assert phase(catalogue, job) == Phase.EXECUTING
+    assert job_row(catalogue, job.id).phase == Phase.EXECUTING
     assert catalogue.jobs.complete(lease, "r")
     assert not catalogue.jobs.fail(lease, BROKEN)
-    assert phase(catalogue, job) == Phase.COMPLETED
+    assert job_row(catalogue, job.id).phase == Phase.COMPLETED
 
 
 def test_cancelling_in_each_phase(catalogue: Catalogue) -> None:
     queued = submitted(catalogue, "a")
     catalogue.jobs.cancel(queued.id)
-    assert phase(catalogue, queued) == Phase.ABORTED
+    assert job_row(catalogue, queued.id).phase == Phase.ABORTED
     assert catalogue.jobs.claim(queued.id, "me") is None
 
-    running, lease = claimed(catalogue, "b")
+    running, lease = at_work(catalogue, "b")
     catalogue.jobs.cancel(running.id)
-    assert phase(catalogue, running) == Phase.EXECUTING
+    assert job_row(catalogue, running.id).phase == Phase.EXECUTING
     assert not catalogue.jobs.heartbeat(lease)
     assert catalogue.jobs.abort(lease)
-    assert phase(catalogue, running) == Phase.ABORTED
+    assert job_row(catalogue, running.id).phase == Phase.ABORTED
 
-    done, lease = claimed(catalogue, "c")
+    done, lease = at_work(catalogue, "c")
     catalogue.jobs.complete(lease, "r")
     catalogue.jobs.cancel(done.id)
-    assert phase(catalogue, done) == Phase.COMPLETED
+    assert job_row(catalogue, done.id).phase == Phase.COMPLETED
 
 
 @BOTH
 def test_a_silent_worker_loses_its_job_and_the_third_loss_ends_it(
     catalogue: Catalogue, caplog: pytest.LogCaptureFixture
 ) -> None:
-    job, lease = claimed(catalogue)
+    job, lease = at_work(catalogue)
     assert catalogue.jobs.give_up_silent(60, 3) == []
     for attempt in (1, 2):
         assert catalogue.jobs.give_up_silent(-1.0, 3) == [job.id], attempt
         assert not catalogue.jobs.complete(lease, "r"), "the silent worker came back and must not be heard"
-        again = catalogue.jobs.claim(job.id, "other")
-        assert again is not None
+        again = claimed(catalogue, job.id, "other")
         lease = again
     assert catalogue.jobs.give_up_silent(-1.0, 3) == []
-    row = catalogue.jobs.get(job.id)
-    assert row is not None and row.phase == Phase.ERROR
+    row = job_row(catalogue, job.id)
+    assert row.phase == Phase.ERROR
     assert row.error is not None and row.error["code"] == "worker-lost"
     (line,) = [record for record in caplog.records if record.levelname == "ERROR"]
     assert job.id in line.getMessage() and "lost 3 times" in line.getMessage()
@@ -194,14 +186,14 @@ def test_a_cancel_is_not_lost_where_the_attempt_ends_meanwhile(
 ) -> None:
     for end, act in ENDS_OF_AN_ATTEMPT.items():
         for transactions in (0, 1):
-            job, lease = claimed(catalogue, f"{end} {transactions}")
+            job, lease = at_work(catalogue, f"{end} {transactions}")
             with monkeypatch.context() as patched:
                 meanwhile(catalogue, patched, transactions, partial(act, catalogue, lease))
                 catalogue.jobs.cancel(job.id)
-            if phase(catalogue, job) == Phase.EXECUTING:  # the cancel was the first
+            if job_row(catalogue, job.id).phase == Phase.EXECUTING:  # the cancel was the first
                 act(catalogue, lease)
-            row = catalogue.jobs.get(job.id)
-            assert row is not None and row.phase == Phase.ABORTED, (end, transactions)
+            row = job_row(catalogue, job.id)
+            assert row.phase == Phase.ABORTED, (end, transactions)
             assert row.ended_at is not None and row.cancel_requested
 
 
@@ -209,32 +201,33 @@ def test_a_cancel_is_not_lost_while_silent_workers_are_given_up(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for transactions in (0, 1, 2):
-        job, _ = claimed(catalogue, str(transactions))
+        job, _ = at_work(catalogue, str(transactions))
         with monkeypatch.context() as patched:
             meanwhile(catalogue, patched, transactions, partial(catalogue.jobs.cancel, job.id))
             back = catalogue.jobs.give_up_silent(-1.0, 3)
-        if phase(catalogue, job) == Phase.QUEUED:
+        if job_row(catalogue, job.id).phase == Phase.QUEUED:
             assert back == [job.id] and transactions == 2, "nobody has cancelled it yet"
             catalogue.jobs.cancel(job.id)
         else:
             assert back == []
-        assert phase(catalogue, job) == Phase.ABORTED
+        assert job_row(catalogue, job.id).phase == Phase.ABORTED
 
 
 def test_a_cancelled_job_is_not_tried_again(catalogue: Catalogue) -> None:
-    silent, _ = claimed(catalogue, "silent")
+    silent, _ = at_work(catalogue, "silent")
     catalogue.jobs.cancel(silent.id)
-    assert catalogue.jobs.give_up_silent(-1.0, 1) == [] and phase(catalogue, silent) == Phase.ABORTED
-    job, lease = claimed(catalogue)
+    assert (
+        catalogue.jobs.give_up_silent(-1.0, 1) == [] and job_row(catalogue, silent.id).phase == Phase.ABORTED
+    )
+    job, lease = at_work(catalogue)
     assert catalogue.jobs.requeue(lease)
-    row = catalogue.jobs.get(job.id)
-    assert row is not None and (row.phase, row.ended_at, row.lease) == (Phase.QUEUED, None, None)
-    again = catalogue.jobs.claim(job.id, "me")
-    assert again is not None
+    row = job_row(catalogue, job.id)
+    assert (row.phase, row.ended_at, row.lease) == (Phase.QUEUED, None, None)
+    again = claimed(catalogue, job.id, "me")
     catalogue.jobs.cancel(job.id)
     assert catalogue.jobs.requeue(again), "the attempt's end is written"
-    row = catalogue.jobs.get(job.id)
-    assert row is not None and row.phase == Phase.ABORTED
+    row = job_row(catalogue, job.id)
+    assert row.phase == Phase.ABORTED
     assert row.ended_at is not None and row.lease is None
     assert waiting(catalogue) == [] and catalogue.jobs.claim(job.id, "other") is None
 
@@ -245,13 +238,12 @@ def test_the_beginning_of_each_count_of_steps_is_kept(
     """Reading 5 images takes 250 s; then each of 11 steps takes 1 s."""
     now = [1000.0]
     monkeypatch.setattr(Database, "now", property(lambda _: literal_column(f"{now[0]!r}", Double)))
-    _job, lease = claimed(catalogue)
+    _job, lease = at_work(catalogue)
 
     def left_s(stage: str, step: int, steps: int, at_s: float) -> float | None:
         now[0] = 1000.0 + at_s
         assert catalogue.jobs.progress(lease, stage, step, steps)
-        row = catalogue.jobs.get(lease.job_id)
-        assert row is not None
+        row = job_row(catalogue, lease.job_id)
         return time_left_s(row, now[0])
 
     assert left_s("reading", 0, 5, 0.0) is None
@@ -263,5 +255,5 @@ def test_the_beginning_of_each_count_of_steps_is_kept(
     assert left_s("errors", 1, 11, 256.0) is None, "a new count of as many steps"
     assert catalogue.jobs.hand_back(lease)
     assert catalogue.jobs.claim(lease.job_id, "other") is not None
-    row = catalogue.jobs.get(lease.job_id)
-    assert row is not None and row.count_at is None and time_left_s(row, now[0]) is None
+    row = job_row(catalogue, lease.job_id)
+    assert row.count_at is None and time_left_s(row, now[0]) is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from psfcore.errors import DataError
+from tests.workers.jobs import claimed, job_row
 from tests.workers.psf_examples import OWNER, certify, identity, product, psf
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.owners import counted_bytes
@@ -20,8 +21,8 @@ def refused(catalogue: Catalogue, name: str) -> str:
 def made_by_a_job(catalogue: Catalogue, result_id: str) -> str:
     """The id of a completed job with this result."""
     row, _ = catalogue.jobs.submit("psf-build", {}, result_id, OWNER)
-    lease = catalogue.jobs.claim(row.id, worker="w")
-    assert lease is not None and catalogue.jobs.complete(lease, result_id)
+    lease = claimed(catalogue, row.id)
+    assert catalogue.jobs.complete(lease, result_id)
     return row.id
 
 
@@ -60,8 +61,8 @@ def test_a_deleted_result_is_made_again_by_a_new_job(catalogue: Catalogue) -> No
     for result, job in zip(results, jobs, strict=True):
         row, new = catalogue.jobs.submit("psf-build", {}, result, OWNER)
         assert new and row.id != job
-        kept = catalogue.jobs.get(job)
-        assert kept is not None and kept.result_id == result, "the history of jobs stays"
+        kept = job_row(catalogue, job)
+        assert kept.result_id == result, "the history of jobs stays"
 
 
 def test_files_that_a_row_of_any_owner_names_are_found(catalogue: Catalogue) -> None:

@@ -13,6 +13,7 @@ from sqlalchemy import select
 
 from tests.whole.many_rows import statements
 from tests.workers.databases import BOTH, rows
+from tests.workers.jobs import claimed, job_row
 from tests.workers.psf_examples import OWNER, certify, identity, psf
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Listed, new_id
@@ -141,8 +142,8 @@ def test_jobs_count_with_their_present_parameters_until_they_are_destroyed(catal
         job, _ = catalogue.jobs.submit("psf-build", parameters, "k", OWNER)
     with counting(catalogue, 0):  # a shared job, and what a job goes through
         assert not catalogue.jobs.submit("psf-build", parameters, "k", OWNER)[1]
-        lease = catalogue.jobs.claim(job.id, "w")
-        assert lease is not None and catalogue.jobs.complete(lease, "r")
+        lease = claimed(catalogue, job.id)
+        assert catalogue.jobs.complete(lease, "r")
     with counting(catalogue, -ROW_BYTES - len(json.dumps(parameters))):
         assert catalogue.uws.destroy(job.id) and not catalogue.uws.destroy(job.id)
     with counting(catalogue, ROW_BYTES + len('{"size": "64"}')):
@@ -161,8 +162,7 @@ def test_jobs_count_with_their_present_parameters_until_they_are_destroyed(catal
 
 def test_bulk_runs_parts_contexts_and_changes_count(catalogue: Catalogue) -> None:
     turn, _ = catalogue.jobs.submit("bulk", {}, new_id(), OWNER)
-    lease = catalogue.jobs.claim(turn.id, "w")
-    assert lease is not None
+    lease = claimed(catalogue, turn.id)
     row = bulk(listed=False)
     with counting(catalogue, ROW_BYTES * (1 + 3) + len("{}")):
         assert catalogue.bulks.create(row, ids(3))[1]
@@ -224,8 +224,8 @@ def test_rows_over_the_quota_are_refused_and_add_nothing(catalogue: Catalogue) -
             assert {table: count for table, count in counts.items() if count} == there, name
         with pytest.raises(OverQuota):
             catalogue.uws.amend(draft.id, lambda given: {"a": "b" * 100}, 1)
-        job = catalogue.jobs.get(draft.id)
-        assert job is not None and job.parameters == {}, "a pending job does not grow either"
+        job = job_row(catalogue, draft.id)
+        assert job.parameters == {}, "a pending job does not grow either"
     catalogue.owners.set_quota(OWNER, 2)
     for add in ADDED.values():
         add(catalogue)

@@ -13,6 +13,7 @@ from sqlalchemy import text
 
 from psfcore.errors import DataError
 from tests.workers.databases import BOTH, change
+from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.stage_times import Spent
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
@@ -50,8 +51,7 @@ def run(folder: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, tas
     monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
     job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     Runner(settings, catalogue, Store(settings.data_dir)).run(job.id)
-    row = catalogue.jobs.get(job.id)
-    assert row is not None
+    row = job_row(catalogue, job.id)
     return row
 
 

@@ -10,6 +10,7 @@ import pytest
 from sqlalchemy import update
 
 from tests.workers.databases import BOTH, change
+from tests.workers.jobs import claimed, job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
 from workers.contract.phases import Phase
@@ -17,12 +18,6 @@ from workers.contract.phases import Phase
 
 def drafted(catalogue: Catalogue, **terms: Any) -> JobRow:
     return catalogue.uws.draft("psf-build", {"instrument": "hri_euv"}, owner=DEFAULT_OWNER, **terms)
-
-
-def phase(catalogue: Catalogue, job: JobRow) -> Phase:
-    row = catalogue.jobs.get(job.id)
-    assert row is not None
-    return Phase(row.phase)
 
 
 def test_a_pending_job_waits_until_it_is_started(catalogue: Catalogue) -> None:
@@ -33,9 +28,9 @@ def test_a_pending_job_waits_until_it_is_started(catalogue: Catalogue) -> None:
 
     with pytest.raises(ValueError):
         catalogue.uws.amend(job.id, fail)
-    row = catalogue.jobs.get(job.id)
-    assert row is not None and row.parameters == job.parameters, "a change that fails changes nothing"
-    assert phase(catalogue, job) == Phase.PENDING and not Phase.PENDING.ended
+    row = job_row(catalogue, job.id)
+    assert row.parameters == job.parameters, "a change that fails changes nothing"
+    assert job_row(catalogue, job.id).phase == Phase.PENDING and not Phase.PENDING.ended
     assert catalogue.jobs.claim(job.id, "me") is None
     assert catalogue.jobs.unsubmitted(0.0) == [] and catalogue.jobs.give_up_silent(0.0, 3) == []
     assert drafted(catalogue).id != job.id, "two may be set up alike"
@@ -50,23 +45,23 @@ def test_each_phase_after_pending(catalogue: Catalogue) -> None:
     assert not catalogue.uws.start(job.id, job.parameters, {"size": 0}, "k"), "it was changed since"
     given = {"instrument": "hri_euv", "size": "64"}
     assert catalogue.uws.start(job.id, given, {"instrument": "hri_euv", "size": 64}, "k")
-    row = catalogue.jobs.get(job.id)
-    assert row is not None and (row.phase, row.parameters["size"], row.request_key) == (Phase.QUEUED, 64, "k")
+    row = job_row(catalogue, job.id)
+    assert (row.phase, row.parameters["size"], row.request_key) == (Phase.QUEUED, 64, "k")
     assert not catalogue.uws.start(job.id, row.parameters, {}, "k")
     assert not catalogue.uws.amend(job.id, lambda given: {})
     assert [waiting.id for waiting in catalogue.jobs.unsubmitted(0.0)] == [job.id]
     assert catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)[0].id != job.id, (
         "its client may destroy or limit it: an equal request does not share that end"
     )
-    lease = catalogue.jobs.claim(job.id, "me")
-    assert lease is not None and not catalogue.uws.start(job.id, row.parameters, {}, "k")
+    lease = claimed(catalogue, job.id, "me")
+    assert not catalogue.uws.start(job.id, row.parameters, {}, "k")
     assert catalogue.jobs.complete(lease, "r")
     assert not catalogue.uws.start(job.id, row.parameters, {}, "k")
-    assert phase(catalogue, job) == Phase.COMPLETED
+    assert job_row(catalogue, job.id).phase == Phase.COMPLETED
 
     dropped = drafted(catalogue)
     catalogue.jobs.cancel(dropped.id)
-    assert phase(catalogue, dropped) == Phase.ABORTED
+    assert job_row(catalogue, dropped.id).phase == Phase.ABORTED
     assert not catalogue.uws.start(dropped.id, dropped.parameters, {}, "other")
     assert not catalogue.uws.amend(dropped.id, lambda given: {})
 
@@ -82,16 +77,15 @@ def test_one_of_many_starts_of_a_job_succeeds_and_identical_jobs_run_in_turn(cat
         told = list(pool.map(lambda other: catalogue.uws.start(other.id, other.parameters, {}, "k"), others))
     assert all(told)
     for other in others:
-        lease = catalogue.jobs.claim(other.id, "me")
-        assert lease is not None and catalogue.jobs.complete(lease, "r")
+        lease = claimed(catalogue, other.id, "me")
+        assert catalogue.jobs.complete(lease, "r")
     assert len({row.request_key for row in catalogue.page(JobRow, owner=DEFAULT_OWNER, limit=20)}) == 7
 
 
 def test_the_worker_of_a_destroyed_job_loses_its_lease(catalogue: Catalogue) -> None:
     job = drafted(catalogue, run_id="mine", destruction_at=time.time() + 60)
     assert catalogue.uws.start(job.id, job.parameters, {}, "k")
-    lease = catalogue.jobs.claim(job.id, "me")
-    assert lease is not None
+    lease = claimed(catalogue, job.id, "me")
     assert catalogue.uws.destroy(job.id) and not catalogue.uws.destroy(job.id)
     assert catalogue.jobs.get(job.id) is None and catalogue.uws.terms(job.id).run_id is None
     assert not catalogue.jobs.heartbeat(lease) and not catalogue.jobs.progress(lease, "s", 1, 2)
@@ -118,5 +112,5 @@ def test_terms_end_jobs(catalogue: Catalogue) -> None:
     change(catalogue, update(JobRow).values(started_at=JobRow.started_at - 1.1))
     assert catalogue.uws.end_by_terms() == []
     assert not catalogue.jobs.heartbeat(leases[slow.id]) and catalogue.jobs.heartbeat(leases[endless.id])
-    assert catalogue.jobs.abort(leases[slow.id]) and phase(catalogue, slow) == Phase.ABORTED
+    assert catalogue.jobs.abort(leases[slow.id]) and job_row(catalogue, slow.id).phase == Phase.ABORTED
     assert [line.id for line in catalogue.uws.lines(owner=DEFAULT_OWNER)] == [kept.id, slow.id, endless.id]

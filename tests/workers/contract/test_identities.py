@@ -130,38 +130,20 @@ OPTIONS: dict[str, Any] = {
 FIT: dict[str, Any] = {"noise": NOISE, "seed": 3, "shape": "knee", "as_published": True, "saturation_dn": 1.5}
 # Computed by commit c86f564, whose catalogues must stay valid: the id of a result that exists must not change. The ids of
 # gap diagnoses are newer: they contain the hash of the library of effects. Those of products changed with product format 2,
-# because the content of the files changed.
+# because the content of the files changed. The first 16 digits of each.
 FROZEN: list[tuple[Callable[[], str], str]] = [
-    (identity, "17e6708fd0c2995c30a4e6de81cd687afb784b7708d2f01654d665d314696cc1"),
-    (
-        lambda: identity(changes_picture=True),
-        "c43f1b57e5b41dcd0972e6765fc2710add6be843b8a604c01d1ebed9072d0f6f",
-    ),
-    (lambda: identity(**OPTIONS), "99226d1e87980f3c871d0b877e203c5f4233b69b5353268058a669e0d46b4c4d"),
-    (
-        lambda: psf_identity(PsfBuild(instrument_file=INSTRUMENT)),
-        "77833efb52eb6c2cd50385ad03591c1e5886f96b8b7460a5169122773fa2e715",
-    ),
-    (_masked, "fdbe2fad028d94d3d1453e504b22b0aea7696b8cc0041a61578a6eb0907a2bfe"),
-    (
-        lambda: _fit(diffraction_recipe=RECIPE),
-        "1ef68522eb129759cea8c5f6bb55e129910d3d6c52796c762458bc382c0c2e38",
-    ),
-    (lambda: _fit(**FIT), "c9fa98e30cbb058c8a780aa601d4ae7aa3c004fb8e44a3b3210659f73b1cecd0"),
-    (_cross_validation, "3e43fc58cebff856c7d2d15e187d1b0b1569004ec53962f077255c53156cef5e"),
-    (
-        lambda: request_identity("psf-tables")(PsfTables(psf_id=B)),
-        "9d664534c5deabe05e6ed2f333d0076ae5ae3d0d1fe4d40e3277c472bd47414e",
-    ),
-    (
-        lambda: _gap(psf_id=B, diffraction_recipe=RECIPE),
-        "8923caaf92865339c6ff9724efe8b4ad91a09e725f480d2835eefa3fff302ce3",
-    ),
-    (
-        lambda: _gap(added_effects=("m",), added_effects_sha256=(A,)),
-        "d110c7d06f82695b0ddd23ec1e5748de822ad892b88ae72a8b14916171219b16",
-    ),
-    (lambda: corrected_psf_identity(A), "3f5c6acb05b9d85505cbb17f4188b25a5a7919c50632992e0e0e5db484f0cd2b"),
+    (identity, "17e6708fd0c2995c"),
+    (lambda: identity(changes_picture=True), "c43f1b57e5b41dcd"),
+    (lambda: identity(**OPTIONS), "99226d1e87980f3c"),
+    (lambda: psf_identity(PsfBuild(instrument_file=INSTRUMENT)), "77833efb52eb6c2c"),
+    (_masked, "fdbe2fad028d94d3"),
+    (lambda: _fit(diffraction_recipe=RECIPE), "1ef68522eb129759"),
+    (lambda: _fit(**FIT), "c9fa98e30cbb058c"),
+    (_cross_validation, "3e43fc58cebff856"),
+    (lambda: request_identity("psf-tables")(PsfTables(psf_id=B)), "9d664534c5deabe0"),
+    (lambda: _gap(psf_id=B, diffraction_recipe=RECIPE), "8923caaf92865339"),
+    (lambda: _gap(added_effects=("m",), added_effects_sha256=(A,)), "d110c7d06f82695b"),
+    (lambda: corrected_psf_identity(A), "3f5c6acb05b9d855"),
 ]
 
 
@@ -183,11 +165,11 @@ def test_identities_of_existing_results_do_not_change_until_a_version_is_raised(
     monkeypatch.setattr(identities, "library_sha256", lambda: A)
     for model, version in VERSIONS.items():
         monkeypatch.setattr(model, "algorithm_version", version)
-    assert [compute() for compute, _ in FROZEN] == [frozen for _, frozen in FROZEN]
+    assert [compute()[:16] for compute, _ in FROZEN] == [frozen for _, frozen in FROZEN]
     for model, version in VERSIONS.items():
         with monkeypatch.context() as patched:
             patched.setattr(model, "algorithm_version", version + 1)
-            assert [compute() for compute, _ in FROZEN] != [frozen for _, frozen in FROZEN], model
+            assert [compute()[:16] for compute, _ in FROZEN] != [frozen for _, frozen in FROZEN], model
 
 
 def test_a_changed_library_of_effects_changes_the_identity_of_a_diagnosis(

@@ -12,7 +12,6 @@ from astropy.io import fits
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, read_summary
 from psfcore.noise_figures import NoiseFigures
-from service.local import LocalService
 from tests.conftest import write_image, write_psf
 from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.methods import RichardsonLucy
@@ -27,6 +26,7 @@ LIMITS = FitsLimits(max_pixels=512 * 512)
 
 
 def summary_of(tmp_path: Path, **cards: Any) -> dict[str, Any]:
+    (tmp_path / "i.fits").unlink(missing_ok=True)
     write_image(tmp_path / "i.fits", **cards)
     row: ImageRow = image_row("a", "0" * 64, 1, "i.fits", read_summary(tmp_path / "i.fits", LIMITS))
     return dict(row.summary)
@@ -35,6 +35,7 @@ def summary_of(tmp_path: Path, **cards: Any) -> dict[str, Any]:
 def psf_of(
     tmp_path: Path, *, instrument: str | None = None, channel: str | None = None, **cards: Any
 ) -> PsfRow:
+    (tmp_path / "p.fits").unlink(missing_ok=True)
     write_psf(tmp_path / "p.fits")
     for key, value in cards.items():
         fits.setval(tmp_path / "p.fits", key, value=value)
@@ -107,13 +108,3 @@ def test_the_summary_of_a_file_that_was_not_uploaded_is_checked_too(tmp_path: Pa
     write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
     header = dataclasses.asdict(read_summary(tmp_path / "i.fits", LIMITS))
     assert refusal(request(), psf_of(tmp_path, **AIA), header).code == "channel-mismatch"
-
-
-def test_the_request_for_a_job_is_refused_before_the_job(local: LocalService, tmp_path: Path) -> None:
-    write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
-    write_psf(tmp_path / "p.fits")
-    fits.setval(tmp_path / "p.fits", "WAVELNTH", value=171)
-    psf_id = local.upload_psf(tmp_path / "p.fits")["id"]
-    with pytest.raises(DataError) as caught:
-        local.deconvolve(tmp_path / "i.fits", psf_id=psf_id)
-    assert caught.value.code == "channel-mismatch"

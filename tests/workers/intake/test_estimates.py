@@ -186,11 +186,11 @@ def completed(catalogue: Catalogue, count: int, took_s: float) -> None:
     """Add completed deconvolutions that were expected to take a second and took so long."""
     rows = [
         JobRow(
-            id=uuid.uuid4().hex, owner=OWNER, kind="deconvolve", parameters={}, request_key=f"{n}", work_key=f"{n}",
+            id=uuid.uuid4().hex, owner=OWNER, kind="deconvolve", parameters={}, request_key=uuid.uuid4().hex, work_key="k",
             phase=Phase.COMPLETED, created_at=0.0, started_at=100.0, ended_at=100.0 + took_s,
             estimate={"memory_mib": 1, "seconds": 1.0, "start_s": 1.0},
         )
-        for n in range(count)
+        for _ in range(count)
     ]  # fmt: skip
     add(catalogue, *rows)
 

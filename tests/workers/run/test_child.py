@@ -16,6 +16,7 @@ import pytest
 from celery import Celery
 
 from tests.whole.stack import wait_for
+from tests.workers.jobs import job_row
 from tests.workers.run.processes import started_worker
 from workers.broker import app as queue
 from workers.catalogue.catalogue import Catalogue
@@ -80,9 +81,7 @@ class Worker:
 
     def row(self, job: JobRow) -> JobRow:
         """The job's row."""
-        row = self.catalogue.jobs.get(job.id)
-        assert row is not None
-        return row
+        return job_row(self.catalogue, job.id)
 
     def wait(self, job: JobRow, phase: str) -> JobRow:
         """The job's row when it has this phase."""

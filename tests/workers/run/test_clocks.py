@@ -10,6 +10,7 @@ import pytest
 from sqlalchemy import select, update
 
 from tests.workers.databases import BOTH, change, database
+from tests.workers.jobs import claimed, job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, PartRow, WorkerRow
@@ -41,15 +42,8 @@ def move_times(catalogue: Catalogue, by_s: float) -> None:
 
 def started(catalogue: Catalogue, key: str = "k") -> tuple[str, Lease]:
     job, _ = catalogue.jobs.submit("psf-build", {}, key, DEFAULT_OWNER)
-    lease = catalogue.jobs.claim(job.id, "w")
-    assert lease is not None
+    lease = claimed(catalogue, job.id)
     return job.id, lease
-
-
-def row(catalogue: Catalogue, job_id: str) -> JobRow:
-    found = catalogue.jobs.get(job_id)
-    assert found is not None
-    return found
 
 
 @pytest.mark.parametrize("off_s", OFF_S)
@@ -71,7 +65,7 @@ def test_a_worker_keeps_its_lease_while_it_is_there_and_no_longer(catalogue: Cat
             assert catalogue.census.count_silent(LEASE_S) == 0
     with clock_off(off_s):
         assert catalogue.jobs.complete(lease, "r")
-    ended = row(catalogue, job_id)
+    ended = job_row(catalogue, job_id)
     assert ended.started_at is not None and ended.ended_at is not None
     assert TRUE_TIME() - 120.0 < ended.started_at <= ended.ended_at < TRUE_TIME() + 1.0
     with clock_off(off_s):
@@ -81,7 +75,7 @@ def test_a_worker_keeps_its_lease_while_it_is_there_and_no_longer(catalogue: Cat
     with clock_off(-off_s):
         assert catalogue.census.count_silent(LEASE_S) == 1
         assert catalogue.jobs.give_up_silent(LEASE_S, 3) == [dead_id]
-    assert row(catalogue, dead_id).phase == Phase.QUEUED
+    assert job_row(catalogue, dead_id).phase == Phase.QUEUED
 
 
 @pytest.mark.parametrize("off_s", OFF_S)
@@ -120,7 +114,7 @@ def test_a_job_executes_as_long_as_its_terms_say(catalogue: Catalogue, off_s: fl
         move_times(catalogue, -passed_s)
         with clock_off(off_s):
             catalogue.uws.end_by_terms()
-        assert row(catalogue, draft.id).cancel_requested is cancelled
+        assert job_row(catalogue, draft.id).cancel_requested is cancelled
 
 
 def test_the_database_s_clock_goes_on_within_a_transaction_of_many_statements(catalogue: Catalogue) -> None:
@@ -163,6 +157,6 @@ def test_a_running_job_survives_a_clock_that_is_set_back_and_a_lost_message_is_r
     assert catalogue.jobs.give_up_silent(LEASE_S, 3) == []
     assert catalogue.jobs.heartbeat(lease)
     assert catalogue.jobs.give_up_silent(LEASE_S, 3) == [] and catalogue.census.count_silent(LEASE_S) == 0
-    job = row(catalogue, job_id)
+    job = job_row(catalogue, job_id)
     assert job.phase == Phase.EXECUTING and job.started_at is not None
     assert job.started_at < TRUE_TIME() + 5.0, "its time limit counts from now"

@@ -14,6 +14,7 @@ from sqlalchemy import update
 
 from tests.whole.stack import wait_for
 from tests.workers.databases import BOTH, change
+from tests.workers.jobs import job_row
 from workers.broker import app as queue
 from workers.broker.reconciler import reconcile
 from workers.catalogue.catalogue import Catalogue
@@ -33,12 +34,6 @@ def started(catalogue: Catalogue, key: str = "k", owner: str = DEFAULT_OWNER) ->
     return draft.id
 
 
-def row(catalogue: Catalogue, job_id: str) -> JobRow:
-    found = catalogue.jobs.get(job_id)
-    assert found is not None
-    return found
-
-
 def claim(catalogue: Catalogue, job_id: str) -> Lease | None:
     return catalogue.jobs.claim(job_id, "w")
 
@@ -54,12 +49,14 @@ def test_of_equal_jobs_that_are_claimed_at_one_moment_one_is_at_work(catalogue: 
     with ThreadPoolExecutor(8) as pool:
         leases = list(pool.map(lambda job: claim(catalogue, job), jobs))
     assert sum(lease is not None for lease in leases) == 1
-    phases = sorted(row(catalogue, job).phase for job in jobs)
+    phases = sorted(job_row(catalogue, job).phase for job in jobs)
     assert phases == [Phase.EXECUTING] + 7 * [Phase.QUEUED]
     assert waiting(catalogue) == set(), "none is given to the broker in vain"
     assert not catalogue.jobs.others_wait("bulk"), "and a bulk does not make way for them"
     assert catalogue.census.count_unsubmitted(-1.0) == 0, "nor does an operator have to look after them"
-    assert all(row(catalogue, job).attempt == 0 for job, lease in zip(jobs, leases, strict=True) if not lease)
+    assert all(
+        job_row(catalogue, job).attempt == 0 for job, lease in zip(jobs, leases, strict=True) if not lease
+    )
 
 
 ENDS: dict[str, Callable[[Catalogue, Lease], object]] = {
@@ -123,17 +120,17 @@ def test_two_at_once_compute_once(
     try:
         assert at_work.wait(60.0)
         runner.run(second)  # another worker is given it now
-        assert row(catalogue, second).phase == Phase.QUEUED
+        assert job_row(catalogue, second).phase == Phase.QUEUED
         assert reconcile(catalogue, queue.make_app(settings), settings) == 0
     finally:
         go_on.set()
         worker.join()
-    wait_for(lambda: row(catalogue, first).phase == Phase.COMPLETED, "the first is done")
+    wait_for(lambda: job_row(catalogue, first).phase == Phase.COMPLETED, "the first is done")
     assert reconcile(catalogue, queue.make_app(settings), settings) == 1 and submitted == [second]
     runner.run(second)
     assert computed == [first]
-    assert row(catalogue, first).result_id == row(catalogue, second).result_id == "k"
-    assert row(catalogue, second).phase == Phase.COMPLETED
+    assert job_row(catalogue, first).result_id == job_row(catalogue, second).result_id == "k"
+    assert job_row(catalogue, second).phase == Phase.COMPLETED
 
 
 def asked_for(catalogue: Catalogue, key: str = "k") -> tuple[JobRow, bool]:
@@ -151,7 +148,7 @@ def test_a_job_that_was_told_to_stop_is_not_shared(catalogue: Catalogue) -> None
     assert shared.id == again.id and not new, "requests after it share the new one"
     assert claim(catalogue, again.id) is None and waiting(catalogue) == set(), "one is at work at a time"
     assert catalogue.jobs.abort(lease)
-    assert row(catalogue, again.id).phase == Phase.QUEUED and waiting(catalogue) == {again.id}
+    assert job_row(catalogue, again.id).phase == Phase.QUEUED and waiting(catalogue) == {again.id}
     assert claim(catalogue, again.id) is not None
 
 
@@ -175,7 +172,7 @@ def test_a_second_cancel_does_not_take_a_third_request_with_it_and_a_job_that_wa
     catalogue.jobs.cancel(first)
     second = asked_for(catalogue)[0].id
     catalogue.jobs.cancel(second)
-    assert row(catalogue, second).phase == Phase.ABORTED
+    assert job_row(catalogue, second).phase == Phase.ABORTED
     third, new = asked_for(catalogue)
     assert new and third.phase == Phase.QUEUED
     late = asked_for(catalogue, "late")[0].id
@@ -202,7 +199,10 @@ def test_a_job_that_ends_on_terms_is_not_shared(catalogue: Catalogue, end: str) 
     else:
         catalogue.uws.set_terms(limited, destruction_at=time.time() - 1)
         assert catalogue.uws.end_by_terms() == [limited]
-    assert row(catalogue, other.id).phase == Phase.QUEUED and not row(catalogue, other.id).cancel_requested
+    assert (
+        job_row(catalogue, other.id).phase == Phase.QUEUED
+        and not job_row(catalogue, other.id).cancel_requested
+    )
     assert claim(catalogue, other.id) is not None
     given = asked_for(catalogue, "given")[0].id
     catalogue.uws.set_terms(given, execution_duration_s=1)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tests.workers.jobs import claimed, job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import JobRow
 from workers.contract.phases import Phase
@@ -77,9 +78,7 @@ class Bench:
         return self.row(job)
 
     def row(self, job: JobRow) -> JobRow:
-        row = self.catalogue.jobs.get(job.id)
-        assert row is not None
-        return row
+        return job_row(self.catalogue, job.id)
 
     def _task(self, context: Context, _parameters: Mapping[str, Any]) -> str:
         self.started.append(context.owner)
@@ -151,8 +150,7 @@ def test_a_pause_needs_as_much_work_as_the_short_job_takes_and_does_not_count_in
         return len(looks) == 2  # the second look finds a job
 
     job, _ = catalogue.jobs.submit("psf-build", {}, "k", "long")
-    lease = catalogue.jobs.claim(job.id, "w")
-    assert lease is not None
+    lease = claimed(catalogue, job.id)
     started = clock.now
     one = Attempt(
         catalogue, lease, 1.0, Stopping(), None, limit_s=12.0, run_short=run_short,
@@ -189,8 +187,8 @@ def test_a_bulk_turn_pauses_for_its_own_owner_too(bench: Bench) -> None:
 
 def test_a_job_whose_worker_was_lost_does_not_pause(bench: Bench) -> None:
     long = bench.submit("long", seconds=60)
-    lease = bench.catalogue.jobs.claim(long.id, "lost")
-    assert lease is not None and bench.catalogue.jobs.requeue(lease)
+    lease = claimed(bench.catalogue, long.id, "lost")
+    assert bench.catalogue.jobs.requeue(lease)
     short = bench.submit("short")
     assert bench.run(long).attempt == 2
     assert bench.row(short).phase == Phase.QUEUED

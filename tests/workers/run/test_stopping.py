@@ -16,6 +16,7 @@ from sqlalchemy import inspect, text
 
 from tests.whole.stack import wait_for
 from tests.workers.databases import change, database
+from tests.workers.jobs import claimed, job_row
 from tests.workers.psf_examples import psf
 from tests.workers.run.processes import started_worker
 from workers import logs
@@ -53,13 +54,7 @@ class Bench:
 
     def row(self, job_id: str) -> JobRow:
         """The job's row."""
-        return row_of(self.catalogue, job_id)
-
-
-def row_of(catalogue: Catalogue, job_id: str) -> JobRow:
-    row = catalogue.jobs.get(job_id)
-    assert row is not None
-    return row
+        return job_row(self.catalogue, job_id)
 
 
 @pytest.fixture
@@ -161,8 +156,8 @@ def test_the_counts_of_files_and_jobs(catalogue: Catalogue) -> None:
     assert catalogue.census.tally() == [] and catalogue.census.oldest_queued_at() is None
     job, _ = catalogue.jobs.submit("psf-build", {}, "a", DEFAULT_OWNER)
     catalogue.jobs.submit("deconvolve", {}, "b", DEFAULT_OWNER)
-    lease = catalogue.jobs.claim(job.id, "w")
-    assert lease is not None and catalogue.jobs.complete(lease, "r")
+    lease = claimed(catalogue, job.id)
+    assert catalogue.jobs.complete(lease, "r")
     (waiting, done) = sorted(catalogue.census.tally(), key=lambda tally: tally.kind)
     assert (waiting.phase, waiting.jobs, waiting.attempts, waiting.run_s) == (Phase.QUEUED, 1, 0, 0.0)
     assert (done.phase, done.jobs, done.attempts, done.retries) == (Phase.COMPLETED, 1, 1, 0)
@@ -212,7 +207,7 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
     code = WORKER.format(task=task)
     worker = started_worker(code, settings, log, stop_s=0.5, heartbeat_s=0.2, lease_s=3)
     try:
-        wait_for(lambda: row_of(catalogue, job.id).phase == "EXECUTING", "the job is at work")
+        wait_for(lambda: job_row(catalogue, job.id).phase == "EXECUTING", "the job is at work")
         wait_for(lambda: len(catalogue.census.workers(3.0)) == 1, "the worker says that it is there")
         processes = [psutil.Process(worker.pid), *psutil.Process(worker.pid).children(recursive=True)]
         worker.send_signal(signal.SIGTERM)
@@ -223,7 +218,7 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
             worker.kill()
             worker.wait()
     assert status == 0 and left == [], f"{status}, {left}; {log.read_text()}"
-    row = row_of(catalogue, job.id)
+    row = job_row(catalogue, job.id)
     assert (row.phase, row.attempt, row.submitted_at) == (Phase.QUEUED, 0, None)
     told_of = log.read_text()
     assert ("another worker has the job" in told_of) == (task == "listens"), told_of

@@ -23,14 +23,24 @@ OF_INPUT = {
 }
 
 
-def test_a_product_does_not_pass_for_its_input(
-    local: LocalService, psf_file: Path, tmp_path: Path, settings: Settings
+def test_a_product_does_not_pass_for_its_input_and_equal_requests_give_equal_bytes(
+    local: LocalService, psf_file: Path, tmp_path: Path
 ) -> None:
     write_image(tmp_path / "image.fits", **OF_INPUT)
-    psf_id = local.upload_psf(psf_file)["id"]
-    product = local.deconvolve(tmp_path / "image.fits", tmp_path / "out.fits", psf_id=psf_id, steps=1)
-    header = fits.getheader(tmp_path / "out.fits")
-    assert header["FILENAME"] == product["details"]["filename"] != OF_INPUT["FILENAME"]
+    (tmp_path / "other name.fits").write_bytes((tmp_path / "image.fits").read_bytes())
+    second = LocalService(Settings.apart(tmp_path / "second"))
+    for name, service in (("image", local), ("other name", second)):
+        psf_id = service.upload_psf(psf_file)["id"]
+        output = tmp_path / f"{name}.out.fits"
+        product = service.deconvolve(tmp_path / f"{name}.fits", output, psf_id=psf_id, steps=1)
+    second.close()
+    assert (tmp_path / "image.out.fits").read_bytes() == (tmp_path / "other name.out.fits").read_bytes()
+    with warnings.catch_warnings(), fits.open(tmp_path / "image.out.fits", checksum=True) as hdus:
+        warnings.simplefilter("error")
+        for hdu in hdus:
+            assert hdu.verify_checksum() == hdu.verify_datasum() == 1, hdu.name
+        header = hdus[0].header
+    assert header["FILENAME"] == product["details"]["filename"]
     assert header["FILENAME"] == f"{OF_INPUT['FILENAME'][:-5]}-{product['id'][:16]}.fits"
     assert header["PARENT"] == OF_INPUT["FILENAME"] and header["LEVEL"] == "L3"
     assert header["CREATOR"] == f"heliopsf {software_version()}"
@@ -38,21 +48,3 @@ def test_a_product_does_not_pass_for_its_input(
     assert header["DATE-BEG"] == OF_INPUT["DATE-BEG"]
     history = list(header["HISTORY"])
     assert product["image_id"] in history and f"input DATE: {OF_INPUT['DATE']}" in history
-
-
-def test_checksums_fit_and_equal_requests_give_equal_bytes(
-    local: LocalService, psf_file: Path, tmp_path: Path
-) -> None:
-    write_image(tmp_path / "image.fits", **OF_INPUT)
-    (tmp_path / "other name.fits").write_bytes((tmp_path / "image.fits").read_bytes())
-    services = {"a": local, "b": LocalService(Settings.apart(tmp_path / "second"))}
-    images = {"a": "image.fits", "b": "other name.fits"}
-    for name, service in services.items():
-        psf_id = service.upload_psf(psf_file)["id"]
-        service.deconvolve(tmp_path / images[name], tmp_path / f"{name}.fits", psf_id=psf_id, steps=1)
-    services["b"].close()
-    assert (tmp_path / "a.fits").read_bytes() == (tmp_path / "b.fits").read_bytes()
-    with warnings.catch_warnings(), fits.open(tmp_path / "a.fits", checksum=True) as hdus:
-        warnings.simplefilter("error")
-        for hdu in hdus:
-            assert hdu.verify_checksum() == hdu.verify_datasum() == 1, hdu.name

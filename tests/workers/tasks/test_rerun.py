@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from sqlalchemy import update
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_plane
 from service.local import LocalService
-from tests.conftest import SMALL_INSTRUMENT
+from tests.conftest import SMALL_INSTRUMENT, write_image
+from tests.workers.databases import add, change
 from tests.workers.psf_examples import OWNER, identity, product, psf
 from workers import lineage
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
-from workers.contract.identities import instrument_text
+from workers.contract import identities
 from workers.lineage import Ancestor, made_by
+from workers.settings import Settings
 from workers.tasks.data import product as product_task
 
 ON_TRANSIT = {"transit_id": "1" * 64, "seed": 5}
@@ -31,12 +35,23 @@ MASKED = (
 
 
 @pytest.fixture
-def made(local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path) -> dict[str, Any]:
+def there(local: LocalService, settings: Settings) -> Iterator[Catalogue]:
+    """The catalogue of the local service."""
+    catalogue = Catalogue(settings.catalogue_url)
+    yield catalogue
+    catalogue.close()
+
+
+@pytest.fixture
+def made(local: LocalService, psf_file: Path, tmp_path: Path) -> dict[str, Any]:
     """A product of an uploaded PSF."""
-    psf_id = local.upload_psf(psf_file)["id"]
-    return local.deconvolve(
-        image_file, tmp_path / "first.fits", psf_id=psf_id, steps=3, noise=(6.0, 2.0), error_draws=4
-    )
+    psf_id, noise = local.upload_psf(psf_file)["id"], {"noise": (6.0, 2.0), "error_draws": 4}
+    write_image(tmp_path / "image.fits", shape=(64, 64))
+    return local.deconvolve(tmp_path / "image.fits", tmp_path / "first.fits", psf_id=psf_id, steps=3, **noise)
+
+
+def change_details(catalogue: Catalogue, product: dict[str, Any], details: dict[str, Any]) -> None:
+    change(catalogue, update(ProductRow).where(ProductRow.id == product["id"]).values(details=details))
 
 
 def again(local: LocalService, of: str, identity: str, output: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -47,7 +62,7 @@ def again(local: LocalService, of: str, identity: str, output: Path) -> tuple[di
 
 
 def test_a_product_made_again_is_the_same_bit_for_bit_and_changes_nothing(
-    local: LocalService, made: dict[str, Any], tmp_path: Path
+    local: LocalService, there: Catalogue, made: dict[str, Any], tmp_path: Path
 ) -> None:
     before = local.get(f"/v1/products/{made['id']}")
     row, report = again(local, "product", made["id"], tmp_path / "r.json")
@@ -63,45 +78,23 @@ def test_a_product_made_again_is_the_same_bit_for_bit_and_changes_nothing(
         read_plane(tmp_path / "first.fits", LIMITS), read_plane(tmp_path / "again.fits", LIMITS)
     )
     assert local.get(f"/v1/products/{made['id']}") == before
-    assert len(local._catalogue.page(ProductRow, owner=OWNER, limit=10)) == 1
+    assert len(there.page(ProductRow, owner=OWNER, limit=10)) == 1
+    second, _ = again(local, "product", made["id"], tmp_path / "2.json")
+    reports = there.page(ReportRow, owner=OWNER, limit=10, about_id=made["id"])
+    assert [one.id for one in reports] == [second["id"], row["id"]], "every rerun is a job of its own"
 
 
 def test_a_product_of_an_earlier_version_is_made_again_although_the_new_one_exists(
-    local: LocalService, made: dict[str, Any], tmp_path: Path
+    local: LocalService, there: Catalogue, made: dict[str, Any], tmp_path: Path
 ) -> None:
     """The earlier version gave the product another id. Deconvolving the image again makes the new product."""
     old_id = "f" * 64
-    with local._catalogue._database.writing.begin() as session:
-        row = session.get(ProductRow, (OWNER, made["id"]))
-        assert row is not None
-        columns = {column.name: getattr(row, column.name) for column in ProductRow.__table__.columns}
-        session.add(ProductRow(**(columns | {"id": old_id})))
+    row = there.get(ProductRow, made["id"], OWNER)
+    assert row is not None
+    columns = {column.name: getattr(row, column.name) for column in ProductRow.__table__.columns}
+    add(there, ProductRow(**(columns | {"id": old_id})))
     _, report = again(local, "product", old_id, tmp_path / "r.json")
     assert report["same"] and (report["id"], report["again"]["id"]) == (old_id, made["id"])
-
-
-def test_a_product_made_before_channels_were_compared_is_made_again(
-    local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path
-) -> None:
-    fits.setval(image_file, "WAVELNTH", value=193)
-    fits.setval(psf_file, "WAVELNTH", value=171)
-    psf_id = local.upload_psf(psf_file)["id"]
-    made = local.deconvolve(image_file, psf_id=psf_id, steps=2, other_channel=True)
-    with local._catalogue._database.writing.begin() as session:
-        row = session.get(ProductRow, (OWNER, made["id"]))
-        assert row is not None
-        before = {n: v for n, v in row.details["parameters"].items() if n != "other_channel"}
-        row.details = row.details | {"parameters": before}
-    _, report = again(local, "product", made["id"], tmp_path / "r.json")
-    assert report["same"]
-
-
-def test_every_rerun_is_a_job_of_its_own(local: LocalService, made: dict[str, Any], tmp_path: Path) -> None:
-    first, _ = again(local, "product", made["id"], tmp_path / "1.json")
-    second, _ = again(local, "product", made["id"], tmp_path / "2.json")
-    assert first["id"] != second["id"]
-    reports = local._catalogue.page(ReportRow, owner=OWNER, limit=10, about_id=made["id"])
-    assert [row.id for row in reports] == [second["id"], first["id"]]
 
 
 def test_a_rerun_finds_software_that_gives_other_values(
@@ -129,17 +122,15 @@ def test_a_rerun_finds_software_that_gives_other_values(
 
 
 def test_a_product_made_before_parameters_were_written_down_is_made_again_from_its_job(
-    local: LocalService, made: dict[str, Any], tmp_path: Path
+    local: LocalService, there: Catalogue, made: dict[str, Any], tmp_path: Path
 ) -> None:
-    with local._catalogue._database.writing.begin() as session:
-        row = session.get(ProductRow, (OWNER, made["id"]))
-        assert row is not None
-        row.details = {
-            name: value for name, value in row.details.items() if name not in ("parameters", "libraries")
-        }
+    row = there.get(ProductRow, made["id"], OWNER)
+    assert row is not None
+    unwritten = ("parameters", "libraries")
+    change_details(there, made, {name: value for name, value in row.details.items() if name not in unwritten})
     _, report = again(local, "product", made["id"], tmp_path / "r.json")
     assert report["same"] and report["first"]["libraries"] is None
-    local._catalogue.uws.destroy(made["details"]["job_id"])
+    there.uws.destroy(made["details"]["job_id"])
     with pytest.raises(DataError) as caught:
         local.submit("rerun", of="product", id=made["id"])
     assert caught.value.code == "parameters-unknown"
@@ -158,25 +149,25 @@ def test_uploaded_and_unknown_psfs_cannot_be_rerun(local: LocalService, psf_file
 
 
 def test_a_psf_built_with_a_mask_can_be_rerun_and_its_lineage_names_the_mask(
-    local: LocalService, tmp_path: Path
+    local: LocalService, there: Catalogue, tmp_path: Path
 ) -> None:
     file, mask = tmp_path / "small.toml", tmp_path / "mask.fits"
     file.write_text(MASKED)
     y, x = np.indices((64, 64)) - 31.5
     fits.PrimaryHDU(((np.hypot(x, y) < 30) & (np.hypot(x, y) > 12)).astype("f4")).writeto(mask)
-    built = local.build_psf(file, size=128, mask=mask)
+    built = local.build_psf(file, size=64, mask=mask)
     _, report = again(local, "psf", built["id"], tmp_path / "r.json")
     assert report["same"] and {"PSF", "AIRY"} <= set(report["arrays"]), report["arrays"].keys()
     assert report["again"]["id"] == built["id"]
-    kept = local._catalogue.get(PsfRow, built["id"], OWNER)
-    assert kept is not None and kept.details["job_id"] != report["again"]["job_id"]
-    told = lineage.lineage(local._catalogue, kept)
-    assert told.made is not None and told.made.parameters == built["details"]["provenance"]["parameters"]
+    row = there.get(PsfRow, built["id"], OWNER)
+    assert row is not None and row.details["job_id"] != report["again"]["job_id"]
+    told = lineage.lineage(there, row)
+    provenance = built["details"]["provenance"]
+    assert told.made is not None and told.made.parameters == provenance["parameters"]
     assert told.made.libraries is not None and "numpy" in told.made.libraries
-    digest = built["details"]["provenance"]["instrument_file_sha256"]
-    assert [(parent.type, parent.id, parent.there) for parent in told.parents] == [
-        ("instrument-file", digest, False),
-        ("image", built["details"]["provenance"]["parameters"]["mask_id"], True),
+    assert types(told) == [
+        ("instrument-file", provenance["instrument_file_sha256"], False),
+        ("image", provenance["parameters"]["mask_id"], True),
     ]
 
 
@@ -185,17 +176,11 @@ def test_a_rerun_uses_the_instrument_file_of_the_first_run(
 ) -> None:
     """Its text is in the PSF's file; that of today is not asked."""
     built = local.build_psf("aia_171", size=64, component="airy")
-    changed = instrument_text.__globals__["instrument_path"]("aia_171").read_text() + "\n# changed\n"
-    monkeypatch.setitem(
-        instrument_text.__globals__, "instrument_path", lambda name: _text(tmp_path / f"{name}.toml", changed)
-    )
+    changed = tmp_path / "aia_171.toml"
+    changed.write_text(identities.instrument_path("aia_171").read_text() + "\n# changed\n")
+    monkeypatch.setattr(identities, "instrument_path", lambda name: changed)
     _, report = again(local, "psf", built["id"], tmp_path / "r.json")
     assert report["same"] and report["again"]["id"] == built["id"]
-
-
-def _text(path: Path, text: str) -> Path:
-    path.write_text(text)
-    return path
 
 
 # Lineage of rows alone ------------------------------------------------------------------------------
@@ -267,39 +252,37 @@ def test_an_owner_s_lineage_shows_nothing_of_another_s(catalogue: Catalogue) -> 
     assert types(lineage.lineage(catalogue, row))[1] == ("psf", identity("secret"), False)
 
 
-@pytest.mark.parametrize(
-    ("values", "kind"),
-    [
-        ({"origin": "built", "details": {"provenance": {"parameters": {"size": 64}}}}, "psf-build"),
-        ({"origin": "fitted", "details": {"provenance": {"parameters": ON_TRANSIT}}}, "psf-fit"),
-        (
-            {"origin": "fitted", "details": {"parents": {}, "provenance": {"parameters": ON_TRANSIT}}},
-            "gap-diagnose",
-        ),
-    ],
+MADE_BY: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("psf-build", {"origin": "built", "details": {"provenance": {"parameters": {"size": 64}}}}),
+    ("psf-fit", {"origin": "fitted", "details": {"provenance": {"parameters": ON_TRANSIT}}}),
+    (
+        "gap-diagnose",
+        {"origin": "fitted", "details": {"parents": {}, "provenance": {"parameters": ON_TRANSIT}}},
+    ),
 )
-def test_the_job_that_made_a_psf(catalogue: Catalogue, values: dict[str, Any], kind: str) -> None:
-    row, _ = catalogue.add(psf("p", **values))
-    found = made_by(catalogue, row)
-    assert (found.of, found.id, found.kind) == ("psf", row.id, kind)
-    said = values["details"]["provenance"]["parameters"]
-    assert {name: found.parameters[name] for name in said} == said
-    assert kind == "psf-build" or found.parameters["diffraction_recipe"] is None, (
-        "what was not said is filled in"
-    )
 
 
-def test_parameters_that_are_no_longer_valid_are_refused(catalogue: Catalogue) -> None:
+def test_the_job_that_made_a_psf(catalogue: Catalogue) -> None:
+    for kind, values in MADE_BY:
+        row, _ = catalogue.add(psf(kind, **values))
+        job = made_by(catalogue, row)
+        assert (job.of, job.id, job.kind) == ("psf", row.id, kind)
+        said = values["details"]["provenance"]["parameters"]
+        assert {name: job.parameters[name] for name in said} == said
+        filled_in = kind == "psf-build" or job.parameters["diffraction_recipe"] is None
+        assert filled_in, "what was not said is filled in"
+
+
+def test_parameters_that_are_no_longer_valid_and_the_job_of_another_owner_are_refused(
+    catalogue: Catalogue,
+) -> None:
     row, _ = catalogue.add(product("x", "p", details={"parameters": {"image_id": "no id"}}))
-    with pytest.raises(DataError, match="made with others: image_id") as caught:
+    with pytest.raises(DataError, match="image_id") as caught:
         made_by(catalogue, row)
     assert caught.value.code == "parameters-outdated"
-
-
-def test_the_job_of_another_owner_is_not_read(catalogue: Catalogue) -> None:
     job, _ = catalogue.jobs.submit("deconvolve", {"secret": 1}, "k", "somebody")
     lease = catalogue.jobs.claim(job.id, "w")
-    row, _ = catalogue.add(product("x", "p", details={"job_id": job.id}))
+    row, _ = catalogue.add(product("y", "p", details={"job_id": job.id}))
     assert lease is not None and catalogue.jobs.complete(lease, row.id)
     with pytest.raises(DataError, match="not recorded"):
         made_by(catalogue, row)

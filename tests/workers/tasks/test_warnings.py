@@ -36,21 +36,6 @@ def clipped(path: Path, level: float, **cards: object) -> None:
     fits.writeto(path, np.minimum(pixels, level).astype("f4"), header, overwrite=True)
 
 
-def test_a_good_pixel_has_quality_0(
-    local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path
-) -> None:
-    product = local.deconvolve(
-        image_file, tmp_path / "o.fits", psf_id=local.upload_psf(psf_file)["id"], **FEW
-    )
-    with fits.open(tmp_path / "o.fits") as hdus:
-        assert [hdu.name for hdu in hdus] == ["PRIMARY", "QUALITY"]
-        quality = hdus["QUALITY"].data
-    band = product["details"]["edge_band_px"]
-    inner = quality[band:-band, band:-band] if band else quality
-    assert quality.shape == fits.getdata(image_file).shape
-    assert np.count_nonzero(inner == 0) > 0.9 * inner.size
-
-
 def test_saturation_seen_in_the_pixels_is_in_quality_header_and_details(
     local: LocalService, psf_file: Path, tmp_path: Path
 ) -> None:
@@ -60,8 +45,11 @@ def test_saturation_seen_in_the_pixels_is_in_quality_header_and_details(
     )
     full = fits.getdata(tmp_path / "i.fits") == 120.0
     with fits.open(tmp_path / "o.fits") as hdus:
-        header = hdus[0].header
-        np.testing.assert_array_equal((hdus["QUALITY"].data & QualityBit.SATURATED) > 0, full)
+        header, quality = hdus[0].header, hdus["QUALITY"].data
+    np.testing.assert_array_equal((quality & QualityBit.SATURATED) > 0, full)
+    band = product["details"]["edge_band_px"]
+    inner = quality[band:-band, band:-band] if band else quality
+    assert np.count_nonzero(inner == 0) > 0.8 * inner.size, "a good pixel has quality 0"
     assert (header["DCNVSATL"], header["DCNVSATF"]) == (120.0, "pixels")
     assert product["details"]["saturation"] == {"level": 120.0, "unit": "DN/s", "found": "pixels"}
     assert product["details"]["masked_pixels"]["saturated"] == np.count_nonzero(full) > 10
@@ -93,52 +81,37 @@ def test_a_psf_of_another_channel_is_refused_unless_told(local: LocalService, tm
     assert "WARNING (channel)" in history and "193 angstrom" in history
 
 
-def test_the_channel_that_an_upload_was_given_counts(local: LocalService, tmp_path: Path) -> None:
-    write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
-    write_psf(tmp_path / "p.fits")
-    psf_id = local.upload_psf(tmp_path / "p.fits", instrument="aia_171", channel="171", kind="total")["id"]
-    with pytest.raises(DataError) as caught:
-        local.deconvolve(tmp_path / "i.fits", psf_id=psf_id, **FEW)
-    assert caught.value.code == "channel-mismatch"
-
-
-def test_a_psf_that_does_not_say_its_channel_is_taken_with_a_warning(
+def test_a_psf_that_does_not_say_its_channel_is_taken_with_a_warning_and_one_of_its_channel_without(
     local: LocalService, psf_file: Path, tmp_path: Path
 ) -> None:
     write_image(tmp_path / "i.fits", **AIA)
     product = local.deconvolve(tmp_path / "i.fits", psf_id=local.upload_psf(psf_file)["id"], **FEW)
     assert codes(product) == ["channel"]
-
-
-def test_a_built_psf_of_the_images_channel_gives_no_warning(local: LocalService, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
     psf_id = local.build_psf(tmp_path / "small.toml", size=64)["id"]
-    write_image(tmp_path / "i.fits", WAVELNTH=171)
-    assert codes(local.deconvolve(tmp_path / "i.fits", psf_id=psf_id, **FEW)) == []
+    write_image(tmp_path / "same.fits", WAVELNTH=171)
+    assert codes(local.deconvolve(tmp_path / "same.fits", psf_id=psf_id, **FEW)) == []
 
 
-@pytest.mark.parametrize(("unit", "label"), [("DN", "DN in 2 s"), ("DN/s", "DN/s"), (None, "unit unknown")])
 def test_pictures_name_the_unit_of_the_image(
-    local: LocalService,
-    psf_file: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    unit: str | None,
-    label: str,
+    local: LocalService, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said = []
+    units: list[str] = []
     for module, name in ((plots, "preview_png"), (assess_plots, "changes_png")):
         real = getattr(module, name)
 
         def noted(*arguments: Any, real: Any = real, **named: Any) -> None:
-            said.append(named["unit"])
+            units.append(named["unit"])
             real(*arguments, **named)
 
         monkeypatch.setattr(module, name, noted)
-    write_image(tmp_path / "i.fits")
-    pixels, header = fits.getdata(tmp_path / "i.fits"), fits.getheader(tmp_path / "i.fits")
-    header.remove("BUNIT") if unit is None else header.set("BUNIT", unit)
-    fits.writeto(tmp_path / "i.fits", pixels, header, overwrite=True)
     psf_id = local.upload_psf(psf_file)["id"]
-    local.deconvolve(tmp_path / "i.fits", psf_id=psf_id, changes=tmp_path / "c.png", **FEW)
-    assert said == [label, label]
+    for number, (unit, label) in enumerate((("DN", "DN in 2 s"), ("DN/s", "DN/s"), (None, "unit unknown"))):
+        path = tmp_path / f"{number}.fits"
+        write_image(path)
+        pixels, header = fits.getdata(path), fits.getheader(path)
+        header.remove("BUNIT") if unit is None else header.set("BUNIT", unit)
+        fits.writeto(path, pixels, header, overwrite=True)
+        local.deconvolve(path, psf_id=psf_id, changes=tmp_path / f"{number}.png", **FEW)
+        assert units == [label, label]
+        units.clear()

@@ -7,14 +7,14 @@ import random
 import pytest
 
 from tests.workers.catalogue.waiting.test_turns import HERE, submitted
+from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.waiting import places
 from workers.contract.queues import Queue
 
 
 def before(catalogue: Catalogue, job_id: str) -> int | None:
-    row = catalogue.jobs.get(job_id)
-    assert row is not None
+    row = job_row(catalogue, job_id)
     return catalogue.places.before(row)
 
 

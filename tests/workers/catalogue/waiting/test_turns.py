@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from sqlalchemy import update
 
 from tests.workers.databases import BOTH, change
+from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import JobRow
@@ -37,8 +38,7 @@ def next_one(catalogue: Catalogue, told_id: str, queue: Queue = HERE) -> Lease |
 
 def owner_of(catalogue: Catalogue, lease: Lease | None) -> str:
     assert lease is not None
-    row = catalogue.jobs.get(lease.job_id)
-    assert row is not None
+    row = job_row(catalogue, lease.job_id)
     return row.owner
 
 
@@ -160,8 +160,8 @@ def test_a_stopping_worker_leaves_a_job_that_is_submitted_again(
     runner = Runner(settings, catalogue, Store(settings.data_dir), stopping=stopping)
     runner.run_next(jobs[0], HERE)  # the message of the job that runs already
     assert [job.id for job in catalogue.jobs.unsubmitted(3600.0)] == [jobs[1]]
-    row = catalogue.jobs.get(jobs[1])
-    assert row is not None and row.phase == Phase.QUEUED
+    row = job_row(catalogue, jobs[1])
+    assert row.phase == Phase.QUEUED
 
 
 @BOTH

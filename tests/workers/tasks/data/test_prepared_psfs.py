@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.io.fits import Header
 
 from psfcore.deconvolve.conditions import new_engine
@@ -14,7 +15,6 @@ from psfcore.fits.psfs import read_psf
 from psfcore.psf_sampling import psf_for_image
 from service.local import LocalService
 from tests.conftest import write_image, write_psf
-from workers.tasks import deconvolve
 from workers.tasks.data import prepared_psfs
 from workers.tasks.data.prepared_psfs import PreparedPsfs
 
@@ -31,8 +31,6 @@ def test_a_psf_is_read_once_and_equals_the_file(psf_file: Path, monkeypatch: pyt
 
 
 def test_a_binned_image_gets_the_psf_of_its_pixels_once(tmp_path: Path) -> None:
-    from astropy.io import fits
-
     write_psf(tmp_path / "psf.fits")
     fits.setval(tmp_path / "psf.fits", "CDELT1", value=0.5)
     prepared, binned = PreparedPsfs(2**30), Header({"CDELT1": 1.0, "CDELT2": 1.0})
@@ -75,14 +73,14 @@ def test_the_least_recently_used_are_removed_but_never_the_last(psf_file: Path) 
 
 
 def test_jobs_share_prepared_psfs(
-    local: LocalService, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    local: LocalService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made: list[object] = []
-    deconvolve._prepared.cache_clear()  # other tests use the same PSF
+    engines: list[object] = []
     real = prepared_psfs.new_engine
-    monkeypatch.setattr(prepared_psfs, "new_engine", lambda *given: made.append(given) or real(*given))
-    psf_id = local.upload_psf(psf_file)["id"]
-    for seed in range(3):
+    monkeypatch.setattr(prepared_psfs, "new_engine", lambda *given: engines.append(given) or real(*given))
+    write_psf(tmp_path / "psf.fits", size=62)  # of a size that no other test uses: a process shares them
+    psf_id = local.upload_psf(tmp_path / "psf.fits")["id"]
+    for seed in range(2):
         write_image(tmp_path / f"{seed}.fits", seed=seed)
         local.deconvolve(tmp_path / f"{seed}.fits", psf_id=psf_id, steps=2)
-    assert len(made) == 1
+    assert len(engines) == 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +26,6 @@ from workers.tasks.data import solutions
 from workers.tasks.data.solutions import solution_identity, solved
 
 REQUEST = ResolvedPsfFit(transit_id="1" * 64)
-
-
-@pytest.fixture
-def catalogue(tmp_path: Path) -> Iterator[Catalogue]:
-    made = Catalogue(f"sqlite:///{tmp_path / 'c.sqlite'}")
-    made.upgrade()
-    yield made
-    made.close()
 
 
 @pytest.fixture
@@ -68,37 +59,28 @@ def row(context: Context) -> SolutionRow:
     return found
 
 
-def test_a_second_job_does_not_invert_again(context: Context, inverted: list[Transit]) -> None:
+def test_later_jobs_of_the_same_owner_share_it(context: Context, inverted: list[Transit]) -> None:
     first, second = solve(context), solve(dataclasses.replace(context, job_id="other"))
     assert len(inverted) == 1
     assert first.inversion.coordinates.tobytes() == second.inversion.coordinates.tobytes()
     assert [s.tobytes() for s in first.sky.scenes] == [s.tobytes() for s in second.sky.scenes]
-
-
-def test_jobs_of_other_kinds_and_seeds_share_it(context: Context, inverted: list[Transit]) -> None:
     for request in (
-        REQUEST,
         ResolvedPsfFit(transit_id="1" * 64, seed=9, as_published=True),
         ResolvedCrossValidate(transit_id="1" * 64, runs=2),
         ResolvedReport(transit_id="1" * 64, dark_offsets=False),
     ):
         solve(context, request=request)
     assert len(inverted) == 1
-
-
-def test_it_belongs_to_its_owner(context: Context, inverted: list[Transit]) -> None:
-    solve(context)
     solve(dataclasses.replace(context, owner="p"))
     assert len(inverted) == 2
 
 
-@pytest.mark.parametrize("first", [False, True])
-def test_a_rerun_neither_uses_nor_keeps_one(context: Context, inverted: list[Transit], first: bool) -> None:
-    if not first:
+def test_a_rerun_neither_uses_nor_keeps_one(context: Context, inverted: list[Transit]) -> None:
+    for runs, kept in ((1, 0), (3, 1)):
+        solve(dataclasses.replace(context, anew=True))
+        assert len(inverted) == runs
+        assert len(context.catalogue.owners.solutions_before(np.inf)) == kept
         solve(context)
-    solve(dataclasses.replace(context, anew=True))
-    assert len(inverted) == (1 if first else 2)
-    assert len(context.catalogue.owners.solutions_before(np.inf)) == (0 if first else 1)
 
 
 def test_everything_that_determines_a_solution_is_in_its_identity(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,25 +111,19 @@ def test_everything_that_determines_a_solution_is_in_its_identity(monkeypatch: p
     assert solution_identity(REQUEST, transit, shape, None) == made[0]
 
 
-def lose(path: Path) -> None:
-    path.unlink()
-
-
 def damage(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1000])
 
 
-@pytest.mark.parametrize("spoil", [lose, damage])
-def test_one_that_cannot_be_read_is_made_and_kept_again(
-    context: Context, inverted: list[Transit], spoil: Callable[[Path], None]
-) -> None:
+def test_one_that_cannot_be_read_is_made_and_kept_again(context: Context, inverted: list[Transit]) -> None:
     solve(context)
-    spoil(context.store.path(row(context).file_sha256))
-    solve(context)
-    solve(context)
-    assert len(inverted) == 2
-    assert context.catalogue.owners.usage("o", 0).used_bytes == row(context).bytes
-    assert context.catalogue.owners.recount() == []
+    for runs, spoil in ((2, Path.unlink), (3, damage)):
+        spoil(context.store.path(row(context).file_sha256))
+        solve(context)
+        solve(context)
+        assert len(inverted) == runs
+        assert context.catalogue.owners.usage("o", 0).used_bytes == row(context).bytes
+        assert context.catalogue.owners.recount() == []
 
 
 def test_storage_that_does_not_answer_costs_time_only(
@@ -164,19 +140,16 @@ def test_storage_that_does_not_answer_costs_time_only(
     assert row(context), "the row stays: the file may still be there"
 
 
-def test_without_room_it_is_not_kept_and_the_job_goes_on(context: Context, inverted: list[Transit]) -> None:
+def test_without_room_or_if_it_is_too_large_it_is_not_kept_and_the_job_goes_on(
+    context: Context, inverted: list[Transit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr("psfcore.scatter.inversion.kept.MOST_BYTES", 1000)
+        solve(context)
+    assert context.catalogue.owners.solutions_before(np.inf) == [] == list(context.store.blobs())
     image = ImageRow(owner="o", id="2" * 64, created_at=1.0, bytes=2**19, summary={})
     context.catalogue.owners.set_quota("o", 1)
     context.catalogue.add(image)
     solve(context)
     assert context.catalogue.owners.solutions_before(np.inf) == []
     assert context.catalogue.owners.usage("o", 0).used_bytes == counted_bytes(image)
-
-
-def test_one_too_large_is_not_kept(
-    context: Context, inverted: list[Transit], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("psfcore.scatter.inversion.kept.MOST_BYTES", 1000)
-    solve(context)
-    assert context.catalogue.owners.solutions_before(np.inf) == []
-    assert list(context.store.blobs()) == []

@@ -1,0 +1,301 @@
+"""The jobs psf-fit, cross-validate and report on one transit: one inversion for all, and the files that each makes."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from psfcore.fits.header import FitsLimits
+from psfcore.fits.product.planes import read_planes
+from psfcore.fits.psfs import read_psf
+from psfcore.psf import REACH_GRID_PX, cumulative_curve
+from psfcore.scatter.inversion import invert
+from psfcore.simulate.scatter_truth import total_kernel
+from service.client.http import ServiceError
+from service.local import LocalService
+from tests.conftest import write_image
+from tests.html_page import check_stands_alone, read_page
+from tests.transit_files import TRUTH, diffraction, write_simulated
+from workers.settings import Settings
+from workers.tasks import report as report_task
+from workers.tasks.data import solutions
+
+LIMITS = FitsLimits(max_pixels=2**24)
+FILES = {f"{k:03d}.fits" for k in range(9)}
+LIBRARIES = {"numpy", "scipy", "numba", "astropy"}
+PNG = b"\x89PNG"
+
+
+@pytest.fixture(scope="module")
+def transit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine bright images of 128 px."""
+    return write_simulated(tmp_path_factory.mktemp("simulated") / "transit")
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalService]:
+    folder = tmp_path_factory.mktemp("service")
+    local = LocalService(Settings(data_dir=folder / "data", database_url=None, broker_url="filesystem://"))
+    yield local
+    local.close()
+
+
+@pytest.fixture(scope="module")
+def inversions() -> Iterator[list[str]]:
+    """The shape of each inversion that a task made."""
+    shapes: list[str] = []
+
+    def counted(transit: Any, shape: Any, **how: Any) -> Any:
+        shapes.append(shape.name)
+        return invert(transit, shape, **how)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(solutions, "invert", counted)
+        yield shapes
+
+
+@pytest.fixture(scope="module")
+def fitted(
+    service: LocalService, transit: Path, inversions: list[str], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
+    """One fit, all of its files, and the steps that its progress told."""
+    out = tmp_path_factory.mktemp("fitted")
+    steps: list[tuple[str, int, int]] = []
+    psf = service.fit_psf(
+        transit,
+        out / "psf.fits",
+        report=out / "r.json",
+        preview=out / "p.png",
+        progress=lambda *step: steps.append(step),
+    )
+    return {"psf": psf, "report": json.loads((out / "r.json").read_text()), "folder": out, "steps": steps}
+
+
+@pytest.fixture(scope="module")
+def folds(
+    service: LocalService, transit: Path, fitted: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
+    """A report of each scheme of cross-validation, of one run of three folds."""
+    out, reports = tmp_path_factory.mktemp("folds"), {}
+    for scheme in ("shared", "exact"):
+        file, picture = out / f"{scheme}.json", out / f"{scheme}.png"
+        row = service.cross_validate(transit, file, preview=picture, scheme=scheme, runs=1)
+        assert picture.read_bytes().startswith(PNG)
+        reports[scheme] = json.loads(file.read_text()) | {"row": row}
+    return reports
+
+
+@pytest.fixture(scope="module")
+def report(
+    service: LocalService, transit: Path, fitted: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
+    """One report of a fit without the slow dark offsets, all of its files, and what the comparison of shapes was given."""
+    out, given = tmp_path_factory.mktemp("report"), []
+
+    def compare(solution: Any, *, seed: int, progress: object) -> Any:
+        given.append((type(solution).__name__, seed))
+        return SimpleNamespace(to_json=lambda: {"shapes": "compared"})
+
+    files = {"page": out / "r.html", "preview": out / "r.png"}
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(report_task, "compare_shapes_by_errors", compare)
+        row = service.report(transit, out / "r.json", **files, seed=3, dark_offsets=False, shapes=True)
+    return {"row": row, "json": json.loads((out / "r.json").read_text()), "given": given, "folder": out}
+
+
+def test_one_inversion_serves_all_jobs(
+    fitted: dict[str, Any], folds: dict[str, Any], report: dict[str, Any], inversions: list[str]
+) -> None:
+    assert inversions.count("softened-power-law") == 1
+
+
+# The fit ----------------------------------------------------------------------------------------------
+
+
+def test_the_curve_is_that_of_the_truth_within_its_errors(fitted: dict[str, Any]) -> None:
+    psf = read_psf(fitted["folder"] / "psf.fits", LIMITS)
+    assert psf.fitted is not None and psf.fitted.parameters == ("b_px", "c", "total")
+    curve = fitted["report"]["curve"]
+    radii, found = np.array(curve["radii_px"]), np.array(curve["light_beyond_pct"])
+    assert cumulative_curve(psf.kernel, radii) == pytest.approx(found, abs=1e-3)
+    truth = cumulative_curve(total_kernel(TRUTH, diffraction(), REACH_GRID_PX), radii)
+    assert np.abs((found - truth) / np.array(curve["sigma"])).max() < 4
+    assert np.abs(found - truth)[radii <= 50].max() < 2
+
+
+def test_the_product_says_what_it_was_made_of(fitted: dict[str, Any]) -> None:
+    psf, report = fitted["psf"], fitted["report"]
+    assert psf["origin"] == "fitted" and psf["report"] == f"/v1/psfs/{psf['id']}/report"
+    assert set(report["inputs_sha256"]) >= {"000.fits", "008.fits", "diffraction.fits", "transit.json"}
+    provenance = psf["details"]["provenance"]
+    assert provenance["inputs_sha256"] == report["inputs_sha256"]
+    assert provenance["parameters"]["shape"] == "softened-power-law"
+    assert set(provenance["libraries"]) >= LIBRARIES
+    assert {frame["file"] for frame in report["frames"]} | set(report["left_out"]) == FILES
+    assert psf["details"]["fit"]["sentence"] == report["sentence"]
+    with fits.open(fitted["folder"] / "psf.fits") as hdus:
+        assert {"DIFFRACTION", "SCATTER", "PROFILE", "FIT"} <= {hdu.name for hdu in hdus}
+    assert (fitted["folder"] / "p.png").read_bytes().startswith(PNG)
+    shares = [
+        step / steps for stage, step, steps in fitted["steps"] if stage not in ("reading", "building the PSF")
+    ]
+    assert len(shares) > 3 and min(shares) >= 0 and max(shares) <= 1
+    assert all(later >= earlier - 0.02 for earlier, later in itertools.pairwise(shares))
+
+
+def test_an_identical_request_gets_the_existing_result(
+    service: LocalService, fitted: dict[str, Any], report: dict[str, Any], transit: Path
+) -> None:
+    again = service.fit_psf(transit)
+    assert again["id"] == fitted["psf"]["id"] and again["created_at"] == fitted["psf"]["created_at"]
+    again = service.report(transit, seed=3, dark_offsets=False, shapes=True)
+    assert again["id"] == report["row"]["id"] and again["created_at"] == report["row"]["created_at"]
+
+
+@pytest.mark.slow
+def test_a_rerun_inverts_anew_and_gives_the_same_fit_bit_for_bit(
+    service: LocalService, fitted: dict[str, Any], inversions: list[str]
+) -> None:
+    before, psf_id = list(inversions), fitted["psf"]["id"]
+    row = service.get(service.wait(service.submit("rerun", of="psf", id=psf_id))["result"])
+    assert len(inversions) == len(before) + 1
+    inversions[:] = before
+    assert row["details"]["same"] is True, row["details"]["sentence"]
+    assert service.get(f"/v1/psfs/{psf_id}")["created_at"] == fitted["psf"]["created_at"]
+
+
+def test_a_deconvolution_with_it_carries_the_psfs_own_error(
+    service: LocalService, fitted: dict[str, Any], tmp_path: Path
+) -> None:
+    image = tmp_path / "image.fits"
+    write_image(image, shape=(64, 64), CDELT1=0.492, CDELT2=0.492, DETECTOR="HRI_EUV")
+    options = {"psf_id": fitted["psf"]["id"], "noise": (6.0, 2.0), "error_draws": 4, "steps": 2}
+    service.deconvolve(image, tmp_path / "o.fits", **options)
+    planes = read_planes(tmp_path / "o.fits")
+    assert planes["PSF_ERROR"].shape == planes["ERROR"].shape
+    assert np.isfinite(planes["PSF_ERROR"]).all()
+    assert 0 < np.median(planes["PSF_ERROR"]) < np.median(planes["ERROR"])
+
+
+def changed(transit: Path, folder: Path, **changes: Any) -> Path:
+    """A copy of a transit with other values in its transit.json."""
+    shutil.copytree(transit, folder)
+    manifest = json.loads((folder / "transit.json").read_text())
+    (folder / "transit.json").write_text(json.dumps(manifest | changes))
+    return folder
+
+
+def test_a_transit_that_cannot_be_fitted_is_an_error_of_its_user(
+    service: LocalService, transit: Path, tmp_path: Path
+) -> None:
+    images = json.loads((transit / "transit.json").read_text())["images"]
+    elsewhere = [image | {"x": 64.0, "y": 110.0} for image in images]
+    with pytest.raises(ServiceError) as caught:
+        service.fit_psf(changed(transit, tmp_path / "elsewhere", images=elsewhere))
+    assert caught.value.code == "too-few-frames" and "(64, 110)" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_a_transit_of_one_pointing_states_a_limit(
+    service: LocalService, transit: Path, tmp_path: Path
+) -> None:
+    images = json.loads((transit / "transit.json").read_text())["images"]
+    two = [image for image in images if image["fov"] < 3]
+    psf = service.fit_psf(changed(transit, tmp_path / "t", images=two))
+    assert any(limit.startswith("with 2 pointings") for limit in psf["details"]["fit"]["limits"])
+
+
+# Cross-validation -------------------------------------------------------------------------------------
+
+
+def test_both_schemes_give_the_same_folds(folds: dict[str, Any]) -> None:
+    shared, exact = folds["shared"]["folds"], folds["exact"]["folds"]
+    assert [(f["run"], f["fold"]) for f in shared] == [(f["run"], f["fold"]) for f in exact]
+    assert sorted(int(n) for f in exact for n in f["held_out_pct"]) == list(range(9)), "each image once"
+    band = folds["exact"]["light_beyond_pct"]
+    width = max(abs(a - b) for a, b in zip(band["plus_1_sigma"], band["minus_1_sigma"], strict=True))
+    for one, other in zip(shared, exact, strict=True):
+        # Second order in a fold's step: small beside the spread of the folds.
+        assert one["curve_pct"] == pytest.approx(other["curve_pct"], abs=max(0.3 * width, 0.05))
+        assert one["held_out_pct"].keys() == other["held_out_pct"].keys()
+
+
+def test_a_cross_validation_says_what_was_done_and_compares_with_a_fit_without_a_formula(
+    folds: dict[str, Any],
+) -> None:
+    for scheme, report in folds.items():
+        assert report["scheme"] == scheme and report["row"]["kind"] == "cross-validation"
+        assert report["row"]["details"]["sentence"] == report["sentence"]
+        assert report["held_out"]["rms_pct"] >= abs(report["held_out"]["mean_pct"])
+        assert len(report["totals"]) == 3 and report["inputs_sha256"]
+        shells = report["shells"]
+        beyond = shells["diffuse_light_beyond_inner_edge_pct"]
+        assert set(beyond) == {"free", "formula"} == set(shells["weight"])
+        assert len(beyond["free"]["median"]) == len(shells["edges_px"]) - 1
+        near = shells["excess_near_centre"]
+        assert abs(near["points"]) < 3 * near["sigma"]  # the truth is a power law
+        assert f"{near['points']:+.1f} ± {near['sigma']:.1f}" in report["sentence"]
+        json.dumps(report["folds"][0]["shells"], allow_nan=False)
+
+
+@pytest.mark.slow
+def test_another_shape_is_another_solution(
+    service: LocalService, transit: Path, fitted: dict[str, Any], inversions: list[str]
+) -> None:
+    for seed in (1, 2):
+        service.cross_validate(transit, shape="stretched", runs=1, seed=seed)
+    assert inversions.count("stretched") == 1
+
+
+# The report -------------------------------------------------------------------------------------------
+
+
+def test_the_report_says_what_was_found_and_what_it_was_made_of(report: dict[str, Any]) -> None:
+    row, content = report["row"], report["json"]
+    assert row["kind"] == "report" and row["html"] == f"/v1/reports/{row['id']}/page"
+    assert row["details"]["sentence"] == content["sentence"] and row["details"]["held_out"] is True
+    assert content["schema"] == "psf-report/1" and content["seed"] == 3
+    assert set(content["inputs"]["sha256"]) >= {"000.fits", "008.fits", "diffraction.fits", "transit.json"}
+    assert content["provenance"]["parameters"]["dark_offsets"] is False
+    assert set(content["provenance"]["libraries"]) >= LIBRARIES
+    total = content["fit"]["parameters"]["total"]
+    assert abs(total["value"] - TRUTH.total) < 4 * total["sigma"]
+    assert content["shapes"] == {"shapes": "compared"}
+    assert report["given"] == [("Solution", 3)], "the comparison starts from the fit and its seed"
+
+
+def test_its_page_stands_alone_and_shows_every_image(report: dict[str, Any]) -> None:
+    html = (report["folder"] / "r.html").read_text("utf-8")
+    check_stands_alone(html)
+    cells = {tag.text for tag in read_page(html) if tag.name == "td"}
+    assert {frame["file"] for frame in report["json"]["evaluation"]["frames"]} <= cells
+    assert set(report["json"]["inputs"]["sha256"].values()) <= cells
+    assert "the effect of wrong dark levels" in html and "not requested" in html
+    assert (report["folder"] / "r.png").read_bytes().startswith(PNG)
+
+
+def test_a_given_psf_is_evaluated_without_a_fit_and_without_diffraction(
+    service: LocalService, transit: Path, tmp_path: Path
+) -> None:
+    folder = changed(transit, tmp_path / "t", known_psf=None, instrument=None)
+    fits.PrimaryHDU(total_kernel(TRUTH, diffraction(), REACH_GRID_PX)).writeto(tmp_path / "true.fits")
+    psf_id = service.upload_psf(tmp_path / "true.fits")["id"]
+    row = service.report(folder, tmp_path / "r.json", page=tmp_path / "r.html", psf_id=psf_id)
+    content = json.loads((tmp_path / "r.json").read_text())
+    assert "fit" not in content and content["psf"]["given"] and row["details"]["psf_id"] == psf_id
+    whole = content["evaluation"]["all"]
+    assert abs(whole["mean_pct"]) < 4 * whole["mean_noise_pct"]
+    assert any("no fit was made" in missing["why"] for missing in content["not_shown"])
+    check_stands_alone((tmp_path / "r.html").read_text("utf-8"))
+    # Dark offsets are of fits: asking for them or not is the same request here.
+    again = service.report(folder, psf_id=psf_id, dark_offsets=False)
+    assert again["created_at"] == row["created_at"]
