@@ -5,27 +5,21 @@ import pickle
 import numpy as np
 import pytest
 from astropy.io import fits
-from numpy.typing import NDArray
 
 from psfcore.errors import DataError, HeaderError
 from psfcore.image import Image, MaskBit
 
 
-@pytest.mark.parametrize(
-    ("pixels", "mask_shape", "code"),
-    [
+def test_a_wrong_image_is_refused() -> None:
+    for pixels, mask_shape, code in (
         (np.ones(400), (400,), "not-2d"),
         (np.ones((15, 200)), (15, 200), "too-small"),
         (np.ones((20, 20)), (20, 21), "mask-shape"),
         (np.full((20, 20), np.nan), (20, 20), "unmasked-nonfinite"),
-    ],
-)
-def test_a_wrong_image_is_refused(
-    pixels: NDArray[np.float64], mask_shape: tuple[int, ...], code: str
-) -> None:
-    with pytest.raises(DataError) as caught:
-        Image(pixels, np.zeros(mask_shape, np.uint8), fits.Header(), None, None)
-    assert caught.value.code == code
+    ):
+        with pytest.raises(DataError) as caught:
+            Image(pixels, np.zeros(mask_shape, np.uint8), fits.Header(), None, None)
+        assert caught.value.code == code
 
 
 def test_any_bit_makes_a_pixel_invalid() -> None:
