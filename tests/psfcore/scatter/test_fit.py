@@ -1,13 +1,16 @@
-"""A complete fit: curves with errors, overdispersion, limits, free shells, progress, and the PSF file."""
+"""A complete fit: curves with errors, overdispersion, limits, free shells, progress, the PSF file, report and plot."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import matplotlib.image
 import numpy as np
 import pytest
 
@@ -15,23 +18,23 @@ from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter import fit as fit_module
-from psfcore.scatter.fit import (
-    RADII_PX,
-    TransitFit,
-    fit_transit,
-    fitted_psf,
-    overdispersion,
-)
+from psfcore.scatter.as_published.published import AS_PUBLISHED, CORRECTED_ALONE, Choices, Published
+from psfcore.scatter.fit import ALONE_SUBSETS, RADII_PX, TransitFit, fit_transit, fitted_psf, overdispersion
+from psfcore.scatter.fit_plot import fit_png
 from psfcore.scatter.inversion import Solution, invert
-from psfcore.scatter.report import fit_json
+from psfcore.scatter.report import fit_json, fit_sentence
 from psfcore.scatter.shapes import SHAPES
 from psfcore.simulate.transit import observed_transit
+from psfcore.transit.transit import Transit
 from tests.psfcore.conftest import LIMITS
 from tests.psfcore.small_transits import (
     DIFFRACTION,
     IMAGES,
     fitted,
+    fitted_with_progress,
     noise_free,
+    observed,
+    recipe,
     sky,
     solved,
     true_curve,
@@ -39,7 +42,8 @@ from tests.psfcore.small_transits import (
 
 
 def fit_of(patch: pytest.MonkeyPatch, solution: Solution, **asked: Any) -> TransitFit:
-    """A fit with a known inversion, without the slow fits of free shells and other shapes."""
+    """A fit with a known inversion, on 512 px, without the slow fits of free shells and other shapes."""
+    patch.setattr(fit_module, "REACH_GRID_PX", 512)
     patch.setattr(fit_module, "_free_shells", lambda *_: fitted().free)
     patch.setattr(fit_module, "compare_shapes", lambda *_, **__: ())
     return fit_transit(solution.transit, solution=lambda *_, **__: solution, **asked)
@@ -82,16 +86,13 @@ def test_kernels_sum_to_1_and_the_diffuse_part_is_the_shape() -> None:
     assert (fit.diffuse_curve.pct[0], fit.diffuse_curve.sigma[0]) == pytest.approx((100 * total, 100 * sigma))
 
 
-def test_noise_alone_is_no_overdispersion() -> None:
+def test_overdispersion_is_the_chi2_of_the_means_unless_chance_explains_it() -> None:
+    """With nine degrees of freedom, chance explains factors up to 1 + 2 sqrt(2 / 9)."""
     fit = fitted()
-    assert fit.overdispersion == 1
+    assert fit.overdispersion == 1, "noise alone is no overdispersion"
     np.testing.assert_array_equal(fit.covariance, fit.inversion.covariance)
     assert fit.value_sigma == fit.inversion.value_sigma
     assert not [line for line in fit.limits if "scatter" in line and "noise" in line]
-
-
-def test_overdispersion_is_the_chi2_of_the_means_unless_chance_explains_it() -> None:
-    """With nine degrees of freedom, chance explains factors up to 1 + 2 sqrt(2 / 9)."""
     inversion = solved().inversion
     edge = 1 + 2 * math.sqrt(2 / 9)
     for factor, expected in ((0.98 * edge, 1.0), (1.02 * edge, 1.02 * edge), (25.0, 25.0)):
@@ -145,15 +146,15 @@ def test_limits_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         frames=tuple(dataclasses.replace(f, chi2=3 * f.chi2) for f in frames),
     )
     words = "; ".join(fit_of(monkeypatch, unsure).limits)
-    for told in (
+    for part in (
         f"did not converge in {len(inversion.rounds)} rounds",
-        "did not use 2 images: 000.fits (too dark); 007.fits (found no occulter)",
-        "with 1 pointing, the data hardly distinguish",
-        "px has a standard error of more than 3 percentage points",
+        "2 images: 000.fits (too dark); 007.fits (found no occulter)",
+        "with 1 pointing",
+        "standard error of more than 3 percentage points",
         "does not describe the occulted pixels",
-        "position of the occulter did not converge in 1 image",
+        "did not converge in 1 image",
     ):
-        assert told in words
+        assert part in words
 
 
 def test_free_shells_agree_with_the_truth_within_the_field() -> None:
@@ -182,24 +183,12 @@ def test_an_unknown_shape_is_refused() -> None:
 
 def test_progress_of_the_whole_fit_increases_to_its_end() -> None:
     """Every call increases the step, and no step exceeds the total (fit without the published recipe)."""
-    seen: list[tuple[str, int, int]] = []
-    whole = fit_module._FitProgress(lambda *at: seen.append(at), 2, compared=True, published=0)
-    stages = [
-        "reconstructing",
-        *[f"round {n}" for n in range(1, 9)],
-        "errors",
-        "free shells",
-        "comparing shapes",
-    ]
-    for stage in stages:
-        for step in range(2):
-            whole(stage, step, 2)
-    done = [step / of for _, step, of in seen]
-    assert [stage for stage, _, _ in seen][::2] == stages
-    assert all(0 < at <= 1 for at in done)
+    _, seen = fitted_with_progress()
     steps = [step for _, step, _ in seen]
     assert steps == sorted(set(steps))
-    assert done[-1] > 0.95
+    assert all(0 < step <= of for _, step, of in seen) and steps[-1] > 0.95 * seen[-1][2]
+    stages = list(dict.fromkeys(stage.rstrip(" 0123456789") for stage, _, _ in seen))
+    assert stages == ["reconstructing", "round", "errors", "free shells", "comparing shapes"]
 
 
 def test_a_fitted_psf_is_written_and_read(tmp_path: Path) -> None:
@@ -220,3 +209,115 @@ def test_a_fitted_psf_is_written_and_read(tmp_path: Path) -> None:
     assert read.fitted.shape == "softened-power-law"
     np.testing.assert_array_equal(read.fitted.coordinates, fit.inversion.coordinates)
     np.testing.assert_array_equal(read.fitted.covariance, fit.covariance)
+
+
+# --- report and plot --------------------------------------------------------------------------------------
+
+
+def as_json(fit: TransitFit) -> dict[str, Any]:
+    """The report after a round trip through JSON. It fails for nan and infinity."""
+    content = json.loads(json.dumps(fit_json(fit), allow_nan=False))
+    assert isinstance(content, dict)
+    return content
+
+
+def test_a_report_is_json_with_the_values_of_the_fit() -> None:
+    fit, content = fitted(), as_json(fitted())
+    assert content["schema"] == "psf-fit/1"
+    assert content["shape"] == "softened-power-law"
+    assert content["curve"]["light_beyond_pct"] == fit.curve.pct.tolist()
+    assert content["curve"]["sigma"] == fit.curve.sigma.tolist()
+    assert content["diffuse_curve"]["radii_px"] == list(RADII_PX)
+    for name, said in content["parameters"].items():
+        assert (said["value"], said["sigma"]) == (fit.inversion.values[name], fit.value_sigma[name])
+    assert content["parameters"]["b_px"]["unit"] == "px"
+    assert content["coordinates"]["covariance"] == fit.covariance.tolist()
+    assert content["coordinates"]["scales"] == ["log", "linear", "logit"]
+    assert content["converged"] is True
+    assert [r["moved_points"] for r in content["rounds"]] == [r.moved_points for r in fit.inversion.rounds]
+    assert [f["file"] for f in content["frames"]] == [f"{n:03d}.fits" for n in range(IMAGES)]
+    one = content["frames"][5]
+    assert one["x"] == pytest.approx(observed(sky()).truth.places[5].x_px, abs=0.1)
+    assert one["residual_pct"] == pytest.approx(100 * (one["expected_dn_s"] / one["observed_dn_s"] - 1))
+    assert one["dark_pixels"] == fit.inversion.frames[5].dark[0].size
+    assert content["limits"] == list(fit.limits)
+    assert [s["name"] for s in content["shapes"]] == [s.name for s in fit.shapes]
+    assert content["shapes"][0]["added"]["stretch_p"]["sigma"] > 0
+    assert len(content["free_shells"]["weight"]["median"]) == 50
+    assert content["first_guess"]["best_fov"] == fit.first_guess.best_pointing
+    assert "stretch" not in content and "as_published" not in content
+
+
+def test_the_sentence_has_the_curves_numbers() -> None:
+    fit, words = fitted(), fit_sentence(fitted())
+    at = {r: (p, s) for r, p, s in zip(RADII_PX, fit.curve.pct, fit.curve.sigma, strict=True)}
+    found = [float(number) for number in re.findall(r"\d+\.\d+", words)]
+    total, sigma = fit.inversion.values["total"], fit.value_sigma["total"]
+    expected = [100 * total, 100 * sigma, *at[0.5], *at[10.0], *at[100.0]]
+    assert found[:8] == pytest.approx(expected, abs=0.00501)
+    assert found[8] == pytest.approx(fit.inversion.chi2_per_pixel, abs=0.000501)
+    assert f"{IMAGES} images" in words
+    assert as_json(fit)["sentence"] == words
+
+
+def test_a_stretch_is_reported_and_free_shells_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = fit_of(monkeypatch, stretched(solved()), shape="stretched-along-x")
+    assert fit.free is None and fit.shapes == ()
+    content = as_json(fit)
+    assert content["stretch"] == pytest.approx({"stretch": 0.05, "angle_deg": 0.0})
+    assert content["shape"] == "stretched-along-x"
+    assert "free_shells" not in content and content["shapes"] == []
+    assert len(content["coordinates"]["covariance"]) == 4
+
+
+def test_the_report_contains_the_published_recipe_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Choices, int]] = []
+
+    def published_recipe(transit: Transit, choices: Choices, *, subsets: int = 100, **_: Any) -> Published:
+        asked.append((choices, subsets))
+        found = recipe(AS_PUBLISHED)[0]
+        return dataclasses.replace(found, curve_pct=found.curve_pct + len(asked) - 1)
+
+    monkeypatch.setattr(fit_module, "invert_as_published", published_recipe)
+    fit = fit_of(monkeypatch, solved(), as_published=True)
+    assert asked == [(AS_PUBLISHED, 100), *((choices, ALONE_SUBSETS) for choices in CORRECTED_ALONE.values())]
+    content = as_json(fit)["as_published"]
+    whole = content["whole"]
+    assert whole["radii_px"] == [0.5, 2, 5, 10, 20, 50]
+    np.testing.assert_allclose(
+        whole["minus_default_points"], np.array(whole["light_beyond_pct"]) - fit.curve.pct[:6]
+    )
+    assert set(whole["spread_of_draws"]) == {"a", "b_px", "c"}
+    assert [r["fit"] for r in whole["rounds"]] == ["free shells"] * 3 + ["softened power law"] * 3
+    alone = content["one_bias_mended"]
+    assert list(alone) == list(CORRECTED_ALONE)
+    for n, one in enumerate(alone.values(), start=1):
+        assert one["minus_published_points"] == pytest.approx([n] * 6)
+
+
+def test_a_fit_is_drawn(tmp_path: Path) -> None:
+    """A fit with all results; and one with a negative disc mean, without free shells, and with one round."""
+    whole = dataclasses.replace(fitted(), published=recipe(AS_PUBLISHED)[0])
+    image = solved().inversion.frames[4]
+    bare = dataclasses.replace(
+        fitted(),
+        free=None,
+        solution=with_inversion(
+            solved(),
+            frames=(dataclasses.replace(image, observed=-0.1 * image.observed),),
+            rounds=solved().inversion.rounds[:1],
+            converged=False,
+        ),
+    )
+    pictures = []
+    for name, fit in (("whole", whole), ("bare", bare)):
+        fit_png(fit, tmp_path / f"{name}.png")
+        pictures.append(matplotlib.image.imread(tmp_path / f"{name}.png"))
+        height, width = pictures[-1].shape[:2]
+        assert 1200 < width < 2000 and 700 < height < 1400
+        assert 20_000 < (tmp_path / f"{name}.png").stat().st_size < 400_000
+        assert 0.05 < pictures[-1][..., :3].std() < 0.4
+    drawn = [
+        int((np.abs(p[..., :3] - np.array([179, 38, 30]) / 255).max(axis=-1) < 0.02).sum()) for p in pictures
+    ]
+    assert drawn[0] > drawn[1] + 300  # the curves of the published recipe

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -24,87 +26,76 @@ def scene(shape: tuple[int, int], seed: int = 1) -> NDArray[np.float64]:
     return np.asarray(rng.uniform(50, 150, shape) + 2000 * (rng.random(shape) > 0.98))
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize(
-    "kernel", [total_kernel(SCATTER, DIFFRACTION, 200), LOPSIDED], ids=["even", "lopsided"]
-)
-def test_it_is_the_convolution(shape: tuple[int, int], kernel: NDArray[np.float64]) -> None:
-    blur, plain, x = Blur(kernel, shape), Convolver(kernel, shape, dtype=np.float64), scene(shape)
-    seen, back = blur.convolve(blur.lanes(x)), blur.correlate(blur.lanes(x))
-    np.testing.assert_allclose(blur.field(seen), plain.apply(x), rtol=1e-5)
-    np.testing.assert_allclose(blur.field(back), plain.adjoint(x), rtol=1e-5)
+def test_it_is_the_convolution() -> None:
+    for kernel, shape in itertools.product((total_kernel(SCATTER, DIFFRACTION, 200), LOPSIDED), SHAPES):
+        blur, plain, x = Blur(kernel, shape), Convolver(kernel, shape, dtype=np.float64), scene(shape)
+        seen, back = blur.convolve(blur.lanes(x)), blur.correlate(blur.lanes(x))
+        np.testing.assert_allclose(blur.field(seen), plain.apply(x), rtol=1e-5)
+        np.testing.assert_allclose(blur.field(back), plain.adjoint(x), rtol=1e-5)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_nothing_is_left_beyond_the_fields_last_row(shape: tuple[int, int]) -> None:
+def test_nothing_is_left_beyond_the_fields_last_row() -> None:
     """Two passes give the same result as two passes with a crop between them."""
-    optics, x = Optics(LOPSIDED, shape), scene(shape)
-    lanes = optics.lanes(x)
-    once = optics.convolve(lanes)
-    np.testing.assert_array_equal(once, optics.lanes(optics.field(once)))
-    undone = optics.invert_once(lanes, adjoint=True)
-    np.testing.assert_array_equal(undone, optics.lanes(optics.field(undone)))
-    np.testing.assert_array_equal(lanes, optics.lanes(x))  # the input is not modified
+    for shape in SHAPES:
+        optics, x = Optics(LOPSIDED, shape), scene(shape)
+        lanes = optics.lanes(x)
+        once = optics.convolve(lanes)
+        np.testing.assert_array_equal(once, optics.lanes(optics.field(once)))
+        undone = optics.invert_once(lanes, adjoint=True)
+        np.testing.assert_array_equal(undone, optics.lanes(optics.field(undone)))
+        np.testing.assert_array_equal(lanes, optics.lanes(x))  # the input is not modified
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_adjoints(shape: tuple[int, int]) -> None:
-    optics = Optics(LOPSIDED, shape)
-    points = scene(shape) - 150
-    x, y = (optics.lanes(plane) for plane in (points, np.roll(points, (2, 3), axis=(0, 1))))
-
-    def dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-        return float(np.vdot(a.astype(np.float64), b.astype(np.float64)))
-
-    size = np.sqrt(dot(x, x) * dot(y, y))
-    assert dot(optics.convolve(x), y) == pytest.approx(dot(x, optics.correlate(y)), abs=1e-6 * size)
-    assert dot(optics.invert_once(x), y) == pytest.approx(
-        dot(x, optics.invert_once(y, adjoint=True)), abs=1e-6 * size
-    )
-    assert (
-        abs(dot(optics.convolve(x), y) - dot(x, optics.convolve(y))) > 1e-4 * size
-    )  # this PSF is not symmetric
+def dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    return float(np.vdot(a.astype(np.float64), b.astype(np.float64)))
 
 
-@pytest.mark.parametrize("shape", [(64, 64), (100, 131)])
-def test_inversion_recovers_the_scene(shape: tuple[int, int]) -> None:
+def test_adjoints() -> None:
+    for shape in SHAPES:
+        optics = Optics(LOPSIDED, shape)
+        points = scene(shape) - 150
+        x, y = (optics.lanes(plane) for plane in (points, np.roll(points, (2, 3), axis=(0, 1))))
+        size = np.sqrt(dot(x, x) * dot(y, y))
+        assert dot(optics.convolve(x), y) == pytest.approx(dot(x, optics.correlate(y)), abs=1e-6 * size)
+        back = dot(x, optics.invert_once(y, adjoint=True))
+        assert dot(optics.invert_once(x), y) == pytest.approx(back, abs=1e-6 * size)
+        # This PSF is not symmetric.
+        assert abs(dot(optics.convolve(x), y) - dot(x, optics.convolve(y))) > 1e-4 * size
+
+
+def test_inversion_recovers_the_scene() -> None:
     kernel = total_kernel(SCATTER, DIFFRACTION, 280)
-    optics, x = Optics(kernel, shape), scene(shape)
-    observed = Convolver(kernel, shape, dtype=np.float64).apply(x)
-
-    def off(steps: int) -> float:
-        return float(np.abs(optics.field(optics.invert(optics.lanes(observed), steps=steps)) - x).max())
-
-    assert off(0) > 500
-    assert off(5) < 0.5
-    assert off(8) < off(5) < off(2) < off(1)
-    nearly = optics.invert(optics.lanes(observed), optics.lanes(x + 1.0), steps=3)
-    np.testing.assert_allclose(optics.field(nearly), x, atol=0.1)
+    for shape in SHAPES[:2]:
+        optics, x = Optics(kernel, shape), scene(shape)
+        observed = optics.lanes(Convolver(kernel, shape, dtype=np.float64).apply(x))
+        off = {n: np.abs(optics.field(optics.invert(observed, steps=n)) - x).max() for n in (0, 1, 2, 5, 8)}
+        assert off[0] > 500
+        assert off[8] < off[5] < off[2] < off[1]
+        assert off[5] < 0.5
+        nearly = optics.invert(observed, optics.lanes(x + 1.0), steps=3)
+        np.testing.assert_allclose(optics.field(nearly), x, atol=0.1)
 
 
 def test_a_kernel_may_have_any_sign() -> None:
     kernel = scatter_kernel(6.2, 2.5, 0.42, 128) - scatter_kernel(6.1, 2.5, 0.41, 128)
     blur, plain, x = Blur(kernel, (50, 60)), Convolver(kernel, (50, 60), dtype=np.float64), scene((50, 60))
-    expected = plain.apply(x)
-    np.testing.assert_allclose(
-        blur.field(blur.convolve(blur.lanes(x))), expected, atol=1e-5 * np.abs(expected).max()
-    )
+    seen, expected = blur.field(blur.convolve(blur.lanes(x))), plain.apply(x)
+    np.testing.assert_allclose(seen, expected, atol=1e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_single_pixels_are_the_right_ones(shape: tuple[int, int]) -> None:
-    blur, x = Blur(DIFFRACTION, shape), scene(shape)
+def test_single_pixels_are_the_right_ones() -> None:
     rng = np.random.default_rng(0)
-    rows, columns = (np.append(rng.integers(0, n, 60), (0, n - 1)) for n in shape)
-    lanes = blur.lanes(x)
-    np.testing.assert_array_equal(pick(lanes, (rows, columns)), x[rows, columns].astype(np.float32))
-    expected = x.astype(np.float32)
-    expected[rows, columns] = 0.0
-    put(lanes, (rows, columns), 0.0)
-    np.testing.assert_array_equal(blur.field(lanes), expected)
-    one = (np.array([shape[0] - 1]), np.array([3]))
-    put(lanes, one, np.array([7.0]))
-    assert pick(lanes, one) == 7.0 and blur.field(lanes)[-1, 3] == 7.0
+    for shape in SHAPES:
+        blur, x = Blur(DIFFRACTION, shape), scene(shape)
+        rows, columns = (np.append(rng.integers(0, n, 60), (0, n - 1)) for n in shape)
+        lanes, expected = blur.lanes(x), x.astype(np.float32)
+        np.testing.assert_array_equal(pick(lanes, (rows, columns)), expected[rows, columns])
+        expected[rows, columns] = 0.0
+        put(lanes, (rows, columns), 0.0)
+        np.testing.assert_array_equal(blur.field(lanes), expected)
+        one = (np.array([shape[0] - 1]), np.array([3]))
+        put(lanes, one, np.array([7.0]))
+        assert pick(lanes, one) == 7.0 and blur.field(lanes)[-1, 3] == 7.0
 
 
 def test_threads_change_nothing() -> None:

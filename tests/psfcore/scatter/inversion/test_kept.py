@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import zipfile
 from collections.abc import Callable
@@ -15,7 +16,7 @@ import pytest
 from psfcore.errors import DataError
 from psfcore.scatter.inversion import Solution, kept, read_solution, solution_of, write_solution
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
-from psfcore.scatter.validation.cross_validation import bootstrap_samples, exact_fit
+from psfcore.transit.transit import Transit
 from tests.psfcore.small_transits import observed, sky, solved, solved_noise_free
 
 Members = dict[str, bytes]
@@ -54,15 +55,10 @@ def test_a_solution_is_read_back_bit_for_bit(file: Path) -> None:
         check_same(getattr(first.sky, name), getattr(again.sky, name))
     assert again.transit is again.sky.transit is first.transit
     assert (again.part, again.threads) == (first.part, first.threads)
+    assert read_solution(file, first.transit, threads=2).threads == 2
     assert again.optics.engine.transfer.tobytes() == first.optics.engine.transfer.tobytes()
     at = first.inversion.coordinates
     assert first.total.kernel(at).tobytes() == again.total.kernel(at).tobytes()
-
-
-def test_a_fit_from_it_is_the_same_bit_for_bit(file: Path) -> None:
-    again = read_solution(file, solved().transit, threads=2)
-    sample = bootstrap_samples(len(solved().transit.frames), runs=1)[0]
-    assert exact_fit(solved(), sample) == exact_fit(again, sample)
 
 
 def test_the_same_solution_gives_the_same_file(file: Path, tmp_path: Path) -> None:
@@ -79,25 +75,27 @@ def test_numbers_that_are_not_finite_survive(tmp_path: Path) -> None:
     assert read_solution(tmp_path / "odd", first.transit).inversion.frames[0].chi2 == float("inf")
 
 
+def refusal(path: Path, transit: Transit | None = None) -> str:
+    """The code of the refusal of a file."""
+    with pytest.raises(DataError) as caught:
+        read_solution(path, transit or solved().transit)
+    return caught.value.code
+
+
 def test_a_solution_of_other_images_is_refused(file: Path) -> None:
     transit = solved().transit
-    fewer = dataclasses.replace(transit, frames=transit.frames[1:])
-    with pytest.raises(DataError, match="this transit has 11 images") as refused:
-        read_solution(file, fewer)
-    assert refused.value.code == "bad-solution"
+    assert refusal(file, dataclasses.replace(transit, frames=transit.frames[1:])) == "bad-solution"
 
 
-def test_a_solution_too_large_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kept, "MOST_BYTES", 2**20)
-    with pytest.raises(DataError) as refused:
-        write_solution(tmp_path / "large", solved())
-    assert refused.value.code == "solution-too-large" and list(tmp_path.iterdir()) == []
-
-
-def test_a_file_too_large_is_not_opened(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_too_large_is_neither_written_nor_read(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(kept, "MOST_BYTES", 2**10)
-    with pytest.raises(DataError, match="more than 1024 bytes"):
-        read_solution(file, solved().transit)
+    assert refusal(file) == "bad-solution"
+    monkeypatch.setattr(kept, "MOST_BYTES", 2**20)
+    with pytest.raises(DataError) as caught:
+        write_solution(tmp_path / "large", solved())
+    assert caught.value.code == "solution-too-large" and list(tmp_path.iterdir()) == []
 
 
 def edited(**changes: Any) -> Callable[[Members], None]:
@@ -107,7 +105,7 @@ def edited(**changes: Any) -> Callable[[Members], None]:
     return edit
 
 
-CHANGES = {
+CHANGES: dict[str, Callable[[Members], object]] = {
     "a later version": edited(version=2),
     "an unknown shape": edited(shape="cube"),
     "an image that the transit lacks": edited(part=[0, 1, 99]),
@@ -118,41 +116,38 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
-def test_a_changed_file_is_refused(file: Path, tmp_path: Path, change: Callable[[Members], object]) -> None:
+def array(values: Any) -> bytes:
+    """The content of a file .npy."""
+    out = io.BytesIO()
+    np.lib.format.write_array(out, values)
+    return out.getvalue()
+
+
+OTHER_ARRAYS = (
+    ("covariance", np.zeros((9, 9))),
+    ("covariance", np.zeros((3, 3), np.float32)),
+    ("covariance", np.zeros((3, 3), object)),
+    ("dark-0000", np.full((2, 5), -1)),
+    ("dark-0000", np.full((2, 5), 128)),
+    ("dark-0000", np.zeros((3, 5), np.int64)),
+    ("scene-0000", np.zeros(2**20, np.float32)),
+)
+
+
+def test_a_changed_file_and_another_array_are_refused(file: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(file) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
-    change(members)
-    with zipfile.ZipFile(tmp_path / "changed", "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-    with pytest.raises(DataError) as refused:
-        read_solution(tmp_path / "changed", solved().transit)
-    assert refused.value.code == "bad-solution"
-
-
-def saved(tmp_path: Path, values: Any, **how: Any) -> bytes:
-    with (tmp_path / "array").open("wb") as out:
-        np.lib.format.write_array(out, values, **how)
-    return (tmp_path / "array").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("covariance", np.zeros((9, 9))),
-        ("covariance", np.zeros((3, 3), np.float32)),
-        ("covariance", np.zeros((3, 3), object)),
-        ("dark-0000", np.full((2, 5), -1)),
-        ("dark-0000", np.full((2, 5), 128)),
-        ("dark-0000", np.zeros((3, 5), np.int64)),
-        ("scene-0000", np.zeros(2**20, np.float32)),
-    ],
-    ids=str,
-)
-def test_another_array_is_refused(file: Path, tmp_path: Path, name: str, values: Any) -> None:
-    changed = saved(tmp_path, values)
-    test_a_changed_file_is_refused(file, tmp_path, lambda members: members.update({f"{name}.npy": changed}))
+    cases = []
+    for what, change in CHANGES.items():
+        other = dict(members)
+        change(other)
+        cases.append((what, other))
+    cases += [(f"{n} {a.shape} {a.dtype}", members | {f"{n}.npy": array(a)}) for n, a in OTHER_ARRAYS]
+    for what, other in cases:
+        with zipfile.ZipFile(tmp_path / "changed", "w") as archive:
+            for name, content in other.items():
+                archive.writestr(name, content)
+        assert refusal(tmp_path / "changed") == "bad-solution", what
 
 
 def test_compressed_and_damaged_files_are_refused(file: Path, tmp_path: Path) -> None:
@@ -167,9 +162,7 @@ def test_compressed_and_damaged_files_are_refused(file: Path, tmp_path: Path) ->
             packed.writestr(name, archive.read(name))
     for bad in (damaged, content[:middle], b"", (tmp_path / "z").read_bytes()):
         (tmp_path / "bad").write_bytes(bad)
-        with pytest.raises(DataError) as refused:
-            read_solution(tmp_path / "bad", solved().transit)
-        assert refused.value.code == "bad-solution"
+        assert refusal(tmp_path / "bad") == "bad-solution"
 
 
 def test_a_solution_is_handed_on_only_for_its_own_transit_and_shape() -> None:

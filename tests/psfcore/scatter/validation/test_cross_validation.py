@@ -1,27 +1,34 @@
-"""Cross-validation: bootstrap samples, and both schemes compared with a fit from the start."""
+"""Cross-validation: bootstrap samples, both schemes compared with a fit from the start, and bands over the fits."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from psfcore.errors import DataError
+from psfcore.scatter import shapes
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.optics import Lanes, Optics
-from psfcore.scatter.validation.bands import Bands, bands
+from psfcore.scatter.shapes import SHAPES
+from psfcore.scatter.validation.bands import LIMITS, ONE_SIGMA, TWO_SIGMA, Bands, Excess, bands, shell_bands
 from psfcore.scatter.validation.cross_validation import (
     FoldFit,
+    FoldShells,
     bootstrap_samples,
     exact_fit,
     shared_fits,
     shared_step,
 )
+from psfcore.scatter.validation.cross_validation_plot import cross_validation_png
+from psfcore.scatter.validation.free_shells import shells
 from psfcore.transit.blocks import folds
-from tests.psfcore.small_transits import IMAGES, observed, sky, solved
+from tests.psfcore.small_transits import IMAGES, TRUE_VALUES, observed, sky, solved
 
 
 @cache
@@ -45,21 +52,16 @@ def test_a_sample_excludes_its_block_and_guard_and_keeps_the_sizes_of_blocks() -
 
 
 def test_an_exact_fold_agrees_with_a_fit_from_the_start() -> None:
-    """Started at the shared step, it converges to the result of `invert` with the same counts."""
+    """Started at the shared step, it converges to the result of `invert` with the same counts, and keeps the solution."""
     draw = bootstrap_samples(IMAGES, runs=1)[1]
+    scenes, places = [scene.copy() for scene in solved().sky.scenes], list(solved().sky.found)
     slow = invert(observed(sky()).transit, counts=draw.counts)
     found = exact_fit(solved(), draw)
     sigma = solved().inversion.curve_sigma
     apart = np.abs(np.array(found.curve_pct) - slow.inversion.curve_pct)
     assert (apart < np.maximum(0.1 * sigma, 0.03)).all()
     assert set(found.held_out_pct) == set(draw.held_out)
-
-
-def test_folds_do_not_change_the_solution() -> None:
-    before = [scene.copy() for scene in solved().sky.scenes]
-    places = list(solved().sky.found)
-    exact_fit(solved(), bootstrap_samples(IMAGES, runs=1)[0])
-    assert all((a == b).all() for a, b in zip(before, solved().sky.scenes, strict=True))
+    assert all((a == b).all() for a, b in zip(scenes, solved().sky.scenes, strict=True))
     assert places == solved().sky.found
 
 
@@ -91,17 +93,18 @@ def test_a_fold_reports_progress_before_every_image(monkeypatch: pytest.MonkeyPa
     assert stages["settling"] == stages["free shells"] != []
 
 
-@pytest.mark.parametrize("stage", ["images held out", "settling"])
-def test_a_progress_callback_can_stop_a_fold(stage: str) -> None:
+def test_a_progress_callback_can_stop_a_fold() -> None:
     class Stop(Exception):
         pass
 
-    def progress(now: str, _step: int, _steps: int) -> None:
-        if now == stage:
-            raise Stop
+    for last in ("images held out", "settling"):
 
-    with pytest.raises(Stop):
-        exact_fit(solved(), bootstrap_samples(IMAGES, runs=1)[1], progress=progress)
+        def progress(stage: str, _step: int, _steps: int, last: str = last) -> None:
+            if stage == last:
+                raise Stop
+
+        with pytest.raises(Stop):
+            exact_fit(solved(), bootstrap_samples(IMAGES, runs=1)[1], progress=progress)
 
 
 def test_both_schemes_agree() -> None:
@@ -139,3 +142,63 @@ def test_folds_go_to_json_and_back() -> None:
     json.dumps(in_bands().to_json(), allow_nan=False)
     without = dataclasses.replace(shared()[0], shells=None)
     assert FoldFit.from_json(json.loads(json.dumps(without.to_json()))) == without
+
+
+# --- bands ------------------------------------------------------------------------------------------------
+
+
+def test_percentiles_are_a_gaussians() -> None:
+    assert np.array(ONE_SIGMA) / 100 == pytest.approx(norm.cdf([-1, 1]), abs=1e-12)
+    assert np.array(TWO_SIGMA) / 100 == pytest.approx(norm.cdf([-2, 2]), abs=1e-12)
+    assert list(LIMITS) == sorted(LIMITS)
+
+
+def test_free_fit_and_formula_agree_if_the_formula_is_true() -> None:
+    found = in_bands().shells
+    assert found is not None
+    assert not found.largest.parts
+    assert abs(found.near_centre.points) < 3 * found.near_centre.sigma
+    assert found.near_centre.within_px == pytest.approx(3.1)
+    assert (found.free_weight >= 0).all() and (np.diff(found.free_weight, axis=0) >= 0).all()
+    total = found.law_beyond_pct[2, 0] / 100
+    assert total == pytest.approx(np.median([f.values["total"] for f in shared()]), rel=1e-6)
+
+
+def made(extra: float, sigma: float, seed: int) -> FoldShells:
+    """A sample whose free fit has `extra` more light in its fourth shell, with a small random difference."""
+    law = np.full(shells().size, 0.4 / shells().size)
+    free = law.copy()
+    free[3] += extra + 1e-4 * np.random.default_rng(seed).standard_normal()
+    return FoldShells(tuple(free), tuple(law), (sigma,) * shells().size)
+
+
+def test_an_excess_has_the_larger_of_its_two_errors() -> None:
+    found = shell_bands([made(0.05, 0.01, seed) for seed in range(200)])
+    near = found.near_centre
+    assert near.points == pytest.approx(5.0, abs=0.01) and near.sigma == pytest.approx(1.0)
+    assert near.of_formula_pct == pytest.approx(100 * 0.05 / (6 * 0.4 / shells().size), rel=0.01)
+    assert found.largest.parts and near.parts
+    assert not Excess(3.1, points=2.9, sigma=1.0, of_formula_pct=10.0).parts
+    by_draws = shell_bands([made(0.05, 1e-9, seed) for seed in range(200)])
+    assert by_draws.near_centre.sigma == pytest.approx(0.01, rel=0.2)
+    beyond = by_draws.free_beyond_pct[2] - by_draws.law_beyond_pct[2]
+    np.testing.assert_allclose(beyond[:4], 5.0, atol=0.02)
+    np.testing.assert_allclose(beyond[4:], 0.0, atol=1e-9)
+
+
+def test_a_stretched_shape_has_no_shells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shapes, "REACH_GRID_PX", 256)  # quicker than 2048 px
+    transit = observed(sky()).transit
+    few = dataclasses.replace(transit, frames=transit.frames[2:9])
+    solution = invert(few, SHAPES["stretched"], start=SHAPES["stretched"].coordinates(TRUE_VALUES))
+    found = bands(shared_fits(solution, bootstrap_samples(7, runs=1)), solution.inversion.radii_px)
+    assert found.shells is None and found.to_json()["shells"] is None
+
+
+def test_the_plot_has_a_second_row_with_a_free_fit(tmp_path: Path) -> None:
+    heights = []
+    for fits in (shared(), tuple(dataclasses.replace(fit, shells=None) for fit in shared())):
+        path = tmp_path / "p.png"
+        cross_validation_png(bands(fits, solved().inversion.radii_px), fits, [1] * IMAGES, path)
+        heights.append(int.from_bytes(path.read_bytes()[20:24], "big"))
+    assert heights[0] == 2 * heights[1]
