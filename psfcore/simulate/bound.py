@@ -199,7 +199,7 @@ def _curve(
     sky: TrueSky, law: Plane, slopes: dict[str, Kernel], total_slopes: dict[str, Kernel], threads: int
 ) -> tuple[CurveBound, ...]:
     """1 - encircled energy of the total PSF and of the scatter kernel, with errors from Eq. (4)."""
-    diffuse = anisotropic_kernel(sky.scatter)
+    diffuse = anisotropic_kernel(sky.scatter, REACH_GRID_PX)
     total = convolved(diffuse, sky.diffraction, REACH_GRID_PX, threads=threads)
     radii = np.array(CURVE_RADII_PX)
     values = [cumulative_curve(kernel, radii) for kernel in (total, diffuse)]

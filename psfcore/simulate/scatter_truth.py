@@ -76,7 +76,7 @@ def total_kernel(
     The convolution is linear, and its result is not renormalised. diffraction: weights [y, x], centre at
     [n // 2, n // 2], sum 1.
     """
-    return convolved(anisotropic_kernel(scatter), diffraction, size, threads=threads)
+    return convolved(anisotropic_kernel(scatter, REACH_GRID_PX), diffraction, size, threads=threads)
 
 
 def convolved(full_kernel: Kernel, diffraction: Kernel, size: int, *, threads: int = 1) -> Kernel:

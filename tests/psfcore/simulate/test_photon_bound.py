@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,9 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.psf import cumulative_curve
+from psfcore.simulate import bound as bound_module
+from psfcore.simulate import scatter_truth
+from psfcore.simulate import sky as sky_module
 from psfcore.simulate.bound import PhotonBound, bound_of_folder, bound_of_sky, photon_bound
 from psfcore.simulate.disc import fully_dark
 from psfcore.simulate.plan import Plan, default_plan
@@ -34,6 +38,16 @@ DIFFRACTION = gaussian(31, 1.5)
 FIELDS = {"b": "b_px", "c": "c", "total": "total", "stretch": "stretch"}
 STEPS = {"b": 1e-3, "c": 1e-4, "total": 1e-4, "stretch": 1e-4}
 Plane = NDArray[np.float64]
+REACH_PX = 1024
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_reach() -> Iterator[None]:
+    """Light is counted over 1024 px instead of 2048 px, which takes a quarter of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (bound_module, scatter_truth, sky_module):
+            patch.setattr(module, "REACH_GRID_PX", REACH_PX)
+        yield
 
 
 def moved(scatter: ScatterTruth, name: str, step: float) -> ScatterTruth:
@@ -68,6 +82,7 @@ def dark_pixels(sky: TrueSky) -> Plane:
 
 
 def dark_variances(sky: TrueSky) -> Plane:
+    """Their variances, in the same order."""
     size = sky.plan.size_px
     rows = []
     for n, shot in enumerate(sky.plan.shots):
@@ -94,7 +109,7 @@ def test_kernel_slopes_are_differences_of_kernels() -> None:
     found, of_a = kernel_slopes(scatter), amplitude_slopes(scatter)
     for name, step in STEPS.items():
         ahead, back = (moved(scatter, name, side * step) for side in (1, -1))
-        expected = (anisotropic_kernel(ahead) - anisotropic_kernel(back)) / (2 * step)
+        expected = (anisotropic_kernel(ahead, REACH_PX) - anisotropic_kernel(back, REACH_PX)) / (2 * step)
         np.testing.assert_allclose(found[name], expected, atol=1e-6 * abs(expected).max())
         assert found[name].sum() == pytest.approx(0, abs=1e-9)
         assert of_a[name] == pytest.approx((ahead.a - back.a) / (2 * step), rel=1e-6, abs=1e-9)
@@ -114,21 +129,21 @@ def test_the_bound_agrees_with_differences_of_whole_simulations(
 
 
 def test_a_fit_scatters_by_the_bound(bound: PhotonBound, sky: TrueSky, slopes: Plane) -> None:
-    """The best linear fit of b, c, total to 300 noisy transits."""
+    """The best linear fit of b, c, total to 120 noisy transits."""
     weighted = slopes[:3] / dark_variances(sky)
     fit = np.linalg.solve(weighted @ slopes[:3].T, weighted)
     expected, size = dark_pixels(sky), sky.plan.size_px
     discs = [fully_dark(sky.plan.place(n), (0, 0), (size, size)) for n in range(6)]
     found = []
-    for seed in range(300):
+    for seed in range(120):
         frames = observed_transit(sky, seed).transit.frames
         seen = np.concatenate([frame.pixels[disc] for frame, disc in zip(frames, discs, strict=True)])
         found.append(fit @ (seen - expected))
     sigmas = np.array([bound.b_px, bound.c, bound.total])
-    # 300 draws know a width to 4 %; whole DN add 1 % to the readout's variance.
-    np.testing.assert_allclose(np.std(found, axis=0), sigmas, rtol=0.13)
-    np.testing.assert_allclose(np.mean(found, axis=0) / sigmas, 0, atol=4 / np.sqrt(300))
-    np.testing.assert_allclose(np.corrcoef(found, rowvar=False)[0, 1], correlation(bound), atol=0.1)
+    # 120 draws know a width to 6.5 %; whole DN add 1 % to the readout's variance.
+    np.testing.assert_allclose(np.std(found, axis=0), sigmas, rtol=0.2)
+    np.testing.assert_allclose(np.mean(found, axis=0) / sigmas, 0, atol=4 / np.sqrt(120))
+    np.testing.assert_allclose(np.corrcoef(found, rowvar=False)[0, 1], correlation(bound), atol=0.15)
 
 
 def correlation(bound: PhotonBound) -> float:
@@ -144,8 +159,8 @@ def test_errors_of_curves_follow_from_their_slopes(bound: PhotonBound) -> None:
     for name in ("b", "c", "total"):
         sides = [moved(SCATTER, name, side * STEPS[name]) for side in (1, -1)]
         for which, kernels in (
-            ("total", [total_kernel(side, DIFFRACTION) for side in sides]),
-            ("diffuse", [anisotropic_kernel(side) for side in sides]),
+            ("total", [total_kernel(side, DIFFRACTION, REACH_PX) for side in sides]),
+            ("diffuse", [anisotropic_kernel(side, REACH_PX) for side in sides]),
         ):
             ahead, back = (cumulative_curve(kernel, radii) for kernel in kernels)
             slopes[which].append((ahead - back) / (2 * STEPS[name]))
@@ -154,7 +169,7 @@ def test_errors_of_curves_follow_from_their_slopes(bound: PhotonBound) -> None:
         expected = np.sqrt(np.einsum("jr,jk,kr->r", rows, covariance, rows))
         stated = [getattr(at, f"{which}_sigma") for at in bound.curve]
         np.testing.assert_allclose(stated, expected, rtol=2e-3)
-    total = cumulative_curve(total_kernel(SCATTER, DIFFRACTION), radii)
+    total = cumulative_curve(total_kernel(SCATTER, DIFFRACTION, REACH_PX), radii)
     np.testing.assert_allclose([at.total_pct for at in bound.curve], total)
     assert bound.curve[0].diffuse_pct == pytest.approx(41.1)
     assert bound.curve[0].diffuse_sigma == pytest.approx(100 * bound.total)
