@@ -1,4 +1,4 @@
-"""What a job would cost, and which PSF it would use, without a job."""
+"""What a job would cost, which PSF it would use, and where it waits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from fastapi.testclient import TestClient
 
 from tests.conftest import write_image, write_psf
-from tests.service.conftest import upload
+from tests.service.conftest import refusal, upload
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import PsfRow
 
@@ -121,3 +121,24 @@ def test_errors_are_those_of_a_job(api: TestClient, image_file: Path) -> None:
         assert estimate.status_code == job.status_code >= 400
         assert estimate.json() == job.json()
     assert "psfs" in api.post("/v1/estimates", json=bodies[0]).json(), "with the fields of the error"
+
+
+BUILD = {"instrument": "hri_euv", "size": 64}
+
+
+def submitted(api: TestClient, **more: Any) -> dict[str, Any]:
+    answer = api.post("/v1/jobs", json={"kind": "psf-build", "parameters": BUILD, **more})
+    assert answer.status_code in (200, 202), answer.text
+    return dict(answer.json())
+
+
+def test_a_job_that_can_wait_goes_up_once_somebody_asks_for_it_at_once(api: TestClient) -> None:
+    later = submitted(api, queue="bulk")
+    assert later["queue"] == "bulk"
+    now = submitted(api)
+    assert (now["id"], now["queue"]) == (later["id"], "interactive")
+    assert submitted(api, queue="bulk")["queue"] == "interactive"
+    assert api.get(f"/v1/jobs/{now['id']}").json()["queue"] == "interactive"
+    for queue in ("interactive", "crossval", "soon", "", 1):
+        body = {"kind": "psf-build", "parameters": BUILD, "queue": queue}
+        refusal(api.post("/v1/jobs", json=body), 422, "invalid-request")  # nobody asks to be before others

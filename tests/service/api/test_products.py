@@ -1,20 +1,31 @@
-"""Thumbnails of products over HTTP."""
+"""Products over HTTP: thumbnails, regions, and products or PSFs that are sent as images."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner
 from fastapi.testclient import TestClient
+from httpx import Response
 from matplotlib.image import imread
+from sqlalchemy import update
 
 from psfcore.drawing.thumbnail import write_thumbnail
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_plane
-from tests.service.conftest import refusal, result_of, upload
+from psfcore.fits.psfs import write_psf
+from service.cli.main import main
+from tests.psfcore.conftest import make_psf
+from tests.service.conftest import execute, job_after, refusal, result_of, upload, work_through_bulks
 from tests.service.vo.made import add_product
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
+from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, ProductRow
 from workers.files.intact import intact
 from workers.files.store import Store
 from workers.settings import Settings
@@ -60,3 +71,155 @@ def test_a_thumbnail_that_is_lost_deleted_or_was_never_made(
     assert store.size(digest)
     assert api.delete(f"/v1/products/{own}").status_code == 204
     assert store.size(digest) is None
+
+
+DEFAULT = {"method": {"name": "linear"}}
+
+
+def ask_for_region(api: TestClient, image_id: str, psf_id: str, **more: Any) -> Response:
+    parameters = {"image_id": image_id, "psf_id": psf_id, **DEFAULT, **more}
+    return api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
+
+
+def test_the_product_of_a_region_is_the_box(
+    api: TestClient, run_jobs: Callable[[], None], image_file: Path, psf_file: Path
+) -> None:
+    fits.setval(image_file, "CRPIX1", value=1.5)
+    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    whole = ask_for_region(api, image_id, psf_id).json()
+    same = ask_for_region(api, image_id, psf_id, region_error=0.5).json()
+    assert same["id"] == whole["id"], "without a region it means nothing"
+    job = ask_for_region(api, image_id, psf_id, region="10:50,20:60", region_error=0.9).json()
+    assert job["id"] != whole["id"]
+    run_jobs()
+    product, of_whole = (
+        api.get(api.get(f"/v1/jobs/{one['id']}").json()["result"]).json() for one in (job, whole)
+    )
+    told = product["details"]["region"]
+    assert told["box"] == "10:50,20:60" and told["rim_px"] > 0 and told["error"] > 0
+    assert of_whole["details"]["region"] is None
+    found, expected = (fits.open(io.BytesIO(api.get(one["file"]).content))[0] for one in (product, of_whole))
+    assert found.data.shape == (40, 40) and found.header["DCNVBERR"] == told["error"]
+    assert found.header["CRPIX1"] == 1.5 - 10
+    assert abs(found.data - expected.data[20:60, 10:50]).max() <= told["error"]
+
+
+def test_a_region_that_cannot_be_is_refused(api: TestClient, image_file: Path, psf_file: Path) -> None:
+    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    box = {"region": "0:40,0:40"}
+    discrepancy = {"name": "linear", "stop": "discrepancy"}
+    cases: list[tuple[dict[str, Any], str, str]] = [
+        ({"region": "10-50,20-60"}, "invalid-request", "region"),
+        ({"region": "0:5000,0:50"}, "region-outside", "the size of the image"),
+        ({"region": "0:40,0:8"}, "region-too-small", "16 px"),
+        (box | {"error_draws": 4}, "invalid-request", "error_draws 0 with a region"),
+        (box | {"method": discrepancy}, "invalid-request", "stopping rule fixed"),
+        (box | {"region_error": 0}, "invalid-request", "region_error"),
+    ]
+    for parameters, code, said in cases:
+        assert said in refusal(ask_for_region(api, image_id, psf_id, **parameters), 422, code)
+    method = {"name": "linear", "steps": 2}
+    whole, part = (
+        api.post("/v1/estimates", json={"kind": "deconvolve", "parameters": parameters}).json()["estimate"]
+        for parameters in (
+            {"image_id": image_id, "psf_id": psf_id, "method": method},
+            {"image_id": image_id, "psf_id": psf_id, "method": method, "region": "0:16,0:16"},
+        )
+    )
+    assert part["memory_mib"] <= whole["memory_mib"] and part["seconds"] <= whole["seconds"]
+
+
+FEW = {"method": {"name": "richardson-lucy", "steps": 1}}
+
+
+def ask(api: TestClient, image_id: str, psf_id: str, **more: Any) -> Response:
+    parameters = {"image_id": image_id, "psf_id": psf_id, **FEW, **more}
+    return api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
+
+
+@pytest.fixture
+def psf_id(api: TestClient, psf_file: Path) -> str:
+    return upload(api, psf_file, "/v1/psfs")
+
+
+@pytest.fixture
+def product_file(
+    api: TestClient, run_jobs: Callable[[], None], image_file: Path, psf_id: str, tmp_path: Path
+) -> Path:
+    """The product of an image."""
+    image_id = upload(api, image_file)
+    product = result_of(api, run_jobs, "deconvolve", image_id=image_id, psf_id=psf_id, **FEW)
+    path = tmp_path / "product.fits"
+    path.write_bytes(api.get(product["file"]).content)
+    return path
+
+
+def test_a_product_is_deconvolved_again_only_if_told(
+    api: TestClient, catalogue: Catalogue, run_jobs: Callable[[], None], product_file: Path, psf_id: str
+) -> None:
+    image_id = upload(api, product_file)
+    assert "again = true" in refusal(ask(api, image_id, psf_id), 409, "already-deconvolved")
+
+    # The row of an image uploaded to an earlier version does not say what it is: the worker refuses it.
+    row = catalogue.get(ImageRow, image_id, "local")
+    assert row is not None
+    summary = {name: value for name, value in row.summary.items() if name != "content"}
+    execute(catalogue, update(ImageRow).where(ImageRow.id == image_id).values(summary=summary))
+    job = job_after(api, run_jobs, "deconvolve", image_id=image_id, psf_id=psf_id, **FEW)
+    assert job["error"]["code"] == "already-deconvolved"
+
+    product = result_of(api, run_jobs, "deconvolve", image_id=image_id, psf_id=psf_id, again=True, **FEW)
+    with fits.open(io.BytesIO(api.get(product["file"]).content)) as hdus:
+        header = hdus[0].header
+    assert fits.getheader(product_file)["DCNVPASS"] == 1 and header["DCNVPASS"] == 2
+    assert any("deconvolution number 2" in line for line in header["HISTORY"])
+
+
+def test_a_psf_is_no_image(api: TestClient, psf_id: str, tmp_path: Path) -> None:
+    kernel = np.zeros((33, 33))
+    kernel[16, 16] = 1.0
+    write_psf(tmp_path / "own.fits", make_psf(kernel))
+    image_id = upload(api, tmp_path / "own.fits")
+    refusal(ask(api, image_id, psf_id), 409, "psf-as-image")
+    assert ask(api, image_id, psf_id, again=True).status_code == 202
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    (tmp_path / "archive").mkdir()
+    return tmp_path / "archive"
+
+
+@pytest.fixture
+def settings(settings: Settings, archive: Path) -> Settings:
+    return settings.model_copy(update={"bulk_roots": str(archive)})
+
+
+def test_a_bulk_run_sets_products_apart_and_goes_on(
+    api: TestClient, settings: Settings, archive: Path, product_file: Path, image_file: Path, psf_id: str
+) -> None:
+    product_file.rename(archive / "a.fits")
+    image_file.rename(archive / "b.fits")
+    request = {"files": [{"glob": f"{archive}/*.fits"}], "psf_id": psf_id, "parameters": FEW}
+
+    def done(**parameters: Any) -> dict[str, Any]:
+        asked = api.post("/v1/bulk", json=request | {"parameters": FEW | parameters})
+        assert asked.status_code == 202, asked.text
+        work_through_bulks(settings)
+        return dict(api.get(f"/v1/bulk/{asked.json()['id']}").json())
+
+    bulk = done()
+    assert (bulk["phase"], bulk["images"]["done"], bulk["images"]["failed"]) == ("COMPLETED", 1, 1)
+    (failure,) = api.get(bulk["failures"]).json()["items"]
+    assert failure["source"].endswith("a.fits") and failure["error"]["code"] == "already-deconvolved"
+    assert done(again=True)["images"]["failed"] == 0
+
+
+def test_the_command_refuses_a_product_too(product_file: Path, psf_file: Path, tmp_path: Path) -> None:
+    command = ["deconvolve", str(product_file), "--psf", str(psf_file), "--local", "--steps", "1"]
+    output = ["-o", str(tmp_path / "twice.fits")]
+    told = CliRunner().invoke(main, [*command, *output])
+    assert told.exit_code == 1 and "--again" in told.output, told.output
+    assert not (tmp_path / "twice.fits").exists()
+    assert CliRunner().invoke(main, [*command, *output, "--again"]).exit_code == 0
+    assert fits.getheader(tmp_path / "twice.fits")["DCNVPASS"] == 2

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import gzip
 import hashlib
 import io
-import json
 import tarfile
 import zipfile
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
 
-from psfcore.errors import DataError
 from psfcore.transit.archive import ArchiveLimits, pack, unpack
 from service.app import create_app
 from service.client.http import Client, ServiceError
-from service.local import LocalService
 from tests.service.conftest import refusal
 from tests.transit_files import READ_NOISE, write_transit
-from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import DEFAULT_OWNER, TransitRow
 from workers.files.store import Store
 from workers.settings import Settings
 
@@ -49,17 +42,13 @@ def as_zip(members: Members) -> bytes:
         return file.getvalue()
 
 
-def as_tar(members: Members, mode: str = "w", links: tuple[str, ...] = ()) -> bytes:
+def as_tar(members: Members, mode: str = "w") -> bytes:
     with io.BytesIO() as file:
         with tarfile.open(fileobj=file, mode=mode) as out:  # type: ignore[call-overload]
             for name, content in members.items():
                 info = tarfile.TarInfo(name)
                 info.size = len(content)
                 out.addfile(info, io.BytesIO(content))
-            for name in links:
-                info = tarfile.TarInfo(name)
-                info.type, info.linkname = tarfile.SYMTYPE, "/etc/passwd"
-                out.addfile(info)
         return file.getvalue()
 
 
@@ -139,40 +128,18 @@ def test_transits_have_limits_of_their_own(api: TestClient, settings: Settings, 
 
 
 def test_archives_that_cannot_be_used(settings: Settings, folder: Path, image_file: Path) -> None:
-    """As each kind of archive, in a body and in a form. More of them are in the table tests/service/http/attacks.py."""
+    """In a body and in a form. More are in the table tests/service/http/attacks.py, all in tests/psfcore/transit."""
     good = members_of(folder)
-    manifest = json.loads(good["transit.json"])
-    changes: tuple[tuple[str, Members, int, str], ...] = (
-        ("transit.json", {name: good[name] for name in good if name != "transit.json"}, 422, "no-manifest"),
-        ("diffraction.fits", {name: good[name] for name in good if name[0] != "d"}, 422, "missing-file"),
-        (
-            "images",
-            {**good, "transit.json": json.dumps(manifest | {"images": []}).encode()},
-            422,
-            "bad-manifest",
-        ),
-        ("002.fits", {**good, "002.fits": b"a letter"}, 422, "not-fits"),
-        ("evil", {**good, "../evil": b"x"}, 422, "archive-climbs"),
-        ("a/b/c.fits", {**good, "a/b/c.fits": b"x"}, 422, "archive-not-plain"),
-    )
-    cases = [
-        (told, make(members), status, code) for told, members, status, code in changes for make in MAKERS
-    ]
-    halves = [make(good)[: len(make(good)) // 2] for make in MAKERS]
+    without = {name: good[name] for name in good if name != "002.fits"}
     packed = [make({**good, "x.bin": bytes(40 * MIB)}) for make in (as_zip, as_tar_gz)]
-    cases += [("expected", half, 422, "archive-broken") for half in halves]
-    cases += [
-        ("x.fits", as_tar(good, links=("x.fits",)), 422, "archive-not-plain"),
-        (str(MIB), as_tar({**good, "x.bin": bytes(MIB)}), 413, "too-large"),
+    cases = [
+        *(("002.fits", make(without), 422, "missing-file") for make in MAKERS),
+        *(("002.fits", make({**good, "002.fits": b"a letter"}), 422, "not-fits") for make in MAKERS),
+        *(("expected", make(good)[: len(make(good)) // 2], 422, "archive-broken") for make in MAKERS),
         *((str(2 * MIB), content, 413, "archive-too-large") for content in packed),
-        ("expected", b"A letter, and no archive.\n" * 100, 415, "not-an-archive"),
+        (str(MIB), as_tar({**good, "x.bin": bytes(MIB)}), 413, "too-large"),
         ("expected", image_file.read_bytes(), 415, "not-an-archive"),
-        ("expected", b"PK", 415, "not-an-archive"),
-        ("expected", bytes(2048), 415, "not-an-archive"),
-        ("expected", gzip.compress(b"SIMPLE  =" + bytes(5000), mtime=0), 415, "not-an-archive"),
         ("expected", b"", 400, "empty-upload"),
-        ("expected", b"PK\x03\x04" + bytes(5000), 422, "archive-broken"),
-        ("expected", b"\x1f\x8b" + bytes(5000), 422, "archive-broken"),
     ]
     # A service that takes 1 MiB, and lets 2 MiB come out of it.
     tight = settings.model_copy(update={"max_transit_mib": 1, "max_transit_unpacked_mib": 2})
@@ -206,17 +173,3 @@ def test_a_client_sends_a_folder_or_an_archive(api: TestClient, folder: Path, tm
         with pytest.raises(ServiceError, match=r"001\.fits") as caught:
             sun.upload_transit(folder)
         assert caught.value.code == "missing-file"
-
-
-def test_the_local_service_takes_the_same(api: TestClient, folder: Path) -> None:
-    with Client("http://testserver", transport=api._transport) as sun:
-        there = sun.upload_transit(folder)
-    apart = Settings.apart(folder.parent / "local")
-    with closing(LocalService(apart)) as local, closing(Catalogue(apart.catalogue_url)) as catalogue:
-        here = local.upload_transit(folder)
-        assert here | {"created_at": 0} == there | {"created_at": 0}
-        (folder / "letter.zip").write_text("a letter")
-        with pytest.raises(DataError, match="not-an-archive"):
-            local.upload_transit(folder / "letter.zip")
-        row = catalogue.get(TransitRow, here["id"], DEFAULT_OWNER)
-        assert row is not None and row.summary["images"] == 4

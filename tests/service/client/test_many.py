@@ -24,29 +24,40 @@ from workers.settings import Settings
 Run = Callable[..., list[Outcome]]
 
 
-class AtOnce(Client):
-    """A client of the application in this process. Its jobs run at once; it counts them and the uploads."""
+class Told(Client):
+    """A client of the application in this process. A job runs when somebody waits for it; what happens is told."""
 
     def __init__(self, api: TestClient, run_jobs: Callable[[], None]) -> None:
         super().__init__("http://testserver", transport=api._transport)
-        self.run_jobs, self.submitted, self.uploaded = run_jobs, 0, 0
-
-    def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        self.submitted += 1
-        job = super().submit(kind, queue=queue, **parameters)
-        self.run_jobs()
-        return job
+        self.run_jobs, self.told = run_jobs, list[str]()
+        self.psf_id, self.uploaded = "", 0
 
     def upload_image(self, path: str | Path) -> dict[str, Any]:
         self.uploaded += 1
         return super().upload_image(path)
+
+    def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
+        self.told.append("submit")
+        return super().submit(kind, queue=queue, **parameters)
+
+    def wait(self, job: dict[str, Any], **more: Any) -> dict[str, Any]:
+        self.told.append("wait")
+        self.run_jobs()
+        return super().wait(job, **more)
+
+    def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
+        super().download(address, path, overwrite=overwrite)
+        self.told.append("download")
+
+    def many(self, images: list[Path], folder: Path, **more: Any) -> Iterator[Outcome]:
+        return deconvolve_many(self, images, folder, psf_id=self.psf_id, steps=1, **more)
 
 
 @pytest.fixture(params=["http", "local"])
 def service(request: pytest.FixtureRequest) -> Iterator[Operations]:
     """A service in this process, reached as over HTTP or directly."""
     if request.param == "http":
-        yield AtOnce(request.getfixturevalue("api"), request.getfixturevalue("run_jobs"))
+        yield Told(request.getfixturevalue("api"), request.getfixturevalue("run_jobs"))
     else:
         with local_service() as here:
             yield here
@@ -146,12 +157,12 @@ def test_failures_are_told_and_the_run_goes_on(
 def test_nothing_is_sent_or_kept_twice(
     api: TestClient, run_jobs: Callable[[], None], images: list[Path], tmp_path: Path
 ) -> None:
-    client = AtOnce(api, run_jobs)
+    client = Told(api, run_jobs)
     write_psf(tmp_path / "psf.fits")
     parameters = {"psf_id": client.upload_psf(tmp_path / "psf.fits")["id"], "steps": 1}
     for _ in range(2):
         list(deconvolve_many(client, images, tmp_path / "out", **parameters))
-        assert (client.uploaded, client.submitted) == (2, 2)
+        assert (client.uploaded, client.told.count("submit")) == (2, 2)
     settings = Settings.apart(tmp_path / "local")
     with closing(LocalService(settings)) as here:
         parameters["psf_id"] = here.upload_psf(tmp_path / "psf.fits")["id"]
@@ -173,31 +184,6 @@ def test_an_error_that_concerns_every_image_ends_the_run(tmp_path: Path, images:
     (tmp_path / "file").touch()
     with local_service() as here, pytest.raises(ServiceError, match="expected a folder"):
         list(deconvolve_many(here, images, tmp_path / "file"))
-
-
-class Told(Client):
-    """A client of the application in this process. A job runs when somebody waits for it; what happens is told."""
-
-    def __init__(self, api: TestClient, run_jobs: Callable[[], None]) -> None:
-        super().__init__("http://testserver", transport=api._transport)
-        self.run_jobs, self.told = run_jobs, list[str]()
-        self.psf_id = ""
-
-    def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
-        self.told.append("submit")
-        return super().submit(kind, queue=queue, **parameters)
-
-    def wait(self, job: dict[str, Any], **more: Any) -> dict[str, Any]:
-        self.told.append("wait")
-        self.run_jobs()
-        return super().wait(job, **more)
-
-    def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
-        super().download(address, path, overwrite=overwrite)
-        self.told.append("download")
-
-    def many(self, images: list[Path], folder: Path, **more: Any) -> Iterator[Outcome]:
-        return deconvolve_many(self, images, folder, psf_id=self.psf_id, steps=1, **more)
 
 
 @pytest.fixture

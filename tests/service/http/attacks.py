@@ -5,9 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
-import stat
 import tarfile
-import warnings
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -66,6 +64,7 @@ def transit(name: str, status: int, code: str, make: Callable[[], bytes]) -> Att
 
 
 # Files of FITS --------------------------------------------------------------------------------------
+# These and the archives are examples; all refusals are tested in tests/psfcore/fits and tests/psfcore/transit.
 
 
 def cards(*lines: str) -> bytes:
@@ -126,45 +125,27 @@ EMPTY_IMAGE = cards(
 FILES = [
     image("half a megabyte of tiles for 537 of pixels", 422, "too-many-pixels", lambda: tiles(16384)),
     image("tiles of a codec that is not taken", 422, "codec-not-allowed", lambda: tiles(64, "HCOMPRESS_1")),
-    image("tiles of a codec there is not", 422, "codec-not-allowed", lambda: tiles(64, "ZIP_99")),
-    image("tiles of no size", 422, "bad-tiles", lambda: changed_tiles(ZTILE1=0)),
     image("tiles larger than any image", 422, "bad-tiles", lambda: changed_tiles(ZTILE1=2**31)),
-    image("tiles that are fewer than said", 422, "bad-tiles", lambda: changed_tiles(ZNAXIS2=65)),
-    image("tiles of negative pixels", 422, "bad-card", lambda: changed_tiles(ZNAXIS1=-64)),
-    image("tiles of 5 bits", 422, "bad-card", lambda: changed_tiles(ZBITPIX=5)),
     image("a heap that is not there", 422, "truncated-data", lambda: changed_tiles(PCOUNT=10**9)),
     image("60000 x 60000 pixels", 422, "too-many-pixels", lambda: primary(16, 60_000, 60_000)),
     image("2^40 x 2^40 pixels", 422, "too-many-pixels", lambda: primary(8, 2**40, 2**40)),
     image("pixels beyond counting", 422, "bad-card", lambda: primary(8, 10**30, 10**30)),
-    image("negative pixels", 422, "bad-card", lambda: primary(8, -64, 64)),
-    image("no pixels", 422, "zero-size", lambda: primary(8, 0, 64)),
     image("999 axes", 422, "not-2d", lambda: primary(8, *([1] * 999)) + bytes(2880)),
-    image("1000 axes", 422, "bad-card", lambda: cards("SIMPLE  =                    T", "BITPIX  = 8", "NAXIS   = 1000")),
-    image("negative axes", 422, "bad-card", lambda: cards("SIMPLE  =                    T", "BITPIX  = 8", "NAXIS   = -2")),
-    image("pixels of 7 bits", 422, "bad-card", lambda: primary(7, 64, 64) + bytes(8640)),
-    image("pixels of a word of bits", 422, "bad-card", lambda: primary("'many'", 64, 64) + bytes(8640)),
-    image("two widths", 422, "bad-card", lambda: primary(8, 64, 64, more=("NAXIS1  =                   32",)) + bytes(8640)),
     image("a size larger than the file", 422, "truncated-data", lambda: primary(16, 512, 512) + bytes(2880)),
     image("a file that only begins like FITS", 422, "truncated-header", lambda: b"SIMPLE  =" + b"x" * 5000),
-    image("less than a card", 422, "truncated-header", lambda: b"SIMP"),
     image("a table alone", 422, "table-only", lambda: written(fits.PrimaryHDU(), fits.BinTableHDU.from_columns([fits.Column("A", "E", array=np.ones(3))]))),
-    image("a header without end", 422, "truncated-header", lambda: primary(16, 64, 64)[:400]),
     image("6 MB of cards", 422, "header-too-long", lambda: long_header(6)),
     image("100 MB of cards in gzip", 422, "header-too-long", lambda: gzip.compress(long_header(100), 1)),
     image("thousands of HDUs", 422, "too-many-hdus", lambda: cards("SIMPLE  =                    T", "BITPIX  = 8", "NAXIS   = 0") + 2500 * EMPTY_IMAGE),
     image("gzip that declares 300 GB", 422, "too-many-bytes", lambda: gzip.compress(primary(8, 10**5, 10**5, 30) + bytes(10**6))),
     image("gzip of gzip", 422, "not-fits", lambda: gzip.compress(gzip.compress(primary(8, 8, 8)))),
     image("gzip that breaks off", 422, "truncated-gzip", lambda: gzip.compress(np.random.default_rng(0).bytes(99_999))[:2000]),
-    image("gzip that is none", 422, "bad-gzip", lambda: b"\x1f\x8b" + b"\xff" * 5000),
     image("an image in a zip", 415, "not-fits", lambda: zipped(("x.fits", primary(8, 8, 8) + bytes(2880)))),
-    image("an image in bzip2", 415, "not-fits", lambda: b"BZh91AY&SY" + bytes(100)),
     image("letters above ASCII in the header", 422, "bad-card", lambda: primary(8, 64, 64).replace(b"64  ", b"\xff\xfe\xfd ", 1)),
     image("a script", 415, "not-fits", lambda: b"#!/bin/sh\nrm -rf /\n" * 500),
-    image("markup", 415, "not-fits", lambda: b"<svg onload=alert(1)>" * 200),
     image("more than may be sent", 413, "too-large", lambda: b"SIMPLE  =" + bytes(9 * MIB)),
     image("nothing", 400, "empty-upload", lambda: b""),
     image("a cube", 422, "three-axes", lambda: written(fits.PrimaryHDU(np.zeros((2, 8, 8), "u1")))),
-    image("random groups", 422, "random-groups", lambda: primary(8, 8, 64, more=("GROUPS  =                    T",)) + bytes(2880)),
 ]  # fmt: skip
 
 
@@ -180,41 +161,34 @@ def manifest(**changes: Any) -> bytes:
     return json.dumps(content | changes).encode()
 
 
-def zipped(*members: tuple[str | zipfile.ZipInfo, bytes]) -> bytes:
+def zipped(*members: tuple[str, bytes]) -> bytes:
     """A .zip of these."""
     file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # names that stand twice
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members:
             archive.writestr(name, content)
     return file.getvalue()
 
 
-def transit_zip(*more: tuple[str | zipfile.ZipInfo, bytes], **changes: Any) -> bytes:
+def transit_zip(*more: tuple[str, bytes], **changes: Any) -> bytes:
     """The archive of a transit with more in it."""
     return zipped(("transit.json", manifest(**changes)), ("0.fits", SMALL_FITS), *more)
 
 
-def linked(target: str) -> zipfile.ZipInfo:
-    """A symbolic link, as a zip has it."""
-    info = zipfile.ZipInfo("link.fits")
-    info.create_system, info.external_attr = 3, (stat.S_IFLNK | 0o777) << 16
-    return info
-
-
-def tarred(
-    name: str, *, kind: bytes = tarfile.REGTYPE, link: str = "", content: bytes = b"x", mode: str = "w"
-) -> bytes:
-    """A .tar of a transit, and one more member."""
+def tarred(name: str, *, link: str = "", content: bytes = b"x", mode: str = "w") -> bytes:
+    """A .tar of a transit, and one more member: a file, or a symbolic link."""
     file = io.BytesIO()
     with tarfile.open(fileobj=file, mode=mode) as archive:  # type: ignore[call-overload]
-        for one, of in (("transit.json", manifest()), ("0.fits", SMALL_FITS), (name, content)):
+        for one, of in (
+            ("transit.json", manifest()),
+            ("0.fits", SMALL_FITS),
+            (name, b"" if link else content),
+        ):
             info = tarfile.TarInfo(one)
             info.size = len(of)
-            if one == name:
-                info.type, info.linkname = kind, link
-                info.size = len(of) if kind == tarfile.REGTYPE else 0
-            archive.addfile(info, io.BytesIO(of) if info.size else None)
+            if link and one == name:
+                info.type, info.linkname = tarfile.SYMTYPE, link
+            archive.addfile(info, io.BytesIO(of))
     return file.getvalue()
 
 
@@ -230,33 +204,18 @@ def lying_tar() -> bytes:
 
 ARCHIVES = [
     transit("a name that climbs, zip", 422, "archive-climbs", lambda: transit_zip(("../x.fits", b"x"))),
-    transit("a name that climbs from within", 422, "archive-climbs", lambda: transit_zip(("a/../../x.fits", b"x"))),
     transit("an absolute name, zip", 422, "archive-climbs", lambda: transit_zip(("/etc/passwd", b"x"))),
-    transit("a name with a drive", 422, "archive-climbs", lambda: transit_zip(("C:/x.fits", b"x"))),
-    transit("a name with backslashes", 422, "archive-climbs", lambda: transit_zip(("..\\x.fits", b"x"))),
     transit("a name that climbs, tar", 422, "archive-climbs", lambda: tarred("../../x.fits")),
     transit("an absolute name, tar", 422, "archive-climbs", lambda: tarred("/etc/cron.d/x")),
-    transit("a name of many folders", 422, "archive-not-plain", lambda: tarred("a/" * 500 + "x.fits")),
-    transit("a name twice", 422, "archive-not-plain", lambda: transit_zip(("0.fits", b"x"))),
-    transit("a name of NUL", 422, "archive-not-plain", lambda: tarred("x\n.fits")),
-    transit("a symbolic link, zip", 422, "archive-not-plain", lambda: transit_zip((linked("/etc/passwd"), b"/etc/passwd"))),
-    transit("a symbolic link, tar", 422, "archive-not-plain", lambda: tarred("l.fits", kind=tarfile.SYMTYPE, link="/etc/passwd")),
-    transit("a hard link, tar", 422, "archive-not-plain", lambda: tarred("l.fits", kind=tarfile.LNKTYPE, link="../../x")),
-    transit("a device", 422, "archive-not-plain", lambda: tarred("l.fits", kind=tarfile.CHRTYPE)),
-    transit("a pipe", 422, "archive-not-plain", lambda: tarred("l.fits", kind=tarfile.FIFOTYPE)),
+    transit("a symbolic link, tar", 422, "archive-not-plain", lambda: tarred("l.fits", link="/etc/passwd")),
     transit("a zip of 100 MB of zeros", 413, "archive-too-large", lambda: transit_zip(("b.fits", bytes(100 * MIB)))),
     transit("a tar.gz of 100 MB of zeros", 413, "archive-too-large", lambda: tarred("b.fits", content=bytes(100 * MIB), mode="w:gz")),
     transit("a member of 2^60 bytes", 413, "archive-too-large", lying_tar),
     transit("20000 members", 413, "archive-too-large", lambda: transit_zip(*((f"{n}.x", b"") for n in range(20_000)))),
     transit("gzip of no tar", 415, "not-an-archive", lambda: gzip.compress(bytes(10 * MIB))),
-    transit("a zip that breaks off", 422, "archive-broken", lambda: transit_zip()[:-30]),
-    transit("no transit.json", 422, "no-manifest", lambda: zipped(("0.fits", SMALL_FITS))),
     transit("a transit.json that names a path", 422, "bad-manifest", lambda: transit_zip(known_psf="../../etc/passwd")),
-    transit("a transit.json that names what is not there", 422, "missing-file", lambda: transit_zip(known_psf="k.fits")),
     transit("a transit.json of lists in lists", 422, "bad-manifest", lambda: zipped(("transit.json", b"[" * DEEP))),
     transit("a transit.json of 20 MB", 422, "bad-manifest", lambda: zipped(("transit.json", b" " * 20 * MIB))),
-    transit("a transit.json of NaN", 422, "bad-manifest", lambda: transit_zip(noise={"photon_gain_dn": float("nan"), "read_noise_dn": 1})),
-    transit("an image that is none", 422, "not-fits", lambda: zipped(("transit.json", manifest()), ("0.fits", b"<html>"))),
 ]  # fmt: skip
 
 
@@ -287,8 +246,6 @@ REQUESTS = [
     body("20 MB of JSON", 413, "too-large", b'"' + b"x" * 20 * MIB + b'"'),
     Attack("JSON that says it is text", 422, "invalid-request", content=lambda: b'{"kind":"psf-build"}', headers={"Content-Type": "text/plain"}),
     body("null", 422, "invalid-request", b"null"),
-    body("a list", 422, "invalid-request", b"[]"),
-    body("no kind", 422, "invalid-request", b'{"parameters": {}}'),
     job("no image", 422, "invalid-request", "deconvolve"),
     job("no steps", 422, "invalid-request", "deconvolve", image_id=A, method={"steps": 0}),
     job("steps that are a word", 422, "invalid-request", "deconvolve", image_id=A, method={"steps": "many"}),
@@ -316,7 +273,6 @@ REQUESTS = [
     job("TOML: lists in lists", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "[" * DEEP),
     job("TOML: tables in tables", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "{b=" * DEEP),
     job("TOML: a key of 30000 parts", 422, "bad-instrument-file", "psf-build", instrument_file=".".join("a" * 30_000) + " = 1"),
-    job("TOML: a table of 30000 parts", 422, "bad-instrument-file", "psf-build", instrument_file="[" + " . ".join("a" * 15_000) + "]"),
     job("TOML: a number of 60000 digits", 422, "bad-instrument-file", "psf-build", instrument_file="a = " + "9" * 60_000),
     body("TOML: half a character", 422, "invalid-request", b'{"kind":"psf-build","parameters":{"instrument_file":"\\ud800"}}'),
     job("TOML: more than fits", 422, "invalid-request", "psf-build", instrument_file="#" * 70_000),
@@ -337,15 +293,10 @@ REQUESTS = [
     got("an image that is not there", 404, "no-such-image", f"/v1/images/{A}"),
     got("a transit that is not there", 404, "no-such-transit", f"/v1/transits/{A}"),
     got("a PSF that is not there", 404, "no-such-psf", f"/v1/psfs/{A}"),
-    got("the file of a PSF that is not there", 404, "no-such-psf", f"/v1/psfs/{A}/file"),
-    got("the picture of a PSF that is not there", 404, "no-such-psf", f"/v1/psfs/{A}/preview"),
     got("a product that is not there", 404, "no-such-product", f"/v1/products/{A}"),
     got("the file of a product that is not there", 404, "no-such-product", f"/v1/products/{A}/file"),
-    got("the picture of a product that is not there", 404, "no-such-product", f"/v1/products/{A}/preview"),
-    Attack("an end of a job that is not there", 404, "no-such-job", "DELETE", f"/v1/jobs/{A[:32]}"),
     got("an id that climbs", 404, "http-404", "/v1/images/..%2f..%2fetc%2fpasswd"),
     got("an id that climbs in a download", 404, "http-404", "/v1/products/..%2f..%2fcatalogue.sqlite/file"),
-    got("an id of dots", 422, "invalid-request", "/v1/products/%2e%2e/file"),
     got("an id of NUL", 422, "invalid-request", "/v1/images/%00"),
     got("an id with a line end", 422, "invalid-request", "/v1/images/%0d%0aSet-Cookie:x=1"),
     got("an id of 9000 letters", 422, "invalid-request", "/v1/images/" + "a" * 9000),
@@ -355,13 +306,9 @@ REQUESTS = [
     got("a cursor of nonsense", 422, "bad-cursor", "/v1/transits?cursor=nonsense"),
     got("a cursor of NUL", 422, "bad-cursor", "/v1/jobs?cursor=MS4wIAA="),
     got("a cursor that is no number", 422, "bad-cursor", "/v1/psfs?cursor=bmFuIHg="),
-    got("a name of NUL", 422, "invalid-request", "/v1/psfs?name=%00"),
     Attack("an upload with a name of NUL", 422, "invalid-request", address="/v1/psfs?name=a%00b"),
     got("a page without end", 422, "invalid-request", "/v1/jobs?limit=1000000"),
-    got("a page of 5000 digits", 422, "invalid-request", "/v1/jobs?limit=" + "9" * 5000),
     got("a cursor of ours it is not", 422, "bad-cursor", "/v1/jobs?cursor=%FF%00"),
-    got("a cursor to infinity", 422, "bad-cursor", "/v1/jobs?cursor=aW5mIHg="),
-    got("a cursor of SQL", 422, "bad-cursor", "/v1/jobs?cursor=MSAnOyBEUk9QIFRBQkxFIGpvYnM="),
     got("a name of control letters", 422, "invalid-request", "/v1/psfs?name=%1b%5b31m"),
     got("a host of another's", 421, "host-not-served", "/v1/jobs", Host="evil.example"),
     Attack("a page of another site", 403, "cross-site", address="/v1/jobs", headers={"Origin": "http://evil.example"}, content=lambda: b"{}"),

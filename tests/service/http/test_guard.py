@@ -66,11 +66,24 @@ SITES: list[tuple[dict[str, str], bool]] = [
     ({"Sec-Fetch-Site": "cross-site"}, True),
     ({"Sec-Fetch-Site": "same-site", "Origin": "http://testserver"}, True),
 ]
-CHANGES = (("POST", "/uws/jobs"), ("POST", "/v1/jobs"), ("POST", "/v1/images"), ("DELETE", "/v1/jobs/x"))
+CHANGES = (
+    ("POST", "/uws/jobs"),
+    ("POST", "/uws/jobs/x/phase"),
+    ("DELETE", "/uws/jobs/x"),
+    ("POST", "/v1/jobs"),
+    ("POST", "/v1/images"),
+    ("DELETE", "/v1/jobs/x"),
+)
 
 
-def test_a_page_of_another_site_changes_nothing(shared_api: TestClient) -> None:
+def test_a_page_of_another_site_changes_nothing(shared_api: TestClient, shared_service: Keyed) -> None:
+    # A browser adds the password of HTTP Basic by itself, also to a form of another site.
+    password = ("anybody", shared_service.key("owner"))
     for headers, foreign in SITES:
+        form = shared_service.api.post(
+            "/uws/jobs", data={"KIND": "psf-build"}, headers=headers, auth=password
+        )
+        assert (form.status_code == 403) == foreign, headers
         for method, address in CHANGES:
             answer = shared_api.request(method, address, headers=headers)
             assert (answer.status_code == 403) == foreign, (headers, method, address, answer.text)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,6 @@ from service.cli.main import main
 from service.local import LocalService
 from tests.conftest import write_image
 from tests.service.conftest import execute, refusal, upload
-from tests.service.keyed import keyed
 from workers.bulk.turns import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.owners import ROW_BYTES, counted_bytes
@@ -154,50 +151,6 @@ def test_a_listing_that_fills_the_quota_stops_and_goes_on_with_room(
     assert catalogue.owners.recount() == []
 
 
-def test_uploads_at_one_moment_that_each_fit_do_not_all_come_in(
-    api: TestClient, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    together = threading.Barrier(5, timeout=60.0)
-    keep = Store.keep
-
-    def keep_together(store: Store, *given: Any) -> str:
-        together.wait()  # by now each was told that it fits
-        return keep(store, *given)
-
-    monkeypatch.setattr(Store, "keep", keep_together)
-    files = [large(tmp_path / f"{n}.fits", 300 + n).read_bytes() for n in range(5)]
-    places = ["/v1/images", "/v1/psfs", "/v1/images", "/v1/psfs", "/v1/images"]
-    headers = {"Content-Type": "application/fits"}
-    with ThreadPoolExecutor(5) as pool:
-        sent = [
-            pool.submit(api.post, where, content=content, headers=headers)
-            for where, content in zip(places, files, strict=True)
-        ]
-        answers = [one.result() for one in sent]
-    assert sorted(answer.status_code for answer in answers) == [201, 201, 201, 413, 413]
-    for answer in answers:
-        if answer.status_code == 413:
-            assert "0.9 of 1.0 MiB are used" in refusal(answer, 413, "quota-exceeded")
-            assert answer.json()["limit_bytes"] == 2**20
-    rows = [row for where in ("/v1/images", "/v1/psfs") for row in api.get(where).json()["items"]]
-    assert len(rows) == 3 and sum(row["bytes"] for row in rows) < counted(catalogue) <= 2**20
-    assert catalogue.owners.recount() == []
-    assert list((tmp_path / "data" / "tmp").iterdir()) == []
-
-
-def test_the_same_upload_at_one_moment_counts_once(
-    api: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    together = threading.Barrier(2, timeout=60.0)
-    keep = Store.keep
-    monkeypatch.setattr(Store, "keep", lambda *given: (together.wait(), keep(*given))[1])
-    content = large(tmp_path / "a.fits", 900).read_bytes()
-    headers = {"Content-Type": "application/fits"}
-    with ThreadPoolExecutor(2) as pool:
-        sent = [pool.submit(api.post, "/v1/images", content=content, headers=headers) for _ in range(2)]
-    assert sorted(answer.result().status_code for answer in sent) == [200, 201]
-
-
 def test_jobs_that_were_queued_while_there_was_room_end_where_there_is_none(
     api: TestClient, catalogue: Catalogue, settings: Settings, image_file: Path, psf_file: Path
 ) -> None:
@@ -255,20 +208,6 @@ def test_a_bulk_that_fills_the_quota_stops_and_goes_on_with_room(
     while catalogue.bulks.at_work():
         work(catalogue, settings)
     assert api.get(here).json()["images"]["done"] == 5
-
-
-def test_quotas_are_each_owner_s_own(settings: Settings, tmp_path: Path) -> None:
-    with keyed(settings) as service:
-        mine, other = service.client("mine"), service.client("other")
-        content = large(tmp_path / "a.fits", 900).read_bytes()
-        headers = {"Content-Type": "application/fits"}
-        assert mine.post("/v1/images", content=content, headers=headers).status_code == 201
-        assert mine.post("/v1/psfs", content=content, headers=headers).status_code == 413
-        assert other.post("/v1/images", content=content, headers=headers).status_code == 201
-        service.catalogue.owners.set_quota("mine", 0)
-        assert mine.post("/v1/psfs", content=content, headers=headers).status_code == 201
-        service.catalogue.owners.set_quota("mine", None)
-        assert mine.post("/v1/psfs", content=content, headers=headers).status_code == 413
 
 
 def test_what_is_counted_is_what_the_rows_say(

@@ -9,35 +9,22 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 from fastapi.testclient import TestClient
+from sqlalchemy import insert
 
 from tests.conftest import write_image, write_psf
-from tests.service.conftest import upload
+from tests.service.conftest import execute, upload
 from workers.catalogue.tables import JobRow, ProductRow
 from workers.contract.phases import Phase
 
 SHAPE = (96, 128)
 # Helioprojective coordinates with different scales and a rotation, so that a swap of axes or signs is noticed.
 WCS_CARDS: dict[str, Any] = {
-    "CTYPE1": "HPLN-TAN",
-    "CTYPE2": "HPLT-TAN",
-    "CUNIT1": "arcsec",
-    "CUNIT2": "arcsec",
-    "CDELT1": 0.5,
-    "CDELT2": 0.5,
-    "CRPIX1": 40.0,
-    "CRPIX2": 60.0,
-    "CRVAL1": 100.0,
-    "CRVAL2": -50.0,
-    "PC1_1": 0.8,
-    "PC1_2": -0.6,
-    "PC2_1": 0.6,
-    "PC2_2": 0.8,
+    **{"CTYPE1": "HPLN-TAN", "CTYPE2": "HPLT-TAN", "CUNIT1": "arcsec", "CUNIT2": "arcsec"},
+    **{"CDELT1": 0.5, "CDELT2": 0.5, "CRPIX1": 40.0, "CRPIX2": 60.0, "CRVAL1": 100.0, "CRVAL2": -50.0},
+    **{"PC1_1": 0.8, "PC1_2": -0.6, "PC2_1": 0.6, "PC2_2": 0.8},
 }
 OBSERVED: dict[str, Any] = {
-    "TELESCOP": "SOLO",
-    "INSTRUME": "EUI",
-    "DETECTOR": "HRI_EUV",
-    "WAVELNTH": 174,
+    **{"TELESCOP": "SOLO", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174},
     "DATE-BEG": "2022-03-17T04:02:00.000",
 }
 STARTED_AT, ENDED_AT = 1_700_000_000.0, 1_700_000_060.5
@@ -96,7 +83,6 @@ def add_product(
     keys = {"request_key": product, "work_key": product, "queue": "interactive"}
     times = {"created_at": STARTED_AT - 1, "started_at": STARTED_AT, "ended_at": ENDED_AT}
     done = {"phase": Phase.COMPLETED, "result_id": product}
-    row = JobRow(id=job, owner=owner, kind="deconvolve", parameters=parameters, **keys, **times, **done)
-    with state.catalogue._database.writing.begin() as session:
-        session.add(row)
+    row = {"id": job, "owner": owner, "kind": "deconvolve", "parameters": parameters, **keys, **times, **done}
+    execute(state.catalogue, insert(JobRow).values(row))
     return {"image": image, "psf": psf, "job": job, "product": product}

@@ -51,7 +51,7 @@ def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
     ended = now(api, first)
     assert (ended["phase"], ended["images"]["done"], ended["images"]["failed"]) == ("COMPLETED", 1, 2)
     failed = {line["error"]["code"]: line for line in api.get(ended["failures"]).json()["items"]}
-    assert set(failed) == {"not-fits", "path-not-utf-8"}
+    assert set(failed) == {"not-fits", "path-not-utf-8"} and failed["not-fits"]["attempts"] == 1
     assert failed["path-not-utf-8"]["source"] == f"{archive}/Sonne\\xf6.fits"
     assert "expected a path in UTF-8; got" in failed["path-not-utf-8"]["error"]["message"]
 

@@ -11,13 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
 from tests.conftest import write_image, write_psf
-from tests.fitted_psfs import EARLY, LATE, write_fitted
 from tests.service.api.bulk.conftest import FEW, failures, now, results, started
 from tests.service.conftest import refusal, upload
 from workers.bulk import image as bulk_image
@@ -238,24 +236,6 @@ def test_a_run_waits_for_a_job_that_is_computing_the_image(
     assert api.get(f"/v1/jobs/{job['id']}").json()["result"] == f"/v1/products/{line['product_id']}"
 
 
-def test_failed_images_are_listed_and_retried(
-    api: TestClient, archive: Path, psf_id: str, work: Work
-) -> None:
-    good, bad = archive / "2020" / "image 0.fits", archive / "2022" / "image 2.fits"
-    held = bad.read_bytes()
-    fits.PrimaryHDU(np.full((64, 64), np.nan, "f4")).writeto(bad, overwrite=True)
-    bulk = started(api, files=[{"glob": str(path)} for path in (good, bad)], psf_id=psf_id)
-    work()
-    assert now(api, bulk)["images"]["failed"] == 1 and now(api, bulk)["phase"] == "COMPLETED"
-    (failed,) = failures(api, bulk)
-    assert failed["error"]["code"] == "all-nan" and failed["attempts"] == 1
-    bad.write_bytes(held)
-    assert api.post(f"/v1/bulk/{bulk['id']}/retry").json()["phase"] == "RUNNING"
-    work()
-    bulk = now(api, bulk)
-    assert (bulk["images"]["done"], bulk["images"]["failed"], bulk["phase"]) == (2, 0, "COMPLETED")
-
-
 def test_an_internal_error_stops_one_image_and_one_of_a_turn_the_run(
     api: TestClient, files: list[dict[str, str]], psf_id: str, work: Work
 ) -> None:
@@ -354,29 +334,6 @@ def test_a_context_pins_the_psf_of_each_image(
     work()
     expected = [of_channel[0]] * 2 + [of_channel[1]]
     assert [line["psf_id"] for line in results(api, bulk)] == expected
-
-
-def test_in_a_context_the_psf_of_an_image_between_two_psfs_is_interpolated(
-    api: TestClient, archive: Path, work: Work, tmp_path: Path
-) -> None:
-    ends = []
-    for version, values, times in (
-        ("1.0.0", EARLY, {"valid_to": "2020-02-01"}),
-        ("1.1.0", LATE, {"valid_from": "2021-01-01"}),
-    ):
-        file = write_fitted(tmp_path / f"{version}.fits", values, instrument="eui")
-        ends.append(upload(api, file, "/v1/psfs?channel=174&kind=total"))
-        body = {"status": "certified", "version": version, **times}
-        assert api.post(f"/v1/psfs/{ends[-1]}/status", json=body).status_code == 200
-    assert api.put("/v1/series/eui/174/total", json={"interpolated": True}).status_code == 200
-    assert api.post("/v1/contexts", json={"name": "aging"}).status_code == 201
-    bulk = started(api, files=[{"glob": f"{archive}/*/image [01].fits"}], context="aging")
-    work()
-    between, last = [line["psf_id"] for line in results(api, bulk)]
-    assert last == ends[1] and between not in ends
-    parents = api.get(f"/v1/psfs/{between}/lineage").json()["parents"]
-    assert [parent["id"] for parent in parents] == ends
-    assert parents[1]["weight"] == pytest.approx(29 / 335, abs=0.005)  # days from 1 February to 1 March
 
 
 INVALID: list[tuple[dict[str, Any], int, str]] = [

@@ -24,7 +24,6 @@ from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from service.app import create_app
 from service.cli.main import main
 from service.client.http import Client, ServiceError
-from service.local import local_service
 from tests.conftest import SMALL_INSTRUMENT
 from tests.conftest import write_psf as write_plain_psf
 from tests.service.conftest import job_after, refusal, result_of, settings_in, upload
@@ -170,21 +169,16 @@ def test_a_fitted_psf_answers_with_errors(
 
 
 def test_a_cutout_is_the_middle_of_the_file_byte_for_byte(served: Served) -> None:
-    api, built = served.api, served.psf
     whole = fits.getdata(served.file)
-    for size in (1, 2, 31, 128):
-        answer = api.get(f"/v1/psfs/{built['id']}/cutout", params={"size": size})
+    for size in (1, 31, 128):
+        answer = served.api.get(f"/v1/psfs/{served.psf['id']}/cutout", params={"size": size})
         assert answer.status_code == 200 and answer.headers["content-type"] == "application/fits"
-        assert len(answer.content) % 2880 == 0
         with fits.open(io.BytesIO(answer.content)) as hdus:
             hdus.verify("exception")
-            assert len(hdus) == 1
             header, pixels = hdus[0].header, hdus[0].data
         first = 64 - size // 2
         assert np.array_equal(pixels, whole[first : first + size, first : first + size])
-        assert header["CRPIX1"] == header["CRPIX2"] == size // 2 + 1
-        assert header["PSFSUM"] == pytest.approx(float(pixels.sum(dtype=np.float64)), rel=1e-12)
-        assert header["PSFNAME"] == "small" and "CHECKSUM" not in header
+        assert header["CRPIX1"] == header["CRPIX2"] == size // 2 + 1 and header["PSFNAME"] == "small"
 
 
 def test_a_cutout_of_an_upload(api: TestClient, tmp_path: Path) -> None:
@@ -258,37 +252,14 @@ def test_psfs_on_other_pixels_are_not_compared(
 
 
 def test_the_client_gets_the_same_answers(served: Served, tmp_path: Path) -> None:
-    api, built = served.api, served.psf
-    with Client("http://testserver", transport=api._transport) as sun:
-        curve = sun.psf_curve(built["id"], [0.5, 10])
-        assert curve == api.get(f"/v1/psfs/{built['id']}/curve?radii=0.5,10").json()
-        assert sun.psf_profile(built["id"])["radius_px"][:3] == [0, 1, 2]
-        assert sun.psf_annulus(built["id"], 1, 2)["light"]["TOTAL"] > 0
-        assert sun.compare_psfs(built["id"], built["id"])["difference_of_sums"] == 0
-        sun.psf_cutout(built["id"], 16, tmp_path / "cut.fits")
+    psf_id = served.psf["id"]
+    with Client("http://testserver", transport=served.api._transport) as sun:
+        assert sun.psf_curve(psf_id, [1]) == served.api.get(f"/v1/psfs/{psf_id}/curve?radii=1").json()
+        sun.psf_cutout(psf_id, 16, tmp_path / "cut.fits")
         assert fits.getdata(tmp_path / "cut.fits").shape == (16, 16)
         with pytest.raises(ServiceError) as caught:
-            sun.psf_encircled(built["id"], -1)
+            sun.psf_encircled(psf_id, -1)
         assert caught.value.code == "bad-radius"
-
-
-def test_in_this_process_missing_tables_are_made_automatically(psf_file: Path, tmp_path: Path) -> None:
-    kernel = read_psf(psf_file, LIMITS).kernel
-    write_plain_psf(tmp_path / "small.fits", size=32)
-    with local_service() as local:
-        psf_id = local.upload_psf(psf_file)["id"]
-        with pytest.raises(ServiceError) as caught:
-            local.ask(psf_id, "curve")
-        assert caught.value.code == "no-tables"
-        light = local.psf_encircled(psf_id, 5)["light_within"]["TOTAL"]
-        assert light == pytest.approx(float(encircled_energy(kernel, 5)), abs=1e-8)
-        other = local.upload_psf(tmp_path / "small.fits")["id"]
-        assert local.compare_psfs(psf_id, other)["difference_points"]["TOTAL"][0] < 0
-        local.psf_cutout(psf_id, 9, tmp_path / "cut.fits")
-        assert fits.getdata(tmp_path / "cut.fits").shape == (9, 9)
-        for wrong in (lambda: local.psf_annulus(psf_id, 3, 2), lambda: local.psf_curve(A)):
-            with pytest.raises(ServiceError):
-                wrong()
 
 
 def run(*arguments: str | Path | float) -> Result:

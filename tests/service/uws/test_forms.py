@@ -1,4 +1,4 @@
-"""Files in the forms of UWS clients: UPLOAD=name,param:part (DALI 1.1)."""
+"""Files in the forms of UWS clients: UPLOAD=name,param:part (DALI 1.1); and documents as vo-models reads them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ from pathlib import Path
 import httpx
 import pytest
 from fastapi.testclient import TestClient
+from pydantic_xml import BaseXmlModel, element
+from vo_models.uws import Jobs, JobSummary, Parameter, Results
+from vo_models.uws.types import ExecutionPhase
 
 from psfcore.transit.archive import pack
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
-from tests.service.uws.test_uws import JOBS, document, parameters
+from tests.service.uws.test_uws import BUILD, JOBS, created, document, parameters
+from tests.service.vo.made import add_product
 from tests.transit_files import write_transit
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.owners import counted_bytes
@@ -185,3 +189,26 @@ def test_a_file_needs_the_scope_and_counts_for_its_owner(settings: Settings, ima
     with keyed(small) as service:
         large = {"f": ("sun.fits", image_file.read_bytes() + bytes(2**20))}
         assert post(service.client("ann"), JOBS, fields, large).status_code == 429
+
+
+class _Parameters(
+    BaseXmlModel, tag="parameters", ns="uws", nsmap={"uws": "http://www.ivoa.net/xml/UWS/v1.0"}
+):
+    """The parameters of a job, whatever their names."""
+
+    parameter: list[Parameter] = element(tag="parameter", default_factory=list)
+
+
+def test_vo_models_reads_the_documents(api: TestClient, tmp_path: Path) -> None:
+    ids = add_product(api, tmp_path)
+    pending = created(api, RUNID="<mine> & yours", **BUILD)
+    listed = Jobs.from_xml(api.get(JOBS).content)
+    assert {one.phase for one in listed.jobref or []} == {ExecutionPhase.PENDING, ExecutionPhase.COMPLETED}
+    waiting = JobSummary[_Parameters].from_xml(api.get(pending).content)
+    assert (waiting.run_id, waiting.owner_id, waiting.quote) == ("<mine> & yours", "local", None)
+    assert {one.id: one.value for one in waiting.parameters.parameter}["KIND"] == "psf-build"  # type: ignore[union-attr]
+    done = JobSummary[_Parameters].from_xml(api.get(f"{JOBS}/{ids['job']}").content)
+    assert done.start_time is not None and done.end_time is not None and done.end_time > done.start_time
+    results = Results.from_xml(api.get(f"{JOBS}/{ids['job']}/results").content)
+    for one in results.results or []:
+        assert api.get(str(one.href)).headers["content-type"] == one.mime_type
