@@ -1,16 +1,20 @@
-"""The package that people import, as they use it: light to import, typed, and equal to what it is made of."""
+"""The package that people import, as they use it: light to import, typed, equal to what it is made of, and drawn."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import fields
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import patch
 
+import matplotlib
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -27,6 +31,7 @@ from psfcore.scatter import fit as fit_module
 from psfcore.scatter.as_published.equations import free_fit
 from psfcore.simulate.transit_files import write
 from tests.conftest import write_image, write_psf
+from tests.fitted_psfs import EARLY, LATE, fitted_psf, write_fitted
 from tests.psfcore.small_transits import SCATTER, observed, sky
 
 HEAVY = {"astropy", "celery", "fastapi", "httpx", "matplotlib", "numba", "numpy"}
@@ -145,3 +150,72 @@ def test_a_gap_is_diagnosed_with_the_coverage_that_was_asked_for(
 def test_a_diffraction_that_is_not_known_is_refused() -> None:
     with pytest.raises(heliopsf.DataError, match=r"known_psf.*hri_euv.*got my-telescope"):
         known_diffraction("my-telescope")
+
+
+@pytest.fixture(autouse=True)
+def _no_windows() -> Iterator[None]:
+    matplotlib.use("agg")
+    yield
+    from matplotlib import pyplot
+
+    pyplot.close("all")
+
+
+def test_a_psf_is_drawn_on_given_axes(psf: heliopsf.Psf) -> None:
+    left, right = Figure().subplots(1, 2)
+    assert psf.plot(left, size=33) is left and psf.plot_curve(right) is right
+    np.testing.assert_array_equal(left.images[0].get_array(), psf.kernel[16:49, 16:49])
+    radii, light = right.lines[0].get_data()
+    np.testing.assert_allclose(light, psf.light_beyond(radii))
+
+
+def test_new_axes_are_made_without_any(psf: heliopsf.Psf) -> None:
+    assert psf.plot() is not psf.plot()
+    assert psf.version in psf.plot_curve().get_title()
+
+
+def test_a_deconvolution_is_drawn(psf: heliopsf.Psf, tmp_path: Path) -> None:
+    write_image(tmp_path / "image.fits", WAVELNTH=171, CDELT1=2.0, CDELT2=2.0)
+    result = heliopsf.deconvolve(tmp_path / "image.fits", psf)
+    before, after = Figure().subplots(1, 2)
+    assert result.plot(before) is before and result.plot_change(after) is after
+    np.testing.assert_array_equal(before.images[0].get_array(), result.pixels)
+    change = 100 * (result.pixels / result.image.pixels - 1)
+    np.testing.assert_allclose(after.images[0].get_array(), change)
+    assert [axes.get_title(loc="left")[:6] for axes in result.quicklook().axes[:3:2]] == ["Before", "After "]
+    assert result.changes["pixels"] > 0
+
+
+def test_quicklooks_are_figures_that_can_be_saved(psf: heliopsf.Psf, tmp_path: Path) -> None:
+    psf.quicklook().savefig(tmp_path / "psf.png")
+    assert (tmp_path / "psf.png").read_bytes().startswith(b"\x89PNG")
+
+
+TIMES = {"before_time": "2022-03-01", "after_time": "2023-03-01T00:00:00Z"}
+
+
+def test_files_and_psfs_give_the_same_psf(tmp_path: Path) -> None:
+    files = [write_fitted(tmp_path / f"{name}.fits", values) for name, values in (("a", EARLY), ("b", LATE))]
+    psf = heliopsf.interpolate_psf(*files, **TIMES, time="2022-08-30T12:00:00")
+    assert psf.fitted is not None and psf.name == "hri_euv-interpolated"
+    middle = np.log(EARLY["b_px"] * LATE["b_px"]) / 2
+    assert psf.fitted.coordinates[0] == pytest.approx(middle)
+    at = datetime(2022, 8, 30, 12, tzinfo=UTC)
+    same = heliopsf.interpolate_psf(heliopsf.read_psf(files[0]), files[1], **TIMES, time=at)
+    np.testing.assert_array_equal(psf.kernel, same.kernel)
+    psf.write(tmp_path / "between.fits")
+    assert heliopsf.read_psf(tmp_path / "between.fits").fitted == psf.fitted
+
+
+def test_wrong_times_and_shapes_are_refused() -> None:
+    given = {"before": fitted_psf(EARLY), "after": fitted_psf(LATE), **TIMES, "time": "2022-06-01"}
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"time": "soon"}, "bad-time"),
+        ({"time": 2022}, "bad-time"),
+        ({"time": "2024-01-01"}, "time-outside-epochs"),
+        ({"after_time": "2021-01-01"}, "epochs-not-in-order"),
+        ({"after": fitted_psf(LATE | {"bend": 0.0}, shape="knee")}, "shapes-differ"),
+    ]
+    for changes, code in wrong:
+        with pytest.raises(heliopsf.DataError, match=code):
+            heliopsf.interpolate_psf(**(given | changes))

@@ -34,17 +34,6 @@ def test_flux_is_kept() -> None:
         assert result.steps_done == 20 and "20 steps" in result.stopped_because
 
 
-def test_without_noise_more_steps_reduce_the_error() -> None:
-    scene = solar_scene((192, 160), 4)
-    observed = look(scene, noisy=False)
-    inside = (slice(16, -16), slice(16, -16))
-    errors = [
-        np.abs(richardson_lucy(make_image(observed), PSF, steps=n).pixels - scene)[inside].mean()
-        for n in (1, 5, 20, 60)
-    ]
-    assert errors == sorted(errors, reverse=True)
-
-
 def test_a_saturated_core_is_estimated_from_its_surroundings() -> None:
     scene = np.full((128, 128), 100.0)
     scene[63:66, 63:66] = 40000.0

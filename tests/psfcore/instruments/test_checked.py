@@ -79,11 +79,7 @@ FAULTS = [
     ({"parts": [{"length": 0.5}]}, "parts.0", "expected length above width; got 0.5"),
     ({"parts": [{}]}, "parts.0.length", "expected this key"),
     ({"corner": [1]}, "corner", "expected 2 entries"),
-    (
-        {"modes": {"A": {"depth": 1, "length": 2}}},
-        "modes.A.depth",
-        "expected one of the keys length, width",
-    ),
+    ({"modes": {"A": {"depth": 1, "length": 2}}}, "modes.A.depth", "expected one of the keys length, width"),
     ({"modes": [1]}, "modes", "expected a table"),
     ({"match": {"COLOUR": "red"}}, "match.COLOUR", "expected one of 'NAME', 'SIZE'"),
     ({"match": {"NAME": "abcd"}}, "match.NAME", "expected at most 3 characters"),

@@ -60,10 +60,7 @@ TOO_LARGE = {
 
 def test_too_many_parts_are_refused_when_the_file_is_read(subtests: pytest.Subtests) -> None:
     for name, text in TOO_MANY.items():
-        with (
-            subtests.test(name),
-            pytest.raises(DataError, match=r"bad-instrument-file: .*(at most|less than)"),
-        ):
+        with subtests.test(name), pytest.raises(DataError, match=r"bad-instrument-file: .*(at most|less)"):
             parse_instrument(text, "greedy.toml")
 
 
@@ -88,54 +85,47 @@ def test_shipped_instruments_are_far_from_the_limits() -> None:
 
 def test_the_sizes_are_those_of_the_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
     aia, size = load_instrument("aia_171"), 64
-    work = workload(aia, size)
-    entrance = aia.meshes[0]
+    work, mesh, seen = workload(aia, size), aia.meshes[0], []
     optics = {"wavelength_angstrom": aia.wavelength_angstrom, "pixel_pitch_um": aia.detector.pixel_pitch_um}
-    seen: list[int] = []
+    series = {key: getattr(mesh, key) for key in ("pitch_um", "wire_um", "windows", "angle_deg")}
 
     def cells(edges: Any, light: Any, spacing_px: float) -> Any:
         seen.append(len(edges) - 1)
         return np.arange(1)
 
-    monkeypatch.setattr(mesh_series, "_first_of_each_cell", cells)
-    mesh_series.rotated_mesh_kernel(
-        **optics,
-        distance_mm=aia.focal_length_mm,
-        pitch_um=entrance.pitch_um,
-        wire_um=entrance.wire_um,
-        windows=entrance.windows,
-        angle_deg=entrance.angle_deg,
-        size=size,
-    )
-
     def light_beyond(v: Any, obscured: float) -> Any:
         seen.append(len(v))
         return np.ones(len(v))
 
+    monkeypatch.setattr(mesh_series, "_first_of_each_cell", cells)
+    mesh_series.rotated_mesh_kernel(**optics, **series, distance_mm=aia.focal_length_mm, size=size)
     monkeypatch.setattr(airy, "airy_light_beyond", light_beyond)
-    aperture = aia.aperture
     airy.airy_kernel(
-        **optics, focal_length_mm=aia.focal_length_mm, diameter_mm=aperture.diameter_mm, size=size
+        **optics, focal_length_mm=aia.focal_length_mm, diameter_mm=aia.aperture.diameter_mm, size=size
     )
-    for got, expected in zip(seen, (work.cells[0], work.airy_points), strict=True):
-        assert 0.9 * expected <= got <= 1.02 * expected
+    for count, expected in zip(seen, (work.cells[0], work.airy_points), strict=True):
+        assert 0.9 * expected <= count <= 1.02 * expected
 
 
 def test_the_mask_and_its_edges_are_not_larger_than_said() -> None:
     hri = load_instrument("hri_euv")
     work = workload(hri, PERIOD_PX)
-    cell_mm = (
-        hri.wavelength_angstrom
-        * 1e-7
-        * hri.focal_length_mm
-        / (PERIOD_PX * hri.detector.pixel_pitch_um * 1e-3)
-    )
+    period_mm = PERIOD_PX * hri.detector.pixel_pitch_um * 1e-3
+    cell_mm = hri.wavelength_angstrom * 1e-7 * hri.focal_length_mm / period_mm
     grid = MaskGrid(entrance_pupil(hri.aperture, mount=hri.mount), cell_mm)
     assert work.mask and abs(grid.cells - work.mask_cells) <= 4
     assert len(grid._entries) <= work.mount_entries + 8 * work.mask_cells
 
 
 SIZE_PX = 1024
+BUILD = """
+import sys
+from psfcore.build import build_psf
+from psfcore.instruments.model import parse_instrument
+from workers.run.child import Child
+with Child(1).limited(int(sys.argv[1])):
+    print(build_psf(parse_instrument(sys.stdin.read(), "greedy.toml"), size=int(sys.argv[2])).kernel.shape)
+"""
 GREEDY = small(MESH + "windows = 400\nangle_deg = 45.0\n", focal_length_mm="200.0", diameter_mm="20.0")
 
 
@@ -145,18 +135,6 @@ def test_a_greedy_file_within_the_limits_keeps_to_its_estimate() -> None:
     check_workload(instrument, "greedy.toml")
     assert max(workload(instrument, SIZE_PX).cells) > 200_000
     estimate_mib = round(COSTS.worker_mib + _build({"instrument_file": GREEDY, "size": SIZE_PX})[1])
-    code = (
-        "import sys\nfrom psfcore.build import build_psf\nfrom psfcore.instruments.model import parse_instrument\n"
-        "from workers.run.child import Child\n"
-        "with Child(1).limited(int(sys.argv[1])):\n"
-        "    print(build_psf(parse_instrument(sys.stdin.read(), 'greedy.toml'), size=int(sys.argv[2])).kernel.shape)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(estimate_mib), str(SIZE_PX)],
-        input=GREEDY,
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        timeout=170,
-    )
+    command = [sys.executable, "-c", BUILD, str(estimate_mib), str(SIZE_PX)]
+    done = subprocess.run(command, input=GREEDY, cwd=REPOSITORY, capture_output=True, text=True, timeout=170)
     assert done.stdout == f"({SIZE_PX}, {SIZE_PX})\n", done.stderr

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io.fits import Header
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, maximum_filter, median_filter, minimum_filter
 
@@ -21,18 +21,17 @@ from psfcore.deconvolve.assess.artefacts import (
     noise_levels,
     ringing_pct,
 )
-from psfcore.deconvolve.assess.changes import BLOCKS_PX, TAILS_PCT, block_means, measure_changes
+from psfcore.deconvolve.assess.changes import BLOCKS_PX, block_means, measure_changes
+from psfcore.deconvolve.assess.from_product import changes_from_json
 from psfcore.deconvolve.assess.plots import changes_png
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.errors import DataError
-from psfcore.fits.images import read_image
 from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf, crop_centred
-from psfcore.scatter.power_law import scatter_kernel
 from psfcore.simulate.observe import observe
 from psfcore.simulate.scene import solar_scene
-from tests.psfcore.conftest import LIMITS, delta, make_image, make_psf
+from tests.psfcore.conftest import delta, make_image, make_psf
 from tests.psfcore.deconvolve.scattering import scattering_psf
 
 Plane = NDArray[np.float64]
@@ -232,16 +231,16 @@ def test_pages_are_drawn(seen: Image, psf: Psf, result: Plane, tmp_path: Path) -
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
-@pytest.mark.slow
-def test_the_real_image(real: Callable[[str], Path]) -> None:
-    """The paper: bright features rise by up to 40 %, dark regions fall by up to 85 %, no artefacts."""
-    image = read_image(real(HRI), LIMITS)
-    scatter = make_psf(scatter_kernel(6.15, 2.53, 0.411, 2048))
-    result = richardson_lucy(image, scatter, steps=20, threads=2).pixels
-    report = measure_changes(image, result, scatter, edge_px=EDGE_PX)
-    assert report.artefacts.score < 1
-    assert len(report.structures) == 2 * len(BLOCKS_PX) * len(TAILS_PCT)
-    bright = [row.up_to_pct for row in report.structures if row.kind == "bright" and row.block_px > 1]
-    dark = [row.up_to_pct for row in report.structures if row.kind == "dark" and row.block_px > 1]
-    assert min(bright) > 5 and max(bright) < 90
-    assert min(dark) > -90 and max(dark) < -5
+def test_figures_come_back_from_json() -> None:
+    rng = np.random.default_rng(1)
+    before = rng.poisson(50, (96, 128)) + 400.0 * (rng.random((96, 128)) > 0.99)
+    image = Image(before, np.zeros(before.shape, np.uint8), Header(), "DN", 1.0)
+    kernel = np.zeros((17, 17))
+    kernel[8, 8] = 1.0
+    after = before * 1.1
+    after[40:60:5, 30:90:9] = -100
+    found = measure_changes(image, after, Psf(kernel, "point", "1", None, "draft"))
+    again = changes_from_json(json.loads(json.dumps(found.as_json())), found.artefacts.suspected)
+    assert again.as_json() == found.as_json()
+    assert again.structures == found.structures and again.ranges == found.ranges
+    np.testing.assert_array_equal(again.artefacts.suspected, found.artefacts.suspected)

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.error_planes import (
+    ErrorPlanes,
     error_planes,
     expected_image,
     mean_of_root,
@@ -21,8 +22,7 @@ from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
 from psfcore.noise import Noise
-from psfcore.psf import Psf, crop_centred
-from psfcore.scatter.power_law import scatter_kernel
+from psfcore.psf import Psf
 from psfcore.simulate.observe import observe
 from psfcore.simulate.scene import solar_scene
 from tests.psfcore.conftest import delta, make_image, make_psf
@@ -174,24 +174,25 @@ def test_sigma_points_have_the_given_mean_and_covariance() -> None:
     np.testing.assert_allclose(np.cov(points.T, bias=True), covariance, rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_sigma_points_agree_with_many_random_samples(psf: Psf) -> None:
-    """The scattered total is known to 0.01: its effect on the image by two sigma points and by 60 random samples."""
-    image = see(cut(0.5), psf, None)
-
-    def build(total: float) -> Psf:
-        return make_psf(crop_centred(scatter_kernel(6.15, 2.53, total, 2048), (128, 128)))
+def test_the_error_of_the_psf_is_the_spread_of_its_results(psf: Psf) -> None:
+    """Of random samples without bias, and of sigma points exactly. It has no value where the other error has none."""
+    rng = np.random.default_rng(1)
+    planes = {total: rng.normal(0, 2.0, (16, 16)) for total in np.linspace(0.9, 1, 200)}
+    psfs = [make_psf(total * delta(16)) for total in planes]
 
     def run(sample: Psf) -> Plane:
-        return richardson_lucy(image, sample, steps=20).pixels
+        return planes[min(planes, key=lambda total: abs(total - sample.total))]
 
-    points = sigma_points(np.array([0.411]), np.array([[1e-4]]))
-    by_points = psf_error_plane([build(float(t)) for (t,) in points], run, chance=False)
-    totals = np.random.default_rng(1).normal(0.411, 0.01, 60)
-    by_chance = psf_error_plane([build(float(t)) for t in totals], run)
-    assert np.median(by_points / by_chance) == pytest.approx(1.0, abs=0.15)  # 60 samples scatter by 9 %
-    planes = error_planes(image, psf, run=lambda seen: seen.pixels, noise=NOISE, draws=2)
-    assert with_psf_error(planes, by_points).psf_error is not None
+    stack = np.array(list(planes.values()))
+    by_points = psf_error_plane(psfs, run, chance=False)
+    np.testing.assert_allclose(by_points, stack.std(axis=0), rtol=1e-9)
+    by_chance = psf_error_plane(psfs, run)
+    np.testing.assert_allclose(by_chance, stack.std(axis=0, ddof=1) / mean_of_root(199), rtol=1e-9)
+    with pytest.raises(DataError, match="bad-draws"):
+        psf_error_plane(psfs[:1], run)
+    error = np.where(np.eye(16) > 0, np.nan, 1.0)
+    both = with_psf_error(ErrorPlanes(error, None, None, 1.0, 2, 0), by_points)
+    np.testing.assert_array_equal(both.psf_error, np.where(np.eye(16) > 0, np.nan, by_points))
 
 
 def test_the_bias_of_the_root_of_a_mean_is_corrected() -> None:

@@ -112,10 +112,7 @@ def plain(name: str, y: Plane, weight: Plane, convolver: Convolver, steps: int, 
     return x
 
 
-CASES = [
-    *((name, {}) for name in METHODS if name != "linear"),
-    ("richardson-lucy-accelerated", {"order": 2}),
-]
+CASES = [*((name, {}) for name in METHODS if name != "linear"), ("richardson-lucy-accelerated", {"order": 2})]
 
 
 def test_single_precision_follows_the_plain_version(seen: Plane, psf: Psf) -> None:
@@ -386,3 +383,21 @@ def test_the_default_is_close_to_a_run_without_edges() -> None:
         (row,) = edge_study.rows(seed, psf, cache, methods=("richardson-lucy",), ways=(None,))
         assert row.edges == "symmetric"
         assert np.all(np.abs(row.bias_pct) <= (2.5, 2.0, 1.0)), row
+
+
+def test_a_deconvolution_between_two_steps_of_another_changes_neither() -> None:
+    psf = make_psf(gaussian(64, 1.5))
+    long, short = make_image(solar_scene((96, 80), 1)), make_image(solar_scene((96, 80), 2))
+    for name in method_names():
+        method, between = method_named(name), []
+
+        def pause(step: int, _steps: int, method=method, between=between) -> None:  # type: ignore[no-untyped-def]
+            if step < 3:
+                between.append(method(short, psf, Conditions()).pixels)
+
+        interrupted = method(long, psf, Conditions(progress=pause)).pixels
+        assert between, "the method reports its steps"
+        np.testing.assert_array_equal(interrupted, method(long, psf, Conditions()).pixels, err_msg=name)
+        alone = method(short, psf, Conditions()).pixels
+        for pixels in between:
+            np.testing.assert_array_equal(pixels, alone, err_msg=name)
