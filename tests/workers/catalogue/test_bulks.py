@@ -525,7 +525,7 @@ def test_every_query_of_a_run_uses_an_index(catalogue: Catalogue) -> None:
     first, second = one_taken(catalogue, bulk_id, lease), one_taken(catalogue, bulk_id, lease)
     bulk = row(catalogue, bulk_id)
     other = made(catalogue, 0, key="listing", listed=False)
-    with statements(catalogue) as sent:
+    with statements() as sent:
         assert bulks.begin_listing(other, lease) and bulks.begin_listing(other, lease) and bulks.cancel(other)
         progress.sources(other)
         third = one_taken(catalogue, bulk_id, lease)
@@ -540,6 +540,6 @@ def test_every_query_of_a_run_uses_an_index(catalogue: Catalogue) -> None:
     queries = [one for one in sent if one[0].lstrip().startswith(("SELECT", "UPDATE", "DELETE"))]
     assert len(queries) >= 24
     for statement, parameters in queries:
-        steps = plan(catalogue, statement, parameters, forced=True)
+        steps = plan(database(catalogue), statement, parameters, forced=True)
         wrong = [step for step in steps if re.search(r"SCAN bulk|TEMP B-TREE|Seq Scan on bulk|Sort", step)]
         assert wrong == [], (statement, steps)

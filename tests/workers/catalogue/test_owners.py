@@ -256,9 +256,9 @@ def test_simultaneous_jobs_are_accepted_up_to_the_quota(catalogue: Catalogue) ->
 def test_a_large_bulk_run_is_counted_in_one_statement_and_a_refused_one_adds_no_row(
     catalogue: Catalogue,
 ) -> None:
-    with statements(catalogue) as sent, counting(catalogue, ROW_BYTES * 3001 + len("{}")):
+    with statements() as sent, counting(catalogue, ROW_BYTES * 3001 + len("{}")):
         catalogue.bulks.create(bulk(), ids(3000), 4)
     assert sum(one.startswith(("INSERT INTO owners", "UPDATE owners")) for one, _ in sent) == 1
-    with statements(catalogue) as sent, pytest.raises(OverQuota):
+    with statements() as sent, pytest.raises(OverQuota):
         catalogue.bulks.create(bulk(key="other"), ids(3000), 4)
     assert not [one for one, _ in sent if one.startswith("INSERT")], "nothing is written to be removed again"

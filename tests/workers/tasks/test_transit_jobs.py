@@ -247,15 +247,6 @@ def test_a_cross_validation_says_what_was_done_and_compares_with_a_fit_without_a
         json.dumps(report["folds"][0]["shells"], allow_nan=False)
 
 
-@pytest.mark.slow
-def test_another_shape_is_another_solution(
-    service: LocalService, transit: Path, fitted: dict[str, Any], inversions: list[str]
-) -> None:
-    for seed in (1, 2):
-        service.cross_validate(transit, shape="stretched", runs=1, seed=seed)
-    assert inversions.count("stretched") == 1
-
-
 # The report -------------------------------------------------------------------------------------------
 
 

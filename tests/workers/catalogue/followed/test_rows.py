@@ -81,9 +81,13 @@ def test_every_query_uses_an_index_on_what_it_asks_for(catalogue: Catalogue) -> 
     with database(catalogue).engine.execution_options(isolation_level="AUTOCOMMIT").connect() as connection:
         connection.execute(text("ANALYZE"))
     jobs = catalogue.followed_jobs
-    with statements(catalogue) as sent:
+    with statements() as sent:
         jobs.ended("ann", Place(1990.0)), jobs.open("ann"), jobs.among("ann", [ANY]), jobs.rows("ann", [ANY])
-    plans = ["\n".join(plan(catalogue, *one, forced=False)) for one in sent if one[0].startswith("SELECT")]
+    plans = [
+        "\n".join(plan(database(catalogue), *one, forced=False))
+        for one in sent
+        if one[0].startswith("SELECT")
+    ]
     ended, executing, queued, among, read = plans
     assert "jobs_ended" in ended and "ended_at" in ended
     assert all("USING INDEX jobs_" in one or "Index Scan" in one for one in (executing, queued)), plans
