@@ -1,4 +1,4 @@
-"""Archives: listed, packed, and unpacked completely or not at all, whatever they declare."""
+"""Archives: listed, packed, and unpacked completely or not at all, whatever they declare; and a transit read in place."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import time
 import tracemalloc
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,7 +31,9 @@ from psfcore.transit.archive import (
     pack,
     unpack,
 )
+from psfcore.transit.in_place import transit_in
 from tests.transit_files import write_transit
+from workers.files.store import sha256_of
 
 LIMITS = ArchiveLimits()
 SMALL = ArchiveLimits(max_files=100, max_bytes=2**20, max_member_bytes=2**19)
@@ -539,26 +540,43 @@ def test_missing_and_wrong_files_are_named(folder: Path, tmp_path: Path, kind: s
         assert caught.value.code == code and name in caught.value.message
 
 
-def test_listing_a_zip_inflates_no_pixels(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = as_zip(tmp_path / "a.zip", [*members_of(folder), ("x.fits", bytes(48 * MIB))])
-    inflated = 0
-    original = zlib.decompressobj
+# --- in place --------------------------------------------------------------------------------------------
 
-    class Counting:
-        def __init__(self, *arguments: int) -> None:
-            self._inner = original(*arguments)
 
-        def decompress(self, data: bytes, most: int = 0) -> bytes:
-            nonlocal inflated
-            got = self._inner.decompress(data, most)
-            inflated += len(got)
-            return got
+@pytest.fixture
+def whole(tmp_path: Path) -> Path:
+    write_transit(tmp_path / "transit")
+    return tmp_path / "transit"
 
-        def __getattr__(self, name: str) -> object:
-            return getattr(self._inner, name)
 
-    monkeypatch.setattr(zlib, "decompressobj", Counting)
-    list_archive(path, LIMITS)
-    assert 0 < inflated < 2**18
+def test_it_is_identified_by_the_archive_that_is_not_written(whole: Path, tmp_path: Path) -> None:
+    before = sorted(path.name for path in whole.iterdir())
+    found = transit_in(whole)
+    assert sorted(path.name for path in whole.iterdir()) == before
+    pack(whole, tmp_path / "transit.tar")
+    assert found.sha256 == sha256_of(tmp_path / "transit.tar")
+    assert found.bytes == (tmp_path / "transit.tar").stat().st_size
+    assert found.contents == list_archive(tmp_path / "transit.tar", ArchiveLimits())
+    assert found.folder == whole.resolve()
+
+
+def test_all_bad_files_are_named_in_one_error_and_nothing_is_written(whole: Path, tmp_path: Path) -> None:
+    (whole / "003.fits").write_text("a letter")
+    checks = (transit_in, lambda whole: pack(whole, tmp_path / "t.tar"))
+    for check in checks:
+        with pytest.raises(DataError, match=r"003\.fits") as caught:
+            check(whole)
+        assert caught.value.code == "not-fits"
+    (whole / "001.fits").unlink()
+    (whole / "diffraction.fits").unlink()
+    for check in checks:
+        with pytest.raises(DataError) as caught:
+            check(whole)
+        assert caught.value.code == "missing-file"
+        for name in ("3 files cannot be used", "001.fits", "003.fits", "diffraction.fits"):
+            assert name in caught.value.message
+        assert "000.fits" not in caught.value.message
+    assert not (tmp_path / "t.tar").exists()
+    with pytest.raises(DataError) as caught:
+        transit_in(tmp_path)
+    assert caught.value.code == "no-manifest"

@@ -46,36 +46,27 @@ PLACES = [Place(20.0, 20.0, RADIUS_PX), Place(20.3, 18.77, RADIUS_PX), Place(19.
 # --- the disc ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("place", PLACES)
-def test_the_covered_area_is_that_of_the_disc(place: Place) -> None:
-    share = coverage((41, 40), place)
-    assert share.sum() == pytest.approx(np.pi * place.radius_px**2, rel=1e-3)
-    np.testing.assert_allclose(share, covered_share(place, (0, 0), (41, 40), 1), atol=0.02)
-    assert share.min() == 0 and share.max() == pytest.approx(1, abs=1e-12)
-
-
-def test_the_covered_area_changes_smoothly() -> None:
-    """Every step covers and uncovers the same area: the width of the disc times the step."""
-    step, n = 0.05, 40
+def test_the_covered_area_is_that_of_the_disc() -> None:
+    for place in PLACES:
+        share = coverage((41, 40), place)
+        assert share.sum() == pytest.approx(np.pi * place.radius_px**2, rel=1e-3)
+        np.testing.assert_allclose(share, covered_share(place, (0, 0), (41, 40), 1), atol=0.02)
+        assert share.min() == 0 and share.max() == pytest.approx(1, abs=1e-12)
+    # It changes smoothly: every step covers and uncovers the width of the disc times the step.
+    step, start = 0.05, Place(20.0, 20.0, RADIUS_PX)
     for axis in ("x_px", "y_px"):
-        start = Place(20.0, 20.0, RADIUS_PX)
-        moved = [
-            coverage((41, 40), dataclasses.replace(start, **{axis: 20.0 + step * k})) for k in range(n + 1)
-        ]
+        moved = [coverage((41, 40), dataclasses.replace(start, **{axis: 20.0 + step * k})) for k in range(41)]
         change = np.array([np.abs(b - a).sum() for a, b in itertools.pairwise(moved)])
         np.testing.assert_allclose(change, 4 * RADIUS_PX * step, rtol=0.03)
 
 
-@pytest.mark.parametrize("place", [*PLACES, Place(3.0, 38.2, RADIUS_PX), Place(-30.0, 10.0, RADIUS_PX)])
-@pytest.mark.parametrize("margin_px", [0.0, 1.3])
-def test_dark_pixels_have_all_corners_in_the_disc(place: Place, margin_px: float) -> None:
-    expected = np.ones((41, 40), bool)
-    for y in range(41):
-        for x in range(40):
-            for dy, dx in ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)):
-                corner = np.hypot(y + dy - place.y_px, x + dx - place.x_px)
-                expected[y, x] &= corner <= place.radius_px - margin_px
-    np.testing.assert_array_equal(fully_dark((41, 40), place, margin_px), expected)
+def test_dark_pixels_have_all_corners_in_the_disc() -> None:
+    y, x = np.indices((41, 40))
+    for place in (*PLACES, Place(3.0, 38.2, RADIUS_PX), Place(-30.0, 10.0, RADIUS_PX)):
+        farthest = np.hypot(abs(y - place.y_px) + 0.5, abs(x - place.x_px) + 0.5)
+        for margin_px in (0.0, 1.3):
+            dark = fully_dark((41, 40), place, margin_px)
+            np.testing.assert_array_equal(dark, farthest <= place.radius_px - margin_px)
 
 
 def test_distances_and_patches() -> None:
@@ -96,19 +87,8 @@ def found_in(
 ) -> list[FoundPlace]:
     """The places found in some frames, with the true scenes and PSF."""
     scenes = [of.true_scene(n).astype(np.float32) for n in range(len(transit.frames))]
-    places = [frame.place for frame in transit.frames]
-    return [
-        find_occulter(
-            n,
-            transit.frames,
-            scenes,
-            places,
-            of.kernel,
-            transit.noise,
-            ephemeris_sigma_px=ephemeris_sigma_px,
-        )
-        for n in indices
-    ]
+    known = (transit.frames, scenes, places_of(transit), of.kernel, transit.noise)
+    return [find_occulter(n, *known, ephemeris_sigma_px=ephemeris_sigma_px) for n in indices]
 
 
 def errors(of: TrueSky, found: Sequence[FoundPlace], indices: Sequence[int]) -> NDArray[np.float64]:
@@ -153,19 +133,9 @@ def test_errors_on_the_disc_agree_with_the_stated_ones() -> None:
 
 def test_far_off_the_limb_faint_places_are_found_to_two_pixels() -> None:
     of = sky(brightness=1.0)
-    for seed in range(2):
-        found = found_in(of, observed(of, seed).transit, EVERY)
-        assert np.hypot(*errors(of, found, EVERY).T).max() < 2
-        assert all(f.seen for f in found)
-
-
-def test_the_ephemeris_decides_if_the_image_has_no_information() -> None:
-    of = sky(brightness=1.0)
-    nothing = Noise(photon_gain_dn=6.0, read_noise_dn=1e6)
-    transit = dataclasses.replace(noise_free(of), noise=nothing)
-    for f, frame in zip(found_in(of, transit, [0, 5]), (transit.frames[0], transit.frames[5]), strict=True):
-        assert (f.place.x_px, f.place.y_px) == pytest.approx((frame.place.x_px, frame.place.y_px), abs=0.05)
-        assert (f.sigma_x_px, f.sigma_y_px) == pytest.approx((1.0, 1.0), abs=0.02)
+    found = found_in(of, observed(of, 0).transit, EVERY)
+    assert np.hypot(*errors(of, found, EVERY).T).max() < 2
+    assert all(f.seen for f in found)
 
 
 def test_the_ephemeris_has_more_weight_if_the_sun_changed() -> None:
@@ -173,7 +143,7 @@ def test_the_ephemeris_has_more_weight_if_the_sun_changed() -> None:
     of = sky(brightness=4.0)
     transit = noise_free(of)
     y, x = np.indices((SIZE_PX, SIZE_PX))
-    for n in EVERY:
+    for n in EVERY[::3]:
         exact = of.plan.place(n)
         patches = np.sin((x - exact.x_px) / 7.0 + 1.0) * np.cos((y - exact.y_px) / 9.0 + 2.0)
         pixels = [f.pixels * np.exp(1.5 * patches * (k == n)) for k, f in enumerate(transit.frames)]
@@ -188,13 +158,13 @@ def test_image_and_ephemeris_are_weighted_by_their_errors() -> None:
     """The fit moves from the ephemeris towards the truth by a share 1 - sigma^2, if the error of the ephemeris is 1."""
     of, exact = sky(), sky().plan.place(5)
     reported = Place(exact.x_px + 1.0, exact.y_px - 1.0, RADIUS_PX)
-    for read_noise_dn in (1e4, 3e4, 6e4):
+    for read_noise_dn in (1e4, 3e4, 6e4, 1e7):
         transit = displaced(noise_free(of), 5, reported)
         transit = dataclasses.replace(transit, noise=Noise(6.0, read_noise_dn))
         found = found_in(of, transit, [5])[0]
         gone = (reported.x_px - found.place.x_px, found.place.y_px - reported.y_px)
         assert gone == pytest.approx((1 - found.sigma_x_px**2, 1 - found.sigma_y_px**2), abs=0.1)
-    assert max(gone) < 0.6
+    assert max(gone) < 0.05, "an image without information"
 
 
 def displaced(transit: Transit, index: int, place: Place) -> Transit:
@@ -212,21 +182,16 @@ def test_an_ephemeris_wrong_by_pixels_is_corrected_and_a_larger_error_is_reporte
     far = Place(exact.x_px + 30.0, exact.y_px + 40.0, RADIUS_PX)
     lost = found_in(of, displaced(noise_free(of), 5, far), [5])[0]
     assert not lost.seen
-
-
-@pytest.mark.parametrize(("x_px", "y_px"), [(-12.0, 60.0), (60.0, SIZE_PX + 11.0), (np.nan, 60.0)])
-def test_a_disc_off_the_frame_is_refused_by_name(x_px: float, y_px: float) -> None:
-    with pytest.raises(DataError, match=r"005\.fits: expected an occulter .*; got x = ") as caught:
-        displaced(noise_free(sky()), 5, Place(x_px, y_px, RADIUS_PX))
-    assert caught.value.code == "occulter-outside"
-
-
-def test_an_image_without_an_occulter_is_recognised() -> None:
-    of = sky()
     pixels = [frame.pixels for frame in noise_free(of).frames]
-    pixels[6] = of.seen_scenes[2].astype(np.float32)
-    lost = found_in(of, with_pixels(noise_free(of), pixels), [6])[0]
-    assert not lost.seen
+    pixels[6] = of.seen_scenes[2].astype(np.float32)  # an image without an occulter
+    assert not found_in(of, with_pixels(noise_free(of), pixels), [6])[0].seen
+
+
+def test_a_disc_off_the_frame_is_refused_by_name() -> None:
+    for x_px, y_px in ((-12.0, 60.0), (60.0, SIZE_PX + 11.0), (np.nan, 60.0)):
+        with pytest.raises(DataError, match=r"005\.fits: .*; got x = ") as caught:
+            displaced(noise_free(sky()), 5, Place(x_px, y_px, RADIUS_PX))
+        assert caught.value.code == "occulter-outside"
 
 
 # --- neighbours -------------------------------------------------------------------------------------------
