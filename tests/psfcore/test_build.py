@@ -82,14 +82,6 @@ def test_the_exact_integral_equals_fine_sampling_of_the_published_formula() -> N
         np.testing.assert_allclose(line(mesh, size), sampled / sampled.sum(), rtol=2e-4, atol=1e-9)
 
 
-def test_an_open_grating_without_wires_has_no_orders() -> None:
-    """Without wires the windows form one slit of N pitches: sinc^2 with zeros at lambda z / (N d)."""
-    slit = Mesh(name="slit", place="entrance", pitch_um=100.0, wire_um=1e-9, windows=4)
-    spacing = spacing_px(slit)  # with wires, the orders would lie at multiples of this
-    pattern = line(slit)
-    assert pattern[1024 + round(spacing)] < 1e-3 * pattern[1024]
-
-
 def test_scatter_amplitude_and_tail() -> None:
     amplitude = amplitude_for_total(6.15, 2.53, 0.411)
     # 0.152 was inferred with more digits of c than the quoted 2.53: +-0.005 in c changes a by 1.7 %.

@@ -1,16 +1,23 @@
+"""PSFs: their checks, curves and arrays, and the PSF for binned pixels."""
+
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.io.fits import Header
 from numpy.typing import NDArray
 
+from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.errors import DataError
+from psfcore.fits.header import plate_scale_arcsec
 from psfcore.image import Image
-from psfcore.psf import crop_centred, crop_or_pad, cumulative_curve, encircled_energy, radial_profile
-from psfcore.psf_sampling import check_compatible
+from psfcore.psf import Psf, crop_centred, crop_or_pad, cumulative_curve, encircled_energy, radial_profile
+from psfcore.psf_sampling import check_compatible, psf_for_image, rebinned, rebinned_kernel
+from psfcore.scatter.power_law import scatter_kernel
 from tests.psfcore.conftest import delta, gaussian, make_psf
 
 
@@ -28,7 +35,10 @@ def test_a_wrong_psf_is_refused() -> None:
         (with_pixel(-1e-6), "psf-negative", "-1e-06"),
         (np.roll(delta(32), (-16, -16), (0, 1)), "psf-not-centred", "corner origin"),
         (np.roll(delta(32), 3, 0), "psf-not-centred", r"= \(16, 16\); got \(19, 16\)"),
-        *((np.roll(gaussian(32, 1.5), s, (0, 1)), "psf-not-centred", "") for s in ((0, 1), (1, 0), (-1, -1))),
+        *(
+            (np.roll(gaussian(32, 1.5), s, (0, 1)), "psf-not-centred", "got")
+            for s in ((0, 1), (1, 0), (-1, -1))
+        ),
         (np.ones(9) / 9, "psf-not-2d", "two axes"),
     ):
         with pytest.raises(DataError, match=words) as caught:
@@ -106,3 +116,151 @@ def test_a_kernel_is_cut_or_padded_about_its_centre() -> None:
         np.testing.assert_array_equal(crop_centred(out, (least, least)), crop_centred(kernel, (least, least)))
         assert size <= 31 or out.sum() == kernel.sum()
     assert crop_or_pad(kernel[:, :20], 40)[20, 20] == kernel[15, 10]
+
+
+# --- binned pixels ---------------------------------------------------------------------------------------
+
+
+Plane = NDArray[np.float64]
+FACTORS = [2, 3, 4, 5]
+
+
+def lopsided(shape: tuple[int, int]) -> Plane:
+    """An asymmetric kernel with its peak at the centre."""
+    kernel = np.random.default_rng(shape[0]).random(shape) ** 4
+    y, x = (np.arange(n) - n // 2 for n in shape)
+    kernel *= np.exp(-0.2 * np.abs(y[:, None] + 0.5) - 0.3 * np.abs(x[None, :] - 0.3))
+    kernel[shape[0] // 2, shape[1] // 2] = 2 * kernel.max()
+    return kernel / kernel.sum()
+
+
+def wings(size: int) -> Psf:
+    scatter = crop_centred(scatter_kernel(6.15, 2.53, 0.411, 2048), (size, size))
+    kernel = np.maximum(linear_convolve(scatter, gaussian(31, 0.8), (size, size)), 0)
+    return make_psf(kernel, plate_scale_arcsec=0.492, components={"SCATTER": scatter})
+
+
+def binned(plane: Plane, factor: int) -> Plane:
+    ny, nx = plane.shape[0] // factor, plane.shape[1] // factor
+    return plane.reshape(ny, factor, nx, factor).mean(axis=(1, 3))
+
+
+def see(scene: Plane, kernel: Plane) -> Plane:
+    return Convolver(kernel, scene.shape, dtype=np.float64).apply(scene)
+
+
+def test_rebinning_is_exact_where_the_scene_is_constant_within_binned_pixels() -> None:
+    """Compare with a convolution at full resolution that is then binned; even, odd and oblong kernels and fields."""
+    for factor, shape in itertools.product(FACTORS, ((24, 24), (25, 25), (24, 31), (33, 20))):
+        scene, kernel = np.random.default_rng(factor).random((13, 18)), lopsided(shape)
+        expected = binned(see(np.kron(scene, np.ones((factor, factor))), kernel), factor)
+        np.testing.assert_allclose(see(scene, rebinned_kernel(kernel, factor)), expected, rtol=0, atol=1e-12)
+
+
+def test_rebinning_holds_on_a_smooth_scene() -> None:
+    """For structures of 6 binned pixels (sigma) on a sky, both ways agree to half a percent."""
+    kernel = wings(256).kernel
+    for factor in FACTORS:
+        y, x = np.mgrid[: 48 * factor, : 60 * factor] / factor
+        scene = 20 + 300 * np.exp(-((y - 20.3) ** 2 + (x - 31.6) ** 2) / (2 * 6.0**2))
+        expected = binned(see(scene, kernel), factor)
+        found = see(binned(scene, factor), rebinned_kernel(kernel, factor))
+        assert np.abs(found / expected - 1).max() < 0.005
+
+
+def test_energy_and_centre_are_kept_and_a_delta_stays_a_delta() -> None:
+    psf = wings(256)
+    for factor in FACTORS:
+        coarse = rebinned(psf, factor)
+        assert coarse.total == pytest.approx(psf.total, rel=1e-12)
+        assert coarse.components["SCATTER"].sum() == pytest.approx(psf.components["SCATTER"].sum(), rel=1e-12)
+        kernel, (cy, cx) = coarse.kernel, (n // 2 for n in coarse.kernel.shape)
+        inner = kernel[cy - 10 : cy + 11, cx - 10 : cx + 11]
+        np.testing.assert_allclose(inner, inner[::-1, ::-1], rtol=1e-9)  # no shift by half a pixel
+        assert kernel.argmax() == cy * kernel.shape[1] + cx
+        assert coarse.plate_scale_arcsec == pytest.approx(0.492 * factor)
+        assert coarse.version.endswith(f"+bin{factor}") and coarse.provenance["binning"] == factor
+        one = rebinned_kernel(delta(32), factor)
+        assert one[one.shape[0] // 2, one.shape[1] // 2] == 1.0 and one.sum() == 1.0
+    for wrong in (-1, 0, 17, 100):
+        with pytest.raises(DataError, match="bad-binning"):
+            rebinned(make_psf(delta(32)), wrong)
+
+
+def test_light_beyond_the_full_reach_is_left_out_before_binning() -> None:
+    kernel = np.zeros((2100, 2100))
+    kernel[1050, 1050] = 0.999
+    kernel[3, 1050] = 0.2  # farther than 1024 px
+    assert rebinned_kernel(kernel, 2).sum() == pytest.approx(0.999)
+
+
+# --- for an image ---
+
+
+def header(step_1: float | None, step_2: float | None = None, unit: str | None = "arcsec") -> Header:
+    steps = {"CDELT1": step_1, "CDELT2": step_1 if step_2 is None else step_2}
+    cards = steps | {"CUNIT1": unit, "CUNIT2": unit}
+    return Header({key: value for key, value in cards.items() if value is not None})
+
+
+def test_the_psf_is_rebinned_to_the_pixels_of_the_image() -> None:
+    psf = wings(128)
+    for of_image, factor in (
+        (header(0.492), 1),
+        (header(0.4935, -0.492), 1),
+        (header(None), 1),
+        (header(0.984), 2),
+        (header(-0.984, 0.984), 2),
+        (header(3 * 0.492 / 3600, unit="deg"), 3),
+        (header(4 * 0.492 / 60, unit="arcmin"), 4),
+        (header(0.984, unit=None), 2),
+        (header(7.0, unit="furlong"), 1),
+    ):
+        found = psf_for_image(psf, of_image)
+        assert found.provenance.get("binning", 1) == factor
+        assert (found is psf) == (factor == 1)
+    no_multiple = (header(0.7), header(0.984, 0.492), header(0.246), header(2.3), header(0.492 * 2.05))
+    for of_image in no_multiple:
+        with pytest.raises(DataError, match=r"plate-scale-mismatch.*0\.492"):
+            psf_for_image(psf, of_image)
+    anywhere = make_psf(delta(32))
+    assert psf_for_image(anywhere, header(3.3)) is anywhere, "a PSF without plate scale"
+
+
+def test_pixels_of_another_telescope_are_not_binned_pixels() -> None:
+    """An FSI pixel equals nine HRI_EUV pixels to 0.3 %."""
+    psf = replace(wings(128), instrument="hri_euv")
+    own, other = header(0.984), header(4.44012445)
+    own["DETECTOR"], other["DETECTOR"] = "HRI_EUV", "FSI"
+    assert psf_for_image(psf, own).provenance["binning"] == 2
+    with pytest.raises(DataError, match="or binned images of its instrument") as caught:
+        psf_for_image(psf, other)
+    assert caught.value.code == "plate-scale-mismatch"
+
+
+def test_a_window_has_the_same_psf_except_near_its_edge() -> None:
+    """Only differences of positions matter, not where the window starts on the detector."""
+    scene = np.random.default_rng(5).random((120, 150))
+    kernel = lopsided((21, 27))
+    whole, window = see(scene, kernel), see(scene[30:95, 41:140], kernel)
+    np.testing.assert_allclose(window[13:-13, 14:-14], whole[43:82, 55:126], rtol=1e-12)
+
+
+def test_plate_scale() -> None:
+    cases: tuple[tuple[object, str | None, float | None], ...] = (
+        (0.5, "arcsec", 0.5),
+        (-0.5, "ARCSEC", 0.5),
+        (0.5, None, 0.5),
+        (1 / 3600, "deg", 1.0),
+        (2.0, "arcmin", 120.0),
+        (0.0, "arcsec", None),
+        (0.5, "um", None),
+        (None, "arcsec", None),
+        ("0.5", "arcsec", None),
+        (True, "arcsec", None),
+    )
+    for step, unit, arcsec in cases:
+        cards = {"CDELT2": step, "CUNIT2": unit}
+        of_image = Header({key: value for key, value in cards.items() if value is not None})
+        assert plate_scale_arcsec(of_image, 2) == (None if arcsec is None else pytest.approx(arcsec))
+        assert plate_scale_arcsec(of_image, 1) is None

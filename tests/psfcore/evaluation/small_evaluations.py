@@ -14,15 +14,7 @@ from psfcore.evaluation.evaluation import Evaluation, evaluate
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy, dark_offset_study
 from psfcore.simulate.scatter_truth import total_kernel
 from psfcore.transit.transit import Kernel
-from tests.psfcore.small_transits import (
-    DIFFRACTION,
-    SCATTER,
-    SIZE_PX,
-    noise_free,
-    observed,
-    sky,
-    solved,
-)
+from tests.psfcore.small_transits import DIFFRACTION, SCATTER, SIZE_PX, noise_free, observed, sky, solved
 
 SEEDS = range(11, 20)
 

@@ -1,10 +1,11 @@
-"""Summaries, trends, the JSON report and the plot of an evaluation."""
+"""Summaries, trends, the JSON report, the plot and the printed table of an evaluation."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +17,12 @@ from psfcore.evaluation.evaluation import evaluate
 from psfcore.evaluation.frame import FrameEvaluation
 from psfcore.evaluation.plot import evaluation_png
 from psfcore.evaluation.report import report, slope_of, summary_of, trends
+from psfcore.evaluation.shapes import FIGURES, ShapeErrors, ShapesByErrors
 from psfcore.evaluation.summary_lines import summary_lines
 from psfcore.transit.occulter import FoundPlace
 from psfcore.transit.transit import Place
 from tests.psfcore.evaluation.small_evaluations import exact_scene, judged, kernel_with, noisy, offsets
-from tests.psfcore.small_transits import (
-    IMAGES,
-    SIZE_PX,
-    noise_free,
-    sky,
-    with_pixels,
-)
+from tests.psfcore.small_transits import IMAGES, SIZE_PX, noise_free, sky, with_pixels
 
 
 def x_px(frame: FrameEvaluation) -> float:
@@ -147,10 +143,37 @@ def test_the_report_is_json_with_the_values_of_the_summary_lines() -> None:
     maps = said["superposed"]
     middle = maps["centre_index"]
     assert maps["mape_pct"][middle][middle] > 0 and maps["mape_pct"][0][0] is None
-    text = "\n".join(summary_lines(report(found, offsets())))
-    assert f"all pointings: 12 images, mean {said['all']['mean_pct']:+.2f} %" in text
-    assert f"MAPE {maps['mape_mean_pct']:.2f} %" in text
-    assert f"at most {said['dark_offsets']['largest_weight_change_pct']:.1f} %" in text
+    said["pointings"][1]["centre_mean_pct"] = said["all"]["rms_pct"] = None
+    lines = summary_lines(said | {"left_out": {"003.fits": "no occulter"}})
+    names = ("mean_pct", "mean_noise_pct", "rms_pct", "noise_pct", "largest_pct", "centre_mean_pct")
+    assert numbers_in(lines[1]) == [round(said["pointings"][0][name], 2) for name in names]
+    assert lines[2].startswith("pointing 2: 4 images") and "centre" not in lines[2]
+    assert lines[4].startswith("all pointings: 12 images") and "rms n/a %" in lines[4]
+    names = ("mpe_rms_pct", "mpe_largest_pct", "mpe_noise_rms_pct", "mape_mean_pct", "mape_noise_mean_pct")
+    assert numbers_in(lines[5]) == [round(maps[name], 2) for name in names]
+    relative = said["trends"][0]["relative_pct"]
+    assert numbers_in(lines[6])[:2] == [round(relative["per_100_px"], 2), round(relative["sigma"], 2)]
+    study = said["dark_offsets"]
+    largest = study["largest_weight_change_pct"], study["largest_curve_change_points"]
+    assert numbers_in(lines[-3]) == [round(largest[0], 1), round(largest[1], 2)] and "-5, +5 DN" in lines[-3]
+    assert lines[-2:] == ["left out: 1 images", "  003.fits: no occulter"]
+
+
+def numbers_in(line: str) -> list[float]:
+    """The numbers of a line that have decimals."""
+    return [float(number) for number in re.findall(r"[+-]?\d+\.\d+", line)]
+
+
+def test_shapes_are_printed_as_a_table_with_differences_from_the_first() -> None:
+    figures = {name: (1.0 + n, 0.5) for n, name in enumerate(FIGURES)}
+    zero, less = dict.fromkeys(FIGURES, (0.0, 0.0)), dict.fromkeys(FIGURES, (-0.25, 0.125))
+    law = ShapeErrors("softened-power-law", {}, figures, zero)
+    shapes = ShapesByErrors(12, 4, (law, ShapeErrors("stretched", {}, figures, less)))
+    lines = summary_lines(report(noisy(11)), json.loads(json.dumps(shapes.to_json())))[-5:]
+    assert "errors of shapes, held out (%)" in lines[0] and "MAPE mean" in lines[0]
+    assert numbers_in(lines[1]) == [2.0, 0.5, 3.0, 0.5, 4.0, 0.5]
+    assert lines[3] == "differences from softened-power-law"
+    assert lines[4].split()[:3] == ["stretched", "-0.25", "±"]
 
 
 def test_an_evaluation_and_one_of_a_single_pointing_are_drawn(tmp_path: Path) -> None:

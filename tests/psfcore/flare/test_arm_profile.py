@@ -20,6 +20,8 @@ from psfcore.flare.arm_profile import (
     flare_centre,
 )
 from psfcore.flare.arm_profile_plot import flare_png
+from psfcore.flare.judge import judge_on_flare
+from psfcore.image import Image
 from psfcore.psf import Psf
 from tests.psfcore.conftest import make_psf
 from tests.simulated_flare import (
@@ -27,6 +29,7 @@ from tests.simulated_flare import (
     NOISE,
     SATURATION,
     SIZE,
+    Plane,
     flare_light,
     flare_psf,
     observed,
@@ -167,6 +170,32 @@ def test_flares_that_cannot_be_compared_are_refused() -> None:
         with pytest.raises(DataError, match=r"expected .*; got") as caught:
             compare_on_flare(plane, usable, flare_psf(), arm_deg=0.0, **where)  # type: ignore[arg-type]
         assert caught.value.code == code
+
+
+def test_images_are_compared_in_the_unit_of_their_headers() -> None:
+    planes = pair(0)
+    for unit, exposure_s, divisor, label in (
+        ("DN", 2.0, 2.0, "DN/s"),
+        ("DN/s", 2.0, 1.0, "DN/s"),
+        (None, 2.0, 2.0, "unit unknown, per s"),
+        ("DN", None, 1.0, "DN, exposure unknown"),
+        (None, None, 1.0, "unit unknown"),
+    ):
+        images = [image(plane, unit, exposure_s) for plane in planes]
+        found = judge_on_flare(*images, flare_psf(), centre_xy=CENTRE, arm_deg=0.0)
+        assert found.unit == label
+        np.testing.assert_allclose(found.difference, (planes[0] - planes[1]) / divisor)
+    flaring = image(planes[0], "DN", 2.0)
+    for code, other in (
+        ("flare-units", image(planes[1], "DN", None)),
+        ("flare-shapes", image(planes[1][:, 1:], "DN", 2.0)),
+    ):
+        with pytest.raises(DataError, match=code):
+            judge_on_flare(flaring, other, flare_psf(), centre_xy=CENTRE, arm_deg=0.0)
+
+
+def image(pixels: Plane, unit: str | None, exposure_s: float | None) -> Image:
+    return Image(pixels, np.zeros(pixels.shape, np.uint8), fits.Header(), unit, exposure_s)
 
 
 def test_the_comparison_is_plotted(tmp_path: Path) -> None:

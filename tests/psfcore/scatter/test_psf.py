@@ -1,4 +1,4 @@
-"""Convolution with a PSF and its inverse, in the engine's order, compared with a plain float64 convolution."""
+"""The total PSF, its slopes and its convolution with a field."""
 
 from __future__ import annotations
 
@@ -8,13 +8,80 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psfcore.convolution.convolver import Convolver
+from psfcore.convolution.convolver import Convolver, linear_convolve
+from psfcore.psf import REACH_GRID_PX, crop_centred, cumulative_curve
 from psfcore.scatter.optics import Blur, Optics, pick, put
 from psfcore.scatter.power_law import scatter_kernel
+from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
+from psfcore.scatter.total_psf import CURVE_RADII_PX, TotalPsf
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from tests.psfcore.small_transits import DIFFRACTION, SCATTER
 
-SHAPES = [(64, 64), (100, 131), (97, 40), (33, 64), (17, 50), (47, 48)]
+AT = SOFTENED_POWER_LAW.coordinates({"b_px": 6.15, "c": 2.53, "total": 0.411})
+
+
+def test_scatter_and_diffraction_convolve() -> None:
+    """The square agrees with the full reach, except for light that is diffracted back from outside it."""
+    total = TotalPsf(DIFFRACTION, SOFTENED_POWER_LAW, (100, 131))
+    assert total.size == 262
+    assert TotalPsf(DIFFRACTION, SOFTENED_POWER_LAW, (1500, 10)).size == REACH_GRID_PX, (
+        "not more than the full reach"
+    )
+    kernel = total.kernel(AT)
+    by_hand = linear_convolve(SOFTENED_POWER_LAW.kernel(AT, 262), DIFFRACTION, (262, 262))
+    np.testing.assert_allclose(kernel, by_hand, atol=1e-15)
+    truth = total_kernel(SCATTER, DIFFRACTION, 262)
+    inner = (slice(16, -16), slice(16, -16))
+    np.testing.assert_allclose(kernel[inner], truth[inner], rtol=1e-10)
+    np.testing.assert_allclose(kernel, truth, atol=1e-7)
+
+
+def test_a_pattern_larger_than_the_square_counts_where_it_reaches() -> None:
+    wide = np.zeros((401, 401))
+    wide[200, 200], wide[200, 390] = 0.9, 0.1  # the second is farther than two pixels of a 64 px field
+    total = TotalPsf(wide, SOFTENED_POWER_LAW, (64, 64))
+    scatter = SOFTENED_POWER_LAW.kernel(AT, 128)
+    np.testing.assert_allclose(total.kernel(AT), 0.9 * scatter, rtol=1e-9, atol=1e-15)
+
+
+def test_slopes_are_differences_of_kernels() -> None:
+    for name, k in (*(("softened-power-law", k) for k in range(3)), ("stretched", 4)):
+        shape = SHAPES[name]
+        total = TotalPsf(DIFFRACTION, shape, (64, 64))
+        at = shape.coordinates({"b_px": 6.15, "c": 2.53, "total": 0.411})
+        axis = np.eye(at.size)[k]
+        near, far = (
+            (total.kernel(at + h * axis) - total.kernel(at - h * axis)) / (2 * h) for h in (4e-3, 8e-3)
+        )
+        expected = (4 * near - far) / 3
+        largest = np.abs(expected).max()
+        assert largest > 1e-4
+        np.testing.assert_allclose(total.slope(at, k), expected, atol=1e-5 * largest)
+
+
+def test_curve_slopes_are_differences_of_curves() -> None:
+    total = TotalPsf(DIFFRACTION, SOFTENED_POWER_LAW, (64, 64))
+    assert total.radii_px.tolist() == [0.5, 2, 5, 10, 20, 50]
+    assert set(total.radii_px) < set(CURVE_RADII_PX)
+    slopes = total.slopes(AT)
+    for k, slope in enumerate(slopes):
+        np.testing.assert_array_equal(slope, total.slope(AT, k))
+    found = total.curve_slopes(slopes)
+    assert found.shape == (6, 3)
+    for k in range(3):
+        step = np.zeros(3)
+        step[k] = 1e-3
+        ahead, behind = (cumulative_curve(total.kernel(AT + side * step), total.radii_px) for side in (1, -1))
+        np.testing.assert_allclose(found[:, k], (ahead - behind) / 2e-3, rtol=1e-8)
+    assert (found[:, 2] > 0).all()  # more scatter, more light beyond every distance
+    crop = crop_centred(total.kernel(AT), (64, 64))
+    assert cumulative_curve(crop, [20.0]) == pytest.approx(cumulative_curve(total.kernel(AT), [20.0]))
+
+
+# --- convolution in the order of the engine --------------------------------------------------------------
+
+
+FIELDS = [(64, 64), (100, 131), (97, 40), (33, 64), (17, 50), (47, 48)]
 LOPSIDED = total_kernel(
     ScatterTruth(6.15, 2.53, 0.411, stretch=0.2, angle_deg=30.0, dipole=0.3), DIFFRACTION, 200
 )
@@ -27,7 +94,7 @@ def scene(shape: tuple[int, int], seed: int = 1) -> NDArray[np.float64]:
 
 
 def test_it_is_the_convolution() -> None:
-    for kernel, shape in itertools.product((total_kernel(SCATTER, DIFFRACTION, 200), LOPSIDED), SHAPES):
+    for kernel, shape in itertools.product((total_kernel(SCATTER, DIFFRACTION, 200), LOPSIDED), FIELDS):
         blur, plain, x = Blur(kernel, shape), Convolver(kernel, shape, dtype=np.float64), scene(shape)
         seen, back = blur.convolve(blur.lanes(x)), blur.correlate(blur.lanes(x))
         np.testing.assert_allclose(blur.field(seen), plain.apply(x), rtol=1e-5)
@@ -36,7 +103,7 @@ def test_it_is_the_convolution() -> None:
 
 def test_nothing_is_left_beyond_the_fields_last_row() -> None:
     """Two passes give the same result as two passes with a crop between them."""
-    for shape in SHAPES:
+    for shape in FIELDS:
         optics, x = Optics(LOPSIDED, shape), scene(shape)
         lanes = optics.lanes(x)
         once = optics.convolve(lanes)
@@ -51,7 +118,7 @@ def dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
 
 
 def test_adjoints() -> None:
-    for shape in SHAPES:
+    for shape in FIELDS:
         optics = Optics(LOPSIDED, shape)
         points = scene(shape) - 150
         x, y = (optics.lanes(plane) for plane in (points, np.roll(points, (2, 3), axis=(0, 1))))
@@ -65,7 +132,7 @@ def test_adjoints() -> None:
 
 def test_inversion_recovers_the_scene() -> None:
     kernel = total_kernel(SCATTER, DIFFRACTION, 280)
-    for shape in SHAPES[:2]:
+    for shape in FIELDS[:2]:
         optics, x = Optics(kernel, shape), scene(shape)
         observed = optics.lanes(Convolver(kernel, shape, dtype=np.float64).apply(x))
         off = {n: np.abs(optics.field(optics.invert(observed, steps=n)) - x).max() for n in (0, 1, 2, 5, 8)}
@@ -85,7 +152,7 @@ def test_a_kernel_may_have_any_sign() -> None:
 
 def test_single_pixels_are_the_right_ones() -> None:
     rng = np.random.default_rng(0)
-    for shape in SHAPES:
+    for shape in FIELDS:
         blur, x = Blur(DIFFRACTION, shape), scene(shape)
         rows, columns = (np.append(rng.integers(0, n, 60), (0, n - 1)) for n in shape)
         lanes, expected = blur.lanes(x), x.astype(np.float32)
