@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,8 @@ from scipy.signal import fftconvolve
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.fits.images import read_image
-from psfcore.psf import cumulative_curve
 from psfcore.scatter.power_law import scatter_kernel
-from psfcore.simulate.disc import Behind, covered_share, fully_dark
+from psfcore.simulate.disc import covered_share, fully_dark
 from psfcore.simulate.plan import COMBINED, HIGH, Plan, default_plan, plan_from_json
 from psfcore.simulate.pointings import drawn_scene, scene_from_image
 from psfcore.simulate.scatter_truth import ScatterTruth, anisotropic_kernel, total_kernel
@@ -68,23 +69,17 @@ def test_126_images_are_divided_as_in_the_paper() -> None:
     ]
 
 
-@pytest.mark.parametrize("images", [1, 2, 3, 7, 30, 61, 200])
-@pytest.mark.parametrize("size_px", [64, 100, 512])
-def test_a_plan_can_have_any_number_of_images_and_any_field(images: int, size_px: int) -> None:
-    plan = default_plan(images, size_px)
-    assert len(plan.shots) == images
-    times = [shot.time_s for shot in plan.shots]
-    assert times == sorted(times) and len(set(times)) == images
-    for index in range(images):
-        place = plan.place(index)
-        assert place.radius_px < min(place.x_px, place.y_px)
-        assert max(place.x_px, place.y_px) < size_px - 1 - place.radius_px
-    if images == 30:
-        assert [sum(shot.pointing == pointing for shot in plan.shots) for pointing in (1, 2, 3)] == [
-            10,
-            10,
-            10,
-        ]
+def test_a_plan_can_have_any_number_of_images_and_any_field() -> None:
+    for images, size_px in itertools.product((1, 2, 3, 7, 30, 61, 200), (64, 100, 512)):
+        plan = default_plan(images, size_px)
+        assert len(plan.shots) == images
+        times = [shot.time_s for shot in plan.shots]
+        assert times == sorted(times) and len(set(times)) == images
+        for index in range(images):
+            place = plan.place(index)
+            assert place.radius_px < min(place.x_px, place.y_px)
+            assert max(place.x_px, place.y_px) < size_px - 1 - place.radius_px
+    assert Counter(shot.pointing for shot in default_plan(30, 512).shots) == {1: 10, 2: 10, 3: 10}
 
 
 def test_a_plan_is_read_back_from_json() -> None:
@@ -92,9 +87,8 @@ def test_a_plan_is_read_back_from_json() -> None:
     assert plan_from_json(json.loads(json.dumps(plan.as_json()))) == plan
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
+def test_impossible_plans_scatter_and_diffraction_are_refused() -> None:
+    plans: tuple[dict[str, object], ...] = (
         {"oversampling": 3},
         {"beyond": "dim"},
         {"brightness": 0.0},
@@ -102,61 +96,47 @@ def test_a_plan_is_read_back_from_json() -> None:
         {"dark_offset_dn": float("inf")},
         {"radius_px": 40.0},
         {"views": ("disc", "disc")},
-    ],
-)
-def test_an_impossible_plan_is_refused(changes: dict[str, object]) -> None:
-    with pytest.raises(DataError, match="bad-plan"):
-        default_plan(6, 64, **changes)
+    )
+    for changes in plans:
+        with pytest.raises(DataError, match="bad-plan"):
+            default_plan(6, 64, **changes)
+    for values in ({"b_px": 0.0}, {"c": float("nan")}, {"total": 1.0}, {"stretch": -1.0}, {"dipole": 1.1}):
+        with pytest.raises(DataError, match="bad-scatter"):
+            dataclasses.replace(SCATTER, **values)
+    with pytest.raises(DataError, match="bad-diffraction"):
+        simulate(default_plan(1, 64), SCATTER, 0.9 * DIFFRACTION, 1)
 
 
 # --- the occulter -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("fine", [1, 2])
-def test_the_covered_area_is_that_of_the_circle(fine: int) -> None:
+def test_the_covered_area_is_that_of_the_circle() -> None:
     place = Place(20.3, 18.77, 10.75)
-    share = covered_share(place, (0, 0), (40, 41), fine)
-    assert share.sum() / fine**2 == pytest.approx(np.pi * 10.75**2, rel=1e-12)
     # Brute force: 40 points a pixel and axis.
-    n = 40 * fine
-    y, x = ((np.arange(40 * 41) + 0.5) / 40 - 0.5 for _ in range(2))
-    inside = np.hypot(x[None, :] - place.x_px, y[: 40 * 40, None] - place.y_px) <= place.radius_px
-    counted = inside.reshape(40 * fine, n // fine**2, 41 * fine, n // fine**2).mean(axis=(1, 3))
-    np.testing.assert_allclose(share, counted, atol=0.03)
-
-
-def test_fully_dark_pixels_are_completely_covered() -> None:
-    place = Place(20.3, 18.77, 10.75)
+    y, x = ((np.arange(40 * n) + 0.5) / 40 - 0.5 for n in (40, 41))
+    inside = np.hypot(x[None, :] - place.x_px, y[:, None] - place.y_px) <= place.radius_px
+    for fine in (1, 2):
+        share = covered_share(place, (0, 0), (40, 41), fine)
+        assert share.sum() / fine**2 == pytest.approx(np.pi * 10.75**2, rel=1e-12)
+        n = 40 // fine
+        counted = inside.reshape(40 * fine, n, 41 * fine, n).mean(axis=(1, 3))
+        np.testing.assert_allclose(share, counted, atol=0.03)
     dark = fully_dark(place, (3, 5), (36, 35))
     np.testing.assert_array_equal(dark, covered_share(place, (3, 5), (36, 35)) > 1 - 1e-12)
     assert 290 < dark.sum() < 350
 
 
-def test_hidden_slopes_agree_with_shifts() -> None:
-    rng = np.random.default_rng(1)
-    around = Behind((4, 6), rng.uniform(50, 150, (60, 60)), 2)
-    by_x, by_y = around.hidden_slopes(Place(20.2, 19.1, 10.75))
-    for slope, shift in ((by_x, (0.02, 0.0)), (by_y, (0.0, 0.02))):
-        ahead = around.hidden(Place(20.2 + shift[0] / 2, 19.1 + shift[1] / 2, 10.75))
-        back = around.hidden(Place(20.2 - shift[0] / 2, 19.1 - shift[1] / 2, 10.75))
-        np.testing.assert_allclose((ahead - back) / 0.02, slope, atol=0.5)
-        assert abs(slope).max() > 50
-
-
 # --- the PSF ----------------------------------------------------------------------------------------------
 
 
-def test_isotropic_scatter_is_the_power_law() -> None:
+def test_isotropic_scatter_is_the_power_law_and_every_kernel_sums_to_1() -> None:
     expected = scatter_kernel(6.15, 2.53, 0.411, 128)
     np.testing.assert_allclose(anisotropic_kernel(SCATTER, 128), expected, rtol=1e-10)
-
-
-@pytest.mark.parametrize("stretch, dipole", [(0.0, 0.0), (0.15, 0.0), (-0.1, 0.3)])
-def test_the_kernel_sums_to_1(stretch: float, dipole: float) -> None:
-    scatter = dataclasses.replace(SCATTER, stretch=stretch, angle_deg=30.0, dipole=dipole)
-    kernel = anisotropic_kernel(scatter)
-    assert kernel.sum() == pytest.approx(1, abs=1e-12)
-    assert kernel[1024, 1024] == pytest.approx(1 - 0.411, abs=1e-12)
+    for stretch, dipole in ((0.0, 0.0), (-0.1, 0.3)):
+        scatter = dataclasses.replace(SCATTER, stretch=stretch, angle_deg=30.0, dipole=dipole)
+        kernel = anisotropic_kernel(scatter)
+        assert kernel.sum() == pytest.approx(1, abs=1e-12)
+        assert kernel[1024, 1024] == pytest.approx(1 - 0.411, abs=1e-12)
     assert total_kernel(scatter, DIFFRACTION).sum() == pytest.approx(1, abs=3e-5)  # 1e-5 falls past the reach
 
 
@@ -174,19 +154,6 @@ def test_dipole_follows_its_definition() -> None:
     kernel = anisotropic_kernel(scatter, 128)
     assert kernel[64, 64 + 20] / kernel[64, 64 - 20] == pytest.approx(1.25 / 0.75, rel=1e-12)
     assert kernel[64 + 20, 64] == pytest.approx(kernel[64 - 20, 64], rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    "changes", [{"b_px": 0.0}, {"c": float("nan")}, {"total": 1.0}, {"stretch": -1.0}, {"dipole": 1.1}]
-)
-def test_impossible_scatter_is_refused(changes: dict[str, float]) -> None:
-    with pytest.raises(DataError, match="bad-scatter"):
-        dataclasses.replace(SCATTER, **changes)
-
-
-def test_a_diffraction_that_loses_light_is_refused() -> None:
-    with pytest.raises(DataError, match="bad-diffraction"):
-        simulate(default_plan(1, 64), SCATTER, 0.9 * DIFFRACTION, 1)
 
 
 # --- what a camera without noise sees ---------------------------------------------------------------------
@@ -216,17 +183,6 @@ def test_a_pixel_is_the_sum_of_the_definition(beyond: TrueSky) -> None:
         assert expected[y, x] == pytest.approx((weights * diffracted).sum(), rel=1e-9)
 
 
-def test_all_light_of_a_field_lands_on_the_full_reach(small: SimulatedTransit) -> None:
-    scene = small.true_scene(4)
-    kernel = total_kernel(SCATTER, DIFFRACTION, 256)
-    wide = np.zeros((352, 352))
-    wide[128:224, 128:224] = scene
-    seen = Convolver(kernel, wide.shape, dtype=np.float64).apply(wide)
-    lost = cumulative_curve(kernel, [1e9])[0] / 100
-    assert seen.sum() == pytest.approx(scene.sum() * (1 - lost), rel=1e-9)
-    assert 0.0 < lost < 0.15
-
-
 def test_the_occulter_is_dark_in_the_true_scene_and_lit_by_scatter(small: SimulatedTransit) -> None:
     for index in range(6):
         dark = fully_dark(small.plan.place(index), (0, 0), (96, 96))
@@ -247,20 +203,6 @@ def test_half_pixels_are_binned_after_the_disc_is_removed() -> None:
     sky = true_sky(plan, SCATTER, DIFFRACTION, 1, scenes={2: fine})
     assert sky.scenes[2][30, 32] == pytest.approx(3.0)
     assert sky.true_scene(0)[30, 32] == pytest.approx(2.0, abs=0.02)
-
-
-def test_light_from_beyond_the_field_raises_the_discs(beyond: TrueSky) -> None:
-    """The same field with a dark surrounding: the discs far off the limb lose most light."""
-    plan = dataclasses.replace(beyond.plan, beyond="dark", beyond_px=None, oversampling=1)
-    fields = {pointing: scene[96:-96, 96:-96] for pointing, scene in beyond.scenes.items()}
-    dark = true_sky(plan, SCATTER, DIFFRACTION, 3, scenes=fields)
-    ratios = []
-    for index in range(6):
-        disc = fully_dark(plan.place(index), (0, 0), (96, 96))
-        ratios.append(beyond.expected(index)[disc].mean() / dark.expected(index)[disc].mean())
-    assert min(ratios) > 1.01
-    assert ratios[0] > 1.3 and ratios[5] > 1.3  # far off the limb
-    assert ratios[0] > ratios[1] and ratios[5] > ratios[4]
 
 
 # --- noise, ephemeris, camera -----------------------------------------------------------------------------
@@ -358,10 +300,10 @@ def test_the_limb_is_on_the_side_of_the_pointing() -> None:
 
 def test_discs_are_as_bright_as_in_practice() -> None:
     """Two or three photons per pixel far off the limb, hundreds of DN on the disc."""
-    simulated = simulate(default_plan(6, 192), SCATTER, DIFFRACTION, 2)
+    simulated = simulate(default_plan(6, 128), SCATTER, DIFFRACTION, 2)
     means = []
     for index, shot in enumerate(simulated.plan.shots):
-        disc = fully_dark(simulated.plan.place(index), (0, 0), (192, 192))
+        disc = fully_dark(simulated.plan.place(index), (0, 0), (128, 128))
         means.append(simulated.noise_free[index][disc].mean() * shot.exposure_s)
     assert 6 < means[0] < 90 and 6 < means[5] < 90
     assert min(means[2:4]) > 150 and max(means[2:4]) < 1500
@@ -399,13 +341,10 @@ def test_a_scene_from_an_image_is_cut_or_enlarged() -> None:
     assert seen.scenes[2].max() == pytest.approx(7.0)
 
 
-@pytest.mark.parametrize("image", [np.zeros((70, 70)), np.full((70, 70), np.nan), np.ones(9)])
-def test_an_image_without_light_is_refused(image: NDArray[np.float64]) -> None:
-    with pytest.raises(DataError, match="bad-scene"):
-        scene_from_image(image, default_plan(3, 64))
-
-
-def test_scenes_of_another_shape_are_refused() -> None:
+def test_scenes_without_light_or_of_another_shape_are_refused() -> None:
+    for image in (np.zeros((70, 70)), np.full((70, 70), np.nan), np.ones(9)):
+        with pytest.raises(DataError, match="bad-scene"):
+            scene_from_image(image, default_plan(3, 64))
     with pytest.raises(DataError, match="bad-scene"):
         true_sky(default_plan(1, 64), SCATTER, DIFFRACTION, 1, scenes={2: np.ones((64, 64))})
 
@@ -429,12 +368,8 @@ def test_a_folder_contains_the_transit_and_its_truth(tmp_path: Path) -> None:
         image = read_image(path, LIMITS)
         assert image.unit == "DN" and image.exposure_s == shot.exposure_s
         np.testing.assert_allclose(image.pixels / shot.exposure_s, frame.pixels, rtol=1e-6, atol=1e-6)
-        assert (entry["fov"], entry["x"], entry["y"], entry["r"]) == (
-            frame.pointing,
-            frame.place.x_px,
-            frame.place.y_px,
-            10.75,
-        )
+        place = (frame.place.x_px, frame.place.y_px, 10.75)
+        assert (entry["fov"], entry["x"], entry["y"], entry["r"]) == (frame.pointing, *place)
     truth = json.loads((tmp_path / "t/truth.json").read_text())
     assert truth["effects"] == [] and truth["seed"] == 9
     assert truth["psf"]["total"] == 0.411 and truth["psf"]["stretch"] == 0.1
