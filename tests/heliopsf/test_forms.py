@@ -140,16 +140,6 @@ def test_an_uncertainty_is_added_where_asked(psf: heliopsf.Psf) -> None:
         heliopsf.deconvolve(a_map(), psf, noise=noise, error_draws=1)
 
 
-def test_a_cropped_map_is_deconvolved_with_the_same_psf(psf: heliopsf.Psf) -> None:
-    image = a_map()
-    part = image.submap([20, 20] * u.pix, width=79 * u.pix, height=59 * u.pix)
-    result = heliopsf.deconvolve(part, psf)
-    assert result.data.shape == (60, 80) and result.meta["psfvers"] == psf.version
-    whole = heliopsf.deconvolve(image, psf).data[20:80, 20:100]
-    inner = (slice(20, 40), slice(25, 55))
-    np.testing.assert_allclose(result.data[inner], whole[inner], rtol=0.05)
-
-
 def test_a_rebinned_map_gets_the_rebinned_psf(psf: heliopsf.Psf) -> None:
     anonymous = heliopsf.Psf.of(psf)
     binned = a_map().superpixel([2, 2] * u.pix, func=np.mean)

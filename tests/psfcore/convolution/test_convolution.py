@@ -1,10 +1,9 @@
-"""The convolution agrees with a sum term by term and with the padding of the paper, and the engine with the convolution."""
+"""The convolution agrees with a sum term by term, and the engine with the convolution."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.fft
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -31,20 +30,6 @@ def direct(x: NDArray[np.float64], kernel: NDArray[np.float64]) -> NDArray[np.fl
     return out
 
 
-def padded_by_half_on_all_sides(x: NDArray[np.float64], kernel: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The method of the paper: image and PSF of one size, both padded to twice the edge."""
-    ny, nx = x.shape
-    py, px = ny - ny // 2, nx - nx // 2
-    pad = ((py, ny - py), (px, nx - px))
-    image = np.pad(x, pad)
-    shape = image.shape
-    psf = np.zeros(shape)
-    top, left = shape[0] // 2 - kernel.shape[0] // 2, shape[1] // 2 - kernel.shape[1] // 2
-    psf[top : top + kernel.shape[0], left : left + kernel.shape[1]] = kernel
-    product = scipy.fft.fft2(image) * scipy.fft.fft2(scipy.fft.ifftshift(psf))
-    return np.asarray(scipy.fft.ifft2(product).real[py : py + ny, px : px + nx])
-
-
 @settings(max_examples=60, deadline=None)
 @given(SIDES, SIDES, SIDES, SIDES, st.integers(0, 2**32 - 1))
 def test_equals_the_sum_and_its_adjoint_for_any_shapes(ny: int, nx: int, ky: int, kx: int, seed: int) -> None:
@@ -55,15 +40,6 @@ def test_equals_the_sum_and_its_adjoint_for_any_shapes(ny: int, nx: int, ky: int
     seen, sent = np.vdot(convolver.apply(x), y), np.vdot(x, convolver.adjoint(y))
     scale = np.linalg.norm(x) * np.linalg.norm(y) * kernel.sum()
     assert abs(seen - sent) <= 1e-12 * scale
-
-
-def test_equals_padding_by_half_an_edge_on_all_sides() -> None:
-    rng = np.random.default_rng(5)
-    for shape in ((64, 64), (65, 65), (64, 81), (51, 40)):
-        x, kernel = rng.random(shape), rng.random(shape)
-        kernel /= kernel.sum()
-        expected = padded_by_half_on_all_sides(x, kernel)
-        np.testing.assert_allclose(Convolver(kernel, shape, dtype=np.float64).apply(x), expected, atol=1e-13)
 
 
 def test_a_delta_shifts_towards_its_offset_and_adjoint_shifts_back() -> None:

@@ -12,7 +12,7 @@ from psfcore.diffraction.airy import airy_kernel, airy_light_beyond, first_dark_
 from psfcore.diffraction.fraunhofer import FarField, far_field, samples_per_pixel
 from psfcore.diffraction.mesh_series import mesh_line
 from psfcore.diffraction.pupil import MaskGrid, MaskPicture, Pupil, bar, circle, entrance_pupil
-from psfcore.instruments.model import Aperture, Mesh, Mount, Polygon, Rays, load_instrument
+from psfcore.instruments.model import Aperture, Mesh, load_instrument
 from psfcore.psf import cumulative_curve, squared_radii
 
 HRI = load_instrument("hri_euv")
@@ -96,19 +96,6 @@ def test_the_threads_do_not_change_the_pattern() -> None:
     for pupil in (small(), small((POLYGON,))):
         one, three = (far(pupil, 96, threads=threads).pattern for threads in (1, 3))
         np.testing.assert_array_equal(one, three)
-
-
-def test_a_bar_diffracts_perpendicular_to_itself() -> None:
-    """The bar lies at 30 degrees from +x towards +y; its light goes to 120 degrees."""
-    pattern = far(small((bar(-7, 7, 0.5, 30.0),)), 128).pattern
-    y, x = np.indices(pattern.shape) - 64
-    towards = {
-        angle: pattern[
-            (np.hypot(x, y) > 20) & (abs(np.angle(np.exp(1j * (np.arctan2(y, x) - np.radians(angle))))) < 0.1)
-        ].sum()
-        for angle in (30, 60, 120, 150)
-    }
-    assert towards[120] > 5 * max(towards[30], towards[60], towards[150])
 
 
 def test_energy_is_conserved() -> None:
@@ -198,25 +185,6 @@ def test_a_square_mesh_is_the_analytic_series() -> None:
     assert found.sum() == pytest.approx(exact.sum(), abs=1e-3)
 
 
-def test_orders_of_the_entrance_mesh_are_5_7365_px_apart() -> None:
-    """Maxima of parabolas through the logarithm, on pixels of 1 um.
-
-    Orders 1 and 2 are left out: the wings of the centre shift them.
-    """
-    meshes = [mesh for mesh in HRI.meshes if mesh.place == "entrance"]
-    fine, size = 10, 1024
-    pattern = far(entrance_pupil(HRI.aperture, meshes=meshes), size, pixel_pitch_um=10 / fine).pattern
-    row = np.log(pattern[size // 2])
-    spacings = []
-    for order in range(3, 9):
-        near = size // 2 + round(order * 5.7365 * fine)
-        top = near - 2 + int(row[near - 2 : near + 3].argmax())
-        low, middle, high = row[top - 1 : top + 2]
-        place = top - size // 2 + 0.5 * (low - high) / (low - 2 * middle + high)
-        spacings.append(place / fine / order)
-    assert np.mean(spacings) == pytest.approx(5.7365, abs=0.001)
-
-
 def test_progress_is_reported_and_may_stop_the_work() -> None:
     reported: list[tuple[int, int]] = []
 
@@ -229,13 +197,3 @@ def test_progress_is_reported_and_may_stop_the_work() -> None:
         far(small((POLYGON,)), 32, progress=stop)
     assert [done for done, _ in reported] == [1, 2, 3]
     assert len({of for _, of in reported}) == 1
-
-
-def test_mount_and_polygons_come_from_the_instrument_file() -> None:
-    mount = Mount(
-        basis="assumed",
-        rays=(Rays(count=1, width_mm=1.0, first_angle_deg=30.0),),
-        polygons=(Polygon(corners_mm=tuple(map(tuple, POLYGON))),),
-    )
-    described = far(entrance_pupil(Aperture(diameter_mm=12.0), mount=mount), 32).pattern
-    np.testing.assert_allclose(described, far(small((bar(0, 7, 1.0, 30.0), POLYGON)), 32).pattern, rtol=1e-4)

@@ -143,14 +143,6 @@ def test_a_parabola_focuses_at_half_its_radius() -> None:
     np.testing.assert_allclose(np.abs(image) ** 2, expected, atol=1e-4 * expected.max())
 
 
-def test_a_convex_mirror_cancels_a_concave_one() -> None:
-    grid = Grid("mirror", 4001, 0.001)
-    concave = Mirror(name="m", radius_mm=257.0, conic=-2.04, diameter_mm=3.001, figure="concave")
-    convex = replace(concave, figure="convex")
-    product = mirror_transmission(concave, grid, LAMBDA_MM) * mirror_transmission(convex, grid, LAMBDA_MM)
-    np.testing.assert_allclose(product, np.abs(grid.x_mm) < 1.5005, atol=1e-9)
-
-
 def test_a_mesh_is_open_in_its_windows() -> None:
     grid = Grid("g", 1270, 0.01)  # ten pitches
     still, moved = (

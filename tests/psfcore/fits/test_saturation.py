@@ -107,13 +107,25 @@ def test_a_clipped_simulated_image_is_found_in_any_unit() -> None:
             np.testing.assert_array_equal(saturated(image), pixels == clip_dn)
 
 
-def test_few_equal_pixels_give_a_warning_and_no_mask() -> None:
-    pixels = np.arange(128 * 128, dtype=float).reshape(128, 128)
-    pixels[10, 10:16] = pixels.max()
-    image = with_saturation(image_of(pixels))
-    assert not saturated(image).any() and image.saturation is not None and image.saturation.found is None
-    assert image.saturation.warning is not None and "7 pixels" in image.saturation.warning
-    assert "--saturation" in image.saturation.warning
+def test_what_is_doubtful_is_told() -> None:
+    """Few equal pixels; clipping below the known level; and saturated pixels that the header counts and the image lacks.
+
+    The request has the last word.
+    """
+    few = np.arange(128 * 128, dtype=float).reshape(128, 128)
+    few[10, 10:16] = few.max()
+    clipped = exposure(3, clip_dn=1000.0)
+    for image, options, marked, words in (
+        (image_of(few), {}, np.inf, ("7 pixels", "--saturation")),
+        (image_of(clipped, SATURATE=4000.0), {}, 1000.0, ("SATURATE",)),
+        (image_of(exposure(4), TELESCOP="SDO/AIA", NSATPIX=12), {}, np.inf, ("NSATPIX counts 12 saturated",)),
+        (image_of(clipped), {"requested_dn": 1e6}, np.inf, ()),
+    ):
+        seen = with_saturation(image, **options)
+        np.testing.assert_array_equal(saturated(seen), image.pixels >= marked)
+        assert seen.saturation is not None and (seen.saturation.found == "pixels") == (marked == 1000.0)
+        assert (seen.saturation.warning is None) == (words == ())
+        assert all(word in (seen.saturation.warning or "") for word in words)
 
 
 def test_the_chance_is_the_poisson_probability() -> None:
@@ -149,26 +161,6 @@ def test_the_level_and_its_source() -> None:
         assert image.saturation is not None
         assert (image.saturation.level, image.saturation.found) == (level, source), (cards, given)
         np.testing.assert_array_equal(saturated(image), pixels >= (np.inf if level is None else level))
-
-
-def test_the_request_has_the_last_word() -> None:
-    image = with_saturation(image_of(exposure(3, clip_dn=1000.0)), requested_dn=1e6)
-    assert not saturated(image).any()
-    assert image.saturation is not None and image.saturation.warning is None
-
-
-def test_clipping_below_the_known_level_is_marked_and_told() -> None:
-    pixels = exposure(3, clip_dn=1000.0)
-    image = with_saturation(image_of(pixels, SATURATE=4000.0))
-    np.testing.assert_array_equal(saturated(image), pixels == 1000.0)
-    assert image.saturation is not None and image.saturation.found == "pixels"
-    assert image.saturation.warning is not None and "SATURATE" in image.saturation.warning
-
-
-def test_saturated_pixels_that_the_header_counts_and_the_image_lacks_are_told() -> None:
-    image = with_saturation(image_of(exposure(4), TELESCOP="SDO/AIA", NSATPIX=12))
-    assert image.saturation is not None and image.saturation.warning is not None
-    assert "NSATPIX counts 12 saturated pixels" in image.saturation.warning
 
 
 def test_the_demo_is_not_saturated(tmp_path: Path, limits: FitsLimits) -> None:

@@ -75,12 +75,3 @@ def test_the_documentation_lists_every_telescope() -> None:
     table = (Path(__file__).parents[3] / "docs" / "instruments.md").read_text("utf-8")
     for telescope in TELESCOPES:
         assert f"\n| {telescope.name}" in table, telescope.name
-
-
-def test_sentences_can_be_put_together() -> None:
-    """A sentence of a step follows a full stop; a reason follows a colon. The error adds the full stop of both."""
-    for telescope in TELESCOPES:
-        assert telescope.reason[0].islower() or telescope.reason.startswith("Hofmeister")
-        for text in (telescope.reason, *telescope.ways.values()):
-            assert not text.endswith(".")
-        assert all(sentence[0].isupper() for sentence in telescope.ways.values())

@@ -35,6 +35,7 @@ from tests.psfcore.conftest import make_image, make_psf
 
 SIZE = 288
 STEP = -(-SIZE // THUMBNAIL_PX)
+Run = tuple[list[Treated], list[Failure]]
 DEAD = (slice(40, 80, 4), slice(40, 280, 8))  # [y, x] of dead pixels, which are not on the Sun
 
 
@@ -67,13 +68,11 @@ def reader(images: dict[str, Image], psf: Psf) -> Callable[[str], Treated]:
 
 
 @pytest.fixture(scope="module")
-def run(images: dict[str, Image], psf: Psf) -> tuple[list[Treated], list[Failure]]:
+def run(images: dict[str, Image], psf: Psf) -> Run:
     return treat_many(["gone", "clean", "dead", "empty", "other"], reader(images, psf))
 
 
-def test_the_most_doubtful_come_first_and_failures_do_not_stop_the_run(
-    run: tuple[list[Treated], list[Failure]],
-) -> None:
+def test_the_most_doubtful_come_first_and_failures_do_not_stop_the_run(run: Run) -> None:
     treated, failures = run
     assert treated[0].name == "dead" and {row.name for row in treated} == {"clean", "dead", "other"}
     scores = [row.score for row in treated]
@@ -96,9 +95,7 @@ def test_an_internal_error_is_not_a_failure_of_the_image() -> None:
         treat_many(["a"], broken)
 
 
-def test_numbers_belong_to_the_deconvolution(
-    run: tuple[list[Treated], list[Failure]], images: dict[str, Image], psf: Psf
-) -> None:
+def test_numbers_belong_to_the_deconvolution(run: Run, images: dict[str, Image], psf: Psf) -> None:
     row = next(row for row in run[0] if row.name == "clean")
     result = method_named("richardson-lucy")(images["clean"], psf, Conditions(), steps=8)
     assert row.steps_done == 8
@@ -111,7 +108,7 @@ def test_numbers_belong_to_the_deconvolution(
     assert structure.sum_pct > 5
 
 
-def test_the_table_is_json_with_a_summary(run: tuple[list[Treated], list[Failure]]) -> None:
+def test_the_table_is_json_with_a_summary(run: Run) -> None:
     content = json.loads(json.dumps(table(*run), allow_nan=False))
     rows, summary = content["images"], content["summary"]
     assert [row["file"] for row in rows] == [row.name for row in run[0]]
@@ -126,9 +123,7 @@ def drawn(path: Path) -> NDArray[np.float64]:
     return np.asarray(matplotlib.image.imread(path), dtype=np.float64)[..., :3]
 
 
-def test_the_sheet_shows_every_image_and_every_failure(
-    run: tuple[list[Treated], list[Failure]], tmp_path: Path
-) -> None:
+def test_the_sheet_shows_every_image_and_every_failure(run: Run, tmp_path: Path) -> None:
     contact_sheet_png(*run, tmp_path / "all.png")
     contact_sheet_png(run[0], run[1], tmp_path / "one.png", most=1)
     contact_sheet_png(run[0], [], tmp_path / "well.png")

@@ -9,14 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.assess.quality import NEAR_MASKED_PX, QualityBit, quality_plane
-from psfcore.deconvolve.edges import edge_band_px
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.image import MaskBit
 from psfcore.psf import Psf
 from psfcore.simulate.observe import observe
-from tests.psfcore.conftest import delta, gaussian, make_image, make_psf
+from tests.psfcore.conftest import make_image
 from tests.psfcore.deconvolve.scattering import scattering_psf
 
 Plane = NDArray[np.float64]
@@ -97,19 +95,6 @@ def test_each_reason_has_its_bit() -> None:
 
 def test_the_first_bits_are_those_of_the_mask() -> None:
     assert all(QualityBit[str(bit.name)] == bit for bit in MaskBit)
-
-
-def test_the_edge_band_ends_where_little_of_the_light_is_from_outside(psf: Psf) -> None:
-    """By brute force: in each row, the share of a uniform Sun's light that comes from beyond the first row."""
-    edge_px = edge_band_px(psf, 0.10)
-    outside = np.zeros((256, 257))
-    outside[:128] = 1.0
-    share = Convolver(psf.kernel, outside.shape, dtype=np.float64).apply(outside)[128:, 128]
-    assert share[edge_px - 1] > 0.10 >= share[edge_px]
-    assert edge_band_px(make_psf(delta(32)), 0.10) == 0
-    assert (
-        edge_band_px(make_psf(gaussian(64, 3.0)), 0.10) == 4
-    )  # 1 - Phi(3.5 / 3) = 0.12, 1 - Phi(4.5 / 3) = 0.07
 
 
 def test_pixels_near_masked_ones_are_those_within_the_distance() -> None:
