@@ -1,14 +1,59 @@
-"""Parameters of job kinds: what is refused."""
+"""Requests for jobs: the table of kinds, parameters that are refused, and names that were meant."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from psfcore.deconvolve.assess.error_planes import SMALLEST_DRAWS
-from workers.contract.bulk import BulkWork
-from workers.contract.kinds import JobRequest
+from workers.contract.bulk import BulkRequest, BulkWork
+from workers.contract.kinds import KINDS, REQUESTS, JobRequest, kind_of_origin, load, queue_of
+from workers.contract.queues import Queue
 from workers.contract.requests import Deconvolve, Report
+from workers.contract.suggestions import did_you_mean, explained
+
+
+def test_every_row_names_a_task_and_a_resolver_that_exist() -> None:
+    for name, kind in KINDS.items():
+        assert callable(kind.load_task()) and callable(load(kind.resolver)), name
+        assert (kind.load_assistant() is None) == (kind.assistant is None), name
+
+
+def test_every_kind_but_bulk_can_be_requested() -> None:
+    assert set(REQUESTS) == set(KINDS) - {"bulk"}
+    tables: Any = TypeAdapter(JobRequest).validate_python(
+        {"kind": "psf-tables", "queue": "bulk", "parameters": {"psf_id": "a" * 64}}
+    )
+    assert isinstance(tables, KINDS["psf-tables"].request) and tables.queue == "bulk"
+    for name, model in REQUESTS.items():
+        assert KINDS[name].parameters is model.model_fields["parameters"].annotation
+        assert KINDS[name].resolved is not None
+
+
+def test_a_schema_names_each_request_by_its_kind() -> None:
+    schema = TypeAdapter(JobRequest).json_schema()
+    assert schema["discriminator"]["mapping"]["psf-build"] == "#/$defs/PsfBuildRequest"
+    assert set(schema["discriminator"]["mapping"]) == set(REQUESTS)
+
+
+def test_what_takes_long_does_not_wait_among_the_quick_jobs() -> None:
+    assert queue_of("cross-validate") == Queue.CROSSVAL and queue_of("bulk") == Queue.BULK
+    assert {queue_of(name) for name in set(KINDS) - {"cross-validate", "bulk"}} == {Queue.INTERACTIVE}
+
+
+def test_a_rerun_finds_the_kind_that_made_a_thing() -> None:
+    origins = {kind.origin: kind.name for kind in KINDS.values() if kind.origin is not None}
+    assert origins == {
+        "deconvolved": "deconvolve",
+        "built": "psf-build",
+        "fitted": "psf-fit",
+        "corrected": "gap-diagnose",
+        "interpolated": "psf-interpolate",
+    }
+    assert all(kind_of_origin(origin).name == name for origin, name in origins.items())
+
 
 A = "a" * 64
 
@@ -64,3 +109,41 @@ def test_shapes_are_compared_only_where_the_transit_is_fitted() -> None:
     assert not Report.model_validate({"transit_id": A, "psf_id": A}).shapes
     with pytest.raises(ValidationError, match="leave out psf_id"):
         Report.model_validate({"transit_id": A, "psf_id": A, "shapes": True})
+
+
+A = "a" * 64
+
+
+def messages(model: Any, body: object) -> str:
+    with pytest.raises(ValidationError) as refused:
+        TypeAdapter(model).validate_python(body)
+    return "\n".join(message for _, message in explained(refused.value.errors(), model))
+
+
+def test_only_a_close_name_is_suggested() -> None:
+    assert did_you_mean("stepz", ["name", "steps"]) == "; did you mean 'steps'?"
+    assert did_you_mean("zzz", ["name", "steps"]) == ""
+    assert did_you_mean("evaluate", ["report"]) == "; did you mean 'report'?"
+    assert did_you_mean("evaluate", ["name"]) == "", (
+        "a former name is suggested only where the new one is known"
+    )
+
+
+CHANGES: tuple[tuple[dict[str, Any], str], ...] = (
+    ({"kind": "evaluate"}, "report"),
+    ({"kind": "deconvolv"}, "deconvolve"),
+    ({"parameters": {"image_id": A, "effects_picture": True}}, "changes_picture"),
+    ({"parameters": {"image_id": A, "eror_draws": 4}}, "error_draws"),
+    ({"parameters": {"image_id": A, "method": {"name": "linar"}}}, "linear"),
+    ({"parameters": {"image_id": A, "method": {"name": "linear", "stepz": 4}}}, "steps"),
+    ({"quue": "bulk"}, "queue"),
+)
+
+
+def test_the_name_that_was_meant_is_suggested() -> None:
+    for change, suggested in CHANGES:
+        body = {"kind": "deconvolve", "parameters": {"image_id": A}} | change
+        assert f"did you mean '{suggested}'?" in messages(JobRequest, body), change
+    assert "gap-diagnose" in messages(JobRequest, {}), "a missing kind is told with the known ones"
+    listed = {"files": [{"glob": "/data/*", "were": {}}], "psf_id": A}
+    assert "did you mean 'where'?" in messages(BulkRequest, listed)

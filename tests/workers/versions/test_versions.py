@@ -1,16 +1,20 @@
-"""Changes of status, version numbers and ranges of times, without a database."""
+"""Statuses, version numbers, ranges and steps of time, and variants of a channel, without a database."""
 
 from __future__ import annotations
 
 import math
 from itertools import product
+from typing import Any
 
+import numpy as np
 import pytest
 
 from psfcore.errors import DataError
+from workers.versions.interpolation import FEWEST_STEPS, LONGEST_STEP_S, rounded
 from workers.versions.series import channel_of, series_of, word
 from workers.versions.status import MAY_BECOME, PsfStatus, check_transition, check_version, next_version
 from workers.versions.validity import Validity, iso, seconds
+from workers.versions.variants import is_variant_of, variant_for, without_variant
 
 DRAFT, CERTIFIED, DEPRECATED = PsfStatus
 ALLOWED = {
@@ -108,3 +112,69 @@ def test_series_and_their_names() -> None:
         assert channel_of(name, wavelength) is None
     words = [word(text) for text in ("AIA_3", "EUI/FSI 304", "  ", None)]
     assert words == ["aia_3", "eui_fsi_304", None, None]
+
+
+DAY = 86_400.0
+
+
+def test_the_nearest_of_enough_steps() -> None:
+    start = seconds("2022-03-01T06:30:00.25")
+    for days in (0.01, 0.5, 7.0, 63.9, 64.0, 365.25, 3000.0):
+        end = start + days * DAY
+        times = np.linspace(start, end, 4001)
+        found = np.array([rounded(start, end, float(at)) for at in times])
+        step = min(LONGEST_STEP_S, days * DAY / FEWEST_STEPS)
+        assert np.abs(found - times).max() <= 0.5 * step + 0.5 + 1e-6, "nearest step, to a whole second"
+        assert found.min() >= start and found.max() <= end and (np.diff(found) >= 0).all(), days
+        assert len(set(found)) <= max(FEWEST_STEPS, np.ceil(days)) + 1, days
+        assert rounded(start, end, start) == start and rounded(start, end, end) == end
+
+
+def test_the_images_of_a_day_share_a_time() -> None:
+    start, end = seconds("2022-03-01"), seconds("2023-03-01")
+    noon, evening = seconds("2022-06-01T11:00:00"), seconds("2022-05-31T13:00:00")
+    assert rounded(start, end, noon) == rounded(start, end, evening) == seconds("2022-06-01")
+
+
+KNOWN = ("174-open_1", "174-open_2", "174-0.984arcsec", "174-open_2-0.984arcsec")
+
+
+def cards(filter_name: str | None = None, scale: float | None = None, **more: Any) -> dict[str, Any]:
+    known = {"FILTER": filter_name, "CDELT1": scale, "CDELT2": scale} | more
+    return {key: value for key, value in known.items() if value is not None}
+
+
+BELONGS: tuple[tuple[dict[str, Any], str | None], ...] = (
+    (cards(), None),
+    (cards("Open 1"), "174-open_1"),
+    (cards("OPEN-2", 0.492), "174-open_2"),
+    (cards("closed", 0.492), None),
+    (cards(None, 0.984), "174-0.984arcsec"),
+    (cards("closed", -0.99), "174-0.984arcsec"),
+    (cards("closed", 1.0), None),
+    (cards("open 2", 0.984), "174-open_2-0.984arcsec"),
+    (cards(None, 0.984 / 3600, CUNIT1="deg", CUNIT2="deg"), "174-0.984arcsec"),
+    (cards(None, 0.984, CDELT2=0.492), None),
+    (cards(EC_FW1_="Open 1", EC_FW2_="Ti_poly"), "174-open_1"),
+    (cards(EC_FW1_="Al_poly", EC_FW2_="Open 2"), "174-open_2"),
+)
+
+
+def test_an_image_belongs_to_the_variant_whose_properties_all_agree() -> None:
+    for header, variant in BELONGS:
+        assert variant_for(header, KNOWN) == variant, header
+        assert variant_for(header, KNOWN[::-1]) == variant, "in any order"
+        assert variant_for(header, ()) is None
+
+
+def test_two_variants_that_agree_equally_well_are_refused() -> None:
+    with pytest.raises(DataError, match=r"174-0\.984arcsec, 174-open_1") as caught:
+        variant_for(cards("open 1", 0.984), KNOWN)
+    assert caught.value.code == "several-variants-fit"
+
+
+def test_names_of_variants() -> None:
+    assert without_variant("174-open_2") == without_variant("174") == "174"
+    assert is_variant_of("174-open_2", "174")
+    for other in ("174", "174-", "304-open_2", "1740-x"):
+        assert not is_variant_of(other, "174")
