@@ -39,12 +39,15 @@ def assignments(unit: Path, key: str) -> list[str]:
     return re.findall(rf"^{key}=(.*)$", unit.read_text("utf-8"), flags=re.M)
 
 
-@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
-def test_a_unit_runs_a_command_that_exists_with_settings_that_exist(unit: Path) -> None:
-    (command,) = assignments(unit, "ExecStart")
-    command_exists(command.split())
-    set_here = {word.split("=")[0] for line in assignments(unit, "Environment") for word in line.split()}
-    assert {name for name in set_here if name.startswith("HELIOPSF_")} <= KNOWN
+def test_a_unit_runs_a_command_that_exists_with_settings_that_exist(subtests: pytest.Subtests) -> None:
+    for unit in UNITS:
+        with subtests.test(str(unit)):
+            (command,) = assignments(unit, "ExecStart")
+            command_exists(command.split())
+            set_here = {
+                word.split("=")[0] for line in assignments(unit, "Environment") for word in line.split()
+            }
+            assert {name for name in set_here if name.startswith("HELIOPSF_")} <= KNOWN
 
 
 def test_the_units_differ_only_in_what_they_run() -> None:

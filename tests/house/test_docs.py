@@ -34,33 +34,36 @@ def test_every_page_is_in_the_navigation_of_the_site() -> None:
     )
 
 
-@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
-def test_relative_links_lead_to_files(path: Path) -> None:
-    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text("utf-8")):
-        if "://" in target:
-            continue
-        # The site makes the pages in _gallery from the tutorials.
-        made = re.fullmatch(r"_gallery/(\w+)\.rst", target)
-        file = DOCS / "tutorials" / f"{made[1]}.py" if made else path.parent / target
-        assert file.is_file(), target
+def test_relative_links_lead_to_files(subtests: pytest.Subtests) -> None:
+    for path in TEXTS:
+        with subtests.test(str(path)):
+            for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text("utf-8")):
+                if "://" in target:
+                    continue
+                # The site makes the pages in _gallery from the tutorials.
+                made = re.fullmatch(r"_gallery/(\w+)\.rst", target)
+                file = DOCS / "tutorials" / f"{made[1]}.py" if made else path.parent / target
+                assert file.is_file(), target
 
 
-@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
-def test_tutorials_compile_and_begin_with_a_title(path: Path) -> None:
-    title = ast.get_docstring(ast.parse(path.read_text("utf-8")))
-    assert title is not None
-    heading, underline = title.splitlines()[:2]
-    assert underline == "=" * len(heading)
+def test_tutorials_compile_and_begin_with_a_title(subtests: pytest.Subtests) -> None:
+    for path in TUTORIALS:
+        with subtests.test(str(path)):
+            title = ast.get_docstring(ast.parse(path.read_text("utf-8")))
+            assert title is not None
+            heading, underline = title.splitlines()[:2]
+            assert underline == "=" * len(heading)
 
 
-@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
-def test_the_commands_of_tutorials_and_their_options_exist(path: Path) -> None:
-    for line in re.findall(r"^#    \$ heliopsf (.+)$", path.read_text("utf-8"), flags=re.M):
-        words, command = shlex.split(line, comments=True), main
-        while isinstance(command, click.Group):
-            _, command, words = command.resolve_command(click.Context(command), words)
-        known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)}
-        assert {word for word in words if word.startswith("-")} <= known, line
+def test_the_commands_of_tutorials_and_their_options_exist(subtests: pytest.Subtests) -> None:
+    for path in TUTORIALS:
+        with subtests.test(str(path)):
+            for line in re.findall(r"^#    \$ heliopsf (.+)$", path.read_text("utf-8"), flags=re.M):
+                words, command = shlex.split(line, comments=True), main
+                while isinstance(command, click.Group):
+                    _, command, words = command.resolve_command(click.Context(command), words)
+                known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)}
+                assert {word for word in words if word.startswith("-")} <= known, line
 
 
 def test_the_start_page_names_every_tutorial() -> None:

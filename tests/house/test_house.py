@@ -39,9 +39,8 @@ def sources(package: str) -> list[Path]:
     return found
 
 
-@pytest.mark.parametrize(
-    ("package", "forbidden"),
-    [
+def test_imports_run_one_way(subtests: pytest.Subtests) -> None:
+    for package, forbidden in (
         (
             "psfcore",
             (
@@ -58,16 +57,15 @@ def sources(package: str) -> list[Path]:
         ),
         ("workers", ("heliopsf", "service", "fastapi", "starlette", "httpx")),
         ("service", ("heliopsf",)),
-    ],
-)
-def test_imports_run_one_way(package: str, forbidden: tuple[str, ...]) -> None:
-    wrong = [
-        (str(path.relative_to(HERE)), name)
-        for path in sources(package)
-        for name in imports(path)
-        if name.split(".")[0] in forbidden
-    ]
-    assert wrong == []
+    ):
+        with subtests.test(str((package, forbidden))):
+            wrong = [
+                (str(path.relative_to(HERE)), name)
+                for path in sources(package)
+                for name in imports(path)
+                if name.split(".")[0] in forbidden
+            ]
+            assert wrong == []
 
 
 def test_what_people_import_stands_on_the_core_the_client_the_folder_of_the_cache_and_the_machine_alone() -> (

@@ -95,11 +95,12 @@ def test_no_folder_is_overfull() -> None:
     assert overfull == {}
 
 
-@pytest.mark.parametrize("folder", sorted(_folders()))
-def test_no_three_files_share_a_prefix(folder: str) -> None:
-    shared: dict[str, list[str]] = defaultdict(list)
-    for name in _folders()[folder]:
-        prefix = name.split("_")[0]
-        if OWN_NAMES.get(folder) != prefix:
-            shared[prefix].append(name)
-    assert {prefix: names for prefix, names in shared.items() if len(names) > 2} == {}
+def test_no_three_files_share_a_prefix(subtests: pytest.Subtests) -> None:
+    for folder in sorted(_folders()):
+        with subtests.test(str(folder)):
+            shared: dict[str, list[str]] = defaultdict(list)
+            for name in _folders()[folder]:
+                prefix = name.split("_")[0]
+                if OWN_NAMES.get(folder) != prefix:
+                    shared[prefix].append(name)
+            assert {prefix: names for prefix, names in shared.items() if len(names) > 2} == {}

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
+from click.testing import CliRunner
 
-from service.cli.bulk import _estimated, _said
+from service.cli import bulk as cli_bulk
+from service.cli.main import main
 from service.client.http import Client
+
+
+@pytest.fixture
+def service(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+    """A client that answers as it is told."""
+    service = MagicMock()
+    service.__enter__.return_value = service
+    service.psf.return_value = {"status": "draft"}
+    monkeypatch.setattr(cli_bulk, "remote", lambda server: service)
+    return service
 
 
 def described(phase: str, total: int, *, listed: bool | None) -> dict[str, Any]:
@@ -20,13 +33,11 @@ def described(phase: str, total: int, *, listed: bool | None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("listed", "said"), [(False, "3 of at least 400 done"), (True, "3 of 400 done"), (None, "3 of 400 done")]
-)
-def test_a_number_of_images_that_may_grow_is_a_lower_limit(listed: bool | None, said: str) -> None:
-    assert _said(described("PAUSED", 400, listed=listed)) == [
-        f"PAUSED: {said}, 0 failed, 0 in progress, 397 waiting"
-    ]
+def test_a_number_of_images_that_may_grow_is_a_lower_limit(service: MagicMock) -> None:
+    for listed, said in ((False, "3 of at least 400 done"), (True, "3 of 400 done"), (None, "3 of 400 done")):
+        service.bulk.return_value = described("PAUSED", 400, listed=listed)
+        told = CliRunner().invoke(main, ["bulk", "status", "a" * 32]).output
+        assert f"PAUSED: {said}, 0 failed, 0 in progress, 397 waiting" in told
 
 
 def test_the_progress_of_a_run_that_lists_files_has_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,12 +60,13 @@ def test_the_progress_of_a_run_that_lists_files_has_no_end(monkeypatch: pytest.M
     ]
 
 
-def test_a_dry_run_names_the_path_of_a_product() -> None:
-    found = {
+def test_a_dry_run_names_the_path_of_a_product(service: MagicMock) -> None:
+    estimate = {
         "images": 4, "complete": True, "examined": 4, "refused_images": 0, "refused": [], "existing": 0,
         "output_bytes": 2**20, "seconds": 8.0, "workers": 1, "memory_mib": 100,
     }  # fmt: skip
     path = "/out/SOLO/2021/03/01/a.fits"
-    assert f"for example: {path}" in _estimated(found | {"example_output": path})
-    for nothing in ({"example_output": None}, {}):  # an older service does not send it
-        assert not any("for example" in line for line in _estimated(found | nothing))
+    for more, named in (({"example_output": path}, True), ({"example_output": None}, False), ({}, False)):
+        service.estimate_bulk.return_value = estimate | more
+        told = CliRunner().invoke(main, ["bulk", "submit", "/x/*.fits", "--psf", "a" * 64, "--dry-run"])
+        assert told.exit_code == 0 and (f"for example: {path}" in told.output) == named, told.output

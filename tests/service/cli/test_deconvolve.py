@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from astropy.io import fits
@@ -33,22 +33,20 @@ def options(folder: Path) -> tuple[object, ...]:
     return "--psf", folder / "psf.dat", "--steps", 1, "--local"
 
 
-@pytest.mark.parametrize("given", ["files", "folder", "one"])
-def test_images_go_into_a_folder(folder: Path, given: str) -> None:
-    images = {
-        "files": [folder / "in" / "0.fits", folder / "in" / "1.fits"],
-        "folder": [folder / "in"],
-        "one": [folder / "in" / "0.fits"],
-    }[given]
-    done = run("deconvolve", *images, "-o", f"{folder}/out/", *options(folder))
-    assert done.exit_code == 0, done.output
-    count = 1 if given == "one" else 2
-    named = "1 image" if count == 1 else f"{count} images"
-    assert f"{named}: {count} deconvolved, 0 existed already, 0 failed" in done.output
-    made = sorted((folder / "out").iterdir())
-    assert [path.name.split("-")[0] for path in made] == ["0", "1"][:count]
-    again = run("deconvolve", *images, "-o", folder / "out", *options(folder))
-    assert again.exit_code == 0 and f"0 deconvolved, {count} existed already" in again.output
+def test_images_go_into_a_folder(folder: Path) -> None:
+    first, second = (folder / "in" / f"{number}.fits" for number in range(2))
+    for name, images, count in (
+        ("files", [first, second], 2),
+        ("folder", [folder / "in"], 2),
+        ("one", [first], 1),
+    ):
+        out = folder / f"out-{name}"
+        done = run("deconvolve", *images, "-o", f"{out}/", *options(folder))
+        assert done.exit_code == 0, done.output
+        assert f"{count} deconvolved, 0 existed already, 0 failed" in done.output
+        assert [path.name.split("-")[0] for path in sorted(out.iterdir())] == ["0", "1"][:count]
+        again = run("deconvolve", *images, "-o", out, *options(folder))
+        assert again.exit_code == 0 and f"0 deconvolved, {count} existed already" in again.output
 
 
 def test_one_image_goes_into_a_file(folder: Path) -> None:
@@ -105,45 +103,25 @@ def test_what_does_not_fit_together_is_refused(folder: Path) -> None:
     assert gone.exit_code == 2 and not (folder / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("phase", "failed", "status"), [("COMPLETED", 0, 0), ("COMPLETED", 1, 1), ("ERROR", 0, 1)]
-)
-def test_a_bulk_run_with_failures_ends_with_status_1(
-    monkeypatch: pytest.MonkeyPatch, phase: str, failed: int, status: int
-) -> None:
-    counts = {"total": 3, "done": 3 - failed, "failed": failed, "reused": 0, "at_work": 0, "waiting": 0}
-    bulk = {
-        "id": "b" * 32,
-        "phase": phase,
-        "images": counts | {"to_look_at": 0},
-        "images_an_hour": None,
-        "time_left_s": None,
-        "error": None,
-    }
-
-    class Ended:
-        def __enter__(self) -> Ended:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            pass
-
-        def bulk(self, bulk_id: str) -> dict[str, Any]:
-            return bulk
-
-        def psf(self, psf_id: str) -> dict[str, Any]:
-            return {"status": "draft"}
-
-        def submit_bulk(self, **_: Any) -> dict[str, Any]:
-            return bulk
-
-        def wait_for_bulk(self, bulk_id: str, **_: Any) -> dict[str, Any]:
-            return bulk
-
-    monkeypatch.setattr(cli_bulk, "remote", lambda server: Ended())
-    assert run("bulk", "status", "b" * 32, "--wait").exit_code == status
-    assert run("bulk", "submit", "/x/*.fits", "--psf", "a" * 64, "--wait").exit_code == status
-    assert run("bulk", "status", "b" * 32).exit_code == 0
+def test_a_bulk_run_with_failures_ends_with_status_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts = {"total": 3, "reused": 0, "at_work": 0, "waiting": 0, "to_look_at": 0}
+    times = {"images_an_hour": None, "time_left_s": None, "error": None}
+    service = MagicMock()
+    service.__enter__.return_value = service
+    service.psf.return_value = {"status": "draft"}
+    monkeypatch.setattr(cli_bulk, "remote", lambda server: service)
+    for phase, failed, status in (("COMPLETED", 0, 0), ("COMPLETED", 1, 1), ("ERROR", 0, 1)):
+        bulk = {
+            "id": "b" * 32,
+            "phase": phase,
+            "images": counts | {"done": 3 - failed, "failed": failed},
+            **times,
+        }
+        for ask in (service.bulk, service.submit_bulk, service.wait_for_bulk):
+            ask.return_value = bulk
+        assert run("bulk", "status", "b" * 32, "--wait").exit_code == status, phase
+        assert run("bulk", "submit", "/x/*.fits", "--psf", "a" * 64, "--wait").exit_code == status, phase
+        assert run("bulk", "status", "b" * 32).exit_code == 0, phase
 
 
 def test_a_region_becomes_a_product_with_its_coordinates(folder: Path) -> None:
@@ -167,15 +145,16 @@ def test_a_region_becomes_a_product_with_its_coordinates(folder: Path) -> None:
     assert difference.max() <= after["DCNVBERR"] + 1e-4 * abs(product[0].data).max()
 
 
-@pytest.mark.parametrize(
-    ("region", "said"),
-    [("8:40", "expected a region as x0:x1,y0:y1"), ("0:9999,0:40", "the size of the image")],
-)
-def test_a_wrong_region_is_refused(folder: Path, region: str, said: str) -> None:
-    image, out = folder / "in" / "0.fits", folder / "out.fits"
-    refused = run("deconvolve", image, "-o", out, "--region", region, *options(folder))
-    assert refused.exit_code != 0 and said in refused.output
-    assert not out.exists()
+def test_a_wrong_region_is_refused(subtests: pytest.Subtests, folder: Path) -> None:
+    for region, said in (
+        ("8:40", "expected a region as x0:x1,y0:y1"),
+        ("0:9999,0:40", "the size of the image"),
+    ):
+        with subtests.test(str((region, said))):
+            image, out = folder / "in" / "0.fits", folder / "out.fits"
+            refused = run("deconvolve", image, "-o", out, "--region", region, *options(folder))
+            assert refused.exit_code != 0 and said in refused.output
+            assert not out.exists()
 
 
 def test_an_image_that_does_not_fit_into_the_memory_is_refused(

@@ -39,24 +39,20 @@ def command(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is missing")
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [
+def test_bash_completes_commands_and_options(subtests: pytest.Subtests, command: dict[str, str]) -> None:
+    for words, found in (
         (["heliopsf", "des"], {"design"}),
         (["heliopsf", "psf", "l"], {"list", "lineage"}),
         (["heliopsf", "job", ""], {"list", "show", "wait", "cancel"}),
         (["heliopsf", "job", "wait", "--s"], {"--server"}),
-    ],
-)
-def test_bash_completes_commands_and_options(
-    command: dict[str, str], words: list[str], found: set[str]
-) -> None:
-    quoted = " ".join(f"'{word}'" for word in words)
-    script = TAB.format(words=quoted, at=len(words) - 1)
-    done = subprocess.run(
-        ["bash", "-c", script], env=command, capture_output=True, text=True, check=True, timeout=60
-    )
-    assert set(done.stdout.split()) == found, done.stderr
+    ):
+        with subtests.test(str((words, found))):
+            quoted = " ".join(f"'{word}'" for word in words)
+            script = TAB.format(words=quoted, at=len(words) - 1)
+            done = subprocess.run(
+                ["bash", "-c", script], env=command, capture_output=True, text=True, check=True, timeout=60
+            )
+            assert set(done.stdout.split()) == found, done.stderr
 
 
 def test_names_are_completed_without_importing_commands() -> None:
@@ -65,9 +61,10 @@ def test_names_are_completed_without_importing_commands() -> None:
     assert [(item.value, item.help) for item in found] == [("one", "The one.")]
 
 
-@pytest.mark.parametrize(
-    ("stop", "told"),
-    [
+def test_control_c_ends_with_status_130_and_says_how_to_go_on(
+    subtests: pytest.Subtests, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for stop, told in (
         (KeyboardInterrupt(), ["interrupted"]),
         (
             WaitInterrupted("job", "0123456789abcdef" * 2, "http://127.0.0.1:8765"),
@@ -94,17 +91,15 @@ def test_names_are_completed_without_importing_commands() -> None:
                 "heliopsf bulk cancel ffffffffffff --server http://127.0.0.1:9\n",
             ],
         ),
-    ],
-)
-def test_control_c_ends_with_status_130_and_says_how_to_go_on(
-    monkeypatch: pytest.MonkeyPatch, stop: KeyboardInterrupt, told: list[str]
-) -> None:
-    @click.command()
-    def one() -> None:
-        raise stop
+    ):
+        with subtests.test(str((stop, told))):
 
-    monkeypatch.setitem(sys.modules, "module_of_one", SimpleNamespace(one=one))  # type: ignore[arg-type]
-    group = LazyGroup(sections={"All": {"one": Lazy("module_of_one", "one", "The one.")}})
-    done = CliRunner().invoke(group, ["one"])
-    assert done.exit_code == 130
-    assert all(line in done.stderr for line in told), done.stderr
+            @click.command()
+            def one() -> None:
+                raise stop  # noqa: B023
+
+            monkeypatch.setitem(sys.modules, "module_of_one", SimpleNamespace(one=one))  # type: ignore[arg-type]
+            group = LazyGroup(sections={"All": {"one": Lazy("module_of_one", "one", "The one.")}})
+            done = CliRunner().invoke(group, ["one"])
+            assert done.exit_code == 130
+            assert all(line in done.stderr for line in told), done.stderr

@@ -42,18 +42,19 @@ def commands(group: click.Group, *path: str) -> Iterator[tuple[tuple[str, ...], 
 ALL = list(commands(main))
 
 
-@pytest.mark.parametrize("path", [path for path, _ in ALL], ids=" ".join)
-def test_the_help_of_a_command_fits_a_screen_and_explains_every_option(path: tuple[str, ...]) -> None:
-    helped = CliRunner().invoke(main, [*path, "-h"])
-    assert helped.exit_code == 0 and len(helped.output.splitlines()) < MOST_LINES
-    command = dict(ALL)[path]
-    assert command.help
-    unexplained = [
-        option.name
-        for option in command.params
-        if isinstance(option, click.Option) and not option.hidden and not option.help
-    ]
-    assert unexplained == []
+def test_the_help_of_a_command_fits_a_screen_and_explains_every_option(subtests: pytest.Subtests) -> None:
+    for path in [path for path, _ in ALL]:
+        with subtests.test(str(path)):
+            helped = CliRunner().invoke(main, [*path, "-h"])
+            assert helped.exit_code == 0 and len(helped.output.splitlines()) < MOST_LINES
+            command = dict(ALL)[path]
+            assert command.help
+            unexplained = [
+                option.name
+                for option in command.params
+                if isinstance(option, click.Option) and not option.hidden and not option.help
+            ]
+            assert unexplained == []
 
 
 def test_the_help_is_grouped() -> None:
@@ -86,14 +87,23 @@ def options_of(name: str) -> dict[str, click.Option]:
     }
 
 
-@pytest.mark.parametrize(
-    "name", ["--local", "--context", "--centre", "--key", "--noise", "--saturation", "--method"]
-)
-def test_an_option_is_explained_in_the_same_words_everywhere(name: str) -> None:
-    found = options_of(name)
-    found.pop("simulate transit", None)  # its --saturation is the level of the simulated camera
-    assert len(found) > 1
-    assert len({(option.help, option.nargs, option.metavar) for option in found.values()}) == 1, found.keys()
+def test_an_option_is_explained_in_the_same_words_everywhere(subtests: pytest.Subtests) -> None:
+    for name in (
+        "--local",
+        "--context",
+        "--centre",
+        "--key",
+        "--noise",
+        "--saturation",
+        "--method",
+    ):
+        with subtests.test(str(name)):
+            found = options_of(name)
+            found.pop("simulate transit", None)  # its --saturation is the level of the simulated camera
+            assert len(found) > 1
+            assert len({(option.help, option.nargs, option.metavar) for option in found.values()}) == 1, (
+                found.keys()
+            )
 
 
 def test_a_psf_is_an_id_or_a_file_everywhere() -> None:
@@ -115,9 +125,13 @@ def test_the_help_says_whether_a_command_needs_a_service() -> None:
         assert ("--local needs none" in helped) == ("--local" in names), path
 
 
-@pytest.mark.parametrize("option", ["-V", "--version"])
-def test_the_version_is_told(option: str) -> None:
-    assert CliRunner().invoke(main, [option]).output.startswith("heliopsf, version ")
+def test_the_version_is_told(subtests: pytest.Subtests) -> None:
+    for option in (
+        "-V",
+        "--version",
+    ):
+        with subtests.test(str(option)):
+            assert CliRunner().invoke(main, [option]).output.startswith("heliopsf, version ")
 
 
 def test_a_row_of_the_table_is_the_command_of_that_name() -> None:
@@ -128,20 +142,18 @@ def test_a_row_of_the_table_is_the_command_of_that_name() -> None:
         assert all(row.summary.endswith(".") for row in group.rows.values())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "meant"),
-    [
+def test_an_old_name_is_answered_with_the_new_one(subtests: pytest.Subtests) -> None:
+    for arguments, meant in (
         (["evaluate", "T"], "`report`"),
         (["effects", "I"], "`changes`"),
         (["deconvolv"], "`deconvolve`"),
         (["psf", "sho"], "`show`"),
         (["deconvolve", "x", "--preview", "y"], "`--plot`"),
         (["deconvolve", "x", "--effects", "y"], "`--changes`"),
-    ],
-)
-def test_an_old_name_is_answered_with_the_new_one(arguments: list[str], meant: str) -> None:
-    refused = CliRunner().invoke(main, arguments)
-    assert refused.exit_code == 2 and f"Did you mean {meant}" in refused.output
+    ):
+        with subtests.test(str((arguments, meant))):
+            refused = CliRunner().invoke(main, arguments)
+            assert refused.exit_code == 2 and f"Did you mean {meant}" in refused.output
 
 
 def test_an_unknown_name_is_refused() -> None:
@@ -150,15 +162,19 @@ def test_an_unknown_name_is_refused() -> None:
     assert "Did you mean" not in refused.output
 
 
-@pytest.mark.parametrize("option", ["-V", "--help"])
-def test_version_and_help_load_nothing_heavy(option: str) -> None:
-    script = (
-        "import sys, json, atexit\n"
-        "atexit.register(lambda: print(json.dumps(sorted(sys.modules))))\n"
-        f"sys.argv = ['heliopsf', {option!r}]\n"
-        "from service.cli.main import main\n"
-        "main()\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
-    loaded = set(json.loads(done.stdout.splitlines()[-1]))
-    assert "service.cli.main" in loaded and loaded & HEAVY == set()
+def test_version_and_help_load_nothing_heavy(subtests: pytest.Subtests) -> None:
+    for option in (
+        "-V",
+        "--help",
+    ):
+        with subtests.test(str(option)):
+            script = (
+                "import sys, json, atexit\n"
+                "atexit.register(lambda: print(json.dumps(sorted(sys.modules))))\n"
+                f"sys.argv = ['heliopsf', {option!r}]\n"
+                "from service.cli.main import main\n"
+                "main()\n"
+            )
+            done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+            loaded = set(json.loads(done.stdout.splitlines()[-1]))
+            assert "service.cli.main" in loaded and loaded & HEAVY == set()

@@ -72,19 +72,17 @@ def test_a_folder_to_fill_is_taken_where_it_is_empty_or_forced(tmp_path: Path) -
     cli_options.check_fresh_folder(tmp_path / "full", overwrite=True)
 
 
-@pytest.mark.parametrize(
-    ("error", "told"),
-    [
+def test_an_error_of_the_user_s_is_a_line(subtests: pytest.Subtests) -> None:
+    for error, told in (
         (DataError("code", "expected a; got b"), "expected a; got b"),
         (ServiceError("refused"), "refused"),
         (OSError("disk full"), "disk full"),
         (TimeoutError("late"), "late"),
-    ],
-)
-def test_an_error_of_the_user_s_is_a_line(error: Exception, told: str) -> None:
-    with pytest.raises(click.ClickException) as caught, cli_options.user_errors():
-        raise error
-    assert caught.value.message == told
+    ):
+        with subtests.test(str((error, told))):
+            with pytest.raises(click.ClickException) as caught, cli_options.user_errors():
+                raise error
+            assert caught.value.message == told
 
 
 def test_an_error_of_ours_keeps_its_traceback() -> None:
@@ -145,22 +143,20 @@ def test_warnings_of_a_product_are_printed(tmp_path: Path) -> None:
     assert taken.exit_code == 0 and "warning: the PSF" in taken.stderr and "193 angstrom" in taken.stderr
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
+def test_a_minus_is_no_name_of_an_output(
+    subtests: pytest.Subtests, image_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for line in (
         "deconvolve IMAGE -o - --local",
         "psf show IMAGE --plot -",
         "simulate transit -o -",
         "psf query IMAGE --json -",
-    ],
-)
-def test_a_minus_is_no_name_of_an_output(
-    line: str, image_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(image_file.parent)
-    refused = CliRunner().invoke(main, line.replace("IMAGE", str(image_file)).split())
-    assert refused.exit_code == 2 and "'./-' is a file of this name" in refused.output
-    assert not (image_file.parent / "-").exists()
+    ):
+        with subtests.test(str(line)):
+            monkeypatch.chdir(image_file.parent)
+            refused = CliRunner().invoke(main, line.replace("IMAGE", str(image_file)).split())
+            assert refused.exit_code == 2 and "'./-' is a file of this name" in refused.output
+            assert not (image_file.parent / "-").exists()
 
 
 def test_numbers_and_lists_in_sentences() -> None:

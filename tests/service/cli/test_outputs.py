@@ -75,19 +75,21 @@ REPLACING = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("command", REPLACING, ids=lambda command: "-".join(command[:2]))
-@pytest.mark.parametrize("overwrite", [(), ("--overwrite",)], ids=["", "overwrite"])
 @pytest.mark.usefixtures("idle")
 def test_an_input_is_never_replaced(
-    files: Path, command: tuple[str, ...], overwrite: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+    subtests: pytest.Subtests, files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(files)
     (files / "changes").mkdir()
     shutil.copy(files / "image.fits", files / "changes" / "changes.json")
     before = contents(files)
-    refused = run(*command, *overwrite)
-    assert refused.exit_code == 1 and "is the same file as the input" in refused.output, refused.output
-    assert contents(files) == before
+    for command in REPLACING:
+        for overwrite in ((), ("--overwrite",)):
+            with subtests.test(str((command, overwrite))):
+                refused = run(*command, *overwrite)
+                assert refused.exit_code == 1, refused.output
+                assert "is the same file as the input" in refused.output, refused.output
+                assert contents(files) == before
 
 
 @pytest.mark.usefixtures("idle")
@@ -106,19 +108,20 @@ WRITES = [
 ]
 
 
-@pytest.mark.parametrize("command", WRITES, ids=lambda command: "-".join(command[:2]))
 def test_an_existing_output_is_replaced_only_if_told(
-    files: Path, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+    subtests: pytest.Subtests, files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(files)
-    Path("old").write_text("old")
-    refused = run(*command, "old")
-    assert refused.exit_code == 1 and "old: the file exists" in refused.output, refused.output
-    assert Path("old").read_text() == "old"
-    replaced = run(*command, "old", "--overwrite")
-    assert replaced.exit_code == 0, replaced.output
-    assert not Path("old").read_bytes().startswith(b"old")
-    assert not [path for path in files.iterdir() if path.name.endswith(".part")]
+    for command in WRITES:
+        with subtests.test(str(command)):
+            monkeypatch.chdir(files)
+            Path("old").write_text("old")
+            refused = run(*command, "old")
+            assert refused.exit_code == 1 and "old: the file exists" in refused.output, refused.output
+            assert Path("old").read_text() == "old"
+            replaced = run(*command, "old", "--overwrite")
+            assert replaced.exit_code == 0, replaced.output
+            assert not Path("old").read_bytes().startswith(b"old")
+            assert not [path for path in files.iterdir() if path.name.endswith(".part")]
 
 
 def test_work_that_fails_while_it_writes_leaves_the_old_file(
@@ -138,19 +141,22 @@ def test_work_that_fails_while_it_writes_leaves_the_old_file(
     assert not [path for path in files.iterdir() if path.name.endswith(".part")]
 
 
-@pytest.mark.parametrize(
-    "output", ["nowhere/new.fits", "image.fits/new.fits", "/proc/new.fits"], ids=["none", "file", "refuses"]
-)
 @pytest.mark.usefixtures("idle")
 def test_an_output_that_cannot_be_written_is_noticed_before_the_work(
-    files: Path, output: str, monkeypatch: pytest.MonkeyPatch
+    subtests: pytest.Subtests, files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(files)
-    for option in (("-o", output), ("-o", "new.fits", "--plot", output)):
-        refused = run(*DECONVOLVE, *option)
-        assert refused.exit_code == 1, refused.output
-        assert f"cannot write {output}" in refused.output
-    assert not Path("new.fits").exists()
+    for output in (
+        "nowhere/new.fits",
+        "image.fits/new.fits",
+        "/proc/new.fits",
+    ):
+        with subtests.test(str(output)):
+            monkeypatch.chdir(files)
+            for option in (("-o", output), ("-o", "new.fits", "--plot", output)):
+                refused = run(*DECONVOLVE, *option)
+                assert refused.exit_code == 1, refused.output
+                assert f"cannot write {output}" in refused.output
+            assert not Path("new.fits").exists()
 
 
 def outputs(command: click.Command) -> Iterator[str]:

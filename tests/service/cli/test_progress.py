@@ -84,15 +84,13 @@ def test_a_short_command_writes_nothing(capsys: pytest.CaptureFixture[str]) -> N
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize(
-    ("stage", "step", "steps", "text"),
-    [
+def test_a_stage_and_its_step_as_text(subtests: pytest.Subtests) -> None:
+    for stage, step, steps, text in (
         ("reading", 3, 20, "reading: step 3 of 20"),
         ("error estimate", 3, 12, "error estimate: realisation 3 of 12"),
         ("saving", 0, 1, "saving"),
         ("saving", 1, 1, "saving: step 1 of 1"),
         ("compiling kernels (only once)", 0, 0, "compiling kernels (only once)"),
-    ],
-)
-def test_a_stage_and_its_step_as_text(stage: str, step: int, steps: int, text: str) -> None:
-    assert progress.told(stage, step, steps) == text
+    ):
+        with subtests.test(str((stage, step, steps, text))):
+            assert progress.told(stage, step, steps) == text

@@ -106,24 +106,22 @@ def test_a_plot_alone_is_enough_and_noise_may_come_with_the_command(
     assert said[0] != said[1]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
+    subtests: pytest.Subtests, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for arguments, said in (
         (["-o", "no/such/folder/R.html"], "there is no folder"),
         (["-o", "R.html", "--psf", "missing.fits"], "expected a PSF id"),
         (["-o", "R.html", "--noise", "-1", "2"], "greater than or equal to 0"),
         (["-o", "R.html", "--seed", "-1"], "not in the range"),
         ([], "expected an output: -o PAGE.html, --json FILE or --plot FILE"),
         (["-o", "R.html", "--shapes", "--psf", 64 * "a"], "--shapes fits every shape to TRANSIT"),
-    ],
-)
-def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], said: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(main, ["report", str(folder), "--local", *arguments])
-    assert done.exit_code != 0 and said in done.output and "Traceback" not in done.output
-    assert list(tmp_path.iterdir()) == []
+    ):
+        with subtests.test(str((arguments, said))):
+            monkeypatch.chdir(tmp_path)
+            done = CliRunner().invoke(main, ["report", str(folder), "--local", *arguments])
+            assert done.exit_code != 0 and said in done.output and "Traceback" not in done.output
+            assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_without_a_transit_is_told(tmp_path: Path) -> None:

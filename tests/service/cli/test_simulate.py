@@ -138,9 +138,8 @@ def test_a_folder_in_use_is_left_alone(made: Path, diffraction: Path, tmp_path: 
     assert (used / "truth.json").read_bytes() != before
 
 
-@pytest.mark.parametrize(
-    "options, said",
-    [
+def test_what_cannot_be_is_refused_in_a_line(subtests: pytest.Subtests, tmp_path: Path) -> None:
+    for options, said in (
         (["--c", "-1"], "c > 0"),
         (["--total", "1.5"], "total < 1"),
         (["--total", "nan"], "finite"),
@@ -151,14 +150,13 @@ def test_a_folder_in_use_is_left_alone(made: Path, diffraction: Path, tmp_path: 
         (["--diffraction-size", "97"], "even size"),
         (["--instrument", "no-such"], "no-such"),
         (["--diffraction", "missing.fits"], "missing.fits"),
-    ],
-)
-def test_what_cannot_be_is_refused_in_a_line(tmp_path: Path, options: list[str], said: str) -> None:
-    result = run("transit", "-o", tmp_path / "t", *SMALL, *options)
-    assert result.exit_code in (1, 2)
-    assert said in result.output
-    assert "Traceback" not in result.output and isinstance(result.exception, SystemExit)
-    assert not (tmp_path / "t").exists()
+    ):
+        with subtests.test(str((options, said))):
+            result = run("transit", "-o", tmp_path / "t", *SMALL, *options)
+            assert result.exit_code in (1, 2)
+            assert said in result.output
+            assert "Traceback" not in result.output and isinstance(result.exception, SystemExit)
+            assert not (tmp_path / "t").exists()
 
 
 def test_files_that_do_not_fit_are_refused(tmp_path: Path, diffraction: Path) -> None:

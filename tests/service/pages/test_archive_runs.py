@@ -161,9 +161,10 @@ def test_a_check_without_an_output_folder(api: TestClient, form: dict[str, str])
     assert api.get(f"/v1{place}").json()["request"]["output"] is None
 
 
-@pytest.mark.parametrize(
-    ("wrong", "told"),
-    [
+def test_a_wrong_form_is_shown_again_with_the_reason(
+    subtests: pytest.Subtests, api: TestClient, form: dict[str, str], archive: Path
+) -> None:
+    for wrong, told in (
         ({"pattern": ""}, "Expected a pattern that names files"),
         ({"pattern": "/etc/*.fits"}, "Expected a path below"),
         ({"pattern": "{archive}/*.none"}, "found no files"),
@@ -175,21 +176,18 @@ def test_a_check_without_an_output_folder(api: TestClient, form: dict[str, str])
         ({"choice": "psf:" + "0" * 64}, "There is no such PSF here"),
         ({"steps": "many"}, "Steps"),
         ({"name": "<script>alert(1)</script>" * 9}, "Name: "),
-    ],
-)
-def test_a_wrong_form_is_shown_again_with_the_reason(
-    api: TestClient, form: dict[str, str], archive: Path, wrong: dict[str, str], told: str
-) -> None:
-    wrong = {name: value.replace("{archive}", str(archive)) for name, value in wrong.items()}
-    answer = api.post("/bulk/check", data=form | wrong)
-    assert answer.status_code in (404, 422), answer.text
-    alert = re.search(r'<div class="error" role="alert">(.*?)</div>', answer.text)
-    assert alert is not None and told in unescape(alert[1]), answer.text
-    values = _Fields(answer.text).values
-    for name in ("pattern", "name", "folder", "layout"):
-        assert values[name] == (form | wrong)[name], "nobody has to write it again"
-    assert "<script>alert" not in answer.text
-    assert runs(api) == []
+    ):
+        with subtests.test(str((wrong, told))):
+            wrong = {name: value.replace("{archive}", str(archive)) for name, value in wrong.items()}
+            answer = api.post("/bulk/check", data=form | wrong)
+            assert answer.status_code in (404, 422), answer.text
+            alert = re.search(r'<div class="error" role="alert">(.*?)</div>', answer.text)
+            assert alert is not None and told in unescape(alert[1]), answer.text
+            values = _Fields(answer.text).values
+            for name in ("pattern", "name", "folder", "layout"):
+                assert values[name] == (form | wrong)[name], "nobody has to write it again"
+            assert "<script>alert" not in answer.text
+            assert runs(api) == []
 
 
 def test_a_start_that_is_refused_shows_the_form_again(api: TestClient, form: dict[str, str]) -> None:

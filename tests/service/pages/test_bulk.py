@@ -236,9 +236,11 @@ def test_a_run_is_deleted_by_its_button(
     assert "There is no such bulk run here. It was deleted" in gone.text
 
 
-@pytest.mark.parametrize(
-    ("fields", "told"),
-    [
+def test_a_wrong_form_says_what_was_expected(
+    subtests: pytest.Subtests, api: TestClient, tmp_path: Path
+) -> None:
+    uploaded(api, tmp_path, 1)
+    for fields, told in (
         ({}, "choose one"),
         ({"choice": "psf:abc"}, "a PSF of the list"),
         ({"choice": f"psf:{'0' * 64}"}, "There is no such PSF here"),
@@ -250,16 +252,12 @@ def test_a_run_is_deleted_by_its_button(
             {"choice": f"psf:{'0' * 64}", "method": "magic"},
             "Method: expected name to be one of richardson-lucy",
         ),
-    ],
-)
-def test_a_wrong_form_says_what_was_expected(
-    api: TestClient, tmp_path: Path, fields: dict[str, str], told: str
-) -> None:
-    uploaded(api, tmp_path, 1)
-    refused = api.post("/bulk/start", data=fields)
-    assert refused.status_code in (404, 409, 422) and told in refused.text
-    assert refused.headers["Content-Type"].startswith("text/html")
-    assert api.get("/v1/bulk").json()["items"] == []
+    ):
+        with subtests.test(str((fields, told))):
+            refused = api.post("/bulk/start", data=fields)
+            assert refused.status_code in (404, 409, 422) and told in refused.text
+            assert refused.headers["Content-Type"].startswith("text/html")
+            assert api.get("/v1/bulk").json()["items"] == []
 
 
 def test_nobody_sees_or_changes_the_run_of_another_owner(settings: Settings, tmp_path: Path) -> None:

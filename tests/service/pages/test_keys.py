@@ -48,9 +48,9 @@ def test_revoking_the_key_of_the_login_ends_the_login(service: Keyed) -> None:
     assert service.api.get("/v1/jobs", headers=bearer(other)).status_code == 401
 
 
-@pytest.mark.parametrize(
-    ("data", "told"),
-    [
+def test_what_cannot_be_made_is_told_on_a_page(subtests: pytest.Subtests, service: Keyed) -> None:
+    client = browser(service, service.key("ann"))
+    for data, told in (
         ({}, "at least one scope"),
         ({"scopes": "everything"}, "at least one scope"),
         ({"scopes": "read", "lasts_days": "-1"}, "a lifetime"),
@@ -58,14 +58,12 @@ def test_revoking_the_key_of_the_login_ends_the_login(service: Keyed) -> None:
         ({"scopes": "read", "owner": "A B"}, "an owner"),
         ({"scopes": "admin"}, "scopes of your own key"),
         ({"scopes": "read", "owner": "bob"}, "your own name"),
-    ],
-)
-def test_what_cannot_be_made_is_told_on_a_page(service: Keyed, data: dict[str, str], told: str) -> None:
-    client = browser(service, service.key("ann"))
-    answer = client.post("/keys", data=data, headers=OWN_PAGE)
-    assert answer.status_code in (403, 422) and told in answer.text
-    assert answer.headers["content-type"].startswith("text/html")
-    assert len(service.catalogue.keys.all()) == 1
+    ):
+        with subtests.test(str((data, told))):
+            answer = client.post("/keys", data=data, headers=OWN_PAGE)
+            assert answer.status_code in (403, 422) and told in answer.text
+            assert answer.headers["content-type"].startswith("text/html")
+            assert len(service.catalogue.keys.all()) == 1
 
 
 def test_a_reader_sees_keys_and_can_change_none(service: Keyed) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import update
+from sqlalchemy import create_engine, update
 
 from service.app import create_app
 from service.pages.login import LONGEST_ADDRESS, local_address
@@ -146,34 +146,31 @@ CHANGES = (
 )
 
 
-@pytest.mark.parametrize(("method", "address"), CHANGES)
-@pytest.mark.parametrize(
-    "headers",
-    [
-        {"Sec-Fetch-Site": "cross-site"},
-        {"Sec-Fetch-Site": "same-site"},
-        {"Origin": "http://evil.example"},
-        {"Origin": "null"},
-    ],
-)
-def test_a_form_of_another_site_changes_nothing(
-    service: Keyed, method: str, address: str, headers: dict[str, str]
-) -> None:
-    client = browser(service, service.key("ann"))
-    sent = headers | {"X-Form-Token": form_token(client)}
-    answer = client.request(method, address, headers=sent)
-    assert answer.status_code == 403 and "another site" in answer.text
-    assert client.get("/v1/jobs").status_code == 200, "still logged in"
+def test_a_form_of_another_site_changes_nothing(subtests: pytest.Subtests, service: Keyed) -> None:
+    for method, address in CHANGES:
+        for headers in (
+            {"Sec-Fetch-Site": "cross-site"},
+            {"Sec-Fetch-Site": "same-site"},
+            {"Origin": "http://evil.example"},
+            {"Origin": "null"},
+        ):
+            with subtests.test(str((method, address, headers))):
+                client = browser(service, service.key("ann"))
+                sent = headers | {"X-Form-Token": form_token(client)}
+                answer = client.request(method, address, headers=sent)
+                assert answer.status_code == 403 and "another site" in answer.text
+                assert client.get("/v1/jobs").status_code == 200, "still logged in"
 
 
-@pytest.mark.parametrize(("method", "address"), CHANGES)
-def test_a_change_that_names_no_site_needs_the_form_token(service: Keyed, method: str, address: str) -> None:
-    client, other = browser(service, service.key("ann")), browser(service, service.key("ann"))
-    for headers in ({}, {"X-Form-Token": "x" * 43}, {"X-Form-Token": form_token(other)}):
-        answer = client.request(method, address, headers=headers)
-        assert answer.status_code == 403 and "form token" in answer.text, answer.text
-    accepted = client.request(method, address, headers={"X-Form-Token": form_token(client)})
-    assert accepted.status_code != 403, accepted.text
+def test_a_change_that_names_no_site_needs_the_form_token(subtests: pytest.Subtests, service: Keyed) -> None:
+    for method, address in CHANGES:
+        with subtests.test(str((method, address))):
+            client, other = browser(service, service.key("ann")), browser(service, service.key("ann"))
+            for headers in ({}, {"X-Form-Token": "x" * 43}, {"X-Form-Token": form_token(other)}):
+                answer = client.request(method, address, headers=headers)
+                assert answer.status_code == 403 and "form token" in answer.text, answer.text
+            accepted = client.request(method, address, headers={"X-Form-Token": form_token(client)})
+            assert accepted.status_code != 403, accepted.text
 
 
 def test_the_form_token_may_be_a_field_of_a_page_s_form(service: Keyed) -> None:
@@ -195,22 +192,20 @@ def test_a_program_with_a_key_needs_no_token(service: Keyed) -> None:
 # No window of the browser's own ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("headers", "offered"),
-    [
+def test_basic_is_offered_to_programs_alone(subtests: pytest.Subtests, service: Keyed) -> None:
+    for headers, offered in (
         ({}, True),
         ({"Accept": "text/html, image/gif, image/jpeg, */*; q=0.2"}, True),  # Java's, as of TOPCAT
         (OWN_PAGE, False),
         (PERSON, False),
         ({"Cookie": f"{COOKIE}=ended"}, False),
-    ],
-)
-def test_basic_is_offered_to_programs_alone(service: Keyed, headers: dict[str, str], offered: bool) -> None:
-    for address in ("/v1/jobs", "/uws/jobs"):
-        answer = service.api.get(address, headers=headers)
-        assert answer.status_code == 401
-        assert answer.headers["WWW-Authenticate"].startswith("Bearer")
-        assert ("Basic" in answer.headers["WWW-Authenticate"]) == offered
+    ):
+        with subtests.test(str((headers, offered))):
+            for address in ("/v1/jobs", "/uws/jobs"):
+                answer = service.api.get(address, headers=headers)
+                assert answer.status_code == 401
+                assert answer.headers["WWW-Authenticate"].startswith("Bearer")
+                assert ("Basic" in answer.headers["WWW-Authenticate"]) == offered
 
 
 # Beginning and end ----------------------------------------------------------------------------------
@@ -272,10 +267,13 @@ def test_a_new_login_ends_the_one_before_it(service: Keyed) -> None:
         service.catalogue.sessions.find(token)
 
 
-def test_an_ended_session_is_told_on_the_login_page(service: Keyed) -> None:
+def test_an_ended_session_is_told_on_the_login_page(service: Keyed, settings: Settings) -> None:
     client = browser(service, service.key("ann"))
     assert "You are logged in as ann" in client.get("/login").text
-    service.catalogue._database.change(update(SessionRow).values(expires_at=time.time() - 1))
+    engine = create_engine(settings.catalogue_url)
+    with engine.begin() as connection:
+        connection.execute(update(SessionRow).values(expires_at=time.time() - 1))
+    engine.dispose()
     answer = client.get("/jobs")
     assert answer.status_code == 303 and "Your login has ended" in client.get(answer.headers["location"]).text
     api = client.get("/v1/jobs")
@@ -295,9 +293,8 @@ def test_a_revoked_key_ends_its_sessions_at_once(service: Keyed) -> None:
     assert client.get("/v1/jobs").json()["type"] == "urn:heliopsf:key-revoked"
 
 
-@pytest.mark.parametrize(
-    "sent",
-    [
+def test_a_login_leads_nowhere_else(subtests: pytest.Subtests, service: Keyed) -> None:
+    for sent in (
         "//evil.example",
         "///evil.example",
         "/\\evil.example",
@@ -317,18 +314,26 @@ def test_a_revoked_key_ends_its_sessions_at_once(service: Keyed) -> None:
         "/login?next=/jobs",
         "/logout",
         "/" + "a" * LONGEST_ADDRESS,
-    ],
-)
-def test_a_login_leads_nowhere_else(service: Keyed, sent: str) -> None:
-    assert local_address(sent) == "/"
-    answer = browser(service).post("/login", data={"key": service.key("ann"), "next": sent}, headers=OWN_PAGE)
-    assert answer.status_code == 303 and answer.headers["location"] == "/"
-    assert "evil" not in browser(service).get("/login", params={"next": sent}).text
+    ):
+        with subtests.test(str(sent)):
+            assert local_address(sent) == "/"
+            answer = browser(service).post(
+                "/login", data={"key": service.key("ann"), "next": sent}, headers=OWN_PAGE
+            )
+            assert answer.status_code == 303 and answer.headers["location"] == "/"
+            assert "evil" not in browser(service).get("/login", params={"next": sent}).text
 
 
-@pytest.mark.parametrize("sent", ["/", "/jobs", "/jobs?phase=ERROR&a=//b", "/psfs/a/vs/b", "/login-help"])
-def test_a_login_leads_to_the_page_that_was_asked_for(sent: str) -> None:
-    assert local_address(sent) == sent
+def test_a_login_leads_to_the_page_that_was_asked_for(subtests: pytest.Subtests) -> None:
+    for sent in (
+        "/",
+        "/jobs",
+        "/jobs?phase=ERROR&a=//b",
+        "/psfs/a/vs/b",
+        "/login-help",
+    ):
+        with subtests.test(str(sent)):
+            assert local_address(sent) == sent
 
 
 def test_a_link_on_another_site_finds_the_session(service: Keyed) -> None:

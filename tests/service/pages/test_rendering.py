@@ -28,14 +28,22 @@ NOTHING = "0" * 32
 # Headers --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("address", ["/", "/jobs", "/bulk", "/login", "/keys", "/nothing"])
-def test_a_page_has_the_policy_and_is_not_kept(api: TestClient, address: str) -> None:
-    answer = api.get(address, headers=PERSON)
-    assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
-    assert answer.headers["Content-Security-Policy"] == POLICY
-    assert answer.headers["Cache-Control"] == "no-store" and answer.headers["Vary"] == "Cookie"
-    assert answer.headers["X-Content-Type-Options"] == "nosniff"
-    assert answer.headers["X-Frame-Options"] == "DENY"
+def test_a_page_has_the_policy_and_is_not_kept(subtests: pytest.Subtests, api: TestClient) -> None:
+    for address in (
+        "/",
+        "/jobs",
+        "/bulk",
+        "/login",
+        "/keys",
+        "/nothing",
+    ):
+        with subtests.test(str(address)):
+            answer = api.get(address, headers=PERSON)
+            assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
+            assert answer.headers["Content-Security-Policy"] == POLICY
+            assert answer.headers["Cache-Control"] == "no-store" and answer.headers["Vary"] == "Cookie"
+            assert answer.headers["X-Content-Type-Options"] == "nosniff"
+            assert answer.headers["X-Frame-Options"] == "DENY"
 
 
 def test_the_policy_allows_no_other_host_and_nothing_inline() -> None:
@@ -133,9 +141,10 @@ def _answer(
     return found
 
 
-@pytest.mark.parametrize(
-    ("status", "told", "kept"),
-    [
+def test_an_error_is_a_page_for_people_and_a_document_for_programs(
+    subtests: pytest.Subtests, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for status, told, kept in (
         (404, "There is nothing here", False),
         (413, "This is too large", False),
         (415, "The service cannot read this file", False),
@@ -143,24 +152,27 @@ def _answer(
         (429, "Too many requests", True),
         (500, "The service failed", True),
         (503, "The service cannot answer now", True),
-    ],
-)
-def test_an_error_is_a_page_for_people_and_a_document_for_programs(
-    settings: Settings, monkeypatch: pytest.MonkeyPatch, status: int, told: str, kept: bool
-) -> None:
-    few = settings.model_copy(update={"reads_per_minute": 5}) if status == 429 else settings
-    with TestClient(create_app(few), raise_server_exceptions=False) as api:
-        answer = _answer(api, status, PERSON, monkeypatch)
-        assert (answer.status_code, answer.headers["Content-Type"]) == (status, "text/html; charset=utf-8")
-        assert answer.headers["Content-Security-Policy"] == POLICY
-        assert answer.headers["Cache-Control"] == "no-store"
-        page = answer.text
-        assert f"<h1>{told}" in page and f"Status {status}" in page and 'role="alert"' in page
-        assert ("Nothing is lost" in page) == kept
-        assert "secret" not in page and "Traceback" not in page
-        answer = _answer(api, status, {"Accept": "*/*"}, monkeypatch)
-        assert (answer.status_code, answer.headers["Content-Type"]) == (status, "application/problem+json")
-        assert answer.json()["status"] == status and answer.json()["detail"]
+    ):
+        with subtests.test(str((status, told, kept))):
+            few = settings.model_copy(update={"reads_per_minute": 5}) if status == 429 else settings
+            with TestClient(create_app(few), raise_server_exceptions=False) as api:
+                answer = _answer(api, status, PERSON, monkeypatch)
+                assert (answer.status_code, answer.headers["Content-Type"]) == (
+                    status,
+                    "text/html; charset=utf-8",
+                )
+                assert answer.headers["Content-Security-Policy"] == POLICY
+                assert answer.headers["Cache-Control"] == "no-store"
+                page = answer.text
+                assert f"<h1>{told}" in page and f"Status {status}" in page and 'role="alert"' in page
+                assert ("Nothing is lost" in page) == kept
+                assert "secret" not in page and "Traceback" not in page
+                answer = _answer(api, status, {"Accept": "*/*"}, monkeypatch)
+                assert (answer.status_code, answer.headers["Content-Type"]) == (
+                    status,
+                    "application/problem+json",
+                )
+                assert answer.json()["status"] == status and answer.json()["detail"]
 
 
 def test_addresses_of_the_interface_never_answer_with_pages(api: TestClient) -> None:

@@ -53,9 +53,10 @@ def test_the_schema_is_that_of_the_model_and_marks_the_names_of_files(api: TestC
     assert {"format": FILE_NAME, "type": "string"} in schema["properties"]["known_psf"]["anyOf"]
 
 
-@pytest.mark.parametrize(
-    ("kind", "form", "expected"),
-    [
+def test_a_form_starts_a_job_with_its_options(
+    subtests: pytest.Subtests, api: TestClient, transit_id: str
+) -> None:
+    for kind, form, expected in (
         ("psf-fit", {"shape": "core", "seed": "7"}, {"shape": "core", "seed": 7, "as_published": False}),
         ("cross-validate", {"runs": "3", "scheme": "exact"}, {"runs": 3, "scheme": "exact"}),
         ("report", {"psf_id": "", "shapes": "1"}, {"shapes": True, "dark_offsets": False, "psf_id": None}),
@@ -64,17 +65,14 @@ def test_the_schema_is_that_of_the_model_and_marks_the_names_of_files(api: TestC
             {"correct": "1", "photon_gain_dn": "5", "read_noise_dn": "1.5"},
             {"correct": True, "noise": {"photon_gain_dn": 5.0, "read_noise_dn": 1.5}},
         ),
-    ],
-)
-def test_a_form_starts_a_job_with_its_options(
-    api: TestClient, transit_id: str, kind: str, form: dict[str, str], expected: dict[str, object]
-) -> None:
-    assert f'action="/transits/{transit_id}/jobs/{kind}"' in api.get(f"/transits/{transit_id}").text
-    answer = api.post(f"/transits/{transit_id}/jobs/{kind}", data=form, follow_redirects=False)
-    assert answer.status_code == 303, answer.text
-    job = api.get("/v1" + answer.headers["location"]).json()
-    assert job["kind"] == kind and job["parameters"]["transit_id"] == transit_id
-    assert {name: job["parameters"].get(name) for name in expected} == expected
+    ):
+        with subtests.test(str((kind, form, expected))):
+            assert f'action="/transits/{transit_id}/jobs/{kind}"' in api.get(f"/transits/{transit_id}").text
+            answer = api.post(f"/transits/{transit_id}/jobs/{kind}", data=form, follow_redirects=False)
+            assert answer.status_code == 303, answer.text
+            job = api.get("/v1" + answer.headers["location"]).json()
+            assert job["kind"] == kind and job["parameters"]["transit_id"] == transit_id
+            assert {name: job["parameters"].get(name) for name in expected} == expected
 
 
 def test_wrong_options_and_kinds_are_told_on_a_page(api: TestClient, transit_id: str) -> None:

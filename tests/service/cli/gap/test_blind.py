@@ -41,23 +41,21 @@ def test_a_set_is_made_and_sealed_and_another_is_not_mixed_in(tmp_path: Path) ->
     assert again.exit_code == 0 and "made case" not in again.output
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
+def test_bad_input_is_said_in_a_line(subtests: pytest.Subtests, tmp_path: Path) -> None:
+    for arguments, said in (
         (["--only", "gremlins"], "expected one of anisotropic_scatter"),
         (["--size", "32"], "--size"),
         (["--cases", "0"], "--cases"),
         (["--simulator", "missing.py"], "expected a readable Python file"),
         (["--simulator", "mine.py", "--only", "ghost"], "expected --simulator without --only"),
         (["--clean-only", "--only", "ghost"], "expected one of --clean-only and --only"),
-    ],
-)
-def test_bad_input_is_said_in_a_line(arguments: list[str], said: str, tmp_path: Path) -> None:
-    answer = run("-o", tmp_path / "set", "--make-only", "--processes", "1", *arguments)
-    assert answer.exit_code != 0
-    assert said in answer.output
-    assert "Traceback" not in answer.output
-    assert not (tmp_path / "set" / "cases").exists()
+    ):
+        with subtests.test(str((arguments, said))):
+            answer = run("-o", tmp_path / "set", "--make-only", "--processes", "1", *arguments)
+            assert answer.exit_code != 0
+            assert said in answer.output
+            assert "Traceback" not in answer.output
+            assert not (tmp_path / "set" / "cases").exists()
 
 
 def test_where_no_case_can_be_made_that_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

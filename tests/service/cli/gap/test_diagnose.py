@@ -161,9 +161,10 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     assert json.loads(numbers.read_text())["verdict"] == "none"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
+    subtests: pytest.Subtests, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for arguments, said in (
         (["--json", "no/such/folder/g.json", "--local"], "there is no folder"),
         (["--corrected", "no/such/folder/p.fits", "--local"], "there is no folder"),
         (["--psf", "missing.fits", "--local"], "expected a PSF id (8 or more hexadecimal digits) or a file"),
@@ -176,15 +177,12 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
         (["--seed", "-1", "--local"], "not in the range"),
         (["--coverage", "0.99", "--local"], "not in the range 0.5<=x<=0.95"),
         (["--server", "http://127.0.0.1:9"], "127.0.0.1:9"),
-    ],
-)
-def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], said: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    done = run(folder, *arguments)
-    assert done.exit_code != 0 and said in done.output and "Traceback" not in done.output
-    assert list(tmp_path.iterdir()) == []
+    ):
+        with subtests.test(str((arguments, said))):
+            monkeypatch.chdir(tmp_path)
+            done = run(folder, *arguments)
+            assert done.exit_code != 0 and said in done.output and "Traceback" not in done.output
+            assert list(tmp_path.iterdir()) == []
 
 
 def test_effects_that_clash_with_the_library_s_are_told(folder: Path, tmp_path: Path) -> None:

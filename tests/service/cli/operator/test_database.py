@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
-from sqlalchemy import text
+from sqlalchemy import create_engine, text
 
 from service.cli.main import main
 from tests.tables import RUN_REVISIONS
@@ -30,10 +30,10 @@ def ask(*words: str) -> Result:
 
 
 def execute(statement: str) -> None:
-    catalogue = Catalogue(Settings().catalogue_url)
-    with catalogue._engine.begin() as connection:
+    engine = create_engine(Settings().catalogue_url)
+    with engine.begin() as connection:
         connection.execute(text(statement))
-    catalogue.close()
+    engine.dispose()
 
 
 def test_status_upgrade_status() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
-from sqlalchemy import text
+from sqlalchemy import create_engine, text
 
 from service.cli.main import main
 from service.cli.operator import doctor as cli_doctor
@@ -36,6 +36,14 @@ def catalogue(tmp_path: Path) -> Catalogue:
     catalogue = Catalogue(Settings().catalogue_url)
     catalogue.upgrade()
     return catalogue
+
+
+def execute(statement: str) -> None:
+    """Change the database behind the back of the service."""
+    engine = create_engine(Settings().catalogue_url)
+    with engine.begin() as connection:
+        connection.execute(text(statement))
+    engine.dispose()
 
 
 def ask(*options: str) -> Result:
@@ -71,9 +79,10 @@ def test_all_is_well_where_a_worker_is_there(catalogue: Catalogue) -> None:
     assert "host:1" in found["workers"]["found"]
 
 
-@pytest.mark.parametrize(
-    ("variable", "url", "what", "says"),
-    [
+def test_a_broken_url_is_a_plain_sentence_without_its_password(
+    subtests: pytest.Subtests, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable, url, what, says in (
         ("DATABASE_URL", "postgresql://u:s3cret@127.0.0.1:PORT/x", "database", "refused"),
         ("DATABASE_URL", "postgresql://u@127.0.0.1:PORT/x?password=s3cret", "database", "refused"),
         ("DATABASE_URL", "nonsense:s3cret", "database", "cannot be used"),
@@ -85,17 +94,15 @@ def test_all_is_well_where_a_worker_is_there(catalogue: Catalogue) -> None:
         ("BROKER_URL", "s3cret", "broker", "cannot be used"),
         ("BROKER_URL", "", "broker", "cannot be used"),
         ("BROKER_URL", "amqp://u:s3cret@127.0.0.1:PORT//", "broker", "does not answer"),
-    ],
-)
-def test_a_broken_url_is_a_plain_sentence_without_its_password(
-    variable: str, url: str, what: str, says: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(f"HELIOPSF_{variable}", url.replace("PORT", str(free_port())))
-    answer = ask()
-    assert answer.exit_code == 1 and isinstance(answer.exception, SystemExit), answer.output
-    assert "s3cret" not in answer.output and "Traceback" not in answer.output
-    found = findings()[what]
-    assert found["state"] == "broken" and says in found["found"] and found["advice"]
+    ):
+        with subtests.test(url), monkeypatch.context() as patched:
+            patched.setenv(f"HELIOPSF_{variable}", url.replace("PORT", str(free_port())))
+            answers = [ask(), ask("--json")]
+            for answer in answers:
+                assert answer.exit_code == 1 and isinstance(answer.exception, SystemExit), answer.output
+                assert "s3cret" not in answer.output and "Traceback" not in answer.output
+            found = {one["what"]: one for one in json.loads(answers[1].output)["findings"]}[what]
+            assert found["state"] == "broken" and says in found["found"] and found["advice"]
 
 
 def test_a_file_that_is_no_database_is_broken(tmp_path: Path) -> None:
@@ -110,50 +117,51 @@ def test_storage_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert states()["storage"] == "broken"
 
 
-@pytest.mark.parametrize(("free", "state"), [(2**20, "broken"), (2**30, "warning"), (2**40, "ok")])
-def test_room(free: int, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "free_bytes", lambda _folder: free)
-    assert states()["storage"] == state
+def test_room(subtests: pytest.Subtests, monkeypatch: pytest.MonkeyPatch) -> None:
+    for free, state in (
+        (2**20, "broken"),
+        (2**30, "warning"),
+        (2**40, "ok"),
+    ):
+        with subtests.test(str((free, state))):
+            monkeypatch.setattr(checks, "free_bytes", lambda _folder, free=free: free)
+            assert states()["storage"] == state
 
 
 @pytest.mark.parametrize(
-    ("statement", "state", "says"),
+    ("statement", "state", "says", "advice"),
     [
-        ("ALTER TABLE jobs DROP COLUMN worker", "broken", "jobs.worker"),
-        ("DROP INDEX jobs_tallied", "warning", "jobs_tallied"),
-        ("DROP TABLE workers", "warning", "workers"),
+        ("ALTER TABLE jobs DROP COLUMN worker", "broken", "jobs.worker", ""),
+        ("DROP INDEX jobs_tallied", "warning", "jobs_tallied", ""),
+        ("DROP TABLE workers", "warning", "workers", ""),
+        ("DROP TABLE alembic_version", "warning", "without a revision", "heliopsf database upgrade"),
+        (
+            "UPDATE alembic_version SET version_num = '0001'",
+            "warning",
+            "at revision 0001",
+            "database upgrade",
+        ),
+        (
+            "UPDATE alembic_version SET version_num = '9999'",
+            "broken",
+            "of a later version",
+            "run the version",
+        ),
     ],
 )
-def test_a_database_of_another_version(catalogue: Catalogue, statement: str, state: str, says: str) -> None:
-    with catalogue._engine.begin() as connection:
-        connection.execute(text(statement))
+def test_a_database_of_another_version(
+    catalogue: Catalogue, statement: str, state: str, says: str, advice: str
+) -> None:
+    execute(statement)
     found = findings()["schema"]
-    assert found["state"] == state and says in found["found"]
+    assert found["state"] == state and says in found["found"] and advice in found["advice"]
 
 
-@pytest.mark.parametrize(
-    ("statement", "state", "says"),
-    [
-        ("DROP TABLE alembic_version", "warning", "without a revision"),
-        ("UPDATE alembic_version SET version_num = '0001'", "warning", "at revision 0001"),
-        ("UPDATE alembic_version SET version_num = '9999'", "broken", "of a later version"),
-    ],
-)
-def test_a_database_at_another_revision(catalogue: Catalogue, statement: str, state: str, says: str) -> None:
-    with catalogue._engine.begin() as connection:
-        connection.execute(text(statement))
-    found = findings()["schema"]
-    assert found["state"] == state and says in found["found"]
-    assert ("heliopsf database upgrade" if state == "warning" else "run the version") in found["advice"]
-
-
-@pytest.mark.parametrize(
-    ("apart", "state"), [(0.2, "ok"), (-3.0, "warning"), (60.0, "warning"), (-60.0, "warning")]
-)
-def test_clocks(catalogue: Catalogue, apart: float, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clocks(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     real = Census.clock
-    monkeypatch.setattr(Census, "clock", lambda self: real(self) + apart)
-    assert states()["clock"] == state
+    for apart, state in ((0.2, "ok"), (-3.0, "warning"), (60.0, "warning")):
+        monkeypatch.setattr(Census, "clock", lambda self, apart=apart: real(self) + apart)
+        assert states()["clock"] == state, apart
 
 
 def test_a_worker_of_another_version(catalogue: Catalogue) -> None:
@@ -164,8 +172,7 @@ def test_a_worker_of_another_version(catalogue: Catalogue) -> None:
 def test_jobs_that_nobody_takes(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     assert states()["workers"] == "warning" and states()["stuck jobs"] == "ok"
-    with catalogue._engine.begin() as connection:
-        connection.execute(text("UPDATE jobs SET created_at = created_at - 7200"))
+    execute("UPDATE jobs SET created_at = created_at - 7200")
     found = findings()
     assert "1 queued" in found["stuck jobs"]["found"] and found["stuck jobs"]["state"] == "warning"
     assert "waited for 2 h" in found["workers"]["found"]
@@ -177,30 +184,25 @@ def test_a_job_whose_worker_is_gone(catalogue: Catalogue) -> None:
     job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     catalogue.jobs.claim(job.id, "host:1")
     assert states()["stuck jobs"] == "ok"
-    with catalogue._engine.begin() as connection:
-        connection.execute(text("UPDATE jobs SET heartbeat_at = heartbeat_at - 7200"))
+    execute("UPDATE jobs SET heartbeat_at = heartbeat_at - 7200")
     assert "1 in progress" in findings()["stuck jobs"]["found"]
 
 
-@pytest.mark.parametrize(
-    ("environment", "says"),
-    [
+def test_threads(subtests: pytest.Subtests, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for environment, says in (
         ({"OMP_NUM_THREADS": "4096"}, "OMP_NUM_THREADS"),
         ({"OMP_NUM_THREADS": "many"}, "set OMP_NUM_THREADS to a number"),
         ({"HELIOPSF_WORKER_THREADS": "4096"}, "HELIOPSF_WORKER_THREADS=2"),
         ({"HELIOPSF_WORKER_PROCESSES": "4096"}, "fewer processes"),
         ({}, ""),
-    ],
-)
-def test_threads(
-    environment: dict[str, str], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setattr(cli_doctor, "cores", lambda: 2)
-    monkeypatch.setattr("workers.settings.cores", lambda: 2)
-    found = cli_doctor.threads(Settings(), tmp_path / "no-limit")
-    assert found.state == ("warning" if environment else "ok") and says in found.advice
+    ):
+        with subtests.test(str(environment)), monkeypatch.context() as patched:
+            for name, value in environment.items():
+                patched.setenv(name, value)
+            patched.setattr(cli_doctor, "cores", lambda: 2)
+            patched.setattr("workers.settings.cores", lambda: 2)
+            found = cli_doctor.threads(Settings(), tmp_path / "no-limit")
+            assert found.state == ("warning" if environment else "ok") and says in found.advice
 
 
 def test_a_container_that_may_use_fewer_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,19 +247,17 @@ def test_the_table_says_what_state_found_and_what_to_do() -> None:
     assert max(map(len, lines[2:])) <= 80
 
 
-@pytest.mark.parametrize(
-    ("url", "said"),
-    [
+def test_an_address_has_no_secret(subtests: pytest.Subtests) -> None:
+    for url, said in (
         ("postgresql://u:s3cret@db:5432/heliopsf?sslmode=require", "postgresql://db:5432/heliopsf"),
         ("redis://:s3/cret@db", "the URL that is set"),
         ("redis://:s3#cret@db", "the URL that is set"),
         ("redis://:s3?cret@db", "the URL that is set"),
         ("redis://u:s3@cret@db/0", "redis://db/0"),
         ("s3cret", "the URL that is set"),
-    ],
-)
-def test_an_address_has_no_secret(url: str, said: str) -> None:
-    assert cli_doctor.address(url) == said
+    ):
+        with subtests.test(str((url, said))):
+            assert cli_doctor.address(url) == said
 
 
 def test_a_setting_that_is_none_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,17 +1,39 @@
-"""``heliopsf psf fit``: what it prints."""
+"""``heliopsf psf fit``: what it prints of a fit."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
+from unittest.mock import MagicMock
 
+import pytest
 from click.testing import CliRunner
 
 from service.cli.main import main
-from tests.transit_files import write_simulated
+from service.cli.psf import make
+from tests.transit_files import write_transit
 
 
-def test_the_id_of_the_fitted_psf_is_printed(tmp_path: Path) -> None:
-    transit, output = write_simulated(tmp_path / "transit"), tmp_path / "psf.fits"
-    told = CliRunner().invoke(main, ["psf", "fit", str(transit), "--local", "-o", str(output)]).output
-    assert re.search(r"psf\.fits: .* \(draft\), id [0-9a-f]{12}$", told, flags=re.M), told
+FIT = {
+    "sentence": "It fits.",
+    "parameters": {"b": {"value": 6.15, "sigma": 0.1, "unit": "px"}},
+    "curve": {"radii_px": [10], "light_beyond_pct": [12.5], "sigma": [0.3]},
+    "limits": ["one limit"],
+}
+
+
+def test_the_id_of_the_fitted_psf_is_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    service = MagicMock()
+    service.__enter__.return_value = service
+    service.fit_psf.return_value = {
+        "id": "0123456789ab" + "c" * 52,
+        "version": "0.1.0",
+        "details": MagicMock(),
+    }
+    monkeypatch.setattr(make, "connection", lambda *_: service)
+    transit, output = write_transit(tmp_path / "transit"), tmp_path / "psf.fits"
+    done = CliRunner().invoke(main, ["psf", "fit", str(transit), "--local", "-o", str(output)])
+    lines = done.output.splitlines()
+    assert lines[0].endswith("psf.fits: fit 0.1.0 (draft), id 0123456789ab"), done.output
+    assert [" ".join(line.split()) for line in lines[1:]] == [
+        "It fits.", "b 6.1500 ± 0.1000 px", "light beyond 10 px 12.50 ± 0.30 %", "note: one limit",
+    ]  # fmt: skip

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Literal, NamedTuple
 
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Page
+from playwright.sync_api import Page, TimeoutError
 
 
 class View(NamedTuple):
@@ -38,10 +38,18 @@ def good(page: Page) -> None:
             if view.rules:
                 report = Axe().run(page)
                 assert report.violations_count == 0, f"{page.url}, {name}: {report.generate_report()}"
-            width = page.evaluate("document.documentElement.scrollWidth")
-            assert width <= view.width, f"{page.url}, {name}: the page is {width} px wide"
+            fits(page, view.width)
     page.emulate_media(color_scheme="light")
     page.set_viewport_size(before)
+
+
+def fits(page: Page, width: int) -> None:
+    """No part of the page is beyond its window, as soon as its plots have been drawn again."""
+    try:
+        page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
+    except TimeoutError as late:
+        now = page.evaluate("document.documentElement.scrollWidth")
+        raise AssertionError(f"{page.url}: in a window of {width} px the page is {now} px wide") from late
 
 
 @contextmanager

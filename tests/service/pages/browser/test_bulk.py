@@ -38,7 +38,7 @@ def uploaded(site: Site, folder: Path, count: int, *, side: int, seed: int) -> l
 def test_a_run_started_by_the_form_is_followed_to_its_end_without_a_reload(
     page: Page, site: Site, psf_id: str, tmp_path: Path
 ) -> None:
-    uploaded(site, tmp_path, 2, side=128, seed=500)
+    uploaded(site, tmp_path, 2, side=256, seed=500)
     page.goto("/bulk")
     page.get_by_label("PSF").first.select_option(f"psf:{psf_id}")
     page.get_by_label("Name").first.fill("quiet Sun")

@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from psfcore.transit.archive import pack
 from tests.conftest import write_image, write_psf
-from tests.service.pages.browser.checks import good
+from tests.service.pages.browser.checks import fits, good
 from tests.service.pages.browser.conftest import UNSERVED, Site, Watch
 from tests.service.pages.browser.products import COORDINATES, write_sun
 from tests.service.pages.gap_report import GAP_ID, keep_gap_report, settings_of
@@ -74,7 +74,7 @@ def test_every_page_is_good_and_no_wider_than_its_window(page: Page, pages: dict
         good(page)
         for width in WIDTHS:
             page.set_viewport_size({"width": width, "height": 800})
-            assert page.evaluate("document.documentElement.scrollWidth") <= width, (address, width)
+            fits(page, width)
             beyond = page.locator("main .card, main .card *").evaluate_all(BEYOND_THEIR_CARDS)
             assert beyond == [], f"{address} at {width} px: something is wider than its card"
 

@@ -37,8 +37,12 @@ def test_radii_are_shown_densely_near_the_centre_and_in_ratios_farther_out() -> 
     assert shown_radii([]) == []
 
 
-@pytest.mark.parametrize(
-    ("value", "text"), [(None, ""), (float("nan"), ""), (0.0, "0"), (1234567.0, "1.2346e+06")]
-)
-def test_numbers_are_written_so_that_a_script_reads_them(value: float | None, text: str) -> None:
-    assert written(value) == text
+def test_numbers_are_written_so_that_a_script_reads_them(subtests: pytest.Subtests) -> None:
+    for value, text in (
+        (None, ""),
+        (float("nan"), ""),
+        (0.0, "0"),
+        (1234567.0, "1.2346e+06"),
+    ):
+        with subtests.test(str((value, text))):
+            assert written(value) == text

@@ -34,9 +34,13 @@ def test_discs_have_their_places_colours_and_rows() -> None:
     assert list(found.residuals.x) == [98.0, 99.0]
 
 
-@pytest.mark.parametrize("images", [[], [image(1, None)]])
-def test_without_held_out_images_there_is_no_map(images: list[dict[str, object]]) -> None:
-    assert gap_map({"shape": [64, 64], "images": images}) is None
+def test_without_held_out_images_there_is_no_map(subtests: pytest.Subtests) -> None:
+    for images in (
+        [],
+        [image(1, None)],
+    ):
+        with subtests.test(str(images)):
+            assert gap_map({"shape": [64, 64], "images": images}) is None
 
 
 def test_only_what_differs_between_two_runs_is_listed() -> None:
