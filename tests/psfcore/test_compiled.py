@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from psfcore.compiled import MARK, KernelFiles, compiled, kernel_folder, trusted
-from psfcore.convolution import fft_kernels
 
 ROOT = Path(__file__).parents[2]
 
@@ -200,11 +199,6 @@ def test_first_kernels_of_two_processes_are_not_mixed_up(tmp_path: Path) -> None
         ["21.0", "21.0", "21.0", "0"],
         ["1.0", "1.0", "1.0", "1"],
     ], "the last kernel must not be compiled again"
-
-
-def test_every_pass_of_the_transforms_has_its_own_name() -> None:
-    passes = [*fft_kernels._FORWARD.values(), *fft_kernels._INVERSE.values()]
-    assert len({kernel.__qualname__ for kernel in passes}) == len(passes) == 8
 
 
 # A kernel that is called by its address; the kernel that calls it does not contain a copy of it.

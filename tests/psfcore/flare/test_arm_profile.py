@@ -205,25 +205,3 @@ def test_the_comparison_is_plotted(tmp_path: Path) -> None:
         found = compare_on_flare(flaring - before, usable, flare_psf(), CENTRE, 0.0, variance=noise)
         flare_png(flaring - before, usable, found, tmp_path / "flare.png", unit="DN")
         assert matplotlib.image.imread(tmp_path / "flare.png").std() > 0.05
-
-
-def test_extended_flare_loops_of_aia_give_a_low_explained_share(shared: Path) -> None:
-    """The loops are 100 px long and change everywhere: a box of 7 px cannot explain them."""
-    folder = shared / "data" / "real" / "aia" / "limbflare_20120719"
-    files = sorted(folder.glob("*T0734*.fits")) + sorted(folder.glob("*T0733*.fits"))
-    psf_file = shared / "data" / "real" / "psf" / "derived_aia171_psf_aiapy0.10.2.fits"
-    if len(files) < 3 or not psf_file.exists():
-        pytest.skip(f"real data not available: {folder}")
-    rates, usable = [], []
-    for file in (files[1], files[3]):  # short exposures, one after the other
-        with fits.open(file) as hdus:
-            hdu = next(h for h in hdus if h.data is not None)
-            rates.append(np.asarray(hdu.data, dtype=np.float64) / hdu.header["EXPTIME"])
-            usable.append(np.asarray(hdu.data) < 12_000)
-    middle = slice(2048 - 200, 2048 + 201)
-    psf = make_psf(np.asarray(fits.getdata(psf_file), dtype=np.float64)[middle, middle])
-    difference = rates[0] - rates[1]
-    centre = flare_centre(difference, *usable)
-    found = compare_on_flare(difference, usable[0] & usable[1], psf, centre, 49.81)
-    assert found.explained < 0.2
-    assert found.total.rms_pct > 50

@@ -14,7 +14,6 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter import fit as fit_module
@@ -32,7 +31,6 @@ from tests.psfcore.small_transits import (
     IMAGES,
     fitted,
     fitted_with_progress,
-    noise_free,
     observed,
     recipe,
     sky,
@@ -174,11 +172,6 @@ def test_free_shells_agree_with_the_truth_within_the_field() -> None:
     of_held = free.fits.fits[:, held]
     assert of_held.shape[0] == 14
     np.testing.assert_allclose(of_held, np.broadcast_to(truth[held], of_held.shape), rtol=0.2)
-
-
-def test_an_unknown_shape_is_refused() -> None:
-    with pytest.raises(DataError, match="unknown-shape"):
-        fit_transit(noise_free(sky()), shape="spiral")
 
 
 def test_progress_of_the_whole_fit_increases_to_its_end() -> None:

@@ -133,10 +133,8 @@ def test_saturated_pixels_are_filled_and_counted(folder: Path) -> None:
     assert transit.frames[1].filled is None
     assert [count.from_frames for count in prepared.frames] == [48, 0, 48, 0, 48, 0]
     assert prepared.to_json()["unfilled"] == 0
-
-
-def test_a_saturation_level_can_be_given(folder: Path) -> None:
-    _, prepared = read_prepared(folder, LIMITS, saturation_dn=1500.0)
+    write_transit(folder)
+    _, prepared = read_prepared(folder, LIMITS, saturation_dn=1500.0)  # the level can be given
     assert [count.saturated for count in prepared.frames] == [48, 0, 48, 0, 48, 0]
 
 
@@ -149,6 +147,8 @@ def test_a_known_psf_sums_to_one_exactly(folder: Path) -> None:
     assert kernel.shape == (32, 24) and kernel.dtype == np.float64
     assert kernel.sum() == pytest.approx(1, abs=1e-14)
     assert np.unravel_index(kernel.argmax(), kernel.shape) == (16, 12)
+    rounded = checked_kernel(dirty((3, 3), -1e-9), "k")
+    assert rounded.min() == 0 and rounded.sum() == pytest.approx(1, abs=1e-14)
 
 
 def dirty(at: tuple[int, int], value: float) -> Flat:
@@ -189,11 +189,6 @@ def test_the_given_diffraction_is_used_only_if_no_known_psf_is_named(folder: Pat
     assert requests == [("hri_euv", SHAPE)] and transit.diffraction.shape == (24, 24)
     assert "diffraction.fits" not in transit.sha256
     refusal(folder, "known-psf-sum", diffraction=2 * gaussian(20))
-
-
-def test_rounding_below_zero_becomes_zero() -> None:
-    kernel = checked_kernel(dirty((3, 3), -1e-9), "k")
-    assert kernel.min() == 0 and kernel.sum() == pytest.approx(1, abs=1e-14)
 
 
 # --- what cannot be used ----------------------------------------------------------------------------------

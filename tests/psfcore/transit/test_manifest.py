@@ -139,11 +139,6 @@ def test_plain_names() -> None:
         assert not is_plain_name(name), name
 
 
-def test_the_practice_manifest_is_read(shared: Path) -> None:
-    manifest = read_manifest(shared / "data/practice/p1")
-    assert manifest.pointings == {1: 10, 2: 10, 3: 10} and len(manifest.files) == 31
-
-
 def test_values_are_counted_before_they_become_objects() -> None:
     start = b'{"schema": "transit/1", '
     for content in (

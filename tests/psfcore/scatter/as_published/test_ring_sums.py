@@ -14,7 +14,7 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.scatter.as_published.ring_sums import ring_sums, segment_sums
 from psfcore.scatter.as_published.segments import Segments, fine_shells, shells_as_published
-from tests.psfcore.scatter.as_published.ring_sum_references import segment_sums_fft, segment_sums_plain
+from tests.psfcore.scatter.as_published.ring_sum_references import segment_sums_plain
 
 FINE = tuple(fine_shells(90.0))
 PUBLISHED = tuple(shells_as_published(90.0))
@@ -60,14 +60,6 @@ def test_rings_and_sectors_of_any_kind_of_image_equal_the_plain_sum() -> None:
             expected = segment_sums_plain(image, targets, segments)
             sums = segment_sums(image, targets, segments)
             np.testing.assert_allclose(sums, expected, rtol=1e-9, atol=1e-9, err_msg=f"{dtype}")
-
-
-def test_equals_one_convolution_a_segment() -> None:
-    image, targets = scene((75, 90)), some_targets((75, 90), 30)
-    for sectors in (1, 12):
-        segments = Segments(PUBLISHED, sectors, 128)
-        expected = segment_sums_fft(image, targets, segments)
-        np.testing.assert_allclose(segment_sums(image, targets, segments), expected, rtol=1e-6, atol=1e-7)
 
 
 def test_published_shells_of_a_large_image_equal_the_plain_sum() -> None:
