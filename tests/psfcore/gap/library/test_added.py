@@ -94,8 +94,8 @@ def test_an_error_in_a_source_is_reported_with_its_name(tmp_path: Path) -> None:
             '(EffectParameter("height", "DN/s", 5.0),)', "()"
         ): "edge_glow: expected at least one parameter",
     }
-    for text, said in texts.items():
-        source = source_in(tmp_path, text)
+    for n, (text, said) in enumerate(texts.items()):
+        source = source_in(tmp_path, text, f"mine_{n}.py")
         with pytest.raises(DataError) as refusal:
             added_effects([source])
         assert refusal.value.code == "bad-effects"
@@ -117,9 +117,9 @@ def test_a_change_that_is_not_an_image_is_reported_when_it_is_computed(tmp_path:
         "plane * np.nan": "got an image with NaN or infinite values",
         "plane / nothing": "NameError: name 'nothing' is not defined (line 8)",
     }
-    for change, said in changes.items():
+    for n, (change, said) in enumerate(changes.items()):
         text = GLOW.replace("lambda n, images: plane", f"lambda n, images: {change}")
-        (faulty,) = one_of(source_in(tmp_path, text)).changes(view)
+        (faulty,) = one_of(source_in(tmp_path, text, f"mine_{n}.py")).changes(view)
         with pytest.raises(DataError) as refusal:
             faulty.change(0, view.expected)
         assert refusal.value.code == "bad-effects" and said in refusal.value.message

@@ -44,7 +44,7 @@ def test_its_changes_are_finite_images_that_are_not_all_zero() -> None:
             assert why[0].islower() and not why.endswith("."), name
             continue
         changes = effect.changes(view())
-        assert len(changes) == len(effect.parameters), name
+        assert 0 < len(changes) <= len(effect.parameters), name
         for change in changes:
             fields = [change.change(n, images) for n in (0, len(images) // 2, len(images) - 1)]
             assert all(field.shape == images[0].shape and np.isfinite(field).all() for field in fields), name
