@@ -93,3 +93,15 @@ def elsewhere(store: Store, folder: Path) -> Store:
     if type(store) is Store:
         return store
     return open_store(Settings(data_dir=folder / "elsewhere", store_url=f"s3://{root_of(store)}"))
+
+
+def kept(store: Store, content: bytes) -> str:
+    """Store a file; returns its SHA-256."""
+    with store.temporary() as path:
+        path.write_bytes(content)
+        return store.keep(path)
+
+
+def digests(store: Store) -> set[str]:
+    """The SHA-256 of all files of a store."""
+    return {blob.digest for blob in store.blobs()}

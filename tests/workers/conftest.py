@@ -17,6 +17,7 @@ from tests.workers.databases import change
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import Base
 from workers.settings import Settings
+from workers.tasks import stage_timer
 
 
 @pytest.fixture(scope="package", autouse=True)
@@ -70,3 +71,22 @@ def catalogue(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalo
         tables = reversed(Base.metadata.sorted_tables)
         change(catalogue, text("SET LOCAL lock_timeout = '10s'"), *(table.delete() for table in tables))
     catalogue.close()
+
+
+class Clock:
+    """A clock that a test moves."""
+
+    now = 100.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    monotonic = perf_counter
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The clock of the timers of stages."""
+    clock = Clock()
+    monkeypatch.setattr(stage_timer, "time", clock)
+    return clock

@@ -17,7 +17,7 @@ from psfcore.errors import DataError
 from tests.conftest import write_image
 from tests.whole.many_rows import plan, statements
 from tests.workers.databases import BOTH, change, database, rows
-from tests.workers.jobs import claimed, job_row
+from tests.workers.jobs import bulk_row, claimed, job_row
 from tests.workers.psf_examples import product
 from workers.bulk import listing, matching
 from workers.catalogue import bulk_progress
@@ -44,18 +44,14 @@ DONE: dict[str, Any] = {
 
 def made(catalogue: Catalogue, images: int, *, key: str = "k", listed: bool = True) -> str:
     """A bulk with uploads as its images."""
-    row = BulkRow(
-        id=new_id(), owner="o", name="", phase=BulkPhase.RUNNING if listed else BulkPhase.LISTING, request={},
-        request_key=key, psf_id="p" * 64, created_at=time.time(), running_since=time.time(), listed=listed,
-    )  # fmt: skip
-    return catalogue.bulks.create(row, [f"{n:064x}" for n in range(images)])[0].id
+    return catalogue.bulks.create(bulk_row("o", key, listed=listed), [f"{n:064x}" for n in range(images)])[
+        0
+    ].id
 
 
 def turn(catalogue: Catalogue) -> Lease:
     """A worker's lease of a turn."""
-    job, _ = catalogue.jobs.submit("bulk", {}, new_id(), "o")
-    lease = claimed(catalogue, job.id)
-    return lease
+    return claimed(catalogue, catalogue.jobs.submit("bulk", {}, new_id(), "o")[0].id)
 
 
 def row(catalogue: Catalogue, bulk_id: str) -> BulkRow:
@@ -178,8 +174,7 @@ def used(catalogue: Catalogue) -> int:
 
 def turn_bytes(catalogue: Catalogue, lease: Lease) -> int:
     """What the job of a turn counts."""
-    job = job_row(catalogue, lease.job_id)
-    return counted_bytes(job)
+    return counted_bytes(job_row(catalogue, lease.job_id))
 
 
 def images_of(catalogue: Catalogue, bulk_id: str) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,16 +12,14 @@ from sqlalchemy import select
 
 from tests.whole.many_rows import statements
 from tests.workers.databases import BOTH, rows
-from tests.workers.jobs import claimed, job_row
+from tests.workers.jobs import bulk_row, claimed, job_row
 from tests.workers.psf_examples import OWNER, certify, identity, psf
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Listed, new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
 from workers.catalogue.owners import COUNTED, MIB, ROW_BYTES, OverQuota, counted_bytes
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ImageRow, JobRow, SolutionRow
-from workers.contract.bulk import BulkPhase
 from workers.versions.status import PsfStatus
 
 ROW = ROW_BYTES + len("{}")  # what the row of such an image counts, besides its file
@@ -125,13 +122,6 @@ def counting(catalogue: Catalogue, expected: int) -> Iterator[None]:
     assert catalogue.owners.recount() == []
 
 
-def bulk(listed: bool = True, key: str = "k") -> BulkRow:
-    return BulkRow(
-        id=new_id(), owner=OWNER, name="", phase=BulkPhase.RUNNING if listed else BulkPhase.LISTING, request={},
-        request_key=key, psf_id="p" * 64, created_at=time.time(), running_since=time.time(), listed=listed,
-    )  # fmt: skip
-
-
 def ids(count: int) -> list[str]:
     return [f"{number:064x}" for number in range(count)]
 
@@ -163,11 +153,11 @@ def test_jobs_count_with_their_present_parameters_until_they_are_destroyed(catal
 def test_bulk_runs_parts_contexts_and_changes_count(catalogue: Catalogue) -> None:
     turn, _ = catalogue.jobs.submit("bulk", {}, new_id(), OWNER)
     lease = claimed(catalogue, turn.id)
-    row = bulk(listed=False)
+    row = bulk_row(OWNER, listed=False)
     with counting(catalogue, ROW_BYTES * (1 + 3) + len("{}")):
         assert catalogue.bulks.create(row, ids(3))[1]
     with counting(catalogue, 0):
-        assert not catalogue.bulks.create(bulk(listed=False), ids(3))[1], "the same run"
+        assert not catalogue.bulks.create(bulk_row(OWNER, listed=False), ids(3))[1], "the same run"
     with counting(catalogue, 2 * ROW_BYTES):
         assert catalogue.bulks.begin_listing(row.id, lease)
         listed = [Listed("/a", False), Listed("/b", False)]
@@ -197,7 +187,7 @@ def certification(**more: str) -> StatusAsked:
 ADDED: dict[str, Callable[[Catalogue], object]] = {
     "job": lambda catalogue: catalogue.jobs.submit("psf-build", {}, "new", OWNER, quota_mib=1),
     "uws": lambda catalogue: catalogue.uws.draft("psf-build", {}, owner=OWNER, quota_mib=1),
-    "bulk": lambda catalogue: catalogue.bulks.create(bulk(), ids(1), 1),
+    "bulk": lambda catalogue: catalogue.bulks.create(bulk_row(OWNER), ids(1), 1),
     "context": lambda catalogue: catalogue.contexts.create("c", OWNER, "x", quota_mib=1),
     "default": lambda catalogue: catalogue.contexts.set_default(None, OWNER, "x", quota_mib=1),
     "range": lambda catalogue: catalogue.psfs.change(identity("a"), OWNER, certification(), "x", 1),
@@ -257,8 +247,8 @@ def test_a_large_bulk_run_is_counted_in_one_statement_and_a_refused_one_adds_no_
     catalogue: Catalogue,
 ) -> None:
     with statements() as sent, counting(catalogue, ROW_BYTES * 3001 + len("{}")):
-        catalogue.bulks.create(bulk(), ids(3000), 4)
+        catalogue.bulks.create(bulk_row(OWNER), ids(3000), 4)
     assert sum(one.startswith(("INSERT INTO owners", "UPDATE owners")) for one, _ in sent) == 1
     with statements() as sent, pytest.raises(OverQuota):
-        catalogue.bulks.create(bulk(key="other"), ids(3000), 4)
+        catalogue.bulks.create(bulk_row(OWNER, "other"), ids(3000), 4)
     assert not [one for one, _ in sent if one.startswith("INSERT")], "nothing is written to be removed again"

@@ -12,6 +12,7 @@ import pytest
 from sqlalchemy import text
 
 from psfcore.errors import DataError
+from tests.workers.conftest import Clock
 from tests.workers.databases import BOTH, change
 from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
@@ -21,7 +22,6 @@ from workers.contract.phases import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
-from workers.tasks import stage_timer
 from workers.tasks.context import Context
 from workers.tasks.stage_timer import STARTING
 
@@ -53,22 +53,6 @@ def run(folder: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, tas
     Runner(settings, catalogue, Store(settings.data_dir)).run(job.id)
     row = job_row(catalogue, job.id)
     return row
-
-
-class Clock:
-    """A clock that the task and the catalogue move."""
-
-    now = 100.0
-
-    def perf_counter(self) -> float:
-        return self.now
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr(stage_timer, "time", clock)
-    return clock
 
 
 def test_an_attempt_stores_its_stages_without_the_time_of_writing(

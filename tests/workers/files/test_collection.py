@@ -16,7 +16,7 @@ from sqlalchemy import text
 from psfcore.errors import DataError
 from service.cli.main import main
 from service.local import LocalService
-from tests.s3 import client_of, elsewhere, key_of, opened_store, root_of
+from tests.s3 import client_of, digests, elsewhere, kept, key_of, opened_store, root_of
 from tests.workers.databases import change
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ReportRow, SolutionRow
@@ -45,16 +45,6 @@ def remote(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
 
 
 in_a_folder = pytest.mark.parametrize("store", ["folder"], indirect=True)
-
-
-def kept(store: Store, content: bytes) -> str:
-    with store.temporary() as path:
-        path.write_bytes(content)
-        return store.keep(path)
-
-
-def digests(store: Store) -> set[str]:
-    return {blob.digest for blob in store.blobs()}
 
 
 def image(digest: str) -> ImageRow:

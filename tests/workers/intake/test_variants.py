@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from psfcore.errors import DataError
-from tests.workers.psf_examples import OWNER, certify, identity, psf, years
+from tests.workers.psf_examples import OWNER, certify, header_of, identity, psf, years
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
 from workers.intake.psf_choice import look_for_image, picked_for_image
@@ -26,15 +26,8 @@ def image(
     filter_name: str | None, scale: float = 0.492, date: str = "2021-06-01", **more: Any
 ) -> dict[str, Any]:
     cards = {"FILTER": filter_name, "CDELT1": scale, "CDELT2": scale, "DETECTOR": "HRI_EUV"}
-    return {
-        "instrument": "hri_euv",
-        "detector": "HRI_EUV",
-        "instrume": "EUI",
-        "wavelnth": 174.0,
-        "date_obs": date,
-        "cards": {key: value for key, value in cards.items() if value is not None},
-        **more,
-    }
+    known = {key: value for key, value in cards.items() if value is not None}
+    return header_of(date, **({"cards": known} | more))
 
 
 def chosen(catalogue: Catalogue, header: dict[str, Any], context: str | None = None) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tests.workers.conftest import Clock
 from tests.workers.jobs import claimed, job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import JobRow
@@ -22,7 +23,6 @@ from workers.run.child import Child
 from workers.run.runner import Runner
 from workers.run.stopping import Stopping
 from workers.settings import Settings
-from workers.tasks import stage_timer
 from workers.tasks.context import Context
 
 STEPS, STEP_S = 10, 0.01
@@ -108,23 +108,8 @@ def test_a_long_job_pauses_for_the_short_job_of_another_owner(bench: Bench) -> N
     )
 
 
-class Clock:
-    """A clock that a test moves."""
-
-    now = 100.0
-
-    def perf_counter(self) -> float:
-        return self.now
-
-    monotonic = perf_counter
-
-
-def test_the_time_of_a_pause_counts_for_the_short_job_alone(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = Clock()
+def test_the_time_of_a_pause_counts_for_the_short_job_alone(bench: Bench, clock: Clock) -> None:
     clock.now = time.perf_counter()  # a timer begins with the true time
-    monkeypatch.setattr(stage_timer, "time", clock)
 
     def work(owner: str, step: int) -> None:
         clock.now += 100.0 if owner == "long" else 10_000.0

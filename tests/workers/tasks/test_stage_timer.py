@@ -5,25 +5,9 @@ from __future__ import annotations
 import pytest
 
 from psfcore.errors import DataError
+from tests.workers.conftest import Clock
 from workers.catalogue.stage_times import Spent
-from workers.tasks import stage_timer
 from workers.tasks.stage_timer import MOST_STAGES, OTHERS, STARTING, StageTimer, short
-
-
-class Clock:
-    """A clock that a test moves."""
-
-    now = 100.0
-
-    def perf_counter(self) -> float:
-        return self.now
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr(stage_timer, "time", clock)
-    return clock
 
 
 def test_time_before_a_step_counts_for_its_stage_and_time_before_a_beginning_for_the_previous_one(

@@ -9,13 +9,11 @@ from sqlalchemy import insert, text
 
 from tests.whole.many_rows import plan, statements
 from tests.workers.databases import BOTH, change, database
-from workers.catalogue.bulk_tables import BulkRow
-from workers.catalogue.bulks import new_id
+from tests.workers.jobs import bulk_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.followed import rows
 from workers.catalogue.followed.rows import Place
 from workers.catalogue.tables import JobRow
-from workers.contract.bulk import BulkPhase
 
 ANY = "0" * 32
 
@@ -61,10 +59,7 @@ def test_rows_are_read_by_owner_phase_and_end(catalogue: Catalogue, monkeypatch:
 def test_open_bulk_runs_are_followed_also_when_paused(catalogue: Catalogue) -> None:
     ids = []
     for number in range(3):
-        row = BulkRow(
-            id=new_id(), owner="ann", name="", phase=BulkPhase.RUNNING, request={}, request_key=new_id(), psf_id="p" * 64,
-            created_at=float(number), listed=True,
-        )  # fmt: skip
+        row = bulk_row("ann", str(number), created_at=float(number))
         ids.append(catalogue.bulks.create(row, ["a" * 64])[0].id)
     catalogue.bulks.pause(ids[0])
     catalogue.bulks.cancel(ids[1])
