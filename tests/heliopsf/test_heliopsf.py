@@ -161,17 +161,16 @@ def _no_windows() -> Iterator[None]:
     pyplot.close("all")
 
 
-def test_a_psf_is_drawn_on_given_axes(psf: heliopsf.Psf) -> None:
+def test_a_psf_is_drawn_on_given_or_new_axes(psf: heliopsf.Psf, tmp_path: Path) -> None:
     left, right = Figure().subplots(1, 2)
     assert psf.plot(left, size=33) is left and psf.plot_curve(right) is right
     np.testing.assert_array_equal(left.images[0].get_array(), psf.kernel[16:49, 16:49])
     radii, light = right.lines[0].get_data()
     np.testing.assert_allclose(light, psf.light_beyond(radii))
-
-
-def test_new_axes_are_made_without_any(psf: heliopsf.Psf) -> None:
     assert psf.plot() is not psf.plot()
     assert psf.version in psf.plot_curve().get_title()
+    psf.quicklook().savefig(tmp_path / "psf.png")
+    assert (tmp_path / "psf.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_deconvolution_is_drawn(psf: heliopsf.Psf, tmp_path: Path) -> None:
@@ -184,11 +183,6 @@ def test_a_deconvolution_is_drawn(psf: heliopsf.Psf, tmp_path: Path) -> None:
     np.testing.assert_allclose(after.images[0].get_array(), change)
     assert [axes.get_title(loc="left")[:6] for axes in result.quicklook().axes[:3:2]] == ["Before", "After "]
     assert result.changes["pixels"] > 0
-
-
-def test_quicklooks_are_figures_that_can_be_saved(psf: heliopsf.Psf, tmp_path: Path) -> None:
-    psf.quicklook().savefig(tmp_path / "psf.png")
-    assert (tmp_path / "psf.png").read_bytes().startswith(b"\x89PNG")
 
 
 TIMES = {"before_time": "2022-03-01", "after_time": "2023-03-01T00:00:00Z"}

@@ -79,7 +79,7 @@ def test_the_core_depends_on_five_packages_and_extras_name_all_that_is_imported(
 
 def _sources() -> str:
     files = [path for package in sorted(OURS) for path in sorted((REPOSITORY / package).rglob("*.py"))]
-    assert len(files) > 300
+    assert len(files) > 100
     return "\n".join(path.read_text("utf-8") for path in files)
 
 

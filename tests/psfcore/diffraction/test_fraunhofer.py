@@ -85,17 +85,14 @@ def test_a_mirrored_pupil_gives_the_pattern_of_the_complex_sum(monkeypatch: pyte
         assert found.pattern.sum() == pytest.approx(complex_sum.pattern.sum(), rel=3e-7)
 
 
-def test_little_memory_gives_the_same_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mask is then read in several passes, each for some of the samples."""
-    whole = far(small(), 32).pattern
-    monkeypatch.setattr(mirrored, "FIELD_BYTES", 1)
-    np.testing.assert_array_equal(far(small(), 32).pattern, whole)
-
-
-def test_the_threads_do_not_change_the_pattern() -> None:
+def test_threads_and_memory_do_not_change_the_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With little memory, the mask is read in several passes, each for some of the samples."""
     for pupil in (small(), small((POLYGON,))):
         one, three = (far(pupil, 96, threads=threads).pattern for threads in (1, 3))
         np.testing.assert_array_equal(one, three)
+    whole = far(small(), 32).pattern
+    monkeypatch.setattr(mirrored, "FIELD_BYTES", 1)
+    np.testing.assert_array_equal(far(small(), 32).pattern, whole)
 
 
 def test_energy_is_conserved() -> None:

@@ -157,6 +157,8 @@ def test_the_suspected_pixels_are_those_of_a_slow_search() -> None:
     before = rng.gamma(4.0, 100.0, (150, 70)).astype(np.float32)
     after = (before * rng.gamma(3.0, 0.4, before.shape)).astype(np.float32)
     after[::17, ::13], after[4::9, 4::9], after[6::19, 2::17] = 0, 20_000, -5_000
+    after[5::9, 4::9], after[7::19, 2::17] = 15_000, -4_000  # beside the extremes, and none themselves
+    after[4::9, 6::9], after[6::19, 4::17] = 18_000, -4_500  # two pixels from them: extremes themselves
     counted, sigma, peak_weight = rng.random(before.shape) > 0.1, 20.0, 0.4
     holes = (after < HOLE_SHARE * before) & (before > DETECTION_SIGMA * sigma)
     overshoots = after > (before + DETECTION_SIGMA * sigma) / peak_weight
@@ -186,6 +188,10 @@ def test_rings_are_measured_in_percent_of_the_peak() -> None:
     assert sources == 3
     assert level == pytest.approx(10.0, abs=1.5)
     assert ringing_pct(before, before, np.ones(before.shape, bool)) == (0.0, 3)
+    for distance_px, count in ((9, 3), (8, 2)):  # a source must have 8 px without a bad one
+        counted = np.ones(before.shape, bool)
+        counted[100 - distance_px, 100] = False
+        assert ringing_pct(before, after, counted)[1] == count
     assert ringing_pct(np.ones((64, 64)), np.ones((64, 64)), np.ones((64, 64), bool))[0] is None
 
 

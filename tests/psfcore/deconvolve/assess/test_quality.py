@@ -91,10 +91,7 @@ def test_each_reason_has_its_bit() -> None:
     assert plane[4, 30] == plane[30, 59] == QualityBit.EDGE and plane[5, 30] == plane[30, 58] == 0
     without = quality_plane(make_image(pixels, mask), result, edge_px=0)
     assert not (without & (QualityBit.NO_ERROR | QualityBit.EDGE)).any()
-
-
-def test_the_first_bits_are_those_of_the_mask() -> None:
-    assert all(QualityBit[str(bit.name)] == bit for bit in MaskBit)
+    assert all(QualityBit[str(bit.name)] == bit for bit in MaskBit), "the first bits are those of the mask"
 
 
 def test_pixels_near_masked_ones_are_those_within_the_distance() -> None:

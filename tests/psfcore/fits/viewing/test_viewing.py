@@ -118,13 +118,10 @@ def test_a_plane_of_an_early_product_in_a_table(tmp_path: Path) -> None:
     np.testing.assert_array_equal(decoded(tmp_path / "p.fits", "quality")[0], plane)
 
 
-def test_a_plane_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
+def test_a_plane_that_cannot_be_decoded_is_an_error_of_the_file(tmp_path: Path) -> None:
     fits.PrimaryHDU(field()).writeto(tmp_path / "x.fits")
     with pytest.raises(DataError, match=r"^no-such-plane: .*\(image\); got error: .*error_draws"):
         decoded(tmp_path / "x.fits", "error")
-
-
-def test_a_damaged_file_is_an_error_of_its_data(tmp_path: Path) -> None:
     (tmp_path / "x.fits").write_bytes(raw_files.compressed("GZIP_1"))
     with pytest.raises(DataError, match=r"^(bad-tile|unreadable-pixels)"):
         decoded(tmp_path / "x.fits")
@@ -271,6 +268,9 @@ def test_means_of_blocks(tmp_path: Path) -> None:
             expected = block_by_block(content, part, bits=False)
             # Sums in float64 of another order: equal to a rounding of the float32 answer.
             np.testing.assert_allclose(got(plane, part), expected, rtol=2**-23, atol=1e-9)
+    content = np.full((4, 4), np.finfo("f4").max, "f4")  # the sum must not overflow
+    plane = plane_of(tmp_path / "p", content)
+    np.testing.assert_array_equal(got(plane, window_of(plane.shape, step=4)), content[:1, :1])
 
 
 def test_unions_of_bits(tmp_path: Path) -> None:
@@ -297,12 +297,6 @@ def test_a_window_outside_the_plane_is_refused() -> None:
     for window in ({"x": 4}, {"y": 3}, {"width": 5}, {"x": 2, "width": 3}, {"y": 1, "height": 3}):
         with pytest.raises(DataError, match=r"^window-outside: .*plane of 4 x 3 px"):
             window_of((3, 4), **window)
-
-
-def test_the_largest_numbers_do_not_overflow(tmp_path: Path) -> None:
-    content = np.full((4, 4), np.finfo("f4").max, "f4")
-    plane = plane_of(tmp_path / "p", content)
-    np.testing.assert_array_equal(got(plane, window_of(plane.shape, step=4)), content[:1, :1])
 
 
 def test_every_card_of_every_hdu_in_the_order_of_the_file(tmp_path: Path) -> None:
