@@ -1,4 +1,4 @@
-"""A report over HTTP and on the command line: upload, job, page with its policy; and requests that cannot be."""
+"""A report over HTTP and on the command line: upload, job, page with its policy."""
 
 from __future__ import annotations
 
@@ -60,21 +60,6 @@ def test_a_transit_becomes_a_page(
     assert equal.status_code == 200 and equal.json()["id"] == job["id"]
 
 
-def test_requests_that_cannot_be(api: TestClient, folder: Path, tmp_path: Path) -> None:
-    def ask(**parameters: object) -> tuple[int, str]:
-        answer = api.post("/v1/jobs", json={"kind": "report", "parameters": parameters})
-        return answer.status_code, answer.json()["type"].removeprefix("urn:heliopsf:")
-
-    assert ask(transit_id="0" * 64) == (404, "no-such-transit")
-    pack(folder, tmp_path / "transit.tar")
-    transit_id = upload(api, tmp_path / "transit.tar", "/v1/transits")
-    assert ask(transit_id=transit_id, psf_id="0" * 64) == (404, "no-such-psf")
-    for wrong in ({"seed": -1}, {"dark_offsets": "perhaps"}, {"psf_id": "mine"}, {"shape": "knee"}):
-        assert ask(transit_id=transit_id, **wrong)[0] == 422, wrong
-    missing = api.get(f"/v1/reports/{'0' * 64}/page")
-    assert missing.status_code == 404 and missing.json()["type"].endswith("no-such-report")
-
-
 def test_the_command_writes_the_page_and_its_numbers(folder: Path, psf: Path, tmp_path: Path) -> None:
     page, numbers = tmp_path / "R.html", tmp_path / "R.json"
     arguments = ["report", folder, "-o", page, "--json", numbers, "--psf", psf, "--local"]
@@ -122,11 +107,3 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
             done = CliRunner().invoke(main, ["report", str(folder), "--local", *arguments])
             assert done.exit_code != 0 and said in done.output and "Traceback" not in done.output
             assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_without_a_transit_is_told(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    done = CliRunner().invoke(
-        main, ["report", str(tmp_path / "empty"), "-o", str(tmp_path / "R.html"), "--local"]
-    )
-    assert done.exit_code == 1 and "transit.json" in done.output

@@ -89,19 +89,6 @@ def test_a_session_allows_what_its_key_allows(service: Keyed) -> None:
     assert page.status_code == 403 and page.headers["content-type"].startswith("text/html")
 
 
-def test_two_owners_do_not_see_across(service: Keyed, image_file: Path) -> None:
-    image_id = upload(service.client("ann"), image_file)
-    ann, bob = browser(service, service.key("ann")), browser(service, service.key("bob"))
-    address = f"/v1/images/{image_id}"
-    assert (ann.get(address).status_code, bob.get(address).status_code) == (200, 404)
-    assert len(ann.get("/v1/images").json()["items"]) == 1 and bob.get("/v1/images").json()["items"] == []
-    assert image_id in ann.get("/").text and image_id[:12] not in bob.get("/").text
-    for_ann = {"X-Owner": "ann"}
-    assert bob.get("/v1/images", headers=for_ann).status_code == 403
-    root = browser(service, service.key("root", *Scope))
-    assert len(root.get("/v1/images", headers=for_ann).json()["items"]) == 1
-
-
 def test_a_key_in_the_request_counts_more_than_the_cookie(service: Keyed) -> None:
     client = browser(service, service.key("ann"))
     assert client.get("/v1/keys", headers=bearer(service.key("bob"))).json()["items"][0]["owner"] == "bob"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,9 @@ from fastapi.testclient import TestClient
 
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.transit.archive import pack
-from service.api.reports import PAGE_POLICY
 from service.cli.main import main
 from tests.gap_files import EDGE_GLOW, GLOW_DN_S, answer_at_once, quick_diagnosis, write_gap
 from tests.html_page import check_stands_alone, read_page
-from tests.psfcore.gap import small_gaps
 from tests.psfcore.gap.report.judged import SHARES, with_shares
 from tests.service.conftest import upload
 
@@ -69,81 +66,21 @@ def test_an_effect_of_one_s_own_is_found_with_its_size(folder: Path, tmp_path: P
     assert "edge_glow" in "".join(header["HISTORY"]).replace("\n", "")
 
 
-def test_a_transit_becomes_a_page_over_http(
-    api: TestClient,
-    run_jobs: Callable[[], None],
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    answer_at_once(monkeypatch, small_gaps.found())
-    pack(folder, tmp_path / "transit.tar")
-    parameters = {"transit_id": upload(api, tmp_path / "transit.tar", "/v1/transits"), "seed": 7}
-    asked = api.post("/v1/jobs", json={"kind": "gap-diagnose", "parameters": parameters})
-    assert asked.status_code == 202, asked.text
-    assert asked.json()["parameters"]["added_effects"] == []
-    run_jobs()
-    job = api.get(asked.headers["location"]).json()
-    assert job["phase"] == "COMPLETED", job["error"]
-    report = api.get(job["result"]).json()
-    assert report["kind"] == "gap" and report["details"]["verdict"] == "attributed"
-    page = api.get(report["html"])
-    assert page.headers["content-type"] == "text/html; charset=utf-8"
-    assert page.headers["content-security-policy"] == PAGE_POLICY
-    assert page.headers["x-content-type-options"] == "nosniff"
-    check_stands_alone(page.text)
-    lead = next(tag for tag in read_page(page.text) if tag.attributes.get("class") == "lead")
-    assert lead.text.replace("\N{NO-BREAK SPACE}", " ") == report["details"]["sentence"]
-    again = api.get(report["html"], headers={"If-None-Match": page.headers["etag"]})
-    assert again.status_code == 304 and again.headers["content-security-policy"] == PAGE_POLICY
-    said = api.get(report["file"])
-    assert said.json()["schema"] == "gap/2" and said.json()["provenance"]["seed"] == 7
-    assert api.get(report["preview"]).content.startswith(b"\x89PNG")
-    psf = api.get(f"/v1/psfs/{report['details']['corrected_psf_id']}").json()
-    assert psf["details"]["parents"] == {"transit": parameters["transit_id"], "report": report["id"]}
-    equal = api.post("/v1/jobs", json={"kind": "gap-diagnose", "parameters": parameters})
-    assert equal.status_code == 200 and equal.json()["id"] == job["id"]
-    listed = api.get("/v1/reports", params={"transit_id": parameters["transit_id"]}).json()
-    assert [one["id"] for one in listed["items"]] == [report["id"]]
-
-
-def test_requests_that_cannot_be(api: TestClient, folder: Path, tmp_path: Path) -> None:
-    def ask(**parameters: Any) -> tuple[int, str]:
-        answer = api.post("/v1/jobs", json={"kind": "gap-diagnose", "parameters": parameters})
-        return answer.status_code, answer.json()["type"].removeprefix("urn:heliopsf:")
-
-    assert ask(transit_id="0" * 64) == (404, "no-such-transit")
+def test_a_request_cannot_choose_whose_code_is_run(api: TestClient, folder: Path, tmp_path: Path) -> None:
     pack(folder, tmp_path / "transit.tar")
     transit_id = upload(api, tmp_path / "transit.tar", "/v1/transits")
-    assert ask(transit_id=transit_id, psf_id="0" * 64) == (404, "no-such-psf")
     wrong: tuple[dict[str, Any], ...] = (
-        {"seed": -1},
-        {"correct": "perhaps"},
-        {"coverage": 0.99},
-        {"psf_id": "mine"},
-        {"added_effects": ["os"]},  # whose code is run is the operator's to say
-        {"effects": "mine.py"},
-    )
+        {"added_effects": ["os"]}, {"effects": "mine.py"}, {"coverage": 0.99}, {"correct": "perhaps"},
+    )  # fmt: skip
     for one in wrong:
-        assert ask(transit_id=transit_id, **one)[0] == 422, one
+        request = {"kind": "gap-diagnose", "parameters": {"transit_id": transit_id, **one}}
+        assert api.post("/v1/jobs", json=request).status_code == 422, one
 
 
-def test_a_psf_that_was_not_fitted_is_no_start(
-    api: TestClient, run_jobs: Callable[[], None], folder: Path, tmp_path: Path
-) -> None:
+def test_a_psf_that_was_not_fitted_is_no_start(folder: Path, tmp_path: Path) -> None:
     kernel = np.zeros((33, 33), "f4")
     kernel[16, 16] = 1.0
     fits.PrimaryHDU(kernel).writeto(tmp_path / "point.fits")
-    pack(folder, tmp_path / "transit.tar")
-    parameters = {
-        "transit_id": upload(api, tmp_path / "transit.tar", "/v1/transits"),
-        "psf_id": upload(api, tmp_path / "point.fits", "/v1/psfs"),
-    }
-    asked = api.post("/v1/jobs", json={"kind": "gap-diagnose", "parameters": parameters})
-    run_jobs()
-    job = api.get(asked.headers["location"]).json()
-    assert job["phase"] == "ERROR"
-    assert job["error"]["code"] == "psf-not-fitted" and job["error"]["fault"] == "user"
     done = run(folder, "--local", "--psf", tmp_path / "point.fits")
     assert done.exit_code == 1 and "expected a PSF that was fitted to a transit" in done.output
 
