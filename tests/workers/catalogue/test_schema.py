@@ -143,7 +143,6 @@ def test_an_upgrade_that_fails_leaves_nothing_behind(catalogue: Catalogue) -> No
 STARTS = """
 import sys
 from workers.catalogue.catalogue import Catalogue
-from workers.bulk import intake  # all tables
 catalogue = Catalogue(sys.argv[1])
 print("ready", flush=True)
 sys.stdin.readline()

@@ -175,10 +175,11 @@ def test_a_rerun_uses_the_instrument_file_of_the_first_run(
     local: LocalService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its text is in the PSF's file; that of today is not asked."""
+    file = tmp_path / "aia_171.toml"
+    file.write_text(SMALL_INSTRUMENT.replace('"small"', '"aia_171"'))
+    monkeypatch.setattr(identities, "instrument_path", lambda name: file)
     built = local.build_psf("aia_171", size=64, component="airy")
-    changed = tmp_path / "aia_171.toml"
-    changed.write_text(identities.instrument_path("aia_171").read_text() + "\n# changed\n")
-    monkeypatch.setattr(identities, "instrument_path", lambda name: changed)
+    file.write_text(file.read_text() + "\n# changed\n")
     _, report = again(local, "psf", built["id"], tmp_path / "r.json")
     assert report["same"] and report["again"]["id"] == built["id"]
 
