@@ -183,7 +183,8 @@ def test_a_deconvolution_builds_the_total_psf_and_a_later_command_the_rest(
 ) -> None:
     folder = tmp_path / "instruments"
     folder.mkdir()
-    (folder / "small.toml").write_text(f'{SMALL_INSTRUMENT}\n[match]\nDETECTOR = "SMALL"\n')
+    smaller = SMALL_INSTRUMENT.replace("pixels = 512", "pixels = 128")
+    (folder / "small.toml").write_text(f'{smaller}\n[match]\nDETECTOR = "SMALL"\n')
     monkeypatch.setattr(files, "_FOLDER", folder)
     files.match_table.cache_clear()
     write_image(tmp_path / "image.fits", DETECTOR="SMALL", WAVELNTH=171, CDELT1=2.0, CDELT2=2.0)

@@ -33,11 +33,17 @@ def certify(api: TestClient, psf_id: str, version: str, start: str | None, end: 
     assert answer.status_code == 200, answer.text
 
 
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The files of two fitted PSFs."""
+    folder = tmp_path_factory.mktemp("fitted")
+    return write_fitted(folder / "early.fits", EARLY), write_fitted(folder / "late.fits", LATE)
+
+
 @pytest.fixture
-def ends(api: TestClient, tmp_path: Path) -> tuple[str, str]:
+def ends(api: TestClient, fitted: tuple[Path, Path]) -> tuple[str, str]:
     """Two fitted PSFs, certified until the end of February 2022 and from March 2023."""
-    early = uploaded(api, write_fitted(tmp_path / "early.fits", EARLY))
-    late = uploaded(api, write_fitted(tmp_path / "late.fits", LATE))
+    early, late = (uploaded(api, path) for path in fitted)
     certify(api, early, "1.0.0", None, "2022-03-01")
     certify(api, late, "1.1.0", "2023-03-01", None)
     return early, late
@@ -109,14 +115,13 @@ def test_an_image_between_two_psfs_is_deconvolved_with_a_psf_between_them(
     said = psf["details"]["provenance"]["interpolated_between"]
     assert [one["file_sha256"] for one in said] == hashes == list(ends), "an upload's id is its hash"
     assert [(one["name"], one["version"]) for one in said] == [("fitted", "1.0.0"), ("fitted", "1.1.0")]
-    for of, identity in (("psfs", psf["id"]), ("products", product["id"])):
-        rerun = api.post(f"/v1/{of}/{identity}/rerun")
-        assert rerun.status_code == 202, rerun.text
-        run_jobs()
-        done = api.get(rerun.headers["Location"]).json()
-        assert done["phase"] == "COMPLETED", done
-        details = api.get(done["result"]).json()["details"]
-        assert details["same"] is True and details["same_file"] is True
+    rerun = api.post(f"/v1/psfs/{psf['id']}/rerun")
+    assert rerun.status_code == 202, rerun.text
+    run_jobs()
+    done = api.get(rerun.headers["Location"]).json()
+    assert done["phase"] == "COMPLETED", done
+    details = api.get(done["result"]).json()["details"]
+    assert details["same"] is True and details["same_file"] is True
     assert api.get(f"/psfs/{psf['id']}", headers={"Accept": "text/html"}).status_code == 200
 
 
@@ -216,17 +221,17 @@ def test_filter_and_plate_scale_choose_the_psf(
     plain = certified(api, tmp_path / "1.fits", 0.40, "1.0.0")
     filtered = certified(api, tmp_path / "2.fits", 0.41, "1.0.0", channel="174-open_2")
     scaled = certified(api, tmp_path / "3.fits", 0.42, "1.0.0", channel="174-0.492arcsec")
+    binned = {"CDELT1": 0.984, "CDELT2": 0.984}
+    assert psf_of(api, tmp_path / "d.fits", **binned)["psf_id"] == plain, "rebinned for a binned image"
+    run_jobs()
+    assert [job["phase"] for job in api.get("/v1/jobs").json()["items"]] == ["COMPLETED"]
     assert psf_of(api, tmp_path / "a.fits", FILTER="Open 1")["psf_id"] == plain
     assert psf_of(api, tmp_path / "b.fits", FILTER="Open 2")["psf_id"] == filtered
     scale = {"CDELT1": 0.492, "CDELT2": 0.492}
     assert psf_of(api, tmp_path / "c.fits", **scale)["psf_id"] == scaled
     found = api.get("/v1/images/" + upload(api, tmp_path / "b.fits") + "/psf").json()
     assert (found["psf"]["id"], found["channel"]) == (filtered, "174-open_2")
-    binned = {"CDELT1": 0.984, "CDELT2": 0.984}
-    assert psf_of(api, tmp_path / "d.fits", **binned)["psf_id"] == plain, "rebinned for a binned image"
     write_image(tmp_path / "e.fits", **SEEN, **{"DATE-BEG": "2022-08-30"}, FILTER="Open 2", **scale)
     body = {"kind": "deconvolve", "parameters": {"image_id": upload(api, tmp_path / "e.fits")}}
     refused = api.post("/v1/jobs", json=body)
     assert refused.status_code == 409 and "174-0.492arcsec, 174-open_2" in refused.json()["detail"]
-    run_jobs()
-    assert {job["phase"] for job in api.get("/v1/jobs").json()["items"]} == {"COMPLETED"}
