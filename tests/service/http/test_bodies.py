@@ -61,7 +61,7 @@ def running(folder: Path, **changes: object) -> Iterator[Live]:
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
-    with running(tmp_path_factory.mktemp("bodies"), body_s=0.5, body_kib_per_s=64) as live:
+    with running(tmp_path_factory.mktemp("bodies"), body_s=0.5, body_kib_per_s=32) as live:
         yield live
 
 
