@@ -93,6 +93,14 @@ def test_plate_scales_must_agree_to_a_percent_where_known() -> None:
                 check_compatible(image, psf)
 
 
+def test_cropping_keeps_the_centre_and_does_not_renormalise() -> None:
+    for size, new in itertools.product((16, 17), (8, 9)):
+        kernel = gaussian(size, 5.0)
+        part = crop_centred(kernel, (new, new))
+        assert part[new // 2, new // 2] == kernel[size // 2, size // 2]
+        assert part.sum() < 1
+
+
 def test_a_kernel_is_cut_or_padded_about_its_centre() -> None:
     kernel = np.arange(31 * 31, dtype=np.float64).reshape(31, 31)
     for size in (31, 64, 65, 20):

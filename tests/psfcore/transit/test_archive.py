@@ -355,47 +355,45 @@ def record(key: bytes, value: bytes) -> bytes:
 
 A_FILE = tar_header("x.fits", 4) + b"1234" + bytes(508)
 SPARSE_MAP = record(b"GNU.sparse.major", b"1") + record(b"GNU.sparse.minor", b"0")
+MANY_RECORDS = b"".join(extended(b"g", record(b"k%d" % n, b"v")) + tar_header(f".{n}", 0) for n in range(99))
+BROKEN = {
+    "many headers before one member": extended(b"x", record(b"comment", b"a")) * 400 + A_FILE,
+    "many long names": extended(b"L", b"a" * 5000) * 50 + A_FILE,
+    "a long run of digits": extended(b"x", b"1" * 60_000) + A_FILE,
+    "digits in a value": extended(b"x", record(b"comment", b"1" * 60_000)) + A_FILE,
+    "records inside each other": extended(b"x", b"2 " * 30_000 + b"=") + A_FILE,
+    "a record that is too long": extended(b"x", b"99 path=x.fits\n") + A_FILE,
+    "a negative header": tar_header("x", -4096, b"x") + A_FILE,
+    "a size beyond the file": extended(b"x", record(b"size", b"99999")) + A_FILE,
+    "a sparse map": extended(b"x", SPARSE_MAP) + tar_header("x.fits", 2**30) + b"9999999\n" + b"1\n" * 2**20,
+    "many global records": MANY_RECORDS + A_FILE,
+    "a damaged second header": A_FILE + b"x" * 512 + A_FILE,
+    "half a header": A_FILE + tar_header("y.fits", 0)[:300],
+    "no end": A_FILE,
+}
+NOT_PLAIN_FILES = {
+    "a negative file": tar_header("x", -4096) + A_FILE,
+    "a negative size in a record": extended(b"x", record(b"size", b"-99999")) + A_FILE,
+    "a sparse file of GNU": tar_header("x.fits", 512, b"S") + b"9" * 2**20,
+    "a sparse name": extended(b"x", record(b"GNU.sparse.name", b"y")) + A_FILE,
+    "a sparse size": extended(b"g", record(b"GNU.sparse.realsize", b"9")) + A_FILE,
+}
+CLIMBING_PATHS = {
+    "a path in a record": extended(b"x", record(b"path", b"../x.fits")) + A_FILE,
+    "a path for all": extended(b"g", record(b"path", b"/x.fits")) + A_FILE,
+}
 TAR_ATTACKS = {
-    "many headers before one member": (
-        extended(b"x", record(b"comment", b"a")) * 400 + A_FILE,
-        "archive-broken",
-    ),
-    "many long names": (extended(b"L", b"a" * 5000) * 50 + A_FILE, "archive-broken"),
-    "a long run of digits": (extended(b"x", b"1" * 60_000) + A_FILE, "archive-broken"),
-    "digits in a value": (extended(b"x", record(b"comment", b"1" * 60_000)) + A_FILE, "archive-broken"),
-    "records inside each other": (extended(b"x", b"2 " * 30_000 + b"=") + A_FILE, "archive-broken"),
-    "a record that is too long": (extended(b"x", b"99 path=x.fits\n") + A_FILE, "archive-broken"),
-    "a negative header": (tar_header("x", -4096, b"x") + A_FILE, "archive-broken"),
-    "a negative file": (tar_header("x", -4096) + A_FILE, "archive-not-plain"),
-    "a negative size in a record": (extended(b"x", record(b"size", b"-99999")) + A_FILE, "archive-not-plain"),
-    "a size beyond the file": (extended(b"x", record(b"size", b"99999")) + A_FILE, "archive-broken"),
-    "a sparse file of GNU": (tar_header("x.fits", 512, b"S") + b"9" * 2**20, "archive-not-plain"),
-    "a sparse name": (extended(b"x", record(b"GNU.sparse.name", b"y")) + A_FILE, "archive-not-plain"),
-    "a sparse size": (extended(b"g", record(b"GNU.sparse.realsize", b"9")) + A_FILE, "archive-not-plain"),
-    "a sparse map": (
-        extended(b"x", SPARSE_MAP) + tar_header("x.fits", 2**30) + b"9999999\n" + b"1\n" * 2**20,
-        "archive-broken",
-    ),
-    "many global records": (
-        b"".join(extended(b"g", record(b"k%d" % n, b"v")) + tar_header(f".{n}", 0) for n in range(99))
-        + A_FILE,
-        "archive-broken",
-    ),
-    "a path in a record that climbs": (
-        extended(b"x", record(b"path", b"../x.fits")) + A_FILE,
-        "archive-climbs",
-    ),
-    "a path for all that climbs": (extended(b"g", record(b"path", b"/x.fits")) + A_FILE, "archive-climbs"),
-    "a damaged second header": (A_FILE + b"x" * 512 + A_FILE, "archive-broken"),
-    "half a header": (A_FILE + tar_header("y.fits", 0)[:300], "archive-broken"),
-    "no end": (A_FILE, "archive-broken"),
+    "archive-broken": BROKEN,
+    "archive-not-plain": NOT_PLAIN_FILES,
+    "archive-climbs": CLIMBING_PATHS,
 }
 
 
 @pytest.mark.parametrize("packed", [False, True], ids=["tar", "tar.gz"])
 def test_headers_of_a_tar_cannot_mislead_tarfile(tmp_path: Path, packed: bool) -> None:
     path = tmp_path / "a"
-    for attack, (content, code) in TAR_ATTACKS.items():
+    for code, attack in ((code, attack) for code, attacks in TAR_ATTACKS.items() for attack in attacks):
+        content = TAR_ATTACKS[code][attack]
         end = b"" if attack in ("no end", "half a header") else bytes(1024)
         path.write_bytes(gzip.compress(content + end, 1) if packed else content + end)
         started = time.process_time()
