@@ -11,10 +11,7 @@ HERE = Path(__file__).parents[2]
 
 
 def test_the_blind_set_and_the_gap_library_share_no_code(subtests: pytest.Subtests) -> None:
-    for room, other in (
-        ("blind", "gap"),
-        ("gap", "blind"),
-    ):
+    for room, other in (("blind", "gap"), ("gap", "blind")):
         with subtests.test(str((room, other))):
             files = sorted((HERE / "psfcore" / room).rglob("*.py"))
             assert files

@@ -200,8 +200,7 @@ def test_a_client_cannot_choose_the_address_that_it_is_counted_under(server: Ser
     """Refused keys are counted by address: with an address of its own choice a client could try keys without end."""
     httpx.get(f"{server.url}/v1/jobs", headers=bearer(server.key()) | {"X-Forwarded-For": "203.0.113.9"})
     httpx.get(
-        f"{server.url}/v1/jobs",
-        headers={"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.9"},
+        f"{server.url}/v1/jobs", headers={"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.9"}
     )
     answer = httpx.post(
         f"{server.url}/uws/jobs",

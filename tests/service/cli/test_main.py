@@ -88,15 +88,7 @@ def options_of(name: str) -> dict[str, click.Option]:
 
 
 def test_an_option_is_explained_in_the_same_words_everywhere(subtests: pytest.Subtests) -> None:
-    for name in (
-        "--local",
-        "--context",
-        "--centre",
-        "--key",
-        "--noise",
-        "--saturation",
-        "--method",
-    ):
+    for name in ("--local", "--context", "--centre", "--key", "--noise", "--saturation", "--method"):
         with subtests.test(str(name)):
             found = options_of(name)
             found.pop("simulate transit", None)  # its --saturation is the level of the simulated camera
@@ -126,10 +118,7 @@ def test_the_help_says_whether_a_command_needs_a_service() -> None:
 
 
 def test_the_version_is_told(subtests: pytest.Subtests) -> None:
-    for option in (
-        "-V",
-        "--version",
-    ):
+    for option in ("-V", "--version"):
         with subtests.test(str(option)):
             assert CliRunner().invoke(main, [option]).output.startswith("heliopsf, version ")
 
@@ -163,10 +152,7 @@ def test_an_unknown_name_is_refused() -> None:
 
 
 def test_version_and_help_load_nothing_heavy(subtests: pytest.Subtests) -> None:
-    for option in (
-        "-V",
-        "--help",
-    ):
+    for option in ("-V", "--help"):
         with subtests.test(str(option)):
             script = (
                 "import sys, json, atexit\n"

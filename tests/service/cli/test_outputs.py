@@ -145,11 +145,7 @@ def test_work_that_fails_while_it_writes_leaves_the_old_file(
 def test_an_output_that_cannot_be_written_is_noticed_before_the_work(
     subtests: pytest.Subtests, files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for output in (
-        "nowhere/new.fits",
-        "image.fits/new.fits",
-        "/proc/new.fits",
-    ):
+    for output in ("nowhere/new.fits", "image.fits/new.fits", "/proc/new.fits"):
         with subtests.test(str(output)):
             monkeypatch.chdir(files)
             for option in (("-o", output), ("-o", "new.fits", "--plot", output)):

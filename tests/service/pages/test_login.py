@@ -312,13 +312,7 @@ def test_a_login_leads_nowhere_else(subtests: pytest.Subtests, service: Keyed) -
 
 
 def test_a_login_leads_to_the_page_that_was_asked_for(subtests: pytest.Subtests) -> None:
-    for sent in (
-        "/",
-        "/jobs",
-        "/jobs?phase=ERROR&a=//b",
-        "/psfs/a/vs/b",
-        "/login-help",
-    ):
+    for sent in ("/", "/jobs", "/jobs?phase=ERROR&a=//b", "/psfs/a/vs/b", "/login-help"):
         with subtests.test(str(sent)):
             assert local_address(sent) == sent
 

@@ -29,14 +29,7 @@ NOTHING = "0" * 32
 
 
 def test_a_page_has_the_policy_and_is_not_kept(subtests: pytest.Subtests, api: TestClient) -> None:
-    for address in (
-        "/",
-        "/jobs",
-        "/bulk",
-        "/login",
-        "/keys",
-        "/nothing",
-    ):
+    for address in ("/", "/jobs", "/bulk", "/login", "/keys", "/nothing"):
         with subtests.test(str(address)):
             answer = api.get(address, headers=PERSON)
             assert answer.headers["Content-Type"] == "text/html; charset=utf-8"

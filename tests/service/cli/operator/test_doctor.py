@@ -118,11 +118,7 @@ def test_storage_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_room(subtests: pytest.Subtests, monkeypatch: pytest.MonkeyPatch) -> None:
-    for free, state in (
-        (2**20, "broken"),
-        (2**30, "warning"),
-        (2**40, "ok"),
-    ):
+    for free, state in ((2**20, "broken"), (2**30, "warning"), (2**40, "ok")):
         with subtests.test(str((free, state))):
             monkeypatch.setattr(checks, "free_bytes", lambda _folder, free=free: free)
             assert states()["storage"] == state

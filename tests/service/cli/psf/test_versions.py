@@ -42,11 +42,7 @@ def ask(*words: str, code: int = 0) -> str:
     answer: Result = CliRunner().invoke(main, list(words))
     assert answer.exit_code == code and (
         answer.exception is None or isinstance(answer.exception, SystemExit)
-    ), (
-        words,
-        answer.output,
-        answer.exception,
-    )
+    ), (words, answer.output, answer.exception)
     return answer.output
 
 

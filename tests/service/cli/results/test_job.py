@@ -108,11 +108,7 @@ def test_jobs_are_cancelled_and_a_wait_for_several_ends_with_1_if_one_failed(
 def test_a_text_that_cannot_be_an_id_is_refused_before_a_request(
     subtests: pytest.Subtests, command: Command
 ) -> None:
-    for identity in (
-        "0123456",
-        "../../metrics",
-        "x" * 12,
-    ):
+    for identity in ("0123456", "../../metrics", "x" * 12):
         with subtests.test(str(identity)):
             assert "expected an id, or its first 8 or more" in command("job", "show", identity, code=2)
 

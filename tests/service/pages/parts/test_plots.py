@@ -38,11 +38,6 @@ def test_radii_are_shown_densely_near_the_centre_and_in_ratios_farther_out() -> 
 
 
 def test_numbers_are_written_so_that_a_script_reads_them(subtests: pytest.Subtests) -> None:
-    for value, text in (
-        (None, ""),
-        (float("nan"), ""),
-        (0.0, "0"),
-        (1234567.0, "1.2346e+06"),
-    ):
+    for value, text in ((None, ""), (float("nan"), ""), (0.0, "0"), (1234567.0, "1.2346e+06")):
         with subtests.test(str((value, text))):
             assert written(value) == text

@@ -35,10 +35,7 @@ def test_discs_have_their_places_colours_and_rows() -> None:
 
 
 def test_without_held_out_images_there_is_no_map(subtests: pytest.Subtests) -> None:
-    for images in (
-        [],
-        [image(1, None)],
-    ):
+    for images in ([], [image(1, None)]):
         with subtests.test(str(images)):
             assert gap_map({"shape": [64, 64], "images": images}) is None
 
