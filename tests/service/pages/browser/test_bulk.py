@@ -46,8 +46,9 @@ def test_a_run_started_by_the_form_is_followed_to_its_end_without_a_reload(
     page.keyboard.press("Enter")
     expect(page).to_have_url(re.compile("/bulk/[0-9a-f]{32}$"))
     page.evaluate(MARK)
-    expect(page.locator("[data-part=phase]")).to_have_text("COMPLETED", timeout=LONG_MS)
-    assert int(page.locator("[data-part=total]").inner_text()) >= 2, "images of other tests may be among them"
+    # Among the images are those of other tests, one of which cannot be deconvolved.
+    expect(page.locator("[data-part=phase]")).to_have_text(re.compile("^COMPLETED"), timeout=LONG_MS)
+    assert int(page.locator("[data-part=total]").inner_text()) >= 2
     expect(page.locator("[data-part=left]")).to_have_text("none")
     expect(page.locator("[data-part=ended]")).to_contain_text("UTC")
     expect(page.get_by_role("button", name="Pause")).to_be_hidden()
@@ -104,7 +105,7 @@ def test_a_run_is_paused_resumed_and_cancelled_and_another_tab_sees_it(
 
 
 def test_a_run_is_deleted_and_other_tabs_see_it(page: Page, site: Site, psf_id: str, tmp_path: Path) -> None:
-    images = uploaded(site, tmp_path, 2, side=128, seed=760)
+    images = uploaded(site, tmp_path, 2, side=256, seed=760)
     run = site.client.submit_bulk(images=images, psf_id=psf_id, name="not needed")
     site.client.pause_bulk(run["id"])
     line, same = page.context.new_page(), page.context.new_page()
