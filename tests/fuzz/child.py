@@ -1,7 +1,7 @@
 """Reads inputs one after the other in a process of its own, under the memory limit of a job.
 
-`python -m tests.fuzz.child KIND COUNT FOLDER` writes a line for each seed: "result", the code of a DataError, or a fault.
-If the process dies, it dies with the seed after the last line.
+`python -m tests.fuzz.child '{"KIND": COUNT, ...}' FOLDER` writes a line for each seed of each kind: "result", the code of a
+DataError, or a fault. If the process dies, it dies with the seed after the last line.
 """
 
 from __future__ import annotations
@@ -103,14 +103,14 @@ def _small_grids() -> None:
     defaults["reach_grid_px"] = SIZE_PX
 
 
-def main(kind: str, count: int, folder: Path) -> None:
-    """Read the inputs of the first ``count`` seeds."""
+def main(counts: dict[str, int], folder: Path) -> None:
+    """Read the inputs of the first seeds of each kind."""
     warnings.simplefilter("ignore")
     np.seterr(all="ignore")
     _small_grids()
-    make, read = KINDS[kind]
     child = Child(threads=1)
-    for seed in range(count):
+    for kind, seed in ((kind, seed) for kind, count in counts.items() for seed in range(count)):
+        make, read = KINDS[kind]
         content = make(seed)
         estimate_mib = COSTS.worker_mib + (_instrument_mib(content) if kind == "instruments" else 0.0)
         try:
@@ -124,4 +124,4 @@ def main(kind: str, count: int, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))
+    main(json.loads(sys.argv[1]), Path(sys.argv[2]))

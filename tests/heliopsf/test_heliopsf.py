@@ -118,7 +118,7 @@ def test_errors_have_a_code(tmp_path: Path) -> None:
 
 def test_a_transit_is_fitted_and_the_fit_drawn(tmp_path: Path) -> None:
     write(observed(sky()), tmp_path / "transit")
-    with patch.object(fit_module, "free_fit", partial(free_fit, subsets=20)):
+    with patch.object(fit_module, "free_fit", partial(free_fit, subsets=4)):
         fit = heliopsf.fit_scatter(tmp_path / "transit", threads=2)
     assert isinstance(fit, heliopsf.ScatterFit)
     assert abs(fit.inversion.values["total"] - SCATTER.total) < 0.03
