@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from psfcore.psf import Psf, crop_centred
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.simulate.transit_files import write
-from tests.psfcore.gap.small_gaps import FEW, QUICK
+from tests.psfcore.gap.small_gaps import FEW, changed, few_sign_flips
 from tests.transit_files import TRUTH, diffraction
 from workers.tasks import gap as gap_task
 
@@ -53,20 +53,16 @@ def write_gap(folder: Path, *, offset_dn: float = 0.0, light_dn_s: float = 0.0) 
     """Twelve images of SIZE_PX px with a wrong dark level, or with light at their right edge."""
     plan = default_plan(12, SIZE_PX, oversampling=1, brightness=8.0)
     made = simulate(plan, TRUTH, diffraction(), seed=8)
-    frames = tuple(
-        replace(f, pixels=(f.pixels + offset_dn / f.exposure_s + light_dn_s * glow()).astype(np.float32))
-        for f in made.transit.frames
-    )
-    write(replace(made, transit=replace(made.transit, frames=frames)), folder)
+    light = light_dn_s * glow()
+    transit = changed(made.transit, lambda n, frame: frame.pixels + offset_dn / frame.exposure_s + light)
+    write(replace(made, transit=transit), folder)
     return folder
 
 
 @contextmanager
 def quick_diagnosis() -> Iterator[None]:
     """Diagnose with a library of a few effects and fewer sign flips."""
-    with ExitStack() as stack:
-        stack.enter_context(patch.object(added_effects, "LIBRARY", FEW))
-        stack.enter_context(QUICK)
+    with patch.object(added_effects, "LIBRARY", FEW), few_sign_flips():
         yield
 
 

@@ -59,15 +59,13 @@ def test_a_decision_among_rivals() -> None:
     assert best_of([2 * energy] * rivals) == pytest.approx(right, abs=0.005)
 
 
-def test_the_rivals_of_one_effect_are_other_effects_and_none() -> None:
+def test_the_rivals_of_an_effect_and_of_a_pair() -> None:
     found = known(ideal(none=50.0, a=0.2, b=6.0, a__b=0.1), ["a"], ["a"], in_library=True)
     assert (found.noncentrality, found.rival) == (50.0, 6.0)
     assert found.alone == pytest.approx(float(ndtr(np.sqrt(6.0) / 2)), abs=1e-6)
     weak = known(ideal(none=5.0, a=0.2, b=4.9), ["a"], ["a"], in_library=True)
     assert weak.alone == pytest.approx(excluded(5.0, 2))
-
-
-def test_the_rivals_of_a_pair_are_its_effects_alone_and_other_pairs() -> None:
+    # Of a pair: its effects alone and other pairs.
     left = ideal(none=90.0, a=40.0, b=12.0, c=80.0, a__b=0.5, a__c=35.0, b__c=11.0)
     found = known(left, ["b", "a"], ["a", "b"], in_library=True)
     assert found.rival == 11.0
@@ -81,9 +79,7 @@ def test_an_effect_that_need_not_be_named_must_be_explained_if_it_shows() -> Non
     assert found.alone == pytest.approx(min(excluded(50.0, 3), best_of([20.0])))
     unseen = ideal(none=50.0, a=2.0, b=25.0, sun=49.0, a__sun=0.5, b__sun=20.0)
     assert known(unseen, ["a"], ["a", "sun"], in_library=True).rival == 25.0
-
-
-def test_of_a_withheld_effect_every_hypothesis_is_a_rival() -> None:
+    # Of a withheld effect every hypothesis is a rival.
     found = known(ideal(none=90.0, a=40.0, b=60.0, a__b=10.0), ["stripes"], ["stripes"], in_library=False)
     assert (found.rival, found.alone) == (10.0, pytest.approx(excluded(10.0, 2)))
 

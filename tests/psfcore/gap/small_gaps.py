@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cache
 from unittest.mock import patch
@@ -18,13 +19,17 @@ from psfcore.transit.transit import Frame, Transit
 from tests.transit_files import TRUTH, diffraction
 
 OFFSET_DN = 6.0
-QUICK = patch.object(where, "SIGN_FLIPS", 99)  # quicker than 999
 # Effects of each stage, and two that these data cannot show: a diagnosis with them takes seconds.
 FEW = tuple(
     effect
     for effect in LIBRARY
     if effect.name in ("dark_offset", "gain_mismatch", "core_blur", "scene_evolution", "saturation_fill")
 )
+
+
+def few_sign_flips() -> AbstractContextManager[object]:
+    """A context in which a diagnosis makes 99 sign flips, which is quicker than 999."""
+    return patch.object(where, "SIGN_FLIPS", 99)
 
 
 @cache
@@ -52,5 +57,5 @@ def with_offset() -> Transit:
 @cache
 def found() -> Diagnosis:
     """The diagnosis of `with_offset`: attributed, with a full refit."""
-    with QUICK:
+    with few_sign_flips():
         return diagnose(with_offset(), library=FEW)
