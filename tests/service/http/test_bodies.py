@@ -229,7 +229,7 @@ def test_a_long_body_at_a_fair_speed_is_received(live: Live) -> None:
 def test_an_owner_sends_one_bulk_run_at_a_time(tmp_path: Path) -> None:
     """Its body may be large; the others of the owner wait until it has come. Another owner's do not."""
     body = json.dumps({"images": ["a" * 64], "psf_id": "b" * 64}).encode()
-    with running(tmp_path) as live, ExitStack() as open_:
+    with running(tmp_path, body_s=60.0) as live, ExitStack() as open_:
         ann, bob = (bearer(live.service.key(name)) for name in ("ann", "bob"))
         at_work = live.service.api.app.state.heliopsf.requests
 
@@ -239,6 +239,8 @@ def test_an_owner_sends_one_bulk_run_at_a_time(tmp_path: Path) -> None:
             connection = open_.enter_context(live.begin("POST", "/v1/bulk", JSON | length | headers, sent))
             if headers is ann:
                 wait_for(lambda: at_work.total() > before, "the caller is let in", timeout_s=20)
+                # Meanwhile the server goes from there to the turn of the owner.
+                live.answer(open_.enter_context(live.begin("GET", "/healthz", {})))
             return connection
 
         first, second = begin(ann, body[:10]), begin(ann, body)
