@@ -215,6 +215,9 @@ def test_tilted_and_shared_meshes_use_the_series(small_reach: None) -> None:
     shared = build_psf(changed(meshes=tuple(halves)), size=128, threads=2).components["ENTRANCE_MESH"]
     other = build_psf(changed(meshes=(replace(halves[1], share=1.0),)), size=128, threads=2)
     np.testing.assert_allclose(shared, (psf.kernel + other.kernel) / 2, rtol=0.02, atol=1e-6)
+    part = build_psf(changed(meshes=(replace(halves[1], share=0.6),)), size=128).components["ENTRANCE_MESH"]
+    without = 0.4 * other.components["AIRY"]
+    np.testing.assert_allclose(part, 0.6 * other.kernel + without, rtol=0.02, atol=1e-6)
 
 
 def test_a_wide_aperture_is_analytic_and_leaves_the_mount_out(small_reach: None) -> None:
