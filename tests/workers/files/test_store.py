@@ -150,7 +150,10 @@ def test_a_file_that_is_stored_again_meanwhile_stays(tmp_path: Path, monkeypatch
     assert digests(store) == [DIGEST]
     os.utime(store.path(DIGEST), (1.0, 1.0))
     before = time.time() - 1.0
-    kept(store)
+    with store.temporary() as path:
+        path.write_bytes(CONTENT)
+        os.utime(path, (1.0, 1.0))  # of an upload that took long
+        store.keep(path)
     (blob,) = store.blobs()
     assert blob.kept_at >= before and not store.remove(DIGEST, kept_before=before), "an old file is new again"
     os.utime(store.path(DIGEST), (1.0, 1.0))
