@@ -143,14 +143,15 @@ def test_a_body_of_lists_without_end_is_counted_before_it_is_parsed(
 
 def test_json_is_parsed_off_the_event_loop(shared_service: Keyed, monkeypatch: pytest.MonkeyPatch) -> None:
     threads: list[str] = []
-    loads = json.loads
+    loads, body = json.loads, b'{"kind": "x"}'
 
-    def parse(content: bytes) -> Any:
-        threads.append(threading.current_thread().name)
-        return loads(content)
+    def parse(content: Any, **options: Any) -> Any:
+        if content == body:  # also the database parses JSON
+            threads.append(threading.current_thread().name)
+        return loads(content, **options)
 
     monkeypatch.setattr("service.http.bodies.json.loads", parse)
-    answer = shared_service.client("ann").post("/v1/jobs", content=b'{"kind": "x"}', headers=JSON)
+    answer = shared_service.client("ann").post("/v1/jobs", content=body, headers=JSON)
     monkeypatch.undo()
     assert answer.status_code == 422
     assert len(threads) == 1 and "worker" in threads[0].lower(), threads
