@@ -50,7 +50,9 @@ def catalogue(
     catalogue = Catalogue(url)
     yield catalogue
     if postgresql:
-        change(catalogue, text("DROP SCHEMA public CASCADE"), text("CREATE SCHEMA public"))
+        # A transaction that a test left open would let this wait for ever.
+        again = ("SET LOCAL lock_timeout = '10s'", "DROP SCHEMA public CASCADE", "CREATE SCHEMA public")
+        change(catalogue, *map(text, again))
     catalogue.close()
 
 
