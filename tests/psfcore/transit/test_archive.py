@@ -113,6 +113,7 @@ FROM_SYSTEMS = (
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_files_of_the_transit_are_unpacked_and_no_others(folder: Path, tmp_path: Path, kind: str) -> None:
     """They are at the top level or in one folder. Hidden files and those of folders beside them are skipped, in any order."""
+    (folder / "large.fits").write_bytes(bytes(range(256)) * 5000)  # more than is read at once
     content = {path.name: path.read_bytes() for path in folder.iterdir()}
     for top, order in itertools.product(("", "p1/", "./", "./p1/"), ("alone", "first", "last")):
         others = [

@@ -62,7 +62,8 @@ def test_the_covered_area_is_that_of_the_disc() -> None:
 
 def test_dark_pixels_have_all_corners_in_the_disc() -> None:
     y, x = np.indices((41, 40))
-    for place in (*PLACES, Place(3.0, 38.2, RADIUS_PX), Place(-30.0, 10.0, RADIUS_PX)):
+    on_the_circle = Place(20.5, 20.5, 5.0)  # eight corners, 3 px and 4 px from the centre, lie on the edge
+    for place in (*PLACES, Place(3.0, 38.2, RADIUS_PX), Place(-30.0, 10.0, RADIUS_PX), on_the_circle):
         farthest = np.hypot(abs(y - place.y_px) + 0.5, abs(x - place.x_px) + 0.5)
         for margin_px in (0.0, 1.3):
             dark = fully_dark((41, 40), place, margin_px)
