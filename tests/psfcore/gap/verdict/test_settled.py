@@ -102,9 +102,11 @@ def test_a_second_strong_effect_leads_to_the_refit_of_the_pair(settle: Settle) -
 
 
 def test_a_pair_is_refitted_although_the_refit_of_its_effect_alone_failed(settle: Settle) -> None:
-    found, asked, failed = settle({NONE: 0.0, A: 30.0, B: 20.0, AB: 40.0}, Refitted({AB: {AB: 45.0}}))
+    logs = {NONE: 0.0, A: 30.0, B: 20.0, AB: 40.0, ABC: 10.0}
+    found, asked, failed = settle(logs, Refitted({AB: {AB: 45.0}}))
     assert asked == [A, AB] and failed == (A,)
     assert A not in found.log_weights and next(iter(found.probabilities())) == AB
+    assert ABC in found.log_weights  # the refit of a pair does not contradict its triples
 
 
 def test_a_refit_of_one_effect_replaces_all_its_triples(settle: Settle) -> None:
