@@ -98,7 +98,7 @@ def test_one_sided_parameters_are_integrated_for_every_choice_of_those_that_act(
     model = with_left(plain, lambda disc: disc.residual - 4 * sigma * disc.jacobian[above])
     jacobian, seen = free_of_psf(model)
     changes = jacobian[:, [below, above]]
-    values = np.linspace(0, 30 * sigma, 3001)
+    values = np.linspace(0, 30 * sigma, 601)
     steps = (values[1] - values[0]) * np.where(np.arange(values.size) == 0, 0.5, 1.0)
     prior = half_normal(values, likely_of(evidence, "column_smear")) * steps
     normal, (first, second) = changes.T @ changes, changes.T @ seen
