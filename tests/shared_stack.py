@@ -32,12 +32,17 @@ OWN = {
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Choose the folder of the run. A run that is told to end stops its services first."""
+    """Choose the folder of the run."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         return
     os.environ[FOLDER] = mkdtemp(prefix="heliopsf-stacks-")
-    if config.getoption("dist", "no") != "no":  # without xdist, tests run in this process and set its signals
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if config.getoption("dist", "no") != "no":
+        _end_in_order()
+
+
+def _end_in_order() -> None:
+    """Let SIGTERM end this process as Control-C does, which stops the services first."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def pytest_unconfigure() -> None:
@@ -84,6 +89,8 @@ def _stack(name: str) -> Stack:
         if (folder / "started").exists():
             stack.attach()
         else:
+            if "PYTEST_XDIST_WORKER" not in os.environ:
+                _end_in_order()
             stack.start_server()
             (folder / "started").touch()
     return stack
