@@ -1,0 +1,28 @@
+"""A worker process of a test's own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from workers.settings import Settings
+
+
+def started_worker(code: str, settings: Settings, log: Path, **changes: float) -> subprocess.Popen[bytes]:
+    """A process that runs this code with the data folder and the broker of the settings; its lines go into a file.
+
+    changes: further settings by name. The caller ends the process.
+    """
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("HELIOPSF_")} | {
+        "HELIOPSF_DATA_DIR": str(settings.data_dir),
+        "HELIOPSF_BROKER_URL": "filesystem://",
+        "HELIOPSF_LOG_FORMAT": "json",
+        "OMP_NUM_THREADS": "1",
+    }
+    environment |= {f"HELIOPSF_{name.upper()}": str(value) for name, value in changes.items()}
+    with log.open("wb") as written:
+        return subprocess.Popen(
+            [sys.executable, "-c", code], env=environment, stdout=subprocess.DEVNULL, stderr=written
+        )
