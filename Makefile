@@ -6,7 +6,7 @@ RUN := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 DOCS := $(VENV)/.installed-docs
 
-.PHONY: demo test test-full bench bench-peers blind chaos lint docs openapi settings pins clean
+.PHONY: demo test test-fast test-full browser bench bench-peers blind chaos lint docs openapi settings pins clean
 .DELETE_ON_ERROR:
 
 $(RUN): pyproject.toml constraints.txt
@@ -26,8 +26,17 @@ $(DOCS): $(RUN)
 demo: $(RUN)
 	$(BIN)/heliopsf demo $(if $(IMAGE),--image "$(IMAGE)")
 
-test: $(DEV)
+test: $(DEV) $(if $(CI),browser)
 	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile tests
+
+# The tests of one room in one process, for example: make test-fast FILES=tests/psfcore/gap/library
+test-fast: $(DEV)
+	$(if $(FILES),,$(error expected the folder or the files of a room: make test-fast FILES=tests/psfcore/gap/library))
+	$(BIN)/python -m pytest -m "not slow" -x -q $(FILES)
+
+# Chromium for the tests of the pages, on a machine of CI where apt-get may install it. Without Chromium these tests are skipped.
+browser:
+	@command -v chromium chromium-browser google-chrome >/dev/null || { apt-get update && apt-get install --yes --no-install-recommends chromium; } >/dev/null 2>&1 || echo "Chromium could not be installed: the tests of the pages are skipped"
 
 test-full: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests
