@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 def session(keyed_stack: Stack, tmp_path_factory: pytest.TempPathFactory) -> requests.Session:
     """A session that sends a key as a password, as TOPCAT does, whose owner has one product."""
     folder = tmp_path_factory.mktemp("images")
-    key = keyed_stack.key("astronomer of products", Scope.READ, Scope.SUBMIT)
+    key = keyed_stack.key("astronomer-of-products", Scope.READ, Scope.SUBMIT)
     write_image(folder / "image.fits", **OBSERVED, **WCS_CARDS)
     write_psf(folder / "psf.fits")
     with Client(keyed_stack.client.server, key=key) as client:
