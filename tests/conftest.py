@@ -10,61 +10,46 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import psutil
 import pytest
 from astropy.io import fits
+
+from psfcore.gap.unused_memory import return_unused_memory
 
 REPOSITORY = Path(__file__).parents[1]
 pytest_plugins = ("tests.chromium", "tests.shared_stack")
 
 # The files that take longest, so that they are begun first: begun last, one of them would leave a core idle.
 LONGEST_FIRST = (
-    "service/api/test_schemathesis.py",
-    "psfcore/test_build.py",
     "psfcore/gap/test_diagnose.py",
-    "psfcore/deconvolve/methods/test_methods.py",
-    "workers/files/test_collection.py",
-    # Not first: its workers, killed while they compile kernels, would compile them again and again.
-    "whole/test_bulk.py",
-    "service/pages/browser/test_jobs.py",
-    "whole/test_first_contact.py",
-    "whole/test_service.py",
-    "service/pages/reports/test_shown.py",
-    "whole/test_real_data.py",
-    "service/api/bulk/test_bulk.py",
-    "service/cli/gap/test_diagnose.py",
-    "workers/tasks/test_rerun.py",
-    "psfcore/report/test_page.py",
-    "workers/tasks/test_gap.py",
-    "psfcore/evaluation/test_shapes.py",
-    "service/cli/test_report.py",
-    "whole/test_uws.py",
-    "psfcore/flare/arms/test_measure.py",
-    "workers/tasks/test_psf_fit.py",
-    "psfcore/scatter/test_shapes.py",
-    "workers/tasks/test_report.py",
-    "whole/test_uws_keys.py",
-    "psfcore/gap/evidence/test_search.py",
-    "whole/test_doors.py",
-    "workers/run/test_stopping.py",
-    "psfcore/gap/evidence/test_near_discs.py",
-    "workers/catalogue/test_schema.py",
-    "fuzz/test_fuzz.py",
-    "service/pages/browser/test_bulk.py",
     "service/pages/browser/test_viewer.py",
-    "whole/test_turns.py",
-    "service/http/test_owners.py",
-    "service/api/test_images_and_jobs.py",
-    "psfcore/scatter/validation/test_bands.py",
-    "service/api/test_psf_fit.py",
-    "psfcore/scatter/as_published/test_published.py",
-    "service/pages/test_login.py",
-    "service/api/psfs/test_versions.py",
-    "psfcore/gap/report/test_page.py",
-    "whole/test_stopping.py",
+    "psfcore/test_build.py",
+    "service/pages/browser/test_waiting.py",
+    "whole/test_killed.py",
+    "service/pages/reports/test_shown.py",
+    "service/cli/gap/test_diagnose.py",
+    "workers/tasks/test_transit_jobs.py",
+    "workers/tasks/test_gap.py",
+    "service/pages/browser/test_way_through.py",
+    "service/api/bulk/test_bulk.py",
+    "workers/files/test_collection.py",
+    "psfcore/gap/verdict/test_correction.py",
+    "psfcore/report/test_report.py",
+    "psfcore/gap/evidence/test_search.py",
 )
 
-
 _CACHE = TemporaryDirectory(prefix="heliopsf-tests-")
+
+
+MUCH_BYTES = 600 * 2**20
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _return_memory() -> Iterator[None]:
+    """Return the memory that a file of tests no longer uses, if its process holds much: C libraries keep freed blocks."""
+    yield
+    if psutil.Process().memory_info().rss > MUCH_BYTES:
+        return_unused_memory()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
