@@ -96,14 +96,13 @@ def test_another_worker_shares_the_folds(
 ) -> None:
     cheap = crossval_task.exact_fit
     by_thread: dict[str, list[tuple[int, int]]] = {}
-    helps = threading.Event()
+    both_at_work = threading.Barrier(2, timeout=60)  # neither may do all folds before the other begins
 
     def slow(solution: Any, draw: Any, **options: Any) -> Any:
         name = threading.current_thread().name
         by_thread.setdefault(name, []).append((draw.run, draw.fold))
-        if name == "helper":
-            helps.set()
-        assert helps.wait(60)
+        if len(by_thread[name]) == 1:
+            both_at_work.wait()
         return cheap(solution, draw, **options)
 
     monkeypatch.setattr(crossval_task, "exact_fit", slow)
