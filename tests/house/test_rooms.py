@@ -1,4 +1,4 @@
-"""The layout of the code: no circular imports between rooms, no overfull folder, no prefix in place of a folder."""
+"""The layout of the code: no circular imports between rooms."""
 
 from __future__ import annotations
 
@@ -7,16 +7,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 HERE = Path(__file__).parents[2]
 PACKAGES = ("heliopsf", "psfcore", "workers", "service", "benchmarks", "studies")
-MOST_FILES = 15
-# Folders that hold one thing of many equal parts: each catalogue table, and each kind of job, has its file there.
-# The revisions of the database are a history, which grows by one file a revision and is read by no one else.
-LARGER = {"workers/catalogue": 17, "workers/catalogue/migrations/versions": 100}
-# Richardson-Lucy is the method's own name; revisions of the database are numbered.
-OWN_NAMES = {"psfcore/deconvolve/methods": "richardson"}
 
 
 def _files() -> list[Path]:
@@ -76,31 +68,3 @@ def test_a_circle_is_found() -> None:
 def test_no_circular_imports_at_any_level() -> None:
     circles = {level: circle for level, graph in _graphs().items() if (circle := _circle(graph))}
     assert circles == {}
-
-
-def _folders() -> dict[str, list[str]]:
-    folders: dict[str, list[str]] = defaultdict(list)
-    for path in _files():
-        if path.name not in ("__init__.py", "__main__.py"):
-            folders[path.parent.as_posix()].append(path.stem)
-    return folders
-
-
-def test_no_folder_is_overfull() -> None:
-    overfull = {
-        folder: len(names)
-        for folder, names in _folders().items()
-        if len(names) > LARGER.get(folder, MOST_FILES)
-    }
-    assert overfull == {}
-
-
-def test_no_three_files_share_a_prefix(subtests: pytest.Subtests) -> None:
-    for folder in sorted(_folders()):
-        with subtests.test(str(folder)):
-            shared: dict[str, list[str]] = defaultdict(list)
-            for name in _folders()[folder]:
-                prefix = name.split("_")[0]
-                if OWN_NAMES.get(folder) != prefix:
-                    shared[prefix].append(name)
-            assert {prefix: names for prefix, names in shared.items() if len(names) > 2} == {}
