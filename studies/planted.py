@@ -45,7 +45,7 @@ SHARED = "HELIOPSF_SHARED"
 LIMIT_S = 600.0
 CONTROL_LIMIT_S = 3600.0
 PATIENCE_S = 30.0  # after SIGINT, the tests may end their servers
-FAILURE = re.compile(r"^(?:FAILED|ERROR) (\S+?::.+?)(?: - .*)?$", re.MULTILINE)
+FAILURE = re.compile(r"^(?:FAILED|ERROR) (\S+?::[^\[\n]+?(?:\[.*?\])?)(?: - .*)?$", re.MULTILINE)
 
 State = Literal["found", "not found", "no answer", "error"]
 
@@ -98,8 +98,8 @@ FAULTS = (
     Fault("deconvolve-region-shares-inverted", "psfcore/deconvolve/region.py",
           "* light.kept - light.light) / light.shares", "* light.kept - light.light) * light.shares",
           ("tests/psfcore/deconvolve/test_region.py",), ("tests/service/api/test_products.py",)),
-    Fault("fits-saturation-level-times-exposure", "psfcore/fits/saturation.py",
-          "level_dn / image.exposure_s if rate and image.exposure_s", "level_dn * image.exposure_s if rate and image.exposure_s",
+    Fault("fits-saturation-level-itself-unmasked", "psfcore/fits/saturation.py",
+          "mask[image.pixels >= level]", "mask[image.pixels > level]",
           ("tests/psfcore/fits/test_saturation.py",), ("tests/psfcore/fits",)),
     Fault("fits-psf-centre-half-a-pixel-off", "psfcore/fits/psfs.py",
           "(size // 2 + 1.0, ", "(size / 2 + 0.5, ",
@@ -358,7 +358,8 @@ def measure(faults: Sequence[Fault], limit_s: float, output: Path | None) -> dic
         check_imports(copy)
         for fault in faults:
             outcome = outcomes[fault.name] = outcome_of(fault, copy, limit_s)
-            print(f"{outcome.state:<10} {fault.name:<48} {outcome.test} {outcome.seconds:.0f} s", flush=True)
+            line = f"{outcome.state:<10} {fault.name:<48} {outcome.test:.140} {outcome.seconds:.0f} s"
+            print(line, flush=True)
             write()
         outcomes = controlled(outcomes, copy)
         write()

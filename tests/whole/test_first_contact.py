@@ -41,7 +41,7 @@ def rest_of(terminal: int) -> Iterator[str]:
 
 def started(stack: Stack, folder: Path) -> str:
     """A job that takes so long that something can happen meanwhile, at work."""
-    write_image(folder / "large.fits", shape=(1024, 1024), OBSERVER=folder.name)
+    write_image(folder / "large.fits", shape=(2048, 2048), OBSERVER=folder.name)
     write_psf(folder / "large-psf.fits")
     image = stack.client.upload_image(folder / "large.fits")["id"]
     psf = stack.client.upload_psf(folder / "large-psf.fits")["id"]

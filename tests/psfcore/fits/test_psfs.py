@@ -66,6 +66,8 @@ def test_a_psf_is_read_back_complete(tmp_path: Path, limits: FitsLimits) -> None
         weight = hdus["PROFILE"].data["diffraction_mean_weight"]
         assert weight[0] == pytest.approx(gaussian(64, 1.0)[32, 32])
         assert hdus[0].header["PSFSUM"] == pytest.approx(0.9)
+        # The first pixel has the number 1, so the centre [32, 32] has the number 33.
+        assert (hdus[0].header["CRPIX1"], hdus[0].header["CRPIX2"]) == (33.0, 33.0)
 
 
 def test_single_precision_keeps_the_sum_of_the_full_psf(tmp_path: Path, limits: FitsLimits) -> None:

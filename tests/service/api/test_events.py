@@ -85,7 +85,10 @@ def test_an_idle_stream_sends_comments_and_a_closed_connection_frees_its_stream(
         lines = answer.iter_lines()  # let go of, it would close the connection
         next(lines)
         assert live.streams() == 2
-        refusal(httpx.get(f"{live.url}/v1/jobs/{job_id}/events"), 429, "too-many-streams")
+        with httpx.stream("GET", f"{live.url}/v1/jobs/{job_id}/events") as answer:
+            assert answer.status_code == 429  # the body of an accepted stream would never end
+            answer.read()
+            refusal(answer, 429, "too-many-streams")
     wait_for(lambda: live.streams() == 1, "the place is free", timeout_s=10)
     live.catalogue.jobs.complete(lease, "r" * 64)
     following.join(10)

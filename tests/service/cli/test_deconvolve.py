@@ -52,7 +52,12 @@ def test_images_go_into_a_folder(folder: Path) -> None:
 def test_one_image_goes_into_a_file(folder: Path) -> None:
     done = run("deconvolve", folder / "in" / "0.fits", "-o", folder / "new.fits", *options(folder))
     assert done.exit_code == 0 and "new.fits: PSF" in done.output, done.output
-    assert fits.getheader(folder / "new.fits")["DCNVITER"] == 1
+    header = fits.getheader(folder / "new.fits")
+    assert header["DCNVITER"] == 1 and "DCNVSATL" not in header
+    level = ("--saturation", 100.0)
+    done = run("deconvolve", folder / "in" / "0.fits", "-o", folder / "level.fits", *level, *options(folder))
+    assert done.exit_code == 0, done.output
+    assert fits.getheader(folder / "level.fits")["DCNVSATL"] == 50.0  # 100 DN in 2 s
 
 
 def test_the_time_of_each_stage_is_printed(folder: Path) -> None:

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence, gather
+from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.library.detector import EFFECTS
 from psfcore.gap.verdict.posterior import (
     NONE,
+    PRIOR,
     UNKNOWN,
     Names,
+    Posterior,
     kind_of,
     posterior,
     without_idle,
@@ -36,6 +42,19 @@ def test_noise_alone_is_no_gap_and_an_offset_is_an_offset(evidence: Evidence) ->
         assert UNKNOWN in found
     weak = posterior(with_residuals(evidence, {"dark_offset": 3.0}))
     assert max(weak.probabilities(3.0).values()) < max(weak.probabilities().values())  # a temperature
+
+
+def test_the_hypotheses_of_a_kind_share_the_prior_of_their_kind() -> None:
+    """However many effects the library has: with equal evidence, its pairs together have the prior of a pair."""
+    blank = Weighed(0.0, (), np.zeros(0), 0.0)
+    for effects in (4, 7):
+        names = [tuple(one) for k in range(4) for one in itertools.combinations("abcdefg"[:effects], k)]
+        weights = (
+            Posterior({}, {}, {}).with_evidence(dict.fromkeys([*names, UNKNOWN], blank), effects).log_weights
+        )
+        for kind, prior in PRIOR.items():
+            share = sum(math.exp(weights[one]) for one in weights if kind_of(one) == kind)
+            assert share == pytest.approx(prior), kind
 
 
 def test_hypotheses_that_the_data_do_not_show_count_to_one_with_fewer_effects() -> None:

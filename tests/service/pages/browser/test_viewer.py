@@ -49,6 +49,9 @@ def opened(page: Page, product: Looked, **view: Any) -> None:
     page.goto(f"{product.page}#{'&'.join(f'{name}={value}' for name, value in view.items())}")
     expect(page.locator("#zoom")).to_contain_text("%")
     page.wait_for_load_state("networkidle")
+    page.locator("#canvas").evaluate(
+        "(canvas) => canvas.scrollIntoView({block: 'center'})"
+    )  # the mouse reaches it
     drawn(page)
 
 
