@@ -34,7 +34,7 @@ from psfcore.build import build_psf
 from psfcore.deconvolve.assess.contact_sheet import treat
 from psfcore.deconvolve.conditions import Conditions, EngineCache
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.images import read_image
+from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.instruments.model import load_instrument
 from psfcore.simulate.observe import demo_image
@@ -175,7 +175,7 @@ def bare_process(archive: str, psf_file: str, steps: int, images: int) -> None:
     for number, path in enumerate(paths):
         if number == 1:  # for image 0, the process loads its kernels and the PSF
             started = time.perf_counter()
-        treat(path.name, read_image(path, LIMITS), psf, conditions=conditions, steps=steps)
+        treat(path.name, read_observation(path, LIMITS), psf, conditions=conditions, steps=steps)
     print(time.perf_counter() - started)
 
 

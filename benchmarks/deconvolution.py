@@ -27,7 +27,7 @@ from psfcore.diffraction.fraunhofer import FEWEST_SAMPLES, far_field
 from psfcore.diffraction.pupil import entrance_pupil
 from psfcore.drawing.plots import preview_png
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.images import read_image
+from psfcore.fits.observation import read_observation
 from psfcore.instruments.model import Instrument, load_instrument
 from psfcore.psf import Psf
 from psfcore.simulate.observe import demo_image
@@ -149,7 +149,7 @@ def main() -> None:
         folder = Path(name)
         path = folder / "image.fits"
         demo_image(path, psf, size=2048)
-        image = read_image(path, FitsLimits(max_pixels=2**24))
+        image = read_observation(path, FitsLimits(max_pixels=2**24))
         fft_libraries.compare(image.pixels.astype(np.float32), psf.kernel.astype(np.float32), folder, f_s)
         richardson_lucy(image, psf, steps=1, threads=THREADS)
         results = []

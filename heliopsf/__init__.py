@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     from heliopsf.outputs import Deconvolution
     from heliopsf.psfs import Psf, build_psf, interpolate_psf, read_psf
     from heliopsf.transits import GapDiagnosis, ScatterFit, diagnose_gap, fit_scatter
-    from psfcore.errors import DataError, MissingExtra
+    from psfcore.errors import DataError, DataWarning, MissingExtra
     from service.client.errors import ServiceError
     from service.client.http import Client
 
 __all__ = [
     "Client",
     "DataError",
+    "DataWarning",
     "Deconvolution",
     "GapDiagnosis",
     "MissingExtra",
@@ -47,6 +48,7 @@ __all__ = [
 _MODULES = {
     "Client": ("service.client.http", "service"),
     "DataError": ("psfcore.errors", ""),
+    "DataWarning": ("psfcore.errors", ""),
     "Deconvolution": ("heliopsf.outputs", ""),
     "GapDiagnosis": ("heliopsf.transits", "fit"),
     "MissingExtra": ("psfcore.errors", ""),

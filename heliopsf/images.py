@@ -26,14 +26,15 @@ from psfcore.deconvolve.methods.registry import may_be_negative
 from psfcore.deconvolve.region import BoxWork, box_work
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.deconvolve.whole import Work, input_warnings, known_noise
-from psfcore.errors import DataError
-from psfcore.fits.header import check_not_deconvolved, content_of, plate_scale_arcsec, seen_by
+from psfcore.errors import DataError, DataWarning
+from psfcore.fits.header import seen_by
+from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.image import Image
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.noise import Noise
 from psfcore.psf import REACH_GRID_PX
 from psfcore.psf import Psf as CorePsf
-from psfcore.psf_sampling import psf_for_image
+from psfcore.psf_sampling import psf_for_image, with_scale
 from psfcore.scatter.samples import possible_psfs
 from workers.machine import cores, free_bytes
 
@@ -64,6 +65,8 @@ def deconvolve(
     noise: tuple[float, float] | None = None,
     error_draws: int = 0,
     saturation_dn: float | None = None,
+    hdu: int | None = None,
+    plate_scale_arcsec: float | None = None,
     edges: Edges | None = None,
     region: Any = None,
     region_error: float = LARGEST_ERROR,
@@ -98,6 +101,8 @@ def deconvolve(
     result. Each realisation takes as long as one deconvolution. 0: no uncertainty.
     saturation_dn: pixels at or above this level (DN) are ignored; default: the level that the header or the instrument
     file gives, or that the pixels show.
+    hdu: number of the HDU with the image, for a path of a FITS file; default: the first image.
+    plate_scale_arcsec: plate scale of a PSF that gives none, arcsec/px.
     edges: "zero", "symmetric" or "extended"; default: the assumption that suits the method best.
     region: deconvolve only a box of the image, which gives nearly the same pixels as the whole image, in less time and
     memory: a text "x0:x1,y0:y1" in pixels, ``np.s_[y0:y1, x0:x1]``, or for a Map its two corners ``(bottom_left,
@@ -117,8 +122,8 @@ def deconvolve(
     mask of the pixels without a measurement (QUALITY 1 or 2: not finite, masked or saturated).
 
     Raises ``DataError``; its ``code`` is the reason, such as "no-psf-for-instrument", "not-fits", "already-deconvolved",
-    "plate-scale-mismatch", "channel-mismatch" or "unknown-method". Gives a ``UserWarning`` if saturated pixels may be
-    missed, or if channels or plate scales cannot be compared.
+    "plate-scale-mismatch", "channel-mismatch" or "unknown-method". Gives a ``DataWarning`` with its ``code`` for
+    everything that may make the result wrong (docs/products.md lists them).
     """
     options: dict[str, Any] = {
         "iterations": iterations,
@@ -127,6 +132,8 @@ def deconvolve(
         "noise": noise,
         "error_draws": error_draws,
         "saturation_dn": saturation_dn,
+        "hdu": hdu,
+        "plate_scale_arcsec": plate_scale_arcsec,
         "edges": edges,
         "region_error": region_error,
         "other_channel": other_channel,
@@ -165,8 +172,8 @@ def psf_for(
     """
     header = header_of(image)
     psf = _built_for(header, threads or cores(), progress, parts=True)
-    for message in input_warnings(psf, _header_only(header), other_channel=False).values():
-        warnings.warn(message, stacklevel=2)
+    for code, message in input_warnings(psf, _header_only(header), None, other_channel=False).items():
+        warnings.warn(DataWarning(code, message), stacklevel=2)
     return _on_pixels(psf, header)
 
 
@@ -191,6 +198,8 @@ def _deconvolved(
     noise: tuple[float, float] | None,
     error_draws: int,
     saturation_dn: float | None,
+    hdu: int | None,
+    plate_scale_arcsec: float | None,
     edges: Edges | None,
     other_channel: bool,
     again: bool,
@@ -201,8 +210,8 @@ def _deconvolved(
 ) -> Deconvolution:
     if box is not None and error_draws:
         raise region_without_errors(error_draws)
-    given = None if psf is None else _given(psf)
-    shape = shape_of(image)
+    given = None if psf is None else cast(Psf, with_scale(_given(psf), plate_scale_arcsec))
+    shape = shape_of(image, hdu)
     asked = Asked(
         method,
         shape if box is None else box.wider(EXPECTED_RIM_PX, shape).shape,
@@ -211,17 +220,17 @@ def _deconvolved(
         draws=error_draws,
     )
     check_memory(asked.image, deconvolution_bytes(asked), free_bytes())
-    observed = image_of(image, saturation_dn=saturation_dn)
+    observed = image_of(image, saturation_dn=saturation_dn, hdu=hdu)
     if not again:
-        check_not_deconvolved(content_of(observed.header))
+        check_exposure_of_sun(observed.header)
     if given is None:
         with compiling_beside(method, (observed.pixels.shape[0], observed.pixels.shape[1])):
             found = _built_for(observed.header, threads, progress, parts=False)
     else:
         found = given
-    said = input_warnings(found, observed, other_channel=other_channel)
-    for message in [*said.values(), *_plate_scale_warning(found, observed.header)]:
-        warnings.warn(message, stacklevel=3)
+    said = input_warnings(found, observed, method, other_channel=other_channel)
+    for code, message in said.items():
+        warnings.warn(DataWarning(code, message), stacklevel=3)
     fitted = _on_pixels(found, observed.header)
     known = found.instrument if psf is None else None
     whole = Work(
@@ -329,15 +338,6 @@ def _with_steps(parameters: Mapping[str, Any], iterations: int | None) -> dict[s
 def _check_draws(draws: int) -> None:
     if draws and not 2 <= draws <= 64:
         raise DataError("bad-draws", f"error_draws: expected 0, or 2 to 64; got {draws}")
-
-
-def _plate_scale_warning(psf: Psf, header: Header) -> list[str]:
-    if psf.plate_scale_arcsec is None or plate_scale_arcsec(header) is not None:
-        return []
-    return [
-        f"the header gives no plate scale (CDELT1 with a unit of angle); the image is taken to have "
-        f"{psf.plate_scale_arcsec:g} arcsec/px, the plate scale of PSF {psf.name}"
-    ]
 
 
 def _header_only(header: Header) -> Image:

@@ -48,7 +48,7 @@ def _is_of(image: Any, module: str, name: str) -> bool:
     return loaded is not None and isinstance(image, getattr(loaded, name, ()))
 
 
-def image_of(image: Any, *, saturation_dn: float | None) -> Image:
+def image_of(image: Any, *, saturation_dn: float | None, hdu: int | None = None) -> Image:
     """The ``Image`` of psfcore for an image of the user.
 
     Pixels that the mask of a Map or NDData excludes are pixels without a value. Raises ``DataError`` "bad-input" for another
@@ -57,7 +57,7 @@ def image_of(image: Any, *, saturation_dn: float | None) -> Image:
     if isinstance(image, Image):
         return image
     if isinstance(image, str | Path):
-        return read_observation(image, LIMITS, saturation_dn=saturation_dn)
+        return read_observation(image, LIMITS, saturation_dn=saturation_dn, hdu=hdu)
     if is_nddata(image) or isinstance(image, np.ndarray):
         data = np.asarray(image.value if isinstance(image, units.Quantity) else _data(image))
         pixels = _pixels(data)
@@ -73,13 +73,13 @@ def image_of(image: Any, *, saturation_dn: float | None) -> Image:
     raise _not_an_image(image)
 
 
-def shape_of(image: Any) -> tuple[int, int]:
+def shape_of(image: Any, hdu: int | None = None) -> tuple[int, int]:
     """The shape (ny, nx) of an image of the user. No pixel of a file is read.
 
     Raises ``DataError`` "bad-input" or "not-2d", and the errors of reading a header.
     """
     if isinstance(image, str | Path):
-        return read_summary(image, LIMITS).shape
+        return read_summary(image, LIMITS, hdu=hdu).shape
     if not (isinstance(image, Image | np.ndarray) or is_nddata(image)):
         raise _not_an_image(image)
     shape = np.shape(image.pixels if isinstance(image, Image) else _data(image))

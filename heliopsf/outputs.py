@@ -158,6 +158,7 @@ def _describe(meta: Any, result: Deconvolution) -> None:
             result,
             saturation=result.image.saturation,
             amplification=None if result.errors is None else result.errors.amplification,
+            warnings=result.warnings,
         )
     )
     cards[CARD_OF_PASS] = (passes_of(result.image.header) + 1, "deconvolutions of this image, with this one")

@@ -32,6 +32,15 @@ class DataError(ValueError):
         return type(self), (self.code, self.message, self.fields)
 
 
+class DataWarning(UserWarning):
+    """The user's data can be used, but the result may be wrong. code, message: as in `DataError`."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+        self.message = message
+
+
 class HeaderError(DataError):
     """The headers of a file show that the file cannot be used. No pixel was read."""
 

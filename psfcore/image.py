@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import IntFlag
 
 import numpy as np
@@ -19,6 +20,7 @@ class MaskBit(IntFlag):
 
     NONFINITE = 1
     SATURATED = 2
+    LOST = 128  # always together with NONFINITE
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,8 @@ class Saturation:
 class Image:
     """Pixels [y, x] (float64, in `unit`), mask [y, x] (bits of MaskBit), header, and exposure time in seconds.
 
-    saturation: how the saturated pixels were found; None: this was not recorded.
+    saturation: how the saturated pixels were found; None: this was not recorded. warnings: sentences about the image, by
+    their codes.
     Raises DataError: "not-2d", "too-small", "mask-shape", "unmasked-nonfinite".
     """
 
@@ -48,6 +51,7 @@ class Image:
     unit: str | None
     exposure_s: float | None
     saturation: Saturation | None = None
+    warnings: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pixels", np.ascontiguousarray(self.pixels, dtype=np.float64))
@@ -65,6 +69,10 @@ class Image:
                 "unmasked-nonfinite",
                 "expected every NaN or infinite pixel to be masked; got at least one such pixel without a mask",
             )
+
+    def warned(self, warnings: Mapping[str, str]) -> Image:
+        """The image with these warnings added."""
+        return replace(self, warnings={**self.warnings, **warnings})
 
     @property
     def finite(self) -> NDArray[np.bool_]:

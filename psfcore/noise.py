@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.image import Image
 
 Plane = NDArray[np.float64]
 
@@ -59,17 +58,3 @@ class Noise:
         if self.read_noise_dn > 0:
             exposure_dn = np.asarray(exposure_dn + rng.normal(0.0, self.read_noise_dn, expected.shape))
         return np.asarray(exposure_dn / dn_per_unit)
-
-
-def dn_per_unit(image: Image) -> float:
-    """DN in one exposure per unit of the image: the exposure time (s) if the unit is DN/s, otherwise 1.
-
-    Raises DataError "no-exposure".
-    """
-    if (image.unit or "").replace(" ", "").lower() != "dn/s":
-        return 1.0
-    if image.exposure_s is None:
-        wanted = "expected XPOSURE or EXPTIME in the header, to compute the noise of an image in DN/s"
-        message = f"{wanted}; got neither: add one of them"
-        raise DataError("no-exposure", message)
-    return image.exposure_s

@@ -22,7 +22,7 @@ from psfcore.errors import DataError
 from psfcore.plate_scale import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
 from psfcore.weight_rules import CENTRE_TOLERANCE as CENTRE_TOLERANCE
 from psfcore.weight_rules import REACH_GRID_PX as REACH_GRID_PX
-from psfcore.weight_rules import check_weights, is_peak
+from psfcore.weight_rules import check_core, check_weights, core_offset_px, is_peak
 
 Kernel = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class Psf:
     components: kernels with the same centre ("DIFFRACTION", "SCATTER"). provenance: texts and numbers for JSON.
     fitted: the fitted formula of SCATTER. cards: texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER,
     which say for which images the PSF is valid. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative",
-    "psf-sum", "psf-not-centred".
+    "psf-sum", "psf-not-centred", "psf-off-centre".
     """
 
     kernel: Kernel
@@ -68,6 +68,7 @@ class Psf:
         object.__setattr__(self, "kernel", np.ascontiguousarray(self.kernel, dtype=np.float64))
         _check_weights(self.kernel)
         _check_centre(self.kernel)
+        _check_core(self.kernel)
 
     @property
     def total(self) -> float:
@@ -114,6 +115,13 @@ def _check_centre(kernel: Kernel) -> None:
             "psf-not-centred",
             f"expected the peak at [y, x] = {centre}; got {found}{hint}: shift the PSF so that its peak is at {centre}",
         )
+
+
+def _check_core(kernel: Kernel) -> None:
+    y, x = kernel.shape[0] // 2, kernel.shape[1] // 2
+    core = kernel[y - 1 : y + 2, x - 1 : x + 2]
+    if core.shape == (3, 3):
+        check_core(core_offset_px(*core.sum(axis=0)), core_offset_px(*core.sum(axis=1)))
 
 
 def crop_centred(kernel: Kernel, shape: tuple[int, int]) -> Kernel:

@@ -1,4 +1,4 @@
-"""Adapts a PSF to the pixels of an image, which may be binned or a cut-out.
+"""Adapts a PSF to the pixels of an image, which may be binned, turned or a cut-out.
 
 A binned pixel is the mean of n x n pixels. For a scene that is constant within binned pixels, the binned PSF is
 
@@ -15,6 +15,9 @@ A cut-out, or a window that starts at another pixel of the detector (PXBEG), has
 because one PSF is used for the whole field: only the difference of two positions matters. Near the edges of a window,
 light from outside the window enters the image; no choice of the PSF can correct this.
 
+If the image was turned by quarter turns or flipped after it was taken, so is the PSF of its detector, which is exact. A PSF is
+not turned by other angles: its core and its arms are too narrow to be interpolated.
+
 | symbol | name | unit |
 |---|---|---|
 | h | kernel, centre at [size // 2, size // 2] | - |
@@ -24,7 +27,7 @@ light from outside the window enters the image; no choice of the PSF can correct
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy.io.fits import Header
@@ -32,7 +35,8 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.binning import binning_factor
-from psfcore.fits.header import plate_scale_arcsec
+from psfcore.fits.cards import Cards
+from psfcore.fits.frame import UNIT, Matrix, frame_of, plate_scale_arcsec
 from psfcore.image import Image
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred
 
@@ -40,9 +44,95 @@ LARGEST_FACTOR = 64
 Kernel = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """The pixels of an image, as a PSF needs them: the binning factor, and the quarter turn or flip of the detector."""
+
+    factor: int
+    turn: Matrix
+
+    def of(self, psf: Psf) -> Psf:
+        """The PSF on these pixels."""
+        return turned(rebinned(psf, self.factor), self.turn)
+
+
+def with_scale(psf: Psf, plate_scale_arcsec: float | None) -> Psf:
+    """The PSF with this plate scale, if its file gives none. Raises DataError "plate-scale-known" for another scale."""
+    if plate_scale_arcsec is None or psf.plate_scale_arcsec == plate_scale_arcsec:
+        return psf
+    if psf.plate_scale_arcsec is not None:
+        raise DataError(
+            "plate-scale-known",
+            f"expected a PSF without plate scale; PSF {psf.name} has {psf.plate_scale_arcsec:g} arcsec/px: leave the plate scale "
+            "out",
+        )
+    return replace(psf, plate_scale_arcsec=plate_scale_arcsec)
+
+
+AS_BUILT = Sampling(1, UNIT)
+
+
+def sampling_of(psf: Psf, header: Cards) -> Sampling:
+    """How an image samples a PSF of its detector. Raises DataError "plate-scale-mismatch"."""
+    turn = frame_of(header).quarter_turns
+    return Sampling(binning_factor(psf, header), UNIT if turn is None or psf.instrument is None else turn)
+
+
 def psf_for_image(psf: Psf, header: Header) -> Psf:
-    """The PSF for the pixels of an image with this header: `psf` itself, or `psf` rebinned by `binning_factor`."""
-    return rebinned(psf, binning_factor(psf, header))
+    """The PSF for the pixels of an image with this header: `psf` itself, or `psf` rebinned and turned with the image."""
+    return sampling_of(psf, header).of(psf)
+
+
+def turned(psf: Psf, turn: Matrix) -> Psf:
+    """The PSF of an image that was turned. turn: the matrix T of `psfcore.fits.frame`, with the values -1, 0 and 1."""
+    if turn == UNIT:
+        return psf
+    return replace(
+        psf,
+        kernel=_turned(psf.kernel, turn),
+        version=f"{psf.version}+turned",
+        components={name: _turned(part, turn) for name, part in psf.components.items()},
+        provenance={**psf.provenance, "turned": str(turn)},
+    )
+
+
+def _turned(kernel: Kernel, turn: Matrix) -> Kernel:
+    """K[p] = h[T p], p: the offset (x, y) from the centre."""
+    (a, b), (c, d) = turn
+    ny, nx = kernel.shape
+    # With one more row and column, an array of even size has an offset on each side for each offset on the other.
+    whole = np.pad(kernel, ((0, 1 - ny % 2), (0, 1 - nx % 2)))
+    size = whole.shape if b == 0 else whole.shape[::-1]
+    y, x = np.meshgrid(*(np.arange(n) - n // 2 for n in size), indexing="ij")
+    column, row = (np.rint(a * x + b * y).astype(int), np.rint(c * x + d * y).astype(int))
+    placed = whole[row + whole.shape[0] // 2, column + whole.shape[1] // 2]
+    return np.ascontiguousarray(placed[: (ny, nx)[b != 0], : (nx, ny)[b != 0]])
+
+
+def frame_warnings(psf: Psf, header: Cards) -> dict[str, str]:
+    """Warnings about the frames and the plate scales of an image and its PSF: sentences by their codes."""
+    frame, warnings = frame_of(header), {}
+    turn = frame.quarter_turns
+    how = "mirrored" if frame.flipped else f"turned by {frame.turn_deg:.3g} degrees"
+    if turn is None:
+        advice = "use the image before the turn"
+        warnings["frame"] = (
+            f"the image is {how} against the detector and interpolated; the PSF is not turned: {advice}"
+        )
+    elif turn != UNIT and psf.instrument is None:
+        warnings["frame"] = f"the image is {how} against the detector; the PSF is used as it stands"
+    elif turn != UNIT:
+        warnings["frame"] = f"the image is {how} against the detector; the PSF was turned with it"
+    if frame.interpolated is not None:
+        warnings["interpolated"] = f"the pixels are not those of the detector: {frame.interpolated}"
+    scales = {"PSF": psf.plate_scale_arcsec, "image": frame.scale_arcsec[0]}
+    unknown = [name for name, scale in scales.items() if scale is None]
+    if len(unknown) == 1:  # two arrays in memory have no scales to compare
+        warnings["plate-scale"] = (
+            f"the plate scales of image and PSF were not compared: {unknown[0]} without plate scale (CDELT1 with a "
+            "unit of angle); a binned image would need another PSF"
+        )
+    return warnings
 
 
 def check_compatible(image: Image, psf: Psf) -> None:

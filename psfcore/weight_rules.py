@@ -34,6 +34,40 @@ def check_finite(total: float) -> None:
         raise DataError("psf-nonfinite", "expected finite weights; got weights that are NaN or infinite")
 
 
+LARGEST_OFFSET_PX = 0.05  # a PSF moves every image by the offset of its core
+
+
+def core_offset_px(before: float, centre: float, after: float) -> float:
+    """The offset of the core from the central pixel along one axis, px, from the sums of three lines of 3 weights.
+
+    A Gaussian through the three sums has its peak at this offset; a core without light beside the central pixel has the
+    offset of its centroid.
+    """
+    if min(before, after) <= 0 or centre <= 0:
+        total = before + centre + after
+        return (after - before) / total if total > 0 else 0.0
+    curvature = 2 * math.log(centre) - math.log(before) - math.log(after)
+    slope = math.log(after) - math.log(before)
+    return (
+        0.0
+        if slope == 0
+        else 0.5 * slope / curvature
+        if curvature > abs(slope)
+        else math.copysign(0.5, slope)
+    )
+
+
+def check_core(offset_x_px: float, offset_y_px: float) -> None:
+    """Raise DataError "psf-off-centre" if the core of a PSF is beside the central pixel."""
+    if max(abs(offset_x_px), abs(offset_y_px)) > LARGEST_OFFSET_PX:
+        raise DataError(
+            "psf-off-centre",
+            f"expected the core of the PSF at the centre of the pixel [ny // 2, nx // 2], within {LARGEST_OFFSET_PX:g} px; got "
+            f"it at x {offset_x_px:+.2f}, y {offset_y_px:+.2f} px from there, which would move every image by as much: "
+            "shift the PSF by whole and part pixels, for example with scipy.ndimage.shift",
+        )
+
+
 def is_peak(centre: float, largest: float) -> bool:
     """Whether the central pixel has the largest weight, up to CENTRE_TOLERANCE. Other PSFs would shift every image."""
     return centre >= largest * (1 - CENTRE_TOLERANCE)

@@ -334,11 +334,11 @@ def main() -> None:
         )
         return
     from psfcore.fits.header import FitsLimits
-    from psfcore.fits.images import read_image
+    from psfcore.fits.observation import read_observation
 
     with TemporaryDirectory(prefix="heliopsf-aia-") as name:
         folder = Path(name)
-        observed = read_image(arguments.image, FitsLimits(max_pixels=2**22))
+        observed = read_observation(arguments.image, FitsLimits(max_pixels=2**22))
         np.save(folder / "image.npy", np.where(observed.mask == 0, np.maximum(observed.pixels, 0), 0))
         own = {channel: own_psf(channel, folder) for channel in CHANNELS}
         subprocess.run(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from psfcore.deconvolve.result import Deconvolved
@@ -21,11 +21,17 @@ class UsedPsf:
 
 
 def deconvolution_cards(
-    psf: UsedPsf, result: Deconvolved, *, saturation: Saturation | None, amplification: float | None
+    psf: UsedPsf,
+    result: Deconvolved,
+    *,
+    saturation: Saturation | None,
+    amplification: float | None,
+    warnings: Iterable[str] = (),
 ) -> dict[str, tuple[str | int | float, str]]:
     """The cards that say how an image was deconvolved.
 
-    saturation: the saturation of the input. amplification: the noise amplification, if known.
+    saturation: the saturation of the input. amplification: the noise amplification, if known. warnings: the codes of the
+    warnings, the most harmful first; HISTORY has the sentences.
     """
     # A hash fills the whole card, so cards with a hash have no comment.
     cards: dict[str, tuple[str | int | float, str]] = {
@@ -49,6 +55,8 @@ def deconvolution_cards(
         cards["DCNVSATF"] = (saturation.found, "where the saturation level was found")
     if amplification is not None:
         cards["DCNVAMPL"] = (amplification, "noise of result / noise of input")
+    for number, code in enumerate(warnings, start=1):
+        cards[f"DCNVWRN{number}"] = (code, "warning, see HISTORY")
     return cards
 
 

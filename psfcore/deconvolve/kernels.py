@@ -56,7 +56,7 @@ def compile_kernels(method: str, shape: tuple[int, int]) -> None:
     """
     # The kernel is not symmetric, as that of most PSFs: there are other kernels for symmetric ones.
     weights = np.random.default_rng(0).random((SIZE_PX, SIZE_PX))
-    weights[SIZE_PX // 2, SIZE_PX // 2] = SIZE_PX
+    weights[SIZE_PX // 2, SIZE_PX // 2] = SIZE_PX**2
     psf = Psf(kernel=weights / weights.sum(), name="small", version="0", instrument=None, status="user")
     pixels = np.full((SIZE_PX, SIZE_PX), 100.0)
     image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN/s", 1.0)

@@ -111,16 +111,12 @@ def solution(
     *,
     method: str,
     last_change: float,
-    negatives_count: bool,
     noise_amplification: float | None = None,
 ) -> Deconvolved:
-    """Turn an estimate on the domain into the result for the image. estimate: a plane [y, x], or in the engine's layout.
-
-    negatives_count: as in `fluxes`.
-    """
+    """Turn an estimate on the domain into the result for the image. estimate: a plane [y, x], or in the engine's layout."""
     image, domain = problem.image, problem.domain
     pixels = domain.cut([(0, estimate)] if estimate.ndim == 2 else problem.engine.row_blocks_of(estimate))
-    flux_in, flux_out, negative_pixels = fluxes(image, pixels, negatives_count=negatives_count)
+    flux_in, flux_out, negative_pixels = fluxes(image, pixels)
     pixels[~image.finite] = np.nan
     return Deconvolved(
         pixels=pixels,

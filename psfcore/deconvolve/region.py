@@ -50,7 +50,7 @@ from psfcore.deconvolve.assess.quality import QualityBit, quality_plane
 from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.deconvolve.conditions import Progress
 from psfcore.deconvolve.edges import Edges, margin_for, share_from_beyond
-from psfcore.deconvolve.methods.registry import defaults_of, keeps_flux, may_be_negative
+from psfcore.deconvolve.methods.registry import defaults_of, keeps_flux
 from psfcore.deconvolve.result import Deconvolved, OfBox, fluxes
 from psfcore.deconvolve.whole import Assessed, Work
 from psfcore.errors import DataError
@@ -105,9 +105,7 @@ class BoxWork:
         """Deconvolve box and rim, and cut out the box. Flux and negative pixels are those of the box."""
         found = self.work.run(progress=progress)
         pixels = np.ascontiguousarray(found.pixels[self.box.inside(self.rim).slices])
-        flux_in, flux_out, negative_pixels = fluxes(
-            self.image, pixels, negatives_count=may_be_negative(self.work.method)
-        )
+        flux_in, flux_out, negative_pixels = fluxes(self.image, pixels)
         return replace(
             found,
             pixels=pixels,

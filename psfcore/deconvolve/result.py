@@ -31,7 +31,7 @@ class Deconvolved:
 
     pixels: estimate [y, x] in the image's unit; NaN where the image has no finite value.
     stopped_because: reason why the iteration ended.
-    flux_in: sum of the image over its valid pixels. If the method counts negative pixels as 0, the sum does too.
+    flux_in: sum of the image over its valid pixels. Negative pixels are included.
     flux_out: sum of the estimate over the same pixels. negative_pixels: number of valid pixels below 0 in the image.
     last_change: rms of the change in the last step, divided by the rms of the estimate.
     edges, margin_px: assumption about the scene beyond the field, and width of the margin.
@@ -57,17 +57,20 @@ class Deconvolved:
     chi2_per_pixel: float | None = None
     of_box: OfBox | None = None
 
+    @property
+    def flux_change_pct(self) -> float:
+        """Change of the flux, percent of the absolute value of the flux before; 0 if that is 0."""
+        return 100 * (self.flux_out - self.flux_in) / abs(self.flux_in) if self.flux_in else 0.0
 
-def fluxes(image: Image, pixels: NDArray[np.float64], *, negatives_count: bool) -> tuple[float, float, int]:
-    """`flux_in`, `flux_out` and `negative_pixels` of a `Deconvolved` with these pixels.
 
-    negatives_count: True if the method uses negative pixels unchanged; False if it counts them as 0.
-    """
+def fluxes(image: Image, pixels: NDArray[np.float64]) -> tuple[float, float, int]:
+    """`flux_in`, `flux_out` and `negative_pixels` of a `Deconvolved` with these pixels."""
     # The sums use no copies of planes: here most of the memory of a deconvolution is in use.
     counted = image.valid
-    flux_out = float(pixels.sum(where=counted))
     negative = image.pixels < 0
     negative &= counted
-    if not negatives_count:
-        counted &= ~negative
-    return float(image.pixels.sum(where=counted)), flux_out, int(np.count_nonzero(negative))
+    return (
+        float(image.pixels.sum(where=counted)),
+        float(pixels.sum(where=counted)),
+        int(np.count_nonzero(negative)),
+    )

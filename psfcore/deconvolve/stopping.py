@@ -27,8 +27,8 @@ from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions, Progress
 from psfcore.deconvolve.edges import Domain
 from psfcore.errors import DataError
+from psfcore.fits.units import dn_per_unit
 from psfcore.image import Image
-from psfcore.noise import dn_per_unit
 
 Stop = Literal["fixed", "discrepancy"]
 MOST_STEPS = 10_000

@@ -144,14 +144,41 @@ def open_source(path: Path, limits: FitsLimits) -> Iterator[Source]:
             yield _PlainSource(file)
 
 
-def first_image(source: Source, limits: FitsLimits) -> tuple[Header, int]:
-    """Header and HDU number of the first 2-D image. Raises HeaderError if there is none."""
+def first_image(source: Source, limits: FitsLimits, hdu: int | None = None) -> tuple[Header, int]:
+    """Header and HDU number of the first 2-D image, or of the image in HDU `hdu`.
+
+    Raises HeaderError if there is none, or if an image of more axes comes first.
+    """
     kinds: list[str] = []
-    for header, hdu, kind in walk(source, limits, to_the_end=False):
-        if kind == "image":
-            return header, hdu
+    for header, number, kind in walk(source, limits, to_the_end=False, hdu=hdu):
         kinds.append(kind)
+        if kind == "image" and hdu in (None, number):
+            return header, number
+        if kind.startswith("cube") and hdu in (None, number):
+            raise _no_image(kinds)
+    if hdu is not None and kinds and len(kinds) <= hdu:
+        raise HeaderError("no-image", f"expected an HDU of the file, 0 to {len(kinds) - 1}; got {hdu}")
     raise _no_image(kinds)
+
+
+def following(
+    source: Source, header: Header, hdu: int, limits: FitsLimits
+) -> Iterator[tuple[Header, int, str]]:
+    """Header, number and kind of each HDU after the one that `first_image` found, up to the first that cannot be read.
+
+    What follows an image is not needed to use it, so damage there is no error.
+    """
+    source.skip(-_data_bytes(header, hdu) % BLOCK_BYTES)
+    try:
+        for number in range(hdu + 1, limits.max_hdus):
+            raw = _read_header(source, limits.max_header_bytes, limits, first=False)
+            if raw is None:
+                return
+            header = _parse(raw, number)
+            yield header, number, _kind(header, number)
+            _pass_data(source, header, number, limits, last=False)
+    except HeaderError:
+        return
 
 
 def enter_data(source: Source, hdu: int, limits: FitsLimits) -> Header:
@@ -172,24 +199,27 @@ def enter_data(source: Source, hdu: int, limits: FitsLimits) -> Header:
     return header
 
 
-def walk(source: Source, limits: FitsLimits, *, to_the_end: bool) -> Iterator[tuple[Header, int, str]]:
+def walk(
+    source: Source, limits: FitsLimits, *, to_the_end: bool, hdu: int | None = None
+) -> Iterator[tuple[Header, int, str]]:
     """Yield header, number and kind (see `_kind`) of each HDU.
 
-    to_the_end: continue to the end of the file instead of stopping at the first image. Raises HeaderError.
+    to_the_end: continue to the end of the file instead of stopping at the first image. hdu: stop at this HDU instead. Raises
+    HeaderError.
     """
     header_bytes = 0
-    for hdu in range(limits.max_hdus):
-        raw = _read_header(source, limits.max_header_bytes - header_bytes, limits, first=hdu == 0)
+    for number in range(limits.max_hdus):
+        raw = _read_header(source, limits.max_header_bytes - header_bytes, limits, first=number == 0)
         if raw is None:
             return
         header_bytes += len(raw)
-        header = _parse(raw, hdu)
-        kind = _kind(header, hdu)
-        last = kind == "image" and not to_the_end
-        if last:
+        header = _parse(raw, number)
+        kind = _kind(header, number)
+        last = not to_the_end and (kind == "image" if hdu is None else number == hdu)
+        if last and kind == "image":
             _check_image(header, limits)
-        _pass_data(source, header, hdu, limits, last=last)
-        yield header, hdu, kind
+        _pass_data(source, header, number, limits, last=last)
+        yield header, number, kind
         if last:
             return
     if not to_the_end or source.read(1):
@@ -209,7 +239,7 @@ def _no_image(kinds: list[str]) -> HeaderError:
         first = ", ".join("0" * (axes - 2)) if axes < _MANY_AXES else "..."
         return HeaderError(
             "three-axes" if axes == 3 else "not-2d",
-            f"{wanted}; got an image of {axes} axes: write one plane of it, for example the first one with astropy: "
+            f"{wanted}; got an image of {axes} axes in HDU {hdu}: name another HDU (--hdu), or write one plane, for example with astropy: "
             f"hdus = fits.open('FILE'); hdus[{hdu}].data = hdus[{hdu}].data[{first}]; hdus.writeto('NEW')",
         )
     if "line" in kinds:

@@ -70,3 +70,43 @@ def card_text(header: Header, key: str) -> str | None:
     """Text of a structural card, without surrounding spaces; None if the card is missing or does not hold text."""
     value = card_value(header, key)
     return value.strip() if isinstance(value, str) else None
+
+
+def optional_text(header: Cards, *keys: str) -> str | None:
+    """Text of the first of the cards `keys` that holds a non-empty string; None if no card does.
+
+    Surrounding spaces are removed.
+    """
+    for key in keys:
+        value = lenient_value(header, key)
+        if isinstance(value, str) and value.strip():
+            return value.strip()
+    return None
+
+
+def optional_number(header: Cards, *keys: str) -> float | None:
+    """Value of the first of the cards `keys` that holds a finite number; None if no card does."""
+    for key in keys:
+        value = lenient_value(header, key)
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
+            return float(value)
+    return None
+
+
+def optional_value(header: Cards, key: str) -> str | float | bool | None:
+    """Value of a card: True or False, a finite number, or a text without surrounding spaces; otherwise None."""
+    value = lenient_value(header, key)
+    if isinstance(value, bool):
+        return value
+    number = optional_number(header, key)
+    return optional_text(header, key) if number is None else number
+
+
+def lenient_value(header: Cards, key: str) -> object:
+    """Value of an optional, descriptive card; None if the card is missing or damaged."""
+    try:
+        return header[key]
+    except KeyError:
+        return None
+    except card_trouble():
+        return None

@@ -6,15 +6,26 @@ of the file must be correct (see `psfcore.fits.blocks`). This module reads no pi
 
 from __future__ import annotations
 
-import math
 import os
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits, first_image, open_source, walk
-from psfcore.fits.cards import Cards, card_count, card_flag, card_text, card_trouble
+from psfcore.fits.blocks import FitsLimits, first_image, following, open_source, walk
+from psfcore.fits.cards import (
+    Cards,
+    card_count,
+    card_flag,
+    card_text,
+    lenient_value,
+    optional_number,
+    optional_text,
+    optional_value,
+)
+from psfcore.fits.frame import plate_scale_arcsec
+from psfcore.fits.times import observed_at
 from psfcore.instruments.files import match_instrument
 
 if TYPE_CHECKING:
@@ -51,18 +62,20 @@ _ANGSTROM_PER_UNIT = {
     "m": 1e10,
 }
 # The content of a file, see `content_of`.
-IMAGE, PRODUCT, PSF = "image", "product", "psf"
-# The cards that are compared to find out whether a PSF and an image fit together.
-ORIGIN_CARDS = ("TELESCOP", "INSTRUME", "DETECTOR", "FILTER")
+IMAGE, PRODUCT, PSF, ELSEWHERE = "image", "product", "psf", "deconvolved elsewhere"
+_DECONVOLVED = re.compile(
+    r"(?<!not )\bdeconvolved\b|_deconvol|richardson.?lucy|psf[ -]correct(ed|ion)", re.IGNORECASE
+)
 # Names of filters. XRT has two filter wheels and one of the last two cards for each; the others have FILTER.
 FILTER_CARDS = ("FILTER", "EC_FW1_", "EC_FW2_")
+# The cards that are compared to find out whether a PSF and an image fit together.
+ORIGIN_CARDS = ("TELESCOP", "OBSRVTRY", "INSTRUME", "DETECTOR", *FILTER_CARDS)
 _FIT_CARDS = (
-    *ORIGIN_CARDS,
-    *FILTER_CARDS[1:],
-    *("WAVELNTH", "WAVEUNIT", "CDELT1", "CDELT2", "CUNIT1", "CUNIT2", "CD1_1", "CD1_2", "CD2_1", "CD2_2"),
-    *("GAINCOMB", "PSFNAME"),
-)
-_ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600.0}
+    *ORIGIN_CARDS, "WAVELNTH", "WAVEUNIT", "GAINCOMB", "PSFNAME", "LVL_NUM", "LEVEL",
+    # The cards that `psfcore.fits.frame` reads.
+    "CDELT1", "CDELT2", "CUNIT1", "CUNIT2", "CTYPE1", "CTYPE2", "CD1_1", "CD1_2", "CD2_1", "CD2_2", "PC1_1", "PC1_2",
+    "PC2_1", "PC2_2", "CROTA", "CROTA1", "CROTA2", "SAT_ROT", "INST_ROT", "P2_ROLL",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -97,11 +110,38 @@ class HeaderSummary:
     cards: dict[str, str | float | bool] = field(default_factory=dict)
 
 
-def read_summary(path: str | os.PathLike[str], limits: FitsLimits) -> HeaderSummary:
-    """Summary of the first 2-D image of a file. Raises HeaderError if the file has no usable image."""
+def read_summary(
+    path: str | os.PathLike[str], limits: FitsLimits, *, hdu: int | None = None
+) -> HeaderSummary:
+    """Summary of the first 2-D image of a file, or of the image in HDU `hdu`.
+
+    Raises HeaderError if the file has no usable image there.
+    """
     with open_source(Path(path), limits) as source:
-        header, hdu = first_image(source, limits)
-        return _summary(header, hdu, source.gzipped)
+        header, number = first_image(source, limits, hdu)
+        return _summary(header, number, source.gzipped)
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """An image after the one that is used. name: its EXTNAME, or empty."""
+
+    hdu: int
+    name: str
+    shape: tuple[int, int]
+
+
+def read_contents(
+    path: str | os.PathLike[str], limits: FitsLimits, *, hdu: int | None = None
+) -> tuple[HeaderSummary, list[Neighbour]]:
+    """As `read_summary`, with the images that follow in the file. Planes of products are left out."""
+    with open_source(Path(path), limits) as source:
+        header, number = first_image(source, limits, hdu)
+        neighbours = []
+        for other, k, kind in following(source, header, number, limits):
+            if kind == "image" and lenient_value(other, "PLANE") is not True:
+                neighbours.append(Neighbour(k, optional_text(other, "EXTNAME") or "", _shape(other)))
+        return _summary(header, number, source.gzipped), neighbours
 
 
 def first_image_header(path: str | os.PathLike[str], limits: FitsLimits) -> Header:
@@ -123,18 +163,28 @@ def check_all_headers(path: str | os.PathLike[str], limits: FitsLimits) -> None:
 def content_of(header: Header) -> str:
     """The content of a file: PRODUCT or PSF if the cards show that heliopsf wrote such a file; otherwise IMAGE.
 
-    A product has the card PSFID or PRODID. A PSF has the card PSFSUM.
+    A product has the card PSFID or PRODID. A PSF has the card PSFSUM. ELSEWHERE: HISTORY says that other software
+    deconvolved the image (xrt_deconvolve, aia_deconvolve_richardsonlucy, aiapy, regularizepsf).
     """
     if "PSFID" in header or "PRODID" in header:
         return PRODUCT
-    return PSF if "PSFSUM" in header else IMAGE
+    if "PSFSUM" in header:
+        return PSF
+    history = str(lenient_value(header, "HISTORY") or "")
+    return ELSEWHERE if _DECONVOLVED.search(history) else IMAGE
 
 
 def check_not_deconvolved(content: str) -> None:
     """Raise DataError if the content of a file is not IMAGE. content: the result of `content_of`.
 
-    Codes: "already-deconvolved" for a product, "psf-as-image" for a PSF.
+    Codes: "already-deconvolved" for a product and for an image that other software deconvolved, "psf-as-image" for a PSF.
     """
+    if content == ELSEWHERE:
+        raise DataError(
+            "already-deconvolved",
+            "expected an image that was not deconvolved before; the HISTORY of its header says that other software "
+            "deconvolved it: use the original image, or allow a second deconvolution (--again, in a request again = true)",
+        )
     if content == PRODUCT:
         raise DataError(
             "already-deconvolved",
@@ -162,48 +212,6 @@ def origin_of(header: Cards) -> tuple[str | None, dict[str, str]]:
     return named, {
         key: text for key, text in texts.items() if text is not None and not (own and key == "INSTRUME")
     }
-
-
-def optional_text(header: Cards, *keys: str) -> str | None:
-    """Text of the first of the cards `keys` that holds a non-empty string; None if no card does.
-
-    Surrounding spaces are removed.
-    """
-    for key in keys:
-        value = _lenient(header, key)
-        if isinstance(value, str) and value.strip():
-            return value.strip()
-    return None
-
-
-def optional_number(header: Cards, *keys: str) -> float | None:
-    """Value of the first of the cards `keys` that holds a finite number; None if no card does."""
-    for key in keys:
-        value = _lenient(header, key)
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
-            return float(value)
-    return None
-
-
-def optional_value(header: Cards, key: str) -> str | float | bool | None:
-    """Value of a card: True or False, a finite number, or a text without surrounding spaces; otherwise None."""
-    value = _lenient(header, key)
-    if isinstance(value, bool):
-        return value
-    number = optional_number(header, key)
-    return optional_text(header, key) if number is None else number
-
-
-def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
-    """Plate scale of an axis in arcsec/px: |CDELT|, or the length of a column of the matrix CDi_j.
-
-    If CUNIT is missing, the unit is arcsec. Returns None if CDELT and the matrix are missing or 0, or if CUNIT is not an angle.
-    """
-    step = optional_number(header, f"CDELT{axis}")
-    if step is None:
-        step = math.hypot(*(optional_number(header, f"CD{row}_{axis}") or 0.0 for row in (1, 2)))
-    factor = _ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{axis}") or "arcsec").lower())
-    return None if not step or factor is None else abs(step) * factor
 
 
 def wavelength_angstrom(header: Cards) -> float | None:
@@ -249,30 +257,25 @@ def seen_by(header: Cards) -> dict[str, Any]:
         "instrume": optional_text(header, "INSTRUME"),
         "detector": optional_text(header, "DETECTOR"),
         "wavelnth": wavelength_angstrom(header),
-        "date_obs": optional_text(header, "DATE-BEG", "DATE-OBS", "DATE_OBS"),
+        "date_obs": observed_at(header),
         "exposure_s": optional_exposure_s(header),
-        "unit": optional_text(header, "BUNIT"),
-        "cdelt1": optional_number(header, "CDELT1"),
-        "cdelt2": optional_number(header, "CDELT2"),
+        "unit": optional_text(header, "BUNIT", "PIXLUNIT"),
+        "cdelt1": plate_scale_arcsec(header, 1),
+        "cdelt2": plate_scale_arcsec(header, 2),
         "gain_mode": optional_text(header, "GAINCOMB"),
     }
 
 
-def _lenient(header: Cards, key: str) -> object:
-    """Value of an optional, descriptive card; None if the card is missing or damaged."""
-    try:
-        return header[key]
-    except KeyError:
-        return None
-    except card_trouble():
-        return None
-
-
 def _pair(header: Header, stem: str) -> tuple[int, int] | None:
-    first, second = (_lenient(header, f"{stem}{axis}") for axis in (1, 2))
+    first, second = (lenient_value(header, f"{stem}{axis}") for axis in (1, 2))
     if isinstance(first, int) and isinstance(second, int):
         return int(first), int(second)
     return None
+
+
+def _shape(header: Header) -> tuple[int, int]:
+    z = "Z" if card_flag(header, "ZIMAGE") else ""
+    return card_count(header, f"{z}NAXIS2"), card_count(header, f"{z}NAXIS1")
 
 
 def _summary(header: Header, hdu: int, gzipped: bool) -> HeaderSummary:
@@ -280,7 +283,7 @@ def _summary(header: Header, hdu: int, gzipped: bool) -> HeaderSummary:
     z = "Z" if compressed else ""
     return HeaderSummary(
         hdu=hdu,
-        shape=(card_count(header, f"{z}NAXIS2"), card_count(header, f"{z}NAXIS1")),
+        shape=_shape(header),
         bitpix=card_count(header, f"{z}BITPIX", smallest=-64, largest=64),
         codec=card_text(header, "ZCMPTYPE") if compressed else None,
         gzipped=gzipped,

@@ -1,4 +1,4 @@
-"""Read images from FITS files, and write products of deconvolution.
+"""Write products of deconvolution and other images to FITS files, and read single planes.
 
 In memory, pixels are float64 [y, x] in the byte order of the machine. Files that this module writes hold float32. They
 have the cards CHECKSUM and DATASUM, but no date of writing. Equal content therefore gives equal bytes.
@@ -16,18 +16,15 @@ from astropy.io import fits
 from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
-from psfcore.errors import DataError
 from psfcore.fits.cards import card_trouble
 from psfcore.fits.hdus import ascii_text, read_pixels, write_hdus
-from psfcore.fits.header import FitsLimits, optional_exposure_s, optional_text, read_summary
+from psfcore.fits.header import FitsLimits, read_summary
 from psfcore.fits.product.planes import Meanings, check_plane, plane_hdu
-from psfcore.fits.saturation import card_levels, in_other_unit, per_second
-from psfcore.image import Image, MaskBit
+from psfcore.image import Image
 
 CardValue = str | int | float | bool
 Cards = Mapping[str, tuple[CardValue, str]]
 
-_FULL_SCALES = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 15, 16))
 # Cards that say how the input file stores its pixels, and cards with statistics of these pixels.
 _STORAGE_CARD = re.compile(
     r"SIMPLE|XTENSION|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|EXTEND|GROUPS|INHERIT|EXTNAME|EXTVER|EXTLEVEL|END|"
@@ -39,90 +36,12 @@ _STORAGE_CARD = re.compile(
 )
 
 
-def read_image(path: str | Path, limits: FitsLimits, *, saturation_dn: float | None = None) -> Image:
-    """Read the first 2-D image of a file and mask its unusable pixels.
-
-    saturation_dn: a pixel at or above this level (DN) is saturated. For an image in DN/s, the level is divided by the
-    exposure time. The cards SATURATE and DATASAT, in the unit of the image, also give a level. If several levels are
-    known, the lowest one is used. Raises HeaderError for an unusable header; DataError "unreadable-pixels",
-    "tile-too-large", "no-exposure", "all-nan", "all-saturated", "no-signal", "too-small".
-    """
-    summary = read_summary(path, limits)
-    pixels, header = read_pixels(path, summary)
-    return image_of(pixels, header, saturation_dn=saturation_dn, stored_as_integer=summary.bitpix > 0)
-
-
-def image_of(
-    pixels: NDArray[np.float64],
-    header: fits.Header,
-    *,
-    saturation_dn: float | None = None,
-    stored_as_integer: bool = False,
-) -> Image:
-    """The image of pixels [y, x] and a header, with its unusable pixels masked as in `read_image`.
-
-    stored_as_integer: whether the pixels are the numbers of an A/D converter, without a calibration. Raises DataError
-    "no-exposure", "all-nan", "all-saturated", "no-signal", "too-small", "not-2d".
-    """
-    unit, exposure_s = optional_text(header, "BUNIT"), optional_exposure_s(header)
-    level = _saturation_level(header, unit, exposure_s, saturation_dn)
-    mask = np.where(np.isfinite(pixels), np.uint8(0), np.uint8(MaskBit.NONFINITE))
-    if level is not None:
-        mask[pixels >= level] |= int(MaskBit.SATURATED)  # for NaN the comparison is False
-    image = Image(pixels=pixels, mask=mask, header=header, unit=unit, exposure_s=exposure_s)
-    _check_signal(image, stored_as_integer=stored_as_integer)
-    return image
-
-
 def read_plane(path: str | Path, limits: FitsLimits) -> NDArray[np.float64]:
     """Read the pixels [y, x] of the first 2-D image of a file without checking their values.
 
     Raises HeaderError for an unusable header; DataError "unreadable-pixels", "tile-too-large".
     """
     return read_pixels(path, read_summary(path, limits))[0]
-
-
-def _saturation_level(
-    header: fits.Header, unit: str | None, exposure_s: float | None, saturation_dn: float | None
-) -> float | None:
-    """Lowest saturated value in the unit of the image; None if no level is known."""
-    levels = list(card_levels(header).values())
-    if saturation_dn is not None and not in_other_unit(unit):
-        if not per_second(unit):
-            levels.append(saturation_dn)
-        elif exposure_s is not None:
-            levels.append(saturation_dn / exposure_s)
-        else:
-            wanted = (
-                "expected XPOSURE or EXPTIME in the header, to convert a saturation level from DN to DN/s"
-            )
-            message = f"{wanted}; got neither: add one of them"
-            raise DataError("no-exposure", message)
-    return min(levels, default=None)
-
-
-def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
-    valid = image.pixels[image.valid]
-    if valid.size == 0:
-        finite = image.finite
-        if not finite.any():
-            raise DataError(
-                "all-nan", "expected finite pixels; got only NaN, infinite or BLANK: use another image"
-            )
-        level = image.pixels[finite].min()
-        raise DataError(
-            "all-saturated",
-            f"expected pixels below saturation; all finite pixels are at {level:g} or above: check the level",
-        )
-    smallest, largest = float(valid.min()), float(valid.max())
-    if largest <= 0:
-        raise DataError(
-            "no-signal", f"expected pixels above zero; the largest is {largest:g}: use another image"
-        )
-    if smallest == largest and stored_as_integer and largest in _FULL_SCALES:
-        found = f"all pixels are {largest:g}, the largest value of an A/D converter"
-        message = f"expected pixels below saturation; {found}: use another image"
-        raise DataError("all-saturated", message)
 
 
 def write_image(

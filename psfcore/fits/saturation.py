@@ -1,7 +1,7 @@
 """The level from which pixels are saturated: from the request, the header, the instrument file, or the pixels.
 
-Cards that give a level: SATURATE and DATASAT, in the unit of the image. AIA has no card with the level, but NSATPIX counts
-the saturated pixels of an image. In 26 level 1 images of a flare of 2012-07-19, NSATPIX is the number of pixels above
+Cards that give a level: SATURATE, DSATVAL (SECCHI, LASCO, WISPR, PUNCH) and SAT_THR (SUVI), in the unit of the image. DATASAT
+and NSATPIX count saturated pixels. AIA has no card with the level, but in 26 level 1 images of a flare of 2012-07-19, NSATPIX is the number of pixels above
 15000 DN (in 25 images exactly, in one it is larger by 1), so an AIA image with NSATPIX has this level. A pixel of exactly
 15000 DN counts as saturated here too.
 
@@ -13,8 +13,9 @@ should not exceed m:
 
     P(n) = probability of at least n events of a Poisson distribution with mean m        Eq. (1)
 
-If P is below MASKED_BELOW, the pixels with the largest value are masked as saturated. If it is only below
-DOUBTED_BELOW, they may be saturated, and the image gets a warning. The test does not depend on the unit, because values
+If P is below MASKED_BELOW, the pixels with the largest value are masked as saturated, except if other pixels reach the
+higher level that a card gives.
+If P is only below DOUBTED_BELOW, they may be saturated, and the image gets a warning. The test does not depend on the unit, because values
 that are equal stay equal after a division by the exposure time. If a flat field or an interpolation made the values of
 saturated pixels different from each other, the test cannot find these pixels.
 
@@ -27,7 +28,6 @@ saturated pixels different from each other, the test cannot find these pixels.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -35,8 +35,8 @@ import numpy as np
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
-from psfcore.errors import DataError
-from psfcore.fits.header import optional_number, optional_text
+from psfcore.fits.cards import optional_number, optional_text
+from psfcore.fits.units import parse_unit, per_dn
 from psfcore.image import Image, MaskBit, Saturation
 
 COMPARED = 100
@@ -45,22 +45,8 @@ DOUBTED_BELOW = 1e-3
 AIA_LEVEL_DN = 15000.0
 _BLOCK_ROWS = 256
 REQUEST, INSTRUMENT, PIXELS = "request", "instrument file", "pixels"
-_LEVEL_CARDS = ("SATURATE", "DATASAT")
+_LEVEL_CARDS = ("SATURATE", "DSATVAL", "SAT_THR")
 _SETTING = "set the level with saturation_dn (--saturation)"
-
-
-def per_second(unit: str | None) -> bool:
-    """Whether a unit is DN/s, possibly with spaces, in upper or lower case, or per pixel."""
-    return (unit or "").replace(" ", "").lower() in ("dn/s", "dn/s/pixel", "dn/s/pix")
-
-
-# The units of counts and of count rates. A level in DN cannot be compared with pixels in another unit, such as photons.
-_COUNTS = re.compile(r"(dn|adu|ct|counts?)(/?pix(el)?)?(/s(/pix(el)?)?)?", re.IGNORECASE)
-
-
-def in_other_unit(unit: str | None) -> bool:
-    """Whether a unit is known, and is neither DN nor DN/s (also written as adu or counts, or per pixel)."""
-    return bool(unit and unit.strip()) and _COUNTS.fullmatch((unit or "").replace(" ", "")) is None
 
 
 def card_levels(header: Header) -> dict[str, float]:
@@ -75,10 +61,9 @@ def with_saturation(
     """The image with its saturated pixels masked, and with the record of how they were found.
 
     requested_dn, instrument_dn: the levels in DN of one exposure that the request and the instrument file give. The
-    level of the request replaces the level of the instrument file, as in `psfcore.fits.images.read_image`. If several
-    levels remain, the lowest one is used. If the request gives no level, the pixels are also tested, see Eq. (1). A
-    level in DN cannot be used for an image whose unit is neither DN nor DN/s: if the request gives one, raises
-    DataError "saturation-unit".
+    level of the request replaces the level of the instrument file. If several levels remain, the lowest one is used. If
+    the request gives no level, the pixels are also tested, see Eq. (1). Raises DataError "saturation-unit" if the request
+    gives a level and the unit of the image is neither counts nor a rate of counts, and "no-exposure".
     """
     known = _levels(image, requested_dn, instrument_dn)
     found = min(known, key=lambda key: known[key], default=None)
@@ -89,7 +74,8 @@ def with_saturation(
         warning = _missing_from(image, mask)
     if requested_dn is None:
         top, count, chance = largest_value(image.pixels, mask == 0)
-        if chance < MASKED_BELOW:
+        confirmed = found in _LEVEL_CARDS and bool(np.any(mask & MaskBit.SATURATED.value))
+        if chance < MASKED_BELOW and not confirmed:
             if found is not None:
                 warning = (
                     f"{count} pixels have the value {top:g}, the largest below the saturation level {level:g} "
@@ -132,13 +118,16 @@ def _brightest_below(
     pixels: NDArray[np.float64], valid: NDArray[np.bool_], top: float
 ) -> NDArray[np.float64]:
     """The COMPARED largest valid values below `top`. Rows are read in blocks, so that large images need no copy."""
-    found = np.empty(0)
+    brightest, least = np.empty(0), -np.inf
     for first in range(0, pixels.shape[0], _BLOCK_ROWS):
         rows = slice(first, first + _BLOCK_ROWS)
-        found = np.concatenate([found, pixels[rows][valid[rows] & (pixels[rows] < top)]])
-        if found.size > COMPARED:
-            found = np.partition(found, found.size - COMPARED)[-COMPARED:]
-    return found
+        block = pixels[rows]
+        chosen = valid[rows] & (block < top) & (block >= least)
+        brightest = np.concatenate([brightest, block[chosen]])
+        if brightest.size > COMPARED:
+            brightest = np.partition(brightest, brightest.size - COMPARED)[-COMPARED:]
+            least = float(brightest.min())  # few pixels of the later blocks are above it
+    return brightest
 
 
 def _levels(image: Image, requested_dn: float | None, instrument_dn: float | None) -> Mapping[str, float]:
@@ -147,18 +136,13 @@ def _levels(image: Image, requested_dn: float | None, instrument_dn: float | Non
     in_dn = {REQUEST: requested_dn}
     if requested_dn is None:
         in_dn = {INSTRUMENT: instrument_dn, "NSATPIX": _aia_level_dn(image.header)}
-    rate = per_second(image.unit)
-    if in_other_unit(image.unit):
-        if requested_dn is not None:
-            raise DataError(
-                "saturation-unit",
-                f"expected an image in DN or DN/s, because the saturation level is in DN; got an image in {image.unit:.30}: "
-                "leave the level out, or use the image in DN",
-            )
-        return levels
-    for source, level_dn in in_dn.items():
-        if level_dn is not None and not (rate and image.exposure_s is None):
-            levels[source] = level_dn / image.exposure_s if rate and image.exposure_s else level_dn
+    unit = parse_unit(image.unit)
+    if requested_dn is not None:
+        scale = per_dn(unit, image.exposure_s, "because the saturation level is in DN")
+    else:
+        scale = unit.dn_per_unit(image.exposure_s) or 0.0
+    if scale > 0:
+        levels |= {source: level / scale for source, level in in_dn.items() if level is not None}
     return levels
 
 

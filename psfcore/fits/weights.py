@@ -16,7 +16,14 @@ from pathlib import Path
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits, Source, enter_data, open_source
 from psfcore.fits.header import PRODUCT, PSF, HeaderSummary, optional_number
-from psfcore.weight_rules import REACH_GRID_PX, check_finite, check_weights, is_peak
+from psfcore.weight_rules import (
+    REACH_GRID_PX,
+    check_core,
+    check_finite,
+    check_weights,
+    core_offset_px,
+    is_peak,
+)
 
 _TYPES = {8: "B", 16: "h", 32: "i", 64: "q", -32: "f", -64: "d"}
 
@@ -25,7 +32,7 @@ def check_is_psf(path: str | os.PathLike[str], summary: HeaderSummary, limits: F
     """Raise DataError if a file is certainly not a PSF.
 
     summary: the summary of the file's header. Codes: "image-as-psf" for a product, or for a compressed image with an
-    exposure time; "psf-nonfinite", "psf-negative", "psf-sum", "psf-not-centred" for weights that no PSF can have; and the
+    exposure time; "psf-nonfinite", "psf-negative", "psf-sum", "psf-not-centred", "psf-off-centre" for weights that no PSF can have; and the
     codes of HeaderError.
     """
     if summary.content == PRODUCT:
@@ -47,6 +54,7 @@ def _check_pixels(path: Path, summary: HeaderSummary, limits: FitsLimits) -> Non
     ny, nx = summary.shape
     rows, columns = _reach(ny), _reach(nx)
     smallest, largest, total, anywhere, centre = math.inf, -math.inf, 0.0, 0.0, 0.0
+    core: list[list[float]] = []
     with open_source(path, limits) as source:
         header = enter_data(source, summary.hdu, limits)
         for row, stored in enumerate(_rows(source, summary)):
@@ -56,6 +64,8 @@ def _check_pixels(path: Path, summary: HeaderSummary, limits: FitsLimits) -> Non
                 total += sum(stored[columns.start : columns.stop])
             if row == ny // 2:
                 centre = stored[nx // 2]
+            if abs(row - ny // 2) <= 1 and nx >= 3:
+                core.append(list(stored[nx // 2 - 1 : nx // 2 + 2]))
     check_finite(anywhere)
     # Stored numbers become weights by BSCALE and BZERO (FITS standard 4.0, Eq. 3).
     scale = optional_number(header, "BSCALE")
@@ -69,6 +79,12 @@ def _check_pixels(path: Path, summary: HeaderSummary, limits: FitsLimits) -> Non
             "psf-not-centred",
             f"expected the largest weight, {largest:.3g}, at [y, x] = {(ny // 2, nx // 2)}; got {centre:.3g} there: "
             "shift the PSF so that its peak is in this pixel",
+        )
+    if len(core) == 3:
+        weights = [[scale * value + zero for value in line] for line in core]
+        check_core(
+            core_offset_px(*(sum(column) for column in zip(*weights, strict=True))),
+            core_offset_px(*(sum(line) for line in weights)),
         )
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from psfcore.drawing.units import rate_label, unit_label
 from psfcore.errors import DataError
+from psfcore.fits.units import parse_unit
 from psfcore.flare.arm_profile import BOX_PX, FlareComparison, compare_on_flare, flare_centre
 from psfcore.flare.arms import measure_arms
 from psfcore.image import Image
@@ -99,8 +100,9 @@ def _same_unit(flaring: Image, before: Image) -> tuple[Plane, Plane, str]:
 
 def _rate(image: Image) -> Plane | None:
     """Pixels in DN/s; None if the exposure time is unknown."""
-    if (image.unit or "").replace(" ", "").lower() == "dn/s":
-        return image.pixels
+    unit = parse_unit(image.unit)
+    if unit.kind == "rate":
+        return image.pixels * unit.scale
     return None if image.exposure_s is None else image.pixels / image.exposure_s
 
 

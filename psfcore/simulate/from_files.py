@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from psfcore.build import build_psf
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.images import read_image, read_plane
+from psfcore.fits.images import read_plane
+from psfcore.fits.observation import read_observation
+from psfcore.fits.units import parse_unit
 from psfcore.instruments.model import load_instrument
 from psfcore.simulate.plan import WEST, Plan
 from psfcore.simulate.pointings import scene_from_image
@@ -56,8 +58,8 @@ def scenes_from_files(files: Sequence[Path], plan: Plan, limits: FitsLimits) -> 
 
 
 def image_rate(file: str | Path, limits: FitsLimits) -> Plane:
-    """Pixels [y, x] of an image. They are divided by the exposure time if their unit is DN and that time is known."""
-    image = read_image(file, limits)
-    if (image.unit or "").replace(" ", "").lower() == "dn" and image.exposure_s is not None:
+    """Pixels [y, x] of an image. They are divided by the exposure time if they are counts and that time is known."""
+    image = read_observation(file, limits)
+    if parse_unit(image.unit).kind == "count" and image.exposure_s is not None:
         return image.pixels / image.exposure_s
     return image.pixels

@@ -10,18 +10,15 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from astropy.io.fits import Header
 
 from psfcore.errors import DataError, together
-from psfcore.fits.gain import saturation_for
 from psfcore.fits.header import FitsLimits, HeaderSummary, plate_scale_arcsec, read_summary
-from psfcore.fits.images import read_image, read_plane
-from psfcore.instruments.files import instrument_names
-from psfcore.instruments.model import Instrument, load_instrument
+from psfcore.fits.images import read_plane
+from psfcore.fits.observation import read_observation
+from psfcore.fits.times import instant
 from psfcore.noise import Noise
 from psfcore.psf import CENTRE_TOLERANCE
 from psfcore.transit.manifest import MANIFEST_NAME, ImageEntry, TransitManifest, read_manifest
@@ -70,13 +67,13 @@ def read_prepared(
 
     progress(done, of) is called after each image. diffraction: weights [y, x], or a function of (name of the instrument
     or None, shape of the images) that returns them; used if transit.json has no known_psf. noise: replaces the noise
-    figures of transit.json. saturation_dn: saturation level of one exposure in DN, used in addition to the levels in the
-    headers; default: the instrument's level for the gain mode of the image, if it is known. Times come from DATE-BEG or
+    figures of transit.json. saturation_dn: saturation level of one exposure in DN; default: as in
+    `psfcore.fits.observation.read_observation`. Times come from DATE-BEG or
     DATE-OBS. If one image has neither, all images keep the order of transit.json, with one second between them.
 
     Raises DataError: "no-manifest", "bad-manifest", "missing-file", "transit-shapes", "occulter-outside",
     "occulter-too-large", "no-noise-figures", "no-known-psf", "known-psf-..." (see ``checked_kernel``), the errors of
-    ``read_image`` with the name of the file, and the errors of ``prepare``. Raises HeaderError for faults of a header. If
+    ``read_observation`` with the name of the file, and the errors of ``prepare``. Raises HeaderError for faults of a header. If
     several images have faults, one error names all of them.
     """
     folder = Path(folder)
@@ -88,7 +85,7 @@ def read_prepared(
     instrument = manifest.instrument or next((h.instrument for h in headers if h.instrument), None)
     known = _known_psf(folder, manifest, limits, diffraction, instrument, headers[0].shape)
     looks = [
-        _Look(entry, time_s, header, _level_dn(header, saturation_dn))
+        _Look(entry, time_s, header, saturation_dn)
         for entry, time_s, header in zip(manifest.images, times_s(headers), headers, strict=True)
     ]
     looks.sort(key=lambda look: look.time_s)  # stable: equal times stay in the order of transit.json
@@ -136,7 +133,7 @@ def _read(folder: Path, look: _Look, limits: FitsLimits) -> tuple[Exposure, floa
     """One exposure, and its plate scale in arcsec/px."""
     entry = look.entry
     with _naming(entry.file):
-        image = read_image(folder / entry.file, limits, saturation_dn=look.saturation_dn)
+        image = read_observation(folder / entry.file, limits, saturation_dn=look.saturation_dn)
     exposure = exposure_of(
         image,
         file=entry.file,
@@ -214,35 +211,12 @@ def _check_frame(
 
 def times_s(headers: Sequence[HeaderSummary]) -> list[float]:
     """Start of each image in seconds after the first image; if one image has no readable date, the index of each image."""
-    starts = [_instant(header.date_obs) for header in headers]
+    starts = [None if header.date_obs is None else instant(header.date_obs) for header in headers]
     known = [start for start in starts if start is not None]
     if len(known) < len(starts):
         return [float(index) for index in range(len(headers))]
     first = min(known)
     return [(start - first).total_seconds() for start in known]
-
-
-def _instant(text: str | None) -> datetime | None:
-    """The instant of a date in a header. A date without a time zone is in UTC. None if the date cannot be read."""
-    if text is None:
-        return None
-    try:
-        instant = datetime.fromisoformat(text)
-    except ValueError:
-        return None
-    return instant if instant.tzinfo is not None else instant.replace(tzinfo=UTC)
-
-
-def _level_dn(header: HeaderSummary, saturation_dn: float | None) -> float | None:
-    """The saturation level of one exposure in DN: the given level, or the instrument's level for the image's gain mode."""
-    if saturation_dn is not None or header.gain_mode is None or header.instrument not in instrument_names():
-        return saturation_dn
-    return saturation_for(_instrument(header.instrument), Header({"GAINCOMB": header.gain_mode}))
-
-
-def _instrument(name: str | None) -> Instrument:
-    assert name is not None
-    return load_instrument(name)
 
 
 def _sha256(path: Path) -> str:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from psfcore.errors import DataError
+from psfcore.fits.units import parse_unit
 from psfcore.image import Image, MaskBit
 from psfcore.transit.transit import Frame, PixelMask, Pixels, Place
 
@@ -95,8 +96,8 @@ def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
 
     Raises DataError "no-exposure", and "unknown-unit" if BUNIT is neither DN nor DN/s.
     """
-    unit = (image.unit or "").replace(" ", "").lower()
-    if unit not in ("dn", "dn/s"):
+    unit = parse_unit(image.unit)
+    if unit.kind not in ("count", "rate"):
         raise DataError(
             "unknown-unit",
             f"{file}: expected BUNIT 'DN' or 'DN/s'; got {image.unit!r:.40}: convert the image, or correct BUNIT",
@@ -106,7 +107,7 @@ def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
             "no-exposure",
             f"{file}: expected XPOSURE or EXPTIME above 0 s in the header; got neither: add one of these keywords",
         )
-    rate = image.pixels if unit == "dn/s" else image.pixels / image.exposure_s
+    rate = image.pixels * unit.scale / (1.0 if unit.kind == "rate" else image.exposure_s)
     with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite and so a gap
         return rate.astype(np.float32), image.exposure_s
 

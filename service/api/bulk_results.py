@@ -135,21 +135,27 @@ def get_results(
     limit: Annotated[
         int | None, Query(ge=1, le=1_000_000, description="number of images; default: all")
     ] = None,
+    warning: Annotated[
+        str | None,
+        Query(max_length=40, description="only images with this warning, by its code, for example `frame`"),
+    ] = None,
 ) -> Response:
     """All images that are done so far, streamed from the database."""
     row = find(state, caller, bulk_id)
-    rows = _in_order(state.catalogue.bulks.progress, row.id, order, limit)
+    rows = _in_order(state.catalogue.bulks.progress, row.id, order, limit, warning)
     headers = {"Content-Disposition": f'attachment; filename="bulk-{bulk_id[:12]}.{format}"'}
     lines, media_type = (_table(rows), CSV) if format == "csv" else (_json_lines(rows), NDJSON)
     return StreamingResponse(lines, media_type=media_type, headers=headers)
 
 
-def _in_order(progress: BulkProgress, bulk_id: str, order: str, limit: int | None) -> Iterator[list[Result]]:
-    """Results in batches; each batch is one query."""
+def _in_order(
+    progress: BulkProgress, bulk_id: str, order: str, limit: int | None, warning: str | None
+) -> Iterator[list[Result]]:
+    """Results in batches; each batch is one query. warning: see `get_results`."""
     left = limit
     after, behind = -1, None
     while left is None or left > 0:
-        size = BATCH if left is None else min(BATCH, left)
+        size = BATCH if left is None or warning is not None else min(BATCH, left)
         if order == "worst":
             batch = progress.worst(bulk_id, after=behind, limit=size)
         else:
@@ -158,8 +164,10 @@ def _in_order(progress: BulkProgress, bulk_id: str, order: str, limit: int | Non
             return
         after = batch[-1].position
         behind = (float(batch[-1].score or 0.0), after)
-        yield [Result.of(row) for row in batch]
-        left = None if left is None else left - len(batch)
+        results = [Result.of(row) for row in batch]
+        results = [one for one in results if warning is None or warning in one.warnings][:left]
+        yield results
+        left = None if left is None else left - len(results)
 
 
 def _json_lines(batches: Iterator[list[Result]]) -> Iterator[str]:

@@ -71,6 +71,16 @@ def _region(context: click.Context, parameter: click.Parameter, text: str | None
     help="Assumed scene outside the image [default: depends on the method]",
 )
 @click.option(
+    "--hdu", type=click.IntRange(0), metavar="N", help="HDU of the image [default: first]"
+)
+@click.option(
+    "--plate-scale",
+    "plate_scale_arcsec",
+    type=click.FloatRange(0, min_open=True),
+    metavar="ARCSEC",
+    help="Plate scale of a PSF without one",
+)
+@click.option(
     "--region",
     metavar="X0:X1,Y0:Y1",
     callback=_region,
@@ -109,6 +119,8 @@ def deconvolve(
     steps: int | None,
     stop: str | None,
     edges: str | None,
+    hdu: int | None,
+    plate_scale_arcsec: float | None,
     region: str | None,
     region_error: float | None,
     noise: tuple[float, float] | None,
@@ -140,6 +152,8 @@ def deconvolve(
         "steps": steps,
         "stop": stop,
         "edges": edges,
+        "hdu": hdu,
+        "plate_scale_arcsec": plate_scale_arcsec,
         "region": region,
         "region_error": region_error,
         "other_channel": other_channel,

@@ -121,19 +121,24 @@ def arms(
     overwrite: bool,
 ) -> None:
     """Measure the diffraction arms around a flare in IMAGE (FITS): their angles, and the spacing of their peaks."""
+    import numpy as np
+
     from psfcore.drawing.units import unit_label
-    from psfcore.fits.images import read_image
+    from psfcore.fits.observation import read_observation
     from psfcore.flare.arms import measure_arms
     from psfcore.flare.arms_plot import arms_png
 
     with user_errors():
-        flare = read_image(image, limits(), saturation_dn=saturation_dn)
-        reference = None if background is None else read_image(background, limits()).pixels
+        flare = read_observation(image, limits(), saturation_dn=saturation_dn)
+        saturated, reference = ~flare.valid, None
+        if background is not None:
+            before = read_observation(background, limits(), saturation_dn=saturation_dn)
+            reference = np.where(before.valid, before.pixels, np.nan)
         found = measure_arms(
             flare.pixels,
             centre,
             reference=reference,
-            saturated=~flare.valid,
+            saturated=saturated,
             n_arms=n_arms,
         )
         if plot is not None:

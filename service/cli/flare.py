@@ -66,7 +66,7 @@ def flare(
     overwrite: bool,
 ) -> None:
     """Simulate the stray light of the flare in IMAGE with a PSF, and compare it along a diffraction arm."""
-    from psfcore.fits.images import read_image
+    from psfcore.fits.observation import read_observation
     from psfcore.fits.psfs import read_psf
     from psfcore.flare.arm_profile_plot import flare_png
     from psfcore.flare.judge import judge_on_flare, summary_lines
@@ -76,8 +76,8 @@ def flare(
         with psf_file(server, psf) as file:
             tested = read_psf(file, limits())
         found = judge_on_flare(
-            read_image(image, limits(), saturation_dn=saturation_dn),
-            read_image(background, limits(), saturation_dn=saturation_dn),
+            read_observation(image, limits(), saturation_dn=saturation_dn),
+            read_observation(background, limits(), saturation_dn=saturation_dn),
             tested,
             centre_xy=None if centre is None else (round(centre[0]), round(centre[1])),
             arm_deg=arm_deg,

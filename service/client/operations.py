@@ -111,6 +111,8 @@ class Operations(ABC):
         context: str | None = None,
         other_channel: bool = False,
         again: bool = False,
+        hdu: int | None = None,
+        plate_scale_arcsec: float | None = None,
         region: str | None = None,
         region_error: float | None = None,
         overwrite: bool = False,
@@ -123,7 +125,8 @@ class Operations(ABC):
         realisations for an ERROR plane, 0 or at least 2. preview, changes: where to write the picture of the image
         before and after, and the picture of difference, ratio and histograms (PNG). other_channel: whether the PSF may be of
         another telescope, channel or filter than the image. again: deconvolve the file even if its header says that it is a
-        product or a PSF. region: deconvolve only this box, "x0:x1,y0:y1" in pixels from 0; region_error: largest bound of
+        product or a PSF. hdu: number of the HDU with the image (default: the first image). plate_scale_arcsec: plate scale of a PSF
+        whose file gives none, arcsec/px. region: deconvolve only this box, "x0:x1,y0:y1" in pixels from 0; region_error: largest bound of
         its error, as a share of its mean light (default 0.05). ``details["warnings"]`` of the product says what may be wrong with it. method_parameters: for example
         ``steps=20``, ``stop="discrepancy"``, ``edges="zero"``.
         """
@@ -139,6 +142,8 @@ class Operations(ABC):
             context=context,
             other_channel=other_channel,
             again=again,
+            hdu=hdu,
+            plate_scale_arcsec=plate_scale_arcsec,
             region=region,
             region_error=region_error,
             **method_parameters,
@@ -351,6 +356,8 @@ def deconvolution(
     context: str | None = None,
     other_channel: bool = False,
     again: bool = False,
+    hdu: int | None = None,
+    plate_scale_arcsec: float | None = None,
     region: str | None = None,
     region_error: float | None = None,
     **method_parameters: Any,
@@ -366,6 +373,7 @@ def deconvolution(
         **({} if context is None else {"context": context}),
         **({"other_channel": True} if other_channel else {}),
         **({"again": True} if again else {}),
+        **_given({"hdu": hdu, "plate_scale_arcsec": plate_scale_arcsec}),
         **_given({"region": region, "region_error": region_error}),
         **_noise(noise),
     }

@@ -21,7 +21,8 @@ from psfcore import build
 from psfcore.diffraction import combined, fraunhofer
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, read_summary
-from psfcore.fits.images import read_image, write_image
+from psfcore.fits.images import write_image
+from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
@@ -47,12 +48,12 @@ def read_an_image(content: bytes, folder: Path) -> str:
     images = []
     for filling in (0x11, 0x77):
         ctypes.CDLL(None).mallopt(_M_PERTURB, filling)
-        images.append(read_image(path, LIMITS))
+        images.append(read_observation(path, LIMITS))
     image = images[0]
     assert np.array_equal(image.pixels, images[1].pixels, equal_nan=True), "pixels hold memory of the process"
     cards = {"PSFNAME": (summary.psf_name or "none", "name of the PSF")}
     write_image(product, image, cards=cards, history=[f"from {summary.instrume}"])
-    assert read_image(product, LIMITS).pixels.shape == summary.shape
+    assert read_observation(product, LIMITS).pixels.shape == summary.shape
     if summary.psf_name is not None:
         read_psf(path, LIMITS)
     return "result"

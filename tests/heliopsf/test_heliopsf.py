@@ -24,7 +24,7 @@ import heliopsf
 from heliopsf.psfs import LIMITS
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
-from psfcore.fits.images import read_image
+from psfcore.fits.observation import read_observation
 from psfcore.gap import diagnose
 from psfcore.known_diffraction import known_diffraction
 from psfcore.scatter import fit as fit_module
@@ -87,7 +87,7 @@ def test_an_image_is_deconvolved_as_the_core_does(tmp_path: Path) -> None:
     steps: list[tuple[int, int]] = []
     paths = tmp_path / "image.fits", tmp_path / "psf.fits"
     result = heliopsf.deconvolve(*paths, steps=3, progress=lambda step, of: steps.append((step, of)))
-    psf, image = heliopsf.read_psf(paths[1]), read_image(paths[0], LIMITS)
+    psf, image = heliopsf.read_psf(paths[1]), read_observation(paths[0], LIMITS)
     again = heliopsf.deconvolve(image, psf, steps=3)
     np.testing.assert_array_equal(result.pixels, again.pixels)
     core = method_named("richardson-lucy")(image, psf, Conditions(), steps=3)

@@ -69,6 +69,7 @@ def product_identity(request: ResolvedDeconvolve) -> str:
     )
     if request.region is None:
         excluded |= {"region", "region_error"}
+    excluded |= {name for name in ("hdu", "plate_scale_arcsec") if getattr(request, name) is None}
     if not request.other_channel:
         excluded.add("other_channel")
     hashed = request.model_dump(mode="json", exclude=excluded)

@@ -135,6 +135,15 @@ class Deconvolve(Treatment):
         False, description="also draw the difference, the ratio and the histogram of the changes"
     )
 
+    hdu: int | None = Field(
+        None, ge=0, le=999, description="number of the HDU with the image; null: the first image of the file"
+    )
+    plate_scale_arcsec: float | None = Field(
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="plate scale of a PSF whose file gives none, arcsec/px; null: the scales are then not compared",
+    )
     region: str | None = Field(
         None,
         pattern=BOX,

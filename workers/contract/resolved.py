@@ -37,6 +37,8 @@ class ResolvedDeconvolve(Parameters):
     saturation_dn: float | None = None
     error_draws: int = 0
     changes_picture: bool = False
+    hdu: int | None = None
+    plate_scale_arcsec: float | None = None
     region: str | None = None
     region_error: float = LARGEST_ERROR
     other_channel: bool = False

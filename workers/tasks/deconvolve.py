@@ -15,8 +15,7 @@ from psfcore.deconvolve.region import BoxWork, box_work
 from psfcore.deconvolve.whole import Work, input_warnings
 from psfcore.errors import DataError
 from psfcore.fits.gain import no_noise_figures
-from psfcore.fits.header import check_not_deconvolved, content_of
-from psfcore.fits.observation import read_observation
+from psfcore.fits.observation import check_exposure_of_sun, read_observation
 from psfcore.fits.psfs import read_psf
 from psfcore.image import Image
 from psfcore.noise import Noise
@@ -70,10 +69,10 @@ def _load_upload(context: Context, request: ResolvedDeconvolve) -> Image:
 def load(context: Context, request: ResolvedDeconvolve, path: Path) -> Image:
     """Read an image file and mask its saturated pixels."""
     context.report("reading", 0, request.method.steps)
-    image = read_observation(path, context.limits, saturation_dn=request.saturation_dn)
+    image = read_observation(path, context.limits, saturation_dn=request.saturation_dn, hdu=request.hdu)
     # A rerun repeats an earlier deconvolution, even if it was made by a version that did not check this.
     if not (request.again or context.anew):
-        check_not_deconvolved(content_of(image.header))
+        check_exposure_of_sun(image.header)
     return image
 
 
@@ -102,7 +101,13 @@ class _Asked:
         """The PSF on the image's pixels."""
         digest = self.inputs.psf_row.file_sha256
         find = partial(self.context.store.verified, digest)
-        return self.prepared.on_pixels_of(self.inputs.image.header, digest, find, self.context.limits)
+        return self.prepared.on_pixels_of(
+            self.inputs.image.header,
+            digest,
+            find,
+            self.context.limits,
+            plate_scale_arcsec=self.request.plate_scale_arcsec,
+        )
 
     @property
     def prepared(self) -> PreparedPsfs:
@@ -119,7 +124,7 @@ class _Asked:
         allowed = self.request.other_channel or self.context.anew
         warning = deprecated_warning(self.context.catalogue, row)
         found = {} if warning is None else {CODE: warning}
-        found |= input_warnings(psf, self.inputs.image, other_channel=allowed)
+        found |= input_warnings(psf, self.inputs.image, self.request.method.name, other_channel=allowed)
         return [Warned(code, message) for code, message in found.items()]
 
     @cached_property

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.images import read_image
+from psfcore.fits.images import read_plane
 from psfcore.fits.psfs import write_psf
 from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.psf import Psf
@@ -147,4 +147,4 @@ def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> N
             f"mask_id: expected the id of the mask image {named.file}, which mount.mask_image names; got none: upload the "
             "file and give its id",
         )
-    return read_image(context.store.verified(build.mask_id), context.limits).pixels
+    return read_plane(context.store.verified(build.mask_id), context.limits)

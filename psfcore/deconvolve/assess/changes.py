@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.artefacts import Artefacts, NoiseAt, find_artefacts
 from psfcore.errors import DataError
+from psfcore.fits.units import dn_per_unit
 from psfcore.image import Image
-from psfcore.noise import Noise, dn_per_unit
+from psfcore.noise import Noise
 from psfcore.psf import Psf
 
 BLOCKS_PX = (1, 4, 8, 16, 32)
@@ -64,16 +65,16 @@ class Structure:
 class Range:
     """Dynamic range, Eq. (2), and contrast of block means, before and after deconvolution.
 
-    Contrast is the standard deviation divided by the mean. A dynamic range is None if the lower percentile is not above
-    zero.
+    Contrast is the standard deviation divided by the mean. It is None if the mean is not above zero, and a dynamic range is
+    None if the lower percentile is not.
     """
 
     block_px: int
     tail_pct: float
     dynamic_before: float | None
     dynamic_after: float | None
-    contrast_before: float
-    contrast_after: float
+    contrast_before: float | None
+    contrast_after: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +127,9 @@ def measure_changes(
         raise DataError("field-shape", f"expected a result of {image.pixels.shape}; got {result.shape}")
     counted = counted_pixels(image, result, edge_px)
     before, after = image.pixels[counted], result[counted]
-    if before.size == 0 or before.sum() <= 0:
+    if before.size == 0:
         raise DataError(
-            "no-signal",
-            "expected trusted pixels with light outside the edge band; got none: use a larger image",
+            "no-signal", "expected trusted pixels outside the edge band; got none: use a larger image"
         )
     sigma = None if noise is None else _noise_at(image, noise)
     centre = (psf.kernel.shape[0] // 2, psf.kernel.shape[1] // 2)
@@ -147,11 +147,11 @@ def measure_changes(
         ]
         structures = tuple(row for part in blocks for row in _structures(part))
         ranges = tuple(row for part in blocks for row in _ranges(part))
-        change_pct, difference = _percentiles(change), _percentiles(after - before)
+        change_pct, difference = _percentiles(change) if change.size else {}, _percentiles(after - before)
     return Changes(
         pixels=int(before.size),
         edge_px=edge_px,
-        flux_change_pct=float(_change_pct(before.sum(), after.sum())),
+        flux_change_pct=float(100 * (after.sum() - before.sum()) / (abs(before.sum()) or 1.0)),
         change_pct=change_pct,
         difference=difference,
         not_positive_before=int(np.count_nonzero(~positive)),
@@ -281,8 +281,9 @@ def _dynamic_range(low: float, high: float) -> float | None:
     return float(high / low) if low > 0 else None  # Eq. (2)
 
 
-def _contrast(means: Plane) -> float:
-    return float(means.std() / means.mean())
+def _contrast(means: Plane) -> float | None:
+    mean = float(means.mean())
+    return float(means.std()) / mean if mean > 0 else None
 
 
 def _percentiles(values: Plane) -> dict[str, float]:

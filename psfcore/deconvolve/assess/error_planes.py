@@ -49,8 +49,9 @@ from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.engine import Engine
 from psfcore.errors import DataError
+from psfcore.fits.units import dn_per_unit
 from psfcore.image import Image
-from psfcore.noise import Noise, dn_per_unit
+from psfcore.noise import Noise
 from psfcore.psf import Psf
 
 WINDOW_PX = 2.0

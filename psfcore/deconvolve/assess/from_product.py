@@ -18,7 +18,7 @@ from psfcore.deconvolve.assess.contact_sheet import THUMBNAIL_PX, Treated
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.drawing.plots import binned
 from psfcore.fits.header import FitsLimits, optional_text
-from psfcore.fits.images import read_image
+from psfcore.fits.observation import read_observation
 from psfcore.fits.product.planes import read_planes
 
 DATE_KEYS = ("DATE-BEG", "DATE-OBS", "T_OBS")
@@ -30,9 +30,9 @@ def changes_in_product(
     """Make the row of one image. ``before``, ``product``: the FITS files of the image and of its product.
 
     details: the product's details, with "changes", "steps_done" and "stopped_because". Raises the errors of
-    ``read_image``.
+    ``read_observation``.
     """
-    image, after = read_image(before, limits), read_image(product, limits)
+    image, after = read_observation(before, limits), read_observation(product, limits)
     suspected = (read_planes(product)["QUALITY"] & QualityBit.ARTEFACT) > 0
     step = max(1, -(-max(image.pixels.shape) // THUMBNAIL_PX))
     return Treated(

@@ -15,7 +15,7 @@ Plane = NDArray[np.float64]
 
 
 class QualityBit(IntFlag):
-    """Bits of the quality plane; a pixel without a bit is good. The first two are the bits of `psfcore.image.MaskBit`.
+    """Bits of the quality plane; a pixel without a bit is good. The bits of `psfcore.image.MaskBit` have the same values.
 
     A negative pixel has no bit. Noise makes some dark pixels negative, and a mean over the other pixels only would be
     too large. Products of earlier versions mark negative pixels with the value 16, which has no meaning now.
@@ -27,6 +27,7 @@ class QualityBit(IntFlag):
     EDGE = 8
     ARTEFACT = 32
     NO_ERROR = 64
+    LOST = 128
 
 
 # What the bits mean, for the header of the plane. A comment of a FITS card has room for about 36 characters here.
@@ -37,6 +38,7 @@ MEANINGS: dict[IntFlag, str] = {
     QualityBit.EDGE: "depends on light beyond the edges",
     QualityBit.ARTEFACT: "sign of an artefact",
     QualityBit.NO_ERROR: "no value in the plane ERROR",
+    QualityBit.LOST: "lost on the way, no result",
 }
 
 
@@ -57,6 +59,7 @@ def quality_plane(
     for mask_bit, bit in (
         (MaskBit.NONFINITE, QualityBit.NONFINITE),
         (MaskBit.SATURATED, QualityBit.SATURATED),
+        (MaskBit.LOST, QualityBit.LOST),
     ):
         plane[(image.mask & mask_bit) != 0] |= np.uint8(bit)
     if not image.valid.all():

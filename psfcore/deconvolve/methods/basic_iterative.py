@@ -62,7 +62,6 @@ def deconvolve(
         ended,
         method=METHOD,
         last_change=iteration.change,
-        negatives_count=True,
         noise_amplification=noise_amplification(sample, np.ones_like(sample.values), ended.steps_done),
     )
 

@@ -61,7 +61,6 @@ def deconvolve(
         ended,
         method=METHOD,
         last_change=iteration.change,
-        negatives_count=True,
         noise_amplification=noise_amplification(sample, g, ended.steps_done),
     )
 

@@ -70,7 +70,6 @@ def deconvolve(
         ended,
         method=METHOD,
         last_change=iteration.change,
-        negatives_count=False,
     )
 
 

@@ -63,7 +63,6 @@ def deconvolve(
         ended,
         method=METHOD,
         last_change=iteration.change,
-        negatives_count=False,
     )
 
 

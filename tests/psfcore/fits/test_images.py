@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, read_summary
-from psfcore.fits.images import read_image, write_image
+from psfcore.fits.images import write_image
+from psfcore.fits.observation import read_observation
 from psfcore.image import Image, MaskBit
 from psfcore.simulate.observe import demo_image
 from tests.psfcore.conftest import gaussian, make_psf
@@ -48,12 +49,12 @@ def test_any_storage_becomes_native_float64(tmp_path: Path, limits: FitsLimits) 
     for dtype in (">u1", ">i2", ">i4", ">f4", ">f8", ">u2"):
         data = (ramp() % 200).astype(dtype)
         path = save(tmp_path / f"{dtype[1:]}.fits", data, BUNIT="DN", EXPTIME=2.0)
-        image = read_image(path, limits)
+        image = read_observation(path, limits)
         assert image.pixels.dtype == np.dtype("=f8")
         np.testing.assert_array_equal(image.pixels, ramp() % 200)
         assert (image.unit, image.exposure_s) == ("DN", 2.0) and image.valid.all()
     path.write_bytes(gzip.compress(path.read_bytes()))
-    np.testing.assert_array_equal(read_image(path, limits).pixels, ramp() % 200)
+    np.testing.assert_array_equal(read_observation(path, limits).pixels, ramp() % 200)
 
 
 def test_blank_is_masked_in_plain_and_compressed_integers(tmp_path: Path, limits: FitsLimits) -> None:
@@ -64,7 +65,7 @@ def test_blank_is_masked_in_plain_and_compressed_integers(tmp_path: Path, limits
         hdu = fits.CompImageHDU(data, fits.Header({"BLANK": -32768}), compression_type=codec)
         fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / f"{codec}.fits")
     for name in ("plain", "RICE_1", "GZIP_1", "GZIP_2"):
-        image = read_image(tmp_path / f"{name}.fits", limits)
+        image = read_observation(tmp_path / f"{name}.fits", limits)
         assert np.argwhere(~image.valid).tolist() == [[3, 4]], name
         assert image.mask[3, 4] == MaskBit.NONFINITE
         np.testing.assert_array_equal(image.pixels[image.valid], ramp()[image.valid])
@@ -75,7 +76,7 @@ def test_blank_is_masked_in_unsigned_images_too(tmp_path: Path, limits: FitsLimi
     stored[3, 4] = -32768
     cards = image_cards(32, 32, 16, "BZERO   = 32768", "BSCALE  = 1", "BLANK   = -32768")
     (tmp_path / "unsigned.fits").write_bytes(block(*cards, data=stored.tobytes()))
-    image = read_image(tmp_path / "unsigned.fits", limits)
+    image = read_observation(tmp_path / "unsigned.fits", limits)
     assert image.mask[3, 4] == MaskBit.NONFINITE and np.isnan(image.pixels[3, 4])
     assert image.pixels[0, 5] == 32773 and np.count_nonzero(image.mask) == 1
 
@@ -83,7 +84,7 @@ def test_blank_is_masked_in_unsigned_images_too(tmp_path: Path, limits: FitsLimi
 def test_nan_is_masked_and_negative_is_data(tmp_path: Path, limits: FitsLimits) -> None:
     data = ramp()
     data[0, 0], data[1, 1], data[2, 2] = np.nan, -5.0, np.inf
-    image = read_image(save(tmp_path / "n.fits", data), limits)
+    image = read_observation(save(tmp_path / "n.fits", data), limits)
     assert np.argwhere(~image.valid).tolist() == [[0, 0], [2, 2]]
     assert image.pixels[1, 1] == -5.0
 
@@ -93,7 +94,7 @@ def test_saturation(tmp_path: Path, limits: FitsLimits) -> None:
     for number, (cards, saturation_dn, level) in enumerate(
         (
             ({"SATURATE": 400.0, "BUNIT": "DN"}, None, 400.0),
-            ({"DATASAT": 300.0, "BUNIT": "DN/s", "XPOSURE": 2.0}, None, 300.0),
+            ({"DSATVAL": 300.0, "BUNIT": "DN/s", "XPOSURE": 2.0}, None, 300.0),
             ({"BUNIT": "DN"}, 350.0, 350.0),
             ({"BUNIT": "DN/s", "XPOSURE": 2.0}, 500.0, 250.0),
             ({"BUNIT": "DN / s", "EXPTIME": 2.0, "SATURATE": 400}, 500.0, 250.0),
@@ -101,7 +102,7 @@ def test_saturation(tmp_path: Path, limits: FitsLimits) -> None:
         )
     ):
         path = save(tmp_path / f"{number}.fits", ramp(), **cards)
-        image = read_image(path, limits, saturation_dn=saturation_dn)
+        image = read_observation(path, limits, saturation_dn=saturation_dn)
         expected = ramp() >= (np.inf if level is None else level)
         np.testing.assert_array_equal(image.mask == MaskBit.SATURATED, expected)
 
@@ -125,7 +126,7 @@ def test_unusable_pixels_are_data_errors(
     for number, (data, cards, saturation_dn, code) in enumerate(UNUSABLE):
         path = save(tmp_path / f"{number}.fits", data, **cards)
         with subtests.test(code), pytest.raises(DataError, match=f"^{code}: .*expected"):
-            read_image(path, limits, saturation_dn=saturation_dn)
+            read_observation(path, limits, saturation_dn=saturation_dn)
 
 
 def test_damaged_tiles_are_data_errors(tmp_path: Path, limits: FitsLimits) -> None:
@@ -134,7 +135,7 @@ def test_damaged_tiles_are_data_errors(tmp_path: Path, limits: FitsLimits) -> No
     fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(path)
     path.write_bytes(path.read_bytes()[:-2880] + b"\xff" * 2880)
     with pytest.raises(DataError, match=r"^unreadable-pixels"):
-        read_image(path, limits)
+        read_observation(path, limits)
 
 
 # --- products ---
@@ -152,10 +153,10 @@ def test_a_product_without_planes_keeps_header_and_wcs_and_opens_as_one_map(
     tmp_path: Path, limits: FitsLimits, real: Find, name: str
 ) -> None:
     source = real(name)
-    image = read_image(source, limits)
+    image = read_observation(source, limits)
     product = tmp_path / "product.fits"
     write_image(product, image, cards=CARDS, history=["Richardson-Lucy, 20 steps"])
-    again = read_image(product, limits)
+    again = read_observation(product, limits)
     np.testing.assert_array_equal(again.pixels, image.pixels.astype(np.float32))
     before, after = sunpy.map.Map(source), sunpy.map.Map(product)
     assert isinstance(after, type(before))
@@ -174,7 +175,7 @@ def test_a_product_without_planes_keeps_header_and_wcs_and_opens_as_one_map(
 
 
 def test_equal_products_are_equal_bytes_with_true_checksums(tmp_path: Path, limits: FitsLimits) -> None:
-    image = read_image(save(tmp_path / "in.fits", ramp(), BUNIT="DN"), limits)
+    image = read_observation(save(tmp_path / "in.fits", ramp(), BUNIT="DN"), limits)
     for name in ("one.fits", "two.fits"):
         write_image(tmp_path / name, image, cards=CARDS, history=["x"])
     assert (tmp_path / "one.fits").read_bytes() == (tmp_path / "two.fits").read_bytes()
@@ -187,7 +188,7 @@ def test_equal_products_are_equal_bytes_with_true_checksums(tmp_path: Path, limi
 
 def test_odd_cards_survive(tmp_path: Path, limits: FitsLimits) -> None:
     long = "word " * 40
-    image = read_image(save(tmp_path / "in.fits", ramp(), LONGTEXT=long.strip(), BUNIT="DN"), limits)
+    image = read_observation(save(tmp_path / "in.fits", ramp(), LONGTEXT=long.strip(), BUNIT="DN"), limits)
     image.header["HIERARCH a long name"] = 7
     image.header.append(fits.Card.fromstring("BADCARD = 1 2 3 / not a value".ljust(80)))
     image.header.append(fits.Card.fromstring("NANCARD =                  NaN".ljust(80)))
@@ -196,7 +197,7 @@ def test_odd_cards_survive(tmp_path: Path, limits: FitsLimits) -> None:
     write_image(
         tmp_path / "out.fits", image, cards={"NOTE": ("dünn\nund lang", "é")}, history=["a\nb " + "y" * 200]
     )
-    header = read_image(tmp_path / "out.fits", limits).header
+    header = read_observation(tmp_path / "out.fits", limits).header
     history = "".join(map(str, header["HISTORY"]))
     assert header["LONGTEXT"] == long.strip()
     assert header["a long name"] == 7
@@ -222,7 +223,7 @@ def test_the_demo_opens_in_sunpy_and_says_it_is_simulated(tmp_path: Path, limits
     for name in ("a.fits", "b.fits"):
         demo_image(tmp_path / name, make_psf(gaussian(32, 1.0), plate_scale_arcsec=0.492), size=128, seed=3)
     assert (tmp_path / "a.fits").read_bytes() == (tmp_path / "b.fits").read_bytes()
-    image = read_image(tmp_path / "a.fits", limits)
+    image = read_observation(tmp_path / "a.fits", limits)
     assert "SIMULATED" in image.header["ORIGIN"]
     seen = sunpy.map.Map(tmp_path / "a.fits")
     assert seen.detector == "HRI_EUV"
@@ -250,7 +251,7 @@ def test_a_product_of_an_image_with_a_garbage_card_is_written(tmp_path: Path, li
     for card in GARBAGE:
         (tmp_path / "bad.fits").write_bytes(content[:at] + card.ljust(80) + content[at + 80 :])
         read_summary(tmp_path / "bad.fits", limits)
-        write_image(tmp_path / "product.fits", read_image(tmp_path / "bad.fits", limits), cards={})
+        write_image(tmp_path / "product.fits", read_observation(tmp_path / "bad.fits", limits), cards={})
         with fits.open(tmp_path / "product.fits") as hdus:
             hdus.verify("exception")
             assert hdus[0].header["OBSERVER"] == "me", card

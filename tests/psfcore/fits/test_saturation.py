@@ -14,7 +14,7 @@ from scipy.stats import poisson
 from psfcore.fits import observation
 from psfcore.fits.gain import noise_for
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.images import read_image
+from psfcore.fits.observation import read_observation
 from psfcore.fits.saturation import largest_value, with_saturation
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import Instrument, parse_instrument
@@ -59,7 +59,7 @@ def exposure(seed: int, *, clip_dn: float | None = None, gain: float = 1.0) -> N
 
 
 def test_aia_marks_what_its_header_counts(limits: FitsLimits, real: Find) -> None:
-    image = with_saturation(read_image(real(FLARE), limits))
+    image = read_observation(real(FLARE), limits)
     assert int(image.header["NSATPIX"]) == np.count_nonzero(saturated(image)) == 351
     assert image.saturation is not None
     assert (image.saturation.level, image.saturation.found, image.saturation.warning) == (
@@ -72,10 +72,12 @@ def test_aia_marks_what_its_header_counts(limits: FitsLimits, real: Find) -> Non
 def test_without_the_card_the_flare_shows_its_saturation_in_the_pixels(
     limits: FitsLimits, real: Find
 ) -> None:
-    image = read_image(real(FLARE), limits)
+    image = read_observation(real(FLARE), limits)
     del image.header["NSATPIX"]
     for unit, exposure_s, scale in (("DN", 2.0, 1.0), ("DN/s", 2.000096, 2.000096)):
-        seen = with_saturation(Image(image.pixels / scale, image.mask, image.header, unit, exposure_s))
+        seen = with_saturation(
+            Image(image.pixels / scale, np.zeros_like(image.mask), image.header, unit, exposure_s)
+        )
         assert seen.saturation is not None and seen.saturation.found == "pixels"
         assert seen.saturation.level == pytest.approx(16383 / scale, rel=1e-12)
         np.testing.assert_array_equal(saturated(seen), image.pixels == 16383)
@@ -84,7 +86,7 @@ def test_without_the_card_the_flare_shows_its_saturation_in_the_pixels(
 
 def test_no_false_alarm_on_unsaturated_real_images(limits: FitsLimits, real: Find) -> None:
     for name in UNSATURATED:
-        image = with_saturation(read_image(real(name), limits))
+        image = read_observation(real(name), limits)
         assert image.saturation is not None and image.saturation.warning is None, name
         assert not saturated(image).any() and image.saturation.found in (None, "NSATPIX"), name
 
@@ -144,8 +146,8 @@ def test_the_chance_is_the_poisson_probability() -> None:
 
 LEVELS = [
     ({"SATURATE": 4000.0}, "DN", {}, 4000.0, "SATURATE"),
-    ({"DATASAT": 3000.0, "SATURATE": 4000.0}, "DN", {}, 3000.0, "DATASAT"),
-    ({"DATASAT": 3000.0}, "DN/s", {}, 3000.0, "DATASAT"),
+    ({"DSATVAL": 3000.0, "SATURATE": 4000.0, "DATASAT": 5}, "DN", {}, 3000.0, "DSATVAL"),
+    ({"SAT_THR": 3000.0}, "DN/s", {}, 3000.0, "SAT_THR"),
     ({}, "DN/s", {"instrument_dn": 4000.0}, 2000.0, "instrument file"),
     ({}, "DN / s", {"requested_dn": 4000.0, "instrument_dn": 100.0}, 2000.0, "request"),
     ({"TELESCOP": "SDO/AIA", "NSATPIX": 0}, None, {}, 15000.0, "NSATPIX"),
@@ -165,7 +167,7 @@ def test_the_level_and_its_source() -> None:
 
 def test_the_demo_is_not_saturated(tmp_path: Path, limits: FitsLimits) -> None:
     demo_image(tmp_path / "a.fits", make_psf(gaussian(32, 1.0), plate_scale_arcsec=0.492), size=128, seed=3)
-    image = with_saturation(read_image(tmp_path / "a.fits", limits))
+    image = read_observation(tmp_path / "a.fits", limits)
     assert image.saturation is not None and image.saturation == type(image.saturation)(None, None, None)
 
 

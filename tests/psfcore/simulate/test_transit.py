@@ -16,7 +16,7 @@ from scipy.signal import fftconvolve
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.fits.images import read_image
+from psfcore.fits.observation import read_observation
 from psfcore.scatter.power_law import scatter_kernel
 from psfcore.simulate.disc import covered_share, fully_dark
 from psfcore.simulate.plan import COMBINED, HIGH, Plan, default_plan, plan_from_json
@@ -354,7 +354,7 @@ def test_a_folder_contains_the_transit_and_its_truth(tmp_path: Path) -> None:
             assert hdus[0].data.dtype.kind == "i" and hdus[0].data.dtype.itemsize == 4
             assert hdus[0].header["GAINCOMB"] == shot.gain_mode
             assert ("SATURATE" in hdus[0].header) == (shot.gain_mode == HIGH)
-        image = read_image(path, LIMITS)
+        image = read_observation(path, LIMITS)
         assert image.unit == "DN" and image.exposure_s == shot.exposure_s
         np.testing.assert_allclose(image.pixels / shot.exposure_s, frame.pixels, rtol=1e-6, atol=1e-6)
         place = (frame.place.x_px, frame.place.y_px, 10.75)

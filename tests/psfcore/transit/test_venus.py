@@ -14,7 +14,7 @@ import pytest
 
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
-from psfcore.fits.images import read_image
+from psfcore.fits.observation import read_observation
 from psfcore.image import Image
 from psfcore.scatter.power_law import scatter_kernel
 from studies.venus_gap import explained, read
@@ -39,7 +39,7 @@ def core_and_ring(image: Image, x: float, y: float, radius: float) -> tuple[floa
 def test_deconvolution_removes_scatter_from_the_disc_of_venus(shared: Path) -> None:
     folder = shared / "data/real/occultation"
     for name, (file, *disc) in DISCS.items():
-        image = read_image(folder / file, LIMITS)
+        image = read_observation(folder / file, LIMITS)
         rows = [core_and_ring(image, *disc)]
         for total in TOTALS:
             psf = make_psf(scatter_kernel(3.0, 2.5, total, 2048))
@@ -50,7 +50,9 @@ def test_deconvolution_removes_scatter_from_the_disc_of_venus(shared: Path) -> N
         assert rows[2][1] == pytest.approx(rows[0][1], rel=0.02)
         if name == "XRT":
             # The peer's own deconvolution takes as much out as five percent of scatter would.
-            peer, _ = core_and_ring(read_image(folder / "L1_XRT20120605_215839.9.deconv.fits", LIMITS), *disc)
+            peer, _ = core_and_ring(
+                read_observation(folder / "L1_XRT20120605_215839.9.deconv.fits", LIMITS), *disc
+            )
             assert cores[2] < peer < cores[0]
 
 

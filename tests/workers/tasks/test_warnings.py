@@ -89,7 +89,7 @@ def test_a_psf_that_does_not_say_its_channel_is_taken_with_a_warning_and_one_of_
     assert codes(product) == ["channel"]
     (tmp_path / "small.toml").write_text(SMALL_INSTRUMENT)
     psf_id = local.build_psf(tmp_path / "small.toml", size=64)["id"]
-    write_image(tmp_path / "same.fits", WAVELNTH=171)
+    write_image(tmp_path / "same.fits", WAVELNTH=171, CDELT1=2.0, CDELT2=2.0)
     assert codes(local.deconvolve(tmp_path / "same.fits", psf_id=psf_id, **FEW)) == []
 
 

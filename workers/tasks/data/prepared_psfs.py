@@ -15,11 +15,10 @@ from astropy.io.fits import Header
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Shape, new_engine
-from psfcore.fits.binning import binning_factor
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.psf import Psf
-from psfcore.psf_sampling import rebinned
+from psfcore.psf_sampling import AS_BUILT, sampling_of, with_scale
 
 Thing = TypeVar("Thing", Psf, tuple[Psf, Engine])
 
@@ -32,18 +31,30 @@ class PreparedPsfs:
         self._kept: OrderedDict[Hashable, tuple[object, int]] = OrderedDict()
 
     def on_pixels_of(
-        self, header: Header, name: Hashable, find: Callable[[], Path], limits: FitsLimits
+        self,
+        header: Header,
+        name: Hashable,
+        find: Callable[[], Path],
+        limits: FitsLimits,
+        *,
+        plate_scale_arcsec: float | None = None,
     ) -> Psf:
         """The PSF of a file on the pixels of an image with this header; repeated calls return the same object.
 
         name: a key that identifies the content of the file. find: returns the path of the file; it is called only if
-        the PSF is not kept.
+        the PSF is not kept. plate_scale_arcsec: the plate scale of a PSF whose file gives none.
         """
-        whole = self._once((name, limits), lambda: read_psf(find(), limits, parts=False), _kernel_bytes)
-        factor = binning_factor(whole, header)
-        if factor == 1:
+
+        def read() -> Psf:
+            return with_scale(read_psf(find(), limits, parts=False), plate_scale_arcsec)
+
+        whole = self._once((name, limits, plate_scale_arcsec), read, _kernel_bytes)
+        sampling = sampling_of(whole, header)
+        if sampling == AS_BUILT:
             return whole
-        return self._once((name, limits, factor), lambda: rebinned(whole, factor), _kernel_bytes)
+        return self._once(
+            (name, limits, plate_scale_arcsec, sampling), lambda: sampling.of(whole), _kernel_bytes
+        )
 
     def engine_for(self, psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
         """The engine for a PSF and a shape. Pass the same PSF object again: the cache compares identity, not content."""

@@ -87,7 +87,7 @@ def write(made: Made, path: Path) -> None:
     write_image(
         path,
         dataclasses.replace(inputs.image, pixels=result.pixels, header=own.header),
-        cards=own.cards | _cards(inputs, made.identity, result, errors),
+        cards=own.cards | _cards(inputs, made.identity, result, errors, made.warnings),
         history=_history(inputs, result, made.warnings) + own.history,
         planes=planes,
         plane_bits={"QUALITY": MEANINGS},
@@ -157,13 +157,18 @@ def _save_changes_picture(made: Made) -> str:
 
 
 def _cards(
-    inputs: Inputs, identity: str, result: Deconvolved, errors: ErrorPlanes | None
+    inputs: Inputs,
+    identity: str,
+    result: Deconvolved,
+    errors: ErrorPlanes | None,
+    warnings: Sequence[Warned],
 ) -> dict[str, tuple[Any, str]]:
     cards = deconvolution_cards(
         _used_psf(inputs),
         result,
         saturation=inputs.image.saturation,
         amplification=None if errors is None else errors.amplification,
+        warnings=[one.code for one in warnings],
     )
     # The cards have the same order as in earlier versions, because equal requests must give equal bytes.
     ordered: dict[str, tuple[Any, str]] = {"PRODID": (identity, "")}
@@ -223,7 +228,7 @@ def details_of(
         "noise_amplification": result.noise_amplification if errors is None else errors.amplification,
         "chi2_per_pixel": result.chi2_per_pixel,
         "region": None if result.of_box is None else _region(result.of_box),
-        "flux_change_pct": 100 * (result.flux_out / result.flux_in - 1),
+        "flux_change_pct": result.flux_change_pct,
         "bright_change_pct": _change_pct(before[bright], after[bright]),
         "dark_change_pct": _change_pct(before[dark], after[dark]),
         "negative_pixels": result.negative_pixels,

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from psfcore.deconvolve.assess.quality import MEANINGS, QualityBit
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.images import read_image, write_image
+from psfcore.fits.images import write_image
+from psfcore.fits.observation import read_observation
 from psfcore.fits.product.cards import described
 from psfcore.fits.product.planes import read_planes
 from tests.psfcore.fits.test_images import AIA, CARDS, ramp, save
@@ -42,7 +43,7 @@ def example_planes(shape: tuple[int, ...]) -> Planes:
 
 
 def write_example(path: Path, source: Path, limits: FitsLimits) -> Planes:
-    image = read_image(source, limits)
+    image = read_observation(source, limits)
     planes = example_planes(image.pixels.shape)
     write_image(path, image, cards=CARDS, planes=planes, plane_bits={"QUALITY": MEANINGS})
     return planes
@@ -67,7 +68,7 @@ def test_planes_are_plain_images_and_read_back(tmp_path: Path, limits: FitsLimit
         stored = np.dtype(np.float32) if plane.dtype.kind == "f" else plane.dtype
         assert back[name].dtype == stored
         np.testing.assert_array_equal(back[name], plane.astype(stored))
-    np.testing.assert_array_equal(read_image(product, limits).pixels, ramp())
+    np.testing.assert_array_equal(read_observation(product, limits).pixels, ramp())
 
 
 def test_the_header_of_a_plane_of_bits_says_what_they_mean(tmp_path: Path, limits: FitsLimits) -> None:
@@ -90,7 +91,7 @@ def test_sunpy_shows_the_image_first_and_every_plane_at_the_same_place(
     maps = sunpy.map.Map(product)
     before = sunpy.map.Map(real(AIA))
     assert len(maps) == 1 + len(planes)
-    np.testing.assert_array_equal(maps[0].data, read_image(product, limits).pixels)
+    np.testing.assert_array_equal(maps[0].data, read_observation(product, limits).pixels)
     for shown in maps:
         assert isinstance(shown, type(before))
         assert shown.wcs.wcs.compare(before.wcs.wcs, tolerance=1e-12)
@@ -127,13 +128,13 @@ def test_planes_of_earlier_versions_are_read(tmp_path: Path) -> None:
 
 
 def test_a_product_without_planes_has_none(tmp_path: Path, limits: FitsLimits) -> None:
-    image = read_image(save(tmp_path / "in.fits", ramp()), limits)
+    image = read_observation(save(tmp_path / "in.fits", ramp()), limits)
     write_image(tmp_path / "out.fits", image, cards=CARDS)
     assert read_planes(tmp_path / "out.fits") == {}
 
 
 def test_a_wrong_plane_is_refused(tmp_path: Path, limits: FitsLimits) -> None:
-    image = read_image(save(tmp_path / "in.fits", ramp()), limits)
+    image = read_observation(save(tmp_path / "in.fits", ramp()), limits)
     for name, plane in (
         ("ERROR", np.zeros((3, 3))),
         ("PRIMARY", np.zeros((20, 24))),

@@ -17,7 +17,7 @@ from astropy.io import fits
 
 from psfcore.errors import DataError, HeaderError
 from psfcore.fits.header import FitsLimits, read_summary
-from psfcore.fits.images import read_image
+from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
 from tests.conftest import REPOSITORY
 from tests.fits_bombs import lying_tiles, psf_with_a_tail
@@ -113,10 +113,10 @@ READER = """
 import sys
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.images import read_image
+from psfcore.fits.observation import read_observation
 for path in sys.argv[1:]:
     try:
-        print(read_image(path, FitsLimits(max_pixels=10**6)).pixels.shape)
+        print(read_observation(path, FitsLimits(max_pixels=10**6)).pixels.shape)
     except DataError as error:
         print(error.code)
 """
@@ -166,7 +166,7 @@ def peak_mib_of_refusal(path: Path, code: str, *, psf: bool = False) -> float:
     tracemalloc.start()
     try:
         with pytest.raises(DataError, match=f"^{code}: .*expected"):
-            (read_psf if psf else read_image)(path, LIMITS)
+            (read_psf if psf else read_observation)(path, LIMITS)
     finally:
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
@@ -221,7 +221,7 @@ def test_a_stream_of_rice_that_ends_too_early_is_refused(tmp_path: Path) -> None
         path = written(tmp_path / "t.fits", pixels, compression_type="RICE_1")
         with_first_length(path, lambda length, cut=cut: max(cut(length), 1))
         with pytest.raises(DataError, match=r"bad-tile: .*ends too early"):
-            read_image(path, LIMITS)
+            read_observation(path, LIMITS)
 
 
 def test_zeros_to_the_end_of_a_stream_of_rice_are_not_followed_past_it(tmp_path: Path) -> None:
@@ -231,7 +231,7 @@ def test_zeros_to_the_end_of_a_stream_of_rice_are_not_followed_past_it(tmp_path:
     heap, content = first_row(path) + 8, path.read_bytes()
     path.write_bytes(content[:heap] + (bytes(2) + b"\x20").ljust(len(content) - heap, b"\0"))
     with pytest.raises(DataError, match=r"bad-tile: .*ends too early"):
-        read_image(path, LIMITS)
+        read_observation(path, LIMITS)
 
 
 def test_scaled_pixels_of_8_bytes_are_refused(tmp_path: Path) -> None:
@@ -239,10 +239,10 @@ def test_scaled_pixels_of_8_bytes_are_refused(tmp_path: Path) -> None:
     pixels = RNG.normal(100, 1, (40, 50))
     options = {"tile_shape": (1, 50), "quantize_level": 4.0, "quantize_method": 1}
     path = written(tmp_path / "t.fits", pixels, compression_type="NOCOMPRESS", **options)
-    assert np.allclose(read_image(path, LIMITS).pixels, pixels, atol=1)
+    assert np.allclose(read_observation(path, LIMITS).pixels, pixels, atol=1)
     with_first_length(path, lambda length: 2 * length)
     with pytest.raises(DataError, match="bad-tile"):
-        read_image(path, LIMITS)
+        read_observation(path, LIMITS)
 
 
 WHOLE, FLOATS = ("u1", "i2", "i4"), ("f4", "f8")
@@ -256,7 +256,7 @@ def test_correct_tiles_pass(tmp_path: Path) -> None:
             options = {"compression_type": codec, "tile_shape": tile, "quantize_level": 0}
             path = written(tmp_path / "tiles.fits", pixels, **options)
             assert read_summary(path, LIMITS).codec == codec
-            assert np.array_equal(read_image(path, LIMITS).pixels, pixels), (codec, dtype, tile)
+            assert np.array_equal(read_observation(path, LIMITS).pixels, pixels), (codec, dtype, tile)
 
 
 def test_quantised_floats_pass_with_tiles_that_could_not_be_quantised(tmp_path: Path) -> None:
@@ -264,7 +264,7 @@ def test_quantised_floats_pass_with_tiles_that_could_not_be_quantised(tmp_path: 
     pixels[3] *= 1e30  # stored in GZIP_COMPRESSED_DATA
     for codec in ("RICE_1", "GZIP_1", "GZIP_2"):
         path = written(tmp_path / "tiles.fits", pixels, compression_type=codec)
-        assert np.allclose(read_image(path, LIMITS).pixels, pixels, rtol=0.01), codec
+        assert np.allclose(read_observation(path, LIMITS).pixels, pixels, rtol=0.01), codec
 
 
 @pytest.mark.parametrize(

@@ -450,3 +450,5 @@ def test_images_of_another_channel_fail_alone_unless_the_request_says_so(
     told = started(api, **request, parameters={**FEW, "other_channel": True})
     work()
     assert [row["warnings"] for row in results(api, told)] == [[], ["channel"]]
+    assert [row["warnings"] for row in results(api, told, warning="channel")] == [["channel"]]
+    assert results(api, told, warning="frame") == []

@@ -1,0 +1,113 @@
+"""Signs in the pixels that an image is not what a deconvolution expects: spikes, a bias that is still in, a scaled picture.
+
+A spike (a cosmic ray, a hot pixel) is brighter than the PSF allows. The PSF puts the share k of a point's light into the
+brightest of the four nearest pixels; a pixel with the excess e over its surroundings is a spike if its neighbours have less
+than half of the excess that its light alone must give them:
+
+    excess of the brightest neighbour < k e / 2,   e > SPIKE_SIGMA sigma        Eq. (1)
+
+sigma is the scatter between neighbouring pixels. Each block of BLOCK_PX pixels is searched for its brightest pixel only, so the
+number of spikes is a lower bound.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.fits.units import parse_unit
+from psfcore.image import Image
+
+BLOCK_PX = 16
+SPIKE_SIGMA = 20.0
+FEWEST_SPIKES = 5
+# A bias is suspected if the darkest of 1000 pixels is above this level (DN) and the others reach less far above it than it is.
+SMALLEST_BIAS_DN = 50.0
+_SAMPLE = 65_536
+_BESIDE = ((0, 1), (0, -1), (1, 0), (-1, 0))
+
+
+def doubts(image: Image, psf_kernel: NDArray[np.float64]) -> dict[str, str]:
+    """Warnings about the pixels of an image: sentences by their codes.
+
+    psf_kernel: weights [y, x] on the pixels of the image, centre at [ny // 2, nx // 2].
+    """
+    warnings = {}
+    spikes = count_spikes(image, psf_kernel)
+    if spikes >= FEWEST_SPIKES:
+        warnings["spikes"] = (
+            f"at least {spikes} pixels are brighter than the PSF allows, as cosmic rays are, and spread: use the image after "
+            "despiking, or mask them"
+        )
+    sample = image.pixels[image.valid]
+    sample = sample[:: max(1, sample.size // _SAMPLE)]
+    if sample.size:
+        low, middle, high = np.percentile(sample, (0.1, 50, 99.9))
+        count = parse_unit(image.unit).kind in ("count", "unknown")
+        if count and low > SMALLEST_BIAS_DN and high - low < low:
+            warnings["bias"] = (
+                f"the darkest pixels are at {low:.4g}, and the others reach to {high:.4g}: if a bias is still in the image, subtract "
+                "it first"
+            )
+        whole = np.array_equal(sample, np.rint(sample))
+        if whole and 200 < float(image.pixels.max(where=image.valid, initial=0)) <= 255 and low >= 0:
+            warnings["picture"] = (
+                "all pixels are whole numbers up to 255, as in a picture: a scaled picture is not proportional to light"
+            )
+        elif not whole and count and low > 0 and high < 6 and high - low < 5 and middle > 1:
+            warnings["scaled"] = (
+                f"the pixels reach from {low:.2f} to {high:.2f}, as logarithms of DN do: use the image before scaling"
+            )
+    return warnings
+
+
+def count_spikes(image: Image, psf_kernel: NDArray[np.float64]) -> int:
+    """The number of blocks of an image whose brightest pixel is a spike, Eq. (1)."""
+    y, x = psf_kernel.shape[0] // 2, psf_kernel.shape[1] // 2
+    near = psf_kernel[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+    peak = float(psf_kernel[y, x])
+    if near.shape != (3, 3) or peak <= 0:
+        return 0
+    share = max(near[1, 0], near[1, 2], near[0, 1], near[2, 1]) / peak
+    rows, columns = _brightest_of_blocks(image)
+    reach = 3
+    ny, nx = image.pixels.shape
+    inside = (rows >= reach) & (columns >= reach) & (rows < ny - reach) & (columns < nx - reach)
+    rows, columns = rows[inside], columns[inside]
+    if rows.size == 0:
+        return 0
+    pixels, usable = image.pixels, image.valid
+    for dy, dx in _BESIDE:
+        good = usable[rows + dy, columns + dx] & usable[rows + reach * dy, columns + reach * dx]
+        rows, columns = rows[good], columns[good]
+    level = np.mean([pixels[rows + reach * dy, columns + reach * dx] for dy, dx in _BESIDE], axis=0)
+    beside = np.max([pixels[rows + dy, columns + dx] for dy, dx in _BESIDE], axis=0) - level
+    excess = pixels[rows, columns] - level
+    sigma = _scatter(image)
+    return int(np.count_nonzero((beside < 0.5 * share * excess) & (excess > SPIKE_SIGMA * sigma)))
+
+
+def _brightest_of_blocks(image: Image) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the brightest pixel of each block that has a pixel far above its mean."""
+    ny, nx = (size // BLOCK_PX for size in image.pixels.shape)
+    if ny == 0 or nx == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    plane = (
+        image.pixels if image.valid.all() else np.where(image.valid, image.pixels, np.nanmin(image.pixels))
+    )
+    blocks = plane[: ny * BLOCK_PX, : nx * BLOCK_PX].reshape(ny, BLOCK_PX, nx, BLOCK_PX)
+    brightest = blocks.max(axis=(1, 3))
+    typical = np.median(blocks[:, BLOCK_PX // 2, :, ::4], axis=-1)
+    chosen = np.argwhere(brightest - typical > SPIKE_SIGMA * _scatter(image))
+    at = [int(blocks[by, :, bx, :].argmax()) for by, bx in chosen]
+    inner = np.array(np.unravel_index(np.array(at, np.intp), (BLOCK_PX, BLOCK_PX)))
+    return chosen[:, 0] * BLOCK_PX + inner[0], chosen[:, 1] * BLOCK_PX + inner[1]
+
+
+def _scatter(image: Image) -> float:
+    """The standard deviation of the difference between a pixel and the next one, from its median, in a sample of rows."""
+    step = max(1, image.pixels.shape[0] // 64)
+    rows = image.pixels[::step]
+    difference = np.abs(np.diff(rows, axis=1))
+    difference = difference[np.isfinite(difference)]
+    return 1.4826 * float(np.median(difference)) / 2**0.5 if difference.size else 0.0

@@ -1,0 +1,153 @@
+"""How the pixels of an image lie on the detector: plate scale, turns and flips, and whether they were interpolated.
+
+World coordinates of a pixel at the offset p from the reference pixel (Greisen and Calabretta 2002, A&A 395, 1061; Thompson
+2006, A&A 449, 791):
+
+    w = M p,   M_ij = CD_ij, or CDELT_i PC_ij, or CDELT_i R_ij(CROTA2)                    Eq. (1)
+
+A PSF is known on the pixels of the detector. Let M_0 be the matrix of an image as the detector gives it: a turn by the roll
+of the spacecraft, without a flip. Then the offset p on the image is, up to the plate scale, the offset T p on the detector:
+
+    T = M_0^-1 M,   both with columns of length 1                                        Eq. (2)
+
+T is the unit matrix for an image as the detector gives it. The roll of M_0 is known where a card states it, although the image
+was turned later: SAT_ROT + INST_ROT of AIA, CROTA of Solar Orbiter. Other spacecraft keep solar north near +y.
+
+| symbol | name | unit |
+|---|---|---|
+| M | matrix | arcsec / px |
+| T | on_detector | - |
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from psfcore.fits.cards import Cards, optional_number, optional_text
+
+_ARCSEC_PER_UNIT = {"arcsec": 1.0, "arcmin": 60.0, "deg": 3600.0, "degree": 3600.0, "rad": 206264.80624709636}
+# Turns below this angle are not mentioned. Where no card states the roll of the detector, pointing errors are allowed for.
+SILENT_DEG = 0.3
+SILENT_WITHOUT_ROLL_DEG = 1.0
+_MAP_AXES = ("CRLN", "HGLN", "CRLT", "HGLT", "RA--", "DEC-")
+
+Matrix = tuple[tuple[float, float], tuple[float, float]]
+UNIT: Matrix = ((1.0, 0.0), (0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The frame of an image.
+
+    scale_arcsec: plate scale along x and y, arcsec/px; None: unknown. on_detector: T of Eq. (2). roll_known: whether a card
+    states the roll of the detector. interpolated: why the pixels are not those of the detector; None: they are.
+    """
+
+    scale_arcsec: tuple[float | None, float | None]
+    on_detector: Matrix
+    roll_known: bool
+    interpolated: str | None
+
+    @property
+    def quarter_turns(self) -> Matrix | None:
+        """T with the values -1, 0 and 1, if the image was turned by quarter turns, or flipped; None for other angles."""
+        limit = SILENT_DEG if self.roll_known else SILENT_WITHOUT_ROLL_DEG
+        (a, b), (c, d) = self.on_detector
+        nearest: Matrix = ((float(round(a)), float(round(b))), (float(round(c)), float(round(d))))
+        far = max(abs(v - n) for v, n in zip((a, b, c, d), (*nearest[0], *nearest[1]), strict=True))
+        return nearest if far <= math.sin(math.radians(limit)) else None
+
+    @property
+    def turn_deg(self) -> float:
+        """The angle from the x axis of the detector to that of the image, -180 to 180 degrees, counted towards +y."""
+        (a, _), (c, _) = self.on_detector
+        return math.degrees(math.atan2(c, a))
+
+    @property
+    def flipped(self) -> bool:
+        """Whether the image is a mirror image of the detector."""
+        (a, b), (c, d) = self.on_detector
+        return a * d - b * c < 0
+
+
+def frame_of(header: Cards) -> Frame:
+    """The frame that the cards of an image describe."""
+    matrix = _matrix(header)
+    columns = [math.hypot(matrix[0][k], matrix[1][k]) for k in (0, 1)] if matrix else [0.0, 0.0]
+    factors = [_ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{k}") or "arcsec").lower()) for k in (1, 2)]
+    known = None not in factors
+    scale = tuple(length if known and length > 0 else None for length in columns)
+    on_detector, roll_known = UNIT, False
+    if matrix is not None and min(columns) > 0:
+        roll = _detector_roll_deg(header)
+        roll_known = roll is not None
+        cosine, sine = math.cos(math.radians(roll or 0.0)), math.sin(math.radians(roll or 0.0))
+        (a, b), (c, d) = ((matrix[0][0] / columns[0], matrix[0][1] / columns[1]),
+                          (matrix[1][0] / columns[0], matrix[1][1] / columns[1]))  # fmt: skip
+        on_detector = (
+            (cosine * a + sine * c, cosine * b + sine * d),
+            (cosine * c - sine * a, cosine * d - sine * b),
+        )  # Eq. (2)
+    return Frame((scale[0], scale[1]), on_detector, roll_known, _interpolated(header))
+
+
+def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
+    """Plate scale of an axis, arcsec/px; None if the header does not give it in a unit of angle. axis: 1 for x, 2 for y."""
+    return frame_of(header).scale_arcsec[axis - 1]
+
+
+def _matrix(header: Cards) -> Matrix | None:
+    """M of Eq. (1) in arcsec/px (in the unit of the header if it is no angle); None if there are no such cards."""
+    factor = [
+        _ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{k}") or "arcsec").lower(), 1.0) for k in (1, 2)
+    ]
+    cd = [[optional_number(header, f"CD{i}_{j}") for j in (1, 2)] for i in (1, 2)]
+    step = [optional_number(header, f"CDELT{i}") for i in (1, 2)]
+    if step == [None, None] and any(value is not None for row in cd for value in row):
+        rows = [[value or 0.0 for value in row] for row in cd]
+    else:
+        if step == [None, None]:
+            return None
+        turn = _turn(header, step[0] or 1.0, step[1] or 1.0)
+        rows = [[(step[i] or 0.0) * turn[i][j] for j in (0, 1)] for i in (0, 1)]
+    (a, b), (c, d) = rows
+    return (factor[0] * a, factor[0] * b), (factor[1] * c, factor[1] * d)
+
+
+def _turn(header: Cards, step_x: float, step_y: float) -> Matrix:
+    """PC_ij, or the turn by CROTA2 for pixels of different sides."""
+    pc = [[optional_number(header, f"PC{i}_{j}") for j in (1, 2)] for i in (1, 2)]
+    if any(value is not None for row in pc for value in row):
+        (a, b), (c, d) = pc
+        return (1.0 if a is None else a, b or 0.0), (c or 0.0, 1.0 if d is None else d)
+    angle = math.radians(optional_number(header, "CROTA2", "CROTA1", "CROTA") or 0.0)
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return (cosine, -sine * step_y / step_x), (sine * step_x / step_y, cosine)
+
+
+def _detector_roll_deg(header: Cards) -> float | None:
+    """The roll of an image as the detector gives it, if a card states it."""
+    telescope = (optional_text(header, "TELESCOP") or "").upper()
+    if telescope.startswith("SDO"):
+        parts = [optional_number(header, key) for key in ("SAT_ROT", "INST_ROT")]
+        return None if None in parts else sum(part or 0.0 for part in parts)
+    if telescope.startswith("SOLO"):
+        return optional_number(header, "CROTA")
+    if (optional_text(header, "INSTRUME") or "").upper() == "SWAP":
+        return optional_number(header, "P2_ROLL")
+    return None
+
+
+def _interpolated(header: Cards) -> str | None:
+    """Why the pixels of an image were interpolated, with the better input; None if no card says so."""
+    telescope = (optional_text(header, "TELESCOP") or "").upper()
+    level = optional_number(header, "LVL_NUM")
+    if telescope.startswith("SDO") and level is not None and level >= 1.5:
+        return f"level {level:g} is turned to solar north and interpolated: use the level 1 image"
+    if (optional_text(header, "INSTRUME") or "").upper() == "SWAP" and optional_number(header, "LEVEL") == 1:
+        return "level 1 of SWAP is turned to solar north and interpolated: use the level 0 image"
+    axes = [(optional_text(header, f"CTYPE{axis}") or "").upper()[:4] for axis in (1, 2)]
+    if any(axis in _MAP_AXES for axis in axes):
+        return f"it was projected onto {axes[0].strip('-')}, {axes[1].strip('-')}: use the image before the projection"
+    return None
