@@ -70,9 +70,7 @@ def _region(context: click.Context, parameter: click.Parameter, text: str | None
     type=click.Choice(["zero", "symmetric", "extended"]),
     help="Assumed scene outside the image [default: depends on the method]",
 )
-@click.option(
-    "--hdu", type=click.IntRange(0), metavar="N", help="HDU of the image [default: first]"
-)
+@click.option("--hdu", type=click.IntRange(0), metavar="N", help="HDU of the image [default: first]")
 @click.option(
     "--plate-scale",
     "plate_scale_arcsec",
