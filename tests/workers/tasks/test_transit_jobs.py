@@ -150,7 +150,8 @@ def test_the_product_says_what_it_was_made_of(fitted: dict[str, Any]) -> None:
         step / steps for stage, step, steps in fitted["steps"] if stage not in ("reading", "building the PSF")
     ]
     assert len(shares) > 3 and min(shares) >= 0 and max(shares) <= 1
-    assert all(later >= earlier - 0.02 for earlier, later in itertools.pairwise(shares))
+    # A step of the last stage is 0.026 of all, and on a busy machine it was told one step late in 2 of 8 runs.
+    assert all(later >= earlier - 0.06 for earlier, later in itertools.pairwise(shares)), fitted["steps"]
 
 
 def test_an_identical_request_gets_the_existing_result(
