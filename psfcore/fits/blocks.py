@@ -169,11 +169,13 @@ def following(
     What follows an image is not needed to use it, so damage there is no error.
     """
     source.skip(-_data_bytes(header, hdu) % BLOCK_BYTES)
+    header_bytes = 0
     try:
         for number in range(hdu + 1, limits.max_hdus):
-            raw = _read_header(source, limits.max_header_bytes, limits, first=False)
+            raw = _read_header(source, limits.max_header_bytes - header_bytes, limits, first=False)
             if raw is None:
                 return
+            header_bytes += len(raw)
             header = _parse(raw, number)
             yield header, number, _kind(header, number)
             _pass_data(source, header, number, limits, last=False)
