@@ -26,8 +26,9 @@ $(DOCS): $(RUN)
 demo: $(RUN)
 	$(BIN)/heliopsf demo $(if $(IMAGE),--image "$(IMAGE)")
 
+# Without the rules of the house, which make lint checks.
 test: $(DEV) $(if $(CI),browser)
-	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile tests
+	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --ignore tests/house tests
 
 # The tests of one room in one process, for example: make test-fast FILES=tests/psfcore/gap/library
 test-fast: $(DEV)

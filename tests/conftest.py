@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import random
 from collections import Counter
@@ -41,15 +42,28 @@ LONGEST_FIRST = (
 _CACHE = TemporaryDirectory(prefix="heliopsf-tests-")
 
 
-MUCH_BYTES = 600 * 2**20
+MUCH_BYTES = 100 * 2**20
+_held_bytes = 0
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _return_memory() -> Iterator[None]:
-    """Return the memory that a file of tests no longer uses, if its process holds much: C libraries keep freed blocks."""
+    """Return the memory that a file of tests no longer uses, if its process holds much more than after the last return.
+
+    C libraries keep freed blocks.
+    """
+    global _held_bytes
     yield
-    if psutil.Process().memory_info().rss > MUCH_BYTES:
+    process = psutil.Process()
+    if process.memory_info().rss > _held_bytes + MUCH_BYTES:
         return_unused_memory()
+        _held_bytes = process.memory_info().rss
+
+
+def pytest_collection_finish() -> None:
+    """Leave what was imported out of later searches for garbage: it is never garbage, and it is most of all objects."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
