@@ -27,6 +27,7 @@ from psfcore.deconvolve.region import BoxWork, box_work
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.deconvolve.whole import Work, input_warnings, known_noise
 from psfcore.errors import DataError, DataWarning
+from psfcore.fits.frame import frame_of
 from psfcore.fits.header import seen_by
 from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.image import Image
@@ -278,7 +279,10 @@ def _built_for(header: Header, threads: int, progress: Told, *, parts: bool) -> 
     summary = seen_by(header)
     if summary["instrument"] is None:
         raise unknown_instrument(summary)
-    return built_psf(summary["instrument"], parts=parts, threads=threads, progress=progress is True)
+    turn_deg = frame_of(header).turn_to_build_deg
+    return built_psf(
+        summary["instrument"], turn_deg=turn_deg, parts=parts, threads=threads, progress=progress is True
+    )
 
 
 def _given(psf: AnyPsf) -> Psf:

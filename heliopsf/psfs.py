@@ -15,7 +15,7 @@ from psfcore.errors import module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.mask_file import read_mask_image
-from psfcore.instruments.files import instrument_path
+from psfcore.instruments.files import instrument_path, turned_text
 from psfcore.instruments.model import load_instrument, read_instrument_text
 from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
@@ -104,20 +104,27 @@ def built_psf(
     *,
     size: int = 2048,
     component: str | None = None,
+    turn_deg: float = 0.0,
     parts: bool = True,
     threads: int | None = None,
     progress: Told = None,
 ) -> Psf:
-    """As ``build_psf``. parts: False: without the components, which a deconvolution does not need."""
+    """As ``build_psf``. turn_deg: for images of a known instrument that are turned by this angle against its detector. parts:
+    False: without the components, which a deconvolution does not need."""
     known = load_instrument(instrument)
     own = isinstance(instrument, Path) or instrument.endswith(".toml")
+    text = (
+        turned_text(str(instrument), turn_deg)
+        if turn_deg
+        else read_instrument_text(Path(instrument) if own else instrument_path(str(instrument)))
+    )
     mask, mask_id = None, None
     if known.mount is not None and known.mount.mask_image is not None:
         file = Path(instrument).parent / known.mount.mask_image.file
         mask, mask_id = read_mask_image(file), sha256_of_file(file)
     recipe = Recipe(
-        text=read_instrument_text(Path(instrument) if own else instrument_path(str(instrument))),
-        name=None if own else str(instrument),
+        text=text,
+        name=None if own or turn_deg else str(instrument),
         mask_id=mask_id,
         size=size,
         component=None if component is None else component.lower(),

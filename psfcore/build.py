@@ -101,6 +101,7 @@ def build_psf(
         wavelength_angstrom=instrument.wavelength_angstrom,
         components={name: crop_centred(part, shape) for name, part in kernels.items()} if parts else {},
         provenance=provenance,
+        turn_deg=instrument.turn_deg,
     )
 
 

@@ -47,7 +47,7 @@ class Psf:
 
     kernel: a weight is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx // 2].
     components: kernels with the same centre ("DIFFRACTION", "SCATTER"). provenance: texts and numbers for JSON.
-    fitted: the fitted formula of SCATTER. cards: texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER,
+    fitted: the fitted formula of SCATTER. turn_deg: the angle from the +x axis of the detector to that of the kernel. cards: texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER,
     which say for which images the PSF is valid. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative",
     "psf-sum", "psf-not-centred", "psf-off-centre".
     """
@@ -63,6 +63,7 @@ class Psf:
     provenance: dict[str, Any] = field(default_factory=dict)
     fitted: FittedShape | None = None
     cards: Mapping[str, str] = field(default_factory=dict)
+    turn_deg: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", np.ascontiguousarray(self.kernel, dtype=np.float64))

@@ -15,8 +15,8 @@ A cut-out, or a window that starts at another pixel of the detector (PXBEG), has
 because one PSF is used for the whole field: only the difference of two positions matters. Near the edges of a window,
 light from outside the window enters the image; no choice of the PSF can correct this.
 
-If the image was turned by quarter turns or flipped after it was taken, so is the PSF of its detector, which is exact. A PSF is
-not turned by other angles: its core and its arms are too narrow to be interpolated.
+If the image was turned by quarter turns or flipped after it was taken, so is the PSF of its detector, which is exact. Its core
+and its arms are too narrow to be interpolated, so for other angles a PSF is built anew from the instrument file.
 
 | symbol | name | unit |
 |---|---|---|
@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.fits.binning import binning_factor
 from psfcore.fits.cards import Cards
-from psfcore.fits.frame import UNIT, Matrix, frame_of, plate_scale_arcsec
+from psfcore.fits.frame import SILENT_DEG, UNIT, Matrix, frame_of, plate_scale_arcsec
 from psfcore.image import Image
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred
 
@@ -75,7 +75,9 @@ AS_BUILT = Sampling(1, UNIT)
 def sampling_of(psf: Psf, header: Cards) -> Sampling:
     """How an image samples a PSF of its detector. Raises DataError "plate-scale-mismatch"."""
     turn = frame_of(header).quarter_turns
-    return Sampling(binning_factor(psf, header), UNIT if turn is None or psf.instrument is None else turn)
+    if turn is None or psf.instrument is None or psf.turn_deg != 0:
+        turn = UNIT
+    return Sampling(binning_factor(psf, header), turn)
 
 
 def psf_for_image(psf: Psf, header: Header) -> Psf:
@@ -114,7 +116,16 @@ def frame_warnings(psf: Psf, header: Cards) -> dict[str, str]:
     frame, warnings = frame_of(header), {}
     turn = frame.quarter_turns
     how = "mirrored" if frame.flipped else f"turned by {frame.turn_deg:.3g} degrees"
-    if turn is None:
+    if not frame.flipped and abs(frame.turn_deg - psf.turn_deg) <= SILENT_DEG < abs(psf.turn_deg):
+        warnings["frame"] = (
+            f"the image is {how} against the detector and interpolated; the PSF was built at this angle: the image before the "
+            "turn gives a better result"
+        )
+    elif psf.turn_deg:
+        warnings["frame"] = (
+            f"the PSF was built for images that are turned by {psf.turn_deg:.3g} degrees; the image is {how}: use another PSF"
+        )
+    elif turn is None:
         advice = "use the image before the turn"
         warnings["frame"] = (
             f"the image is {how} against the detector and interpolated; the PSF is not turned: {advice}"

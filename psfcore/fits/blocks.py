@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol
 from psfcore.errors import HeaderError
 from psfcore.fits.cards import LARGEST_COUNT, card_count, card_flag, card_text, card_trouble
 from psfcore.fits.columns import check_counts
-from psfcore.fits.tiled.compression import compression_of
+from psfcore.fits.compression import check_compression
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
@@ -352,7 +352,7 @@ def _check_image(header: Header, limits: FitsLimits) -> None:
     if not z:
         _check_plain(header)
     else:
-        compression_of(header, nx, ny)
+        check_compression(header, nx, ny)
 
 
 def _check_plain(header: Header) -> None:

@@ -65,6 +65,11 @@ class Frame:
         return math.degrees(math.atan2(c, a))
 
     @property
+    def turn_to_build_deg(self) -> float:
+        """The turn for which a PSF must be built, to 0.01 degrees; 0 if a PSF of the detector can be turned or is as it must be."""
+        return 0.0 if self.flipped or self.quarter_turns is not None else round(self.turn_deg, 2)
+
+    @property
     def flipped(self) -> bool:
         """Whether the image is a mirror image of the detector."""
         (a, b), (c, d) = self.on_detector

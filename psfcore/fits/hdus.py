@@ -7,12 +7,15 @@ gives equal bytes.
 from __future__ import annotations
 
 import errno
+import math
+import re
 import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
+from typing import Any, BinaryIO
 
 import numpy as np
 from astropy.io import fits
@@ -20,13 +23,24 @@ from astropy.io.fits.hdu.compressed._compression import CfitsioException
 from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
-from psfcore.errors import DataError
-from psfcore.fits.header import HeaderSummary
-from psfcore.fits.tiled.compression import compression_of
-from psfcore.fits.tiled.tiles import check_tiles
+from psfcore.errors import DataError, HeaderError
+from psfcore.fits.blocks import FitsLimits, Source, enter_data, open_source
+from psfcore.fits.compression import may_hold_unwritten_memory
+from psfcore.fits.header import HeaderSummary, optional_number
+from psfcore.limited import fill_new_memory, run_limited
 from psfcore.whole_files import probe
 
 _CHECKSUM_COMMENT = "computed when the file was written"
+# The cards of a tile-compressed image that describe the table of its tiles. FITS standard 4.0, sections 7.3 and 10.1.
+TABLE_CARD = re.compile(
+    r"XTENSION|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|CHECKSUM|DATASUM|ZHECKSUM|ZDATASUM|"
+    r"TFIELDS|THEAP|T(TYPE|FORM|UNIT|NULL|SCAL|ZERO|DISP|DIM)\d+|"
+    r"ZIMAGE|ZSIMPLE|ZEXTEND|ZTENSION|ZBITPIX|ZNAXIS\d*|ZPCOUNT|ZGCOUNT|ZTILE\d+|ZCMPTYPE|ZNAME\d+|ZVAL\d+|"
+    r"ZQUANTIZ|ZDITHER0|ZBLANK|ZSCALE|ZZERO|ZMASKCMP|ZBLOCKED"
+)
+_TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
+_OTHER_FILLING = 0x2A
+_NUMBERS = {name: np.dtype(name) for name in ("uint8", "int16", "int32", "int64", "float32", "float64")}
 _RIGHT = 1  # astropy returns this value if the checksum card exists and its value is correct
 # Exceptions that astropy raises for a damaged data unit. The position of the damage decides which exception
 # astropy raises.
@@ -47,35 +61,99 @@ PIXEL_TROUBLE = (
 )
 
 
-def read_pixels(path: str | Path, summary: HeaderSummary) -> tuple[NDArray[np.float64], fits.Header]:
-    """Pixels [y, x] (float64) and header of the image that `summary` describes. Raises the errors of `opened_image`."""
-    with opened_image(path, summary) as hdu:
-        header = hdu.header.copy()
-        data = hdu.data
-        pixels = np.array(data, dtype=np.float64)
-    if pixels.shape != summary.shape:
-        raise _other_shape(summary, pixels.shape)
-    return pixels, header
+def read_pixels(
+    path: str | Path, summary: HeaderSummary, limits: FitsLimits
+) -> tuple[NDArray[np.float64], fits.Header]:
+    """Pixels [y, x] (float64) and header of the image that `summary` describes.
 
-
-@contextmanager
-def opened_image(path: str | Path, summary: HeaderSummary) -> Iterator[Any]:
-    """The HDU of the image that `summary` describes, opened and checked. Its pixels are read in the block.
-
-    Raises DataError "unreadable-pixels", "bad-tile" or "tile-too-large", and OSError if the disk fails.
+    A plain image is read as it stands. A tile-compressed image is decoded by astropy in a process of its own, and its header
+    is that of the image. Raises HeaderError, DataError "unreadable-pixels", and OSError if the disk fails.
     """
-    with readable_pixels(path, f"HDU {summary.hdu}"):
-        if summary.codec is not None:
-            _check_tiles(path, summary)
-        # uint=False: otherwise astropy converts unsigned integers (BZERO 32768) before it applies BLANK.
-        # If an HDU is the first, astropy also inspects the next HDU, which was not checked. For a plain image, astropy
-        # must not prepare that HDU for decompression.
-        options = {"uint": False, "disable_image_compression": summary.codec is None}
-        with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True, **options) as hdus:
-            hdu = hdus[summary.hdu]
-            if hdu.shape != summary.shape:
-                raise _other_shape(summary, hdu.shape)
-            yield hdu
+    with open_source(Path(path), limits) as source:
+        header = enter_data(source, summary.hdu, limits)
+        if summary.codec is None:
+            return _plain_pixels(source, header, summary), header
+    twice = may_hold_unwritten_memory(header)
+    return _decoded_pixels(path, summary, twice=twice), _image_header(header)
+
+
+def _plain_pixels(source: Source, header: fits.Header, summary: HeaderSummary) -> NDArray[np.float64]:
+    """The pixels of a plain image, from a source that stands at its data. FITS standard 4.0, Eqs. (3) and (4)."""
+    ny, nx = summary.shape
+    raw = source.read(nx * ny * abs(summary.bitpix) // 8)
+    stored = np.frombuffer(raw, _TYPES[summary.bitpix])
+    if stored.size != nx * ny:
+        raise HeaderError(
+            "truncated-data",
+            f"expected {nx} x {ny} pixels in HDU {summary.hdu}; the file ends too early: copy the file again",
+        )
+    pixels = stored.astype(np.float64).reshape(summary.shape)
+    scale, zero = (optional_number(header, key) for key in ("BSCALE", "BZERO"))
+    blank = optional_number(header, "BLANK") if summary.bitpix > 0 else None
+    is_blank = None if blank is None else pixels == blank
+    if scale is not None and scale != 1:
+        pixels *= scale
+    if zero:
+        pixels += zero
+    if is_blank is not None:
+        pixels[is_blank] = np.nan
+    return pixels
+
+
+def _decoded_pixels(path: str | Path, summary: HeaderSummary, *, twice: bool) -> NDArray[np.float64]:
+    with TemporaryFile() as target:
+        about = run_limited(
+            decode_tiles,
+            path,
+            target,
+            pixels=math.prod(summary.shape),
+            number=summary.hdu,
+            shape=list(summary.shape),
+            twice=twice,
+        )
+        target.seek(0)
+        stored = np.fromfile(target, _NUMBERS[about["type"]])
+    return stored.reshape(summary.shape).astype(np.float64)
+
+
+def decode_tiles(
+    target: BinaryIO, *, path: str, number: int, shape: list[int], twice: bool
+) -> dict[str, Any]:
+    """Write the pixels of a tile-compressed image to ``target``; returns the type of its numbers.
+
+    twice: decode twice with different contents of new memory, to find pixels that astropy did not write. Call this in a limited
+    process (`psfcore.limited`). Raises DataError "unreadable-pixels".
+    """
+    with readable_pixels(path, f"HDU {number}"):
+        data = _tiles(path, number)
+        if data.shape != tuple(shape):
+            raise DataError(
+                "unreadable-pixels", f"expected {shape} pixels, as the header declares; got {data.shape}"
+            )
+        if twice:
+            fill_new_memory(_OTHER_FILLING)
+            if not np.array_equal(data, _tiles(path, number), equal_nan=True):
+                raise DataError(
+                    "unreadable-pixels",
+                    f"expected all {shape} pixels in HDU {number}; its tiles do not hold them all: copy or make the file again",
+                )
+    target.write(np.ascontiguousarray(data, data.dtype.newbyteorder("=")).data)
+    return {"type": data.dtype.name}
+
+
+def _tiles(path: str, number: int) -> NDArray[Any]:
+    # uint=False: otherwise astropy converts unsigned integers (BZERO 32768) before it applies BLANK.
+    with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=True, uint=False) as hdus:
+        return np.asarray(hdus[number].data)
+
+
+def _image_header(table: fits.Header) -> fits.Header:
+    """The header of a tile-compressed image without the cards of the table that holds its tiles."""
+    header = fits.Header()
+    for card in table.cards:
+        if not TABLE_CARD.fullmatch(card.keyword):
+            header.append(card, end=True)
+    return header
 
 
 @contextmanager
@@ -91,34 +169,6 @@ def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
         wanted = f"expected readable pixels in {part} of {Path(path).name}"
         message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
         raise DataError("unreadable-pixels", message) from None
-
-
-def _other_shape(summary: HeaderSummary, got: tuple[int, ...]) -> DataError:
-    return DataError(
-        "unreadable-pixels", f"expected {summary.shape} pixels, as the header declares; got {got}"
-    )
-
-
-class _TableHeap:
-    """The heap after the rows of a binary table. It holds the compressed tiles."""
-
-    def __init__(self, hdu: fits.BinTableHDU, first: int) -> None:
-        place = hdu.fileinfo()
-        self._file = place["file"]
-        self._first = place["datLoc"] + first
-
-    def read(self, offset: int, count: int) -> bytes:
-        self._file.seek(self._first + offset)
-        return bytes(self._file.read(count))
-
-
-def _check_tiles(path: str | Path, summary: HeaderSummary) -> None:
-    """Check the tiles, and the header again as astropy reads it. Raises HeaderError and the errors of `check_tiles`."""
-    with fits.open(path, memmap=False, lazy_load_hdus=True, disable_image_compression=True) as hdus:
-        table = hdus[summary.hdu]
-        ny, nx = summary.shape
-        image = compression_of(table.header, nx, ny)
-        check_tiles(np.asarray(table.data).view(np.ndarray), image, _TableHeap(table, image.first))
 
 
 def _raise_if_storage(error: Exception) -> None:

@@ -17,7 +17,7 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.fits.cards import card_trouble
-from psfcore.fits.hdus import ascii_text, read_pixels, write_hdus
+from psfcore.fits.hdus import TABLE_CARD, ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import FitsLimits, read_summary
 from psfcore.fits.product.planes import Meanings, check_plane, plane_hdu
 from psfcore.image import Image
@@ -27,11 +27,7 @@ Cards = Mapping[str, tuple[CardValue, str]]
 
 # Cards that say how the input file stores its pixels, and cards with statistics of these pixels.
 _STORAGE_CARD = re.compile(
-    r"SIMPLE|XTENSION|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|EXTEND|GROUPS|INHERIT|EXTNAME|EXTVER|EXTLEVEL|END|"
-    r"BSCALE|BZERO|BLANK|CHECKSUM|DATASUM|ZHECKSUM|ZDATASUM|"
-    r"TFIELDS|THEAP|T(TYPE|FORM|UNIT|NULL|SCAL|ZERO|DISP|DIM)\d+|"
-    r"ZIMAGE|ZSIMPLE|ZEXTEND|ZTENSION|ZBITPIX|ZNAXIS\d*|ZPCOUNT|ZGCOUNT|ZTILE\d+|ZCMPTYPE|ZNAME\d+|ZVAL\d+|"
-    r"ZQUANTIZ|ZDITHER0|ZBLANK|ZSCALE|ZZERO|ZMASKCMP|ZBLOCKED|"
+    rf"{TABLE_CARD.pattern}|SIMPLE|EXTEND|GROUPS|INHERIT|EXTNAME|EXTVER|EXTLEVEL|END|BSCALE|BZERO|BLANK|"
     r"DATAMIN|DATAMAX|DATAMEAN|DATAMEDN|DATARMS|DATASTD|DATASKEW|DATAKURT|DATACENT|DATAP\d\d"
 )
 
@@ -39,9 +35,9 @@ _STORAGE_CARD = re.compile(
 def read_plane(path: str | Path, limits: FitsLimits) -> NDArray[np.float64]:
     """Read the pixels [y, x] of the first 2-D image of a file without checking their values.
 
-    Raises HeaderError for an unusable header; DataError "unreadable-pixels", "tile-too-large".
+    Raises HeaderError for an unusable header; DataError "unreadable-pixels".
     """
-    return read_pixels(path, read_summary(path, limits))[0]
+    return read_pixels(path, read_summary(path, limits), limits)[0]
 
 
 def write_image(

@@ -45,14 +45,14 @@ def read_observation(
 
     saturation_dn: the saturation level in DN of one exposure; None: the level is taken from the header or the
     instrument file, and the pixels are tested, see `psfcore.fits.saturation`. hdu: number of the HDU; None: the first
-    2-D image. Raises HeaderError for an unusable header; DataError "unreadable-pixels", "bad-tile", "tile-too-large", and
-    the errors of `observation_of`.
+    2-D image. Raises HeaderError for an unusable header; DataError "unreadable-pixels", and the errors of
+    `observation_of`.
     """
     summary, neighbours = read_contents(path, limits, hdu=hdu)
-    pixels, header = read_pixels(path, summary)
+    pixels, header = read_pixels(path, summary, limits)
     ours = {one.name.upper(): one for one in neighbours if one.shape == summary.shape}
     if summary.content == IMAGE and "MASK" in ours:  # as CCDData writes it
-        excluded, _ = read_pixels(path, read_summary(path, limits, hdu=ours["MASK"].hdu))
+        excluded, _ = read_pixels(path, read_summary(path, limits, hdu=ours["MASK"].hdu), limits)
         pixels[excluded != 0] = np.nan
     image = observation_of(pixels, header, saturation_dn=saturation_dn, stored_as_integer=summary.bitpix > 0)
     if hdu is not None or summary.content != IMAGE:

@@ -19,6 +19,7 @@ from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels
 from psfcore.fits.header import (
     FitsLimits,
     check_all_headers,
+    optional_number,
     optional_text,
     origin_of,
     plate_scale_arcsec,
@@ -65,6 +66,8 @@ def _psf_header(psf: Psf) -> fits.Header:
     header["REACH"] = (psf.reach_px, "[pixel] farthest pixel from the centre")
     if psf.instrument is not None:
         header["INSTRUME"] = (ascii_text(psf.instrument), "instrument description")
+    if psf.turn_deg:
+        header["PSFTURN"] = (psf.turn_deg, "[deg] from +x of the detector to +x of the PSF")
     if psf.wavelength_angstrom is not None:
         header["WAVELNTH"] = (psf.wavelength_angstrom, "[Angstrom] wavelength")
     for axis, size in ((1, psf.kernel.shape[1]), (2, psf.kernel.shape[0])):
@@ -138,7 +141,7 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     Raises HeaderError; DataError "unreadable-pixels" and the errors of `Psf` ("psf-not-centred", "psf-sum", ...).
     """
     summary = read_summary(path, limits)
-    kernel, header = read_pixels(path, summary)
+    kernel, header = read_pixels(path, summary, limits)
     own = "PSFNAME" in header
     components, provenance, fitted = (
         _read_extras(path, limits, kernel.shape) if own and parts else ({}, {}, None)
@@ -156,6 +159,7 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
         provenance={"file": Path(path).name, **provenance},
         fitted=fitted,
         cards=cards,
+        turn_deg=optional_number(header, "PSFTURN") or 0.0,
     )
 
 

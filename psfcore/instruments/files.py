@@ -34,6 +34,11 @@ def instrument_path(name: str) -> Path:
     return _FOLDER / f"{name}.toml"
 
 
+def turned_text(name: str, turn_deg: float) -> str:
+    """The text of the file of instrument `name` for images that are turned by this angle against the detector."""
+    return f"turn_deg = {turn_deg:.2f}\n{instrument_path(name).read_text('utf-8')}"
+
+
 def match_instrument(cards: Mapping[str, object]) -> str | None:
     """Name of the instrument whose cards in the table [match] all equal the given header cards, or None.
 

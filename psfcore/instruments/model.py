@@ -5,6 +5,7 @@ Every key names its unit. Angles are in degrees from +x of the detector towards 
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from dataclasses import field, replace
@@ -195,7 +196,11 @@ class Scatter(Checked):
 
 
 class Instrument(Checked):
-    """An instrument: all quantities from which a PSF is computed."""
+    """An instrument: all quantities from which a PSF is computed.
+
+    ``turn_deg``: the angle from the +x axis of the detector to that of the images, degrees. The angles and corners of a read
+    instrument are those on the images.
+    """
 
     name: Annotated[str, Limit(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
     version: Annotated[str, Limit(pattern=r"^\d+\.\d+\.\d+$")]
@@ -203,6 +208,7 @@ class Instrument(Checked):
     wavelength_angstrom: Size
     bandpass: Annotated[tuple[SpectralLine, ...], Limit(max_length=MOST_LINES)] = ()
     focal_length_mm: Size
+    turn_deg: Number = 0.0
     match: dict[MatchKey, Name | Size] = field(default_factory=dict)
     aperture: Aperture
     mirrors: Annotated[tuple[Mirror, ...], Limit(max_length=MOST_MIRRORS)] = ()
@@ -232,8 +238,28 @@ class Instrument(Checked):
             for k, line in enumerate(self.bandpass)
             if line.weight < _LEAST * total
         ]
+        if self.turn_deg and self.mount is not None and self.mount.mask_image is not None:
+            wrong.append(
+                Fault(("turn_deg",), "expected 0, because a mask image is not turned", self.turn_deg)
+            )
         if wrong:
             raise BadValues(wrong)
+
+    def on_images(self) -> Instrument:
+        """The instrument as images that are turned by ``turn_deg`` show it: a direction on them is smaller by this angle."""
+        if not self.turn_deg:
+            return self
+        meshes = tuple(replace(mesh, angle_deg=mesh.angle_deg - self.turn_deg) for mesh in self.meshes)
+        mount = self.mount
+        if mount is not None:
+            rays = tuple(
+                replace(one, first_angle_deg=one.first_angle_deg - self.turn_deg) for one in mount.rays
+            )
+            polygons = tuple(
+                replace(one, corners_mm=_turned(one.corners_mm, -self.turn_deg)) for one in mount.polygons
+            )
+            mount = replace(mount, rays=rays, polygons=polygons)
+        return replace(self, meshes=meshes, mount=mount)
 
     @property
     def spectral_lines(self) -> tuple[SpectralLine, ...]:
@@ -255,6 +281,11 @@ class Instrument(Checked):
                 f"{self.name}: distances: expected this table, because mesh {mesh.name!r} is at the filter wheel; got none",
             )
         return self.distances.filter_wheel_to_detector_mm
+
+
+def _turned(corners: tuple[tuple[float, float], ...], angle_deg: float) -> tuple[tuple[float, float], ...]:
+    cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return tuple((cosine * x - sine * y, sine * x + cosine * y) for x, y in corners)
 
 
 def load_instrument(name_or_path: str | Path) -> Instrument:
@@ -288,7 +319,7 @@ def parse_instrument(text: str, label: str) -> Instrument:
     if len(text) > MOST_BYTES:
         raise DataError("bad-instrument-file", f"{label}: expected at most {MOST_BYTES} characters; got more")
     try:
-        return Instrument.read(_parse_toml(text))
+        return Instrument.read(_parse_toml(text)).on_images()
     except BadValues as error:
         raise DataError("bad-instrument-file", f"{label}: {_said(error)}") from None
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:

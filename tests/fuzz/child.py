@@ -6,7 +6,6 @@ DataError, or a fault. If the process dies, it dies with the seed after the last
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import json
 import sys
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from psfcore import build
+from psfcore import build, limited
 from psfcore.diffraction import combined, fraunhofer
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, read_summary
@@ -36,18 +35,17 @@ from workers.run.child import Child
 
 LIMITS = FitsLimits(max_pixels=128 * 128, max_header_bytes=64 * 1024, max_hdus=8)
 SIZE_PX = 64
-_M_PERTURB = -6  # option of mallopt(3): new memory is filled with this byte
 
 
 def read_an_image(content: bytes, folder: Path) -> str:
-    """Read an image twice, between different contents of fresh memory, and write a product from it."""
+    """Read an image twice, with different contents of fresh memory in the process that decodes it, and write a product from it."""
     path, product = folder / "input.fits", folder / "product.fits"
     path.write_bytes(content)
     summary = read_summary(path, LIMITS)
     json.dumps(dataclasses.asdict(summary), allow_nan=False)
     images = []
     for filling in (0x11, 0x77):
-        ctypes.CDLL(None).mallopt(_M_PERTURB, filling)
+        limited.FILLING = filling
         images.append(read_observation(path, LIMITS))
     image = images[0]
     assert np.array_equal(image.pixels, images[1].pixels, equal_nan=True), "pixels hold memory of the process"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore import build
@@ -16,6 +18,8 @@ from psfcore.build import build_psf, component_names
 from psfcore.diffraction import combined
 from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
+from psfcore.fits.header import FitsLimits
+from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.instruments.model import (
     Aperture,
     Instrument,
@@ -25,9 +29,12 @@ from psfcore.instruments.model import (
     Rays,
     SpectralLine,
     load_instrument,
+    parse_instrument,
 )
 from psfcore.psf import Psf, cumulative_curve
+from psfcore.psf_sampling import psf_for_image
 from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel
+from tests.conftest import SMALL_INSTRUMENT
 
 HRI = load_instrument("hri_euv")
 ENTRANCE, WHEEL = HRI.meshes
@@ -256,6 +263,26 @@ def test_a_mask_image_replaces_the_bars_of_the_mount(small_reach: None) -> None:
     np.testing.assert_allclose(pictured.kernel, drawn.kernel, rtol=1e-3, atol=1e-7)
     with pytest.raises(DataError, match=r"mount\.mask_image: expected the pixels of mask\.png"):
         build_psf(changed(mount=mount), size=64)
+
+
+def test_the_psf_of_turned_images_has_all_parts_at_their_angles_on_the_images(
+    small_reach: None, tmp_path: Path
+) -> None:
+    """The image is turned by 90 degrees and the mount has one bar, so the PSF is that of the detector after a quarter turn."""
+    bar = "[mount]\nbasis = 'assumed'\nrays = [{ count = 1, width_mm = 0.5, first_angle_deg = 0.0 }]\n"
+    corners = "[[1.0, 0.5], [1.5, 0.5], [1.5, 1.0]]"
+    text = SMALL_INSTRUMENT + bar + f"polygons = [{{ corners_mm = {corners} }}]\n"
+    psf = build_psf(parse_instrument(text, "a"), size=64)
+    turned = build_psf(parse_instrument("turn_deg = 90.0\n" + text, "b"), size=64)
+    assert turned.turn_deg == 90 and psf.turn_deg == 0
+    difference = np.abs(turned.kernel - psf.kernel).max()
+    by_quarter = psf_for_image(psf, fits.Header({"CDELT1": 2.0, "CDELT2": 2.0, "CROTA2": 90.0}))
+    assert np.abs(turned.kernel - by_quarter.kernel).max() < 1e-3 * difference
+    write_psf(tmp_path / "psf.fits", turned)
+    assert read_psf(tmp_path / "psf.fits", FitsLimits(max_pixels=64**2)).turn_deg == 90
+    mask = "[mount]\nbasis = 'assumed'\n[mount.mask_image]\nfile = 'a.png'\nwidth_mm = 4.0\n"
+    with pytest.raises(DataError, match="turn_deg: expected 0"):
+        parse_instrument("turn_deg = 1.0\n" + SMALL_INSTRUMENT + mask, "c")
 
 
 def test_progress_is_reported_and_may_stop_the_work(small_reach: None) -> None:

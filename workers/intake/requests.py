@@ -8,9 +8,10 @@ from typing import Any
 
 from psfcore.deconvolve.box import Box
 from psfcore.errors import DataError
+from psfcore.fits.frame import frame_of
 from psfcore.fits.header import IMAGE, check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
-from psfcore.instruments.files import instrument_names
+from psfcore.instruments.files import instrument_names, turned_text
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
 from psfcore.noise_figures import NoiseFigures
@@ -242,13 +243,18 @@ def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, o
     if header["instrument"] is None:
         raise no_psf(catalogue, header, owner)
     # The shipped instrument file at full size.
-    recipe = PsfBuild(instrument=header["instrument"])
+    turn_deg = frame_of(header.get("cards") or {}).turn_to_build_deg
+    recipe = (
+        PsfBuild(instrument_file=turned_text(header["instrument"], turn_deg))
+        if turn_deg
+        else PsfBuild(instrument=header["instrument"])
+    )
     identity = psf_identity(recipe)
     check_not_deprecated(
         catalogue,
         identity,
         owner,
-        f"the PSF that heliopsf builds for {recipe.instrument}",
+        f"the PSF that heliopsf builds for {header['instrument']}",
         "name another PSF, or use it anyway with --psf {psf} (psf_id in a request)",
     )
     return {"psf_id": identity, "psf_recipe": recipe}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -202,6 +203,11 @@ def test_warnings_about_frames_and_scales() -> None:
     ):
         assert list(frame_warnings(psf, header(**cards))) == codes, cards
     assert "level 1 image" in frame_warnings(gaussian(), header(LVL_NUM=1.5))["interpolated"]
+    built = replace(gaussian(), turn_deg=30.0)
+    assert "built at this angle" in frame_warnings(built, header(CROTA2=30.0))["frame"]
+    for angle in (0.0, 31.0, 90.0):
+        assert "another PSF" in frame_warnings(built, header(CROTA2=angle))["frame"], angle
+        assert psf_for_image(built, header(CROTA2=angle)) is built
     binned = header(CDELT1=1.198978, CDELT2=1.198978)
     stated = with_scale(gaussian(plate_scale_arcsec=None), 0.599489)
     assert psf_for_image(stated, binned).plate_scale_arcsec == pytest.approx(1.198978)

@@ -102,6 +102,13 @@ def test_an_image_of_a_known_instrument_needs_no_psf_id(api: TestClient, tmp_pat
         "instrument": "hri_euv",
         "size": 2048,
     }
+    turned = {"CDELT1": 0.492, "CDELT2": 0.492, "CROTA2": 30.0, "CROTA": 10.0}
+    write_image(tmp_path / "turned.fits", DETECTOR="HRI_EUV", TELESCOP="SOLO/EUI/HRI_EUV", **turned)
+    parameters = {"image_id": upload(api, tmp_path / "turned.fits")}
+    recipe = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters}).json()["parameters"][
+        "psf_recipe"
+    ]
+    assert recipe["instrument"] is None and recipe["instrument_file"].startswith("turn_deg = 20.00\n")
 
 
 def test_an_image_without_a_known_psf_gets_a_problem_with_the_ways_on(

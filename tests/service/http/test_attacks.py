@@ -153,7 +153,7 @@ def test_tiles_that_lie_pass_the_header_and_end_the_job_within_bounds(
     assert memory.mib < 64
     ended = ann.get(f"/v1/jobs/{job['id']}").json()
     assert ended["phase"] == Phase.ERROR
-    assert (ended["error"]["fault"], ended["error"]["code"]) == ("user", "tile-too-large")
+    assert (ended["error"]["fault"], ended["error"]["code"]) == ("user", "unreadable-pixels")
 
 
 NAMES = (

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import gc
-import io
 import json
 import os
 import threading
 import time
-import tracemalloc
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -37,9 +36,10 @@ LIMITS = FitsLimits(max_pixels=2048 * 2048)
 
 
 def decoded(path: Path, name: str = "image") -> tuple[np.ndarray, str | None]:
-    target = io.BytesIO()
-    about = decode_plane(path, name, LIMITS, target)
-    return np.frombuffer(target.getvalue(), "<f4").reshape(about.shape), about.unit
+    with TemporaryFile() as target:
+        about = decode_plane(path, name, LIMITS, target)
+        target.seek(0)
+        return np.fromfile(target, "<f4").reshape(about.shape), about.unit
 
 
 def field(shape: tuple[int, int] = (300, 211), seed: int = 3) -> np.ndarray:
@@ -108,34 +108,13 @@ def test_the_planes_of_a_product(tmp_path: Path) -> None:
         assert unit == (None if name == "QUALITY" else "DN/s")
 
 
-def test_a_plane_of_an_early_product_in_a_table(tmp_path: Path) -> None:
-    plane = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    table = fits.BinTableHDU.from_columns(
-        [fits.Column("QUALITY", "12B", dim="(4,3)", array=plane[None])], name="QUALITY"
-    )
-    table.header["PLANE"] = True
-    fits.HDUList([fits.PrimaryHDU(np.zeros((3, 4), "f4")), table]).writeto(tmp_path / "p.fits")
-    np.testing.assert_array_equal(decoded(tmp_path / "p.fits", "quality")[0], plane)
-
-
 def test_a_plane_that_cannot_be_decoded_is_an_error_of_the_file(tmp_path: Path) -> None:
     fits.PrimaryHDU(field()).writeto(tmp_path / "x.fits")
     with pytest.raises(DataError, match=r"^no-such-plane: .*\(image\); got error: .*error_draws"):
         decoded(tmp_path / "x.fits", "error")
     (tmp_path / "x.fits").write_bytes(raw_files.compressed("GZIP_1"))
-    with pytest.raises(DataError, match=r"^(bad-tile|unreadable-pixels)"):
+    with pytest.raises(DataError, match=r"^(unreadable-pixels)"):
         decoded(tmp_path / "x.fits")
-
-
-def test_memory_holds_some_rows_and_not_the_plane(tmp_path: Path) -> None:
-    fits.PrimaryHDU(np.zeros((2048, 2048), "f4")).writeto(tmp_path / "x.fits")
-    with (tmp_path / "out").open("wb") as target:
-        decode_plane(tmp_path / "x.fits", "image", LIMITS, target)  # loads what is loaded once
-        tracemalloc.start()
-        decode_plane(tmp_path / "x.fits", "image", LIMITS, target)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    assert peak < 2048 * 2048 * 4, "less than the plane itself"
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from service.cli.main import main
 from service.client.http import Client, ServiceError
 from tests.conftest import SMALL_INSTRUMENT
 from tests.conftest import write_psf as write_plain_psf
-from tests.service.conftest import job_after, refusal, result_of, settings_in, upload
+from tests.service.conftest import refusal, result_of, settings_in, upload
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, PsfRow
 from workers.run.runner import Runner
 
@@ -134,14 +134,6 @@ def test_an_uploaded_psf_says_which_job_makes_its_tables(
     kernel = read_psf(psf_file, LIMITS).kernel
     assert curve["light_beyond_pct"] == {"TOTAL": pytest.approx(cumulative_curve(kernel, [1, 5]), abs=1e-6)}
     assert api.post("/v1/jobs", json=body).json()["phase"] == "COMPLETED", "an equal job is that one"
-
-    # Compressed weights are not checked at upload.
-    packed = fits.CompImageHDU(np.zeros((32, 32), "i4"))
-    fits.HDUList([fits.PrimaryHDU(), packed]).writeto(tmp_path / "dark.fits")
-    psf_id = upload(api, tmp_path / "dark.fits", "/v1/psfs")
-    error = job_after(api, run_jobs, "psf-tables", psf_id=psf_id)["error"]
-    assert error["fault"] == "user" and error["code"] == "psf-sum"
-    assert api.get(f"/v1/psfs/{psf_id}/curve").status_code == 409
 
 
 def test_a_fitted_psf_answers_with_errors(

@@ -1,4 +1,4 @@
-"""Check the header of a tile-compressed image, and read from it how the tiles are stored, before any decoder runs.
+"""Check the header of a tile-compressed image before any decoder runs.
 
 Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sections 7.3 and 10.1. The decoders of
 astropy are C functions that trust the header. With BYTEPIX = 8, the decoder of RICE_1 returns twice the number of bytes
@@ -11,12 +11,11 @@ web process can import it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from psfcore.errors import HeaderError
 from psfcore.fits.cards import card_count, card_text, card_value
-from psfcore.fits.columns import ITEM_BYTES, MOST_COLUMNS, read_columns
+from psfcore.fits.columns import MOST_COLUMNS, read_columns
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
@@ -25,7 +24,6 @@ ALLOWED_CODECS = ("RICE_1", "GZIP_1", "GZIP_2", "NOCOMPRESS")
 MOST_TILES = 65_536  # astropy decodes tile by tile in Python, about 0.1 ms each
 COMPRESSED, GZIPPED, UNCOMPRESSED = "COMPRESSED_DATA", "GZIP_COMPRESSED_DATA", "UNCOMPRESSED_DATA"
 _RICE_BYTEPIX, _RICE_BLOCKSIZE = (1, 2, 4), (16, 32)  # section 10.4.1
-_RICE_DEFAULTS = {"BYTEPIX": 4, "BLOCKSIZE": 32}
 _DITHERS = ("SUBTRACTIVE_DITHER_1", "SUBTRACTIVE_DITHER_2")
 _NO_DITHERS = (None, "NO_DITHER", "NONE")
 _DITHER_SEEDS = 1, 10_000  # section 10.2: the values of ZDITHER0
@@ -35,29 +33,8 @@ _NUMBERS_OF = {"ZSCALE": "ED", "ZZERO": "ED", "ZBLANK": "BIJ"}
 _NUMBERS = "LBIJKED"  # the allowed types of a column that the decoders do not use
 
 
-@dataclass(frozen=True)
-class Compression:
-    """How a compressed image is stored.
-
-    shape: pixels (ny, nx). tile: pixels (ny, nx) of a tile that is not cut off at the edge of the image. items: bytes
-    of an item of the heap, by column. first: offset of the heap from the start of the table's data, bytes. heap_bytes:
-    size of the heap. bytepix, blocksize: bytes of a pixel and pixels of a block for RICE_1. quantised: whether pixels
-    are stored as integers, with a scale and a zero point for each tile.
-    """
-
-    codec: str
-    shape: tuple[int, int]
-    tile: tuple[int, int]
-    items: dict[str, int]
-    first: int
-    heap_bytes: int
-    bytepix: int
-    blocksize: int
-    quantised: bool
-
-
-def compression_of(header: Header, nx: int, ny: int) -> Compression:
-    """How the image of nx x ny pixels in a table with ZIMAGE = T is stored.
+def check_compression(header: Header, nx: int, ny: int) -> None:
+    """Check how the image of nx x ny pixels in a table with ZIMAGE = T is stored.
 
     Raises HeaderError "codec-not-allowed", "bad-tiles", "bad-card".
     """
@@ -66,14 +43,21 @@ def compression_of(header: Header, nx: int, ny: int) -> Compression:
         wanted = ", ".join(ALLOWED_CODECS)
         raise HeaderError("codec-not-allowed", f"expected compression by one of {wanted}; got {codec}")
     _check_keywords(header)
-    tile = _tile(header, nx, ny)
+    _check_tiling(header, nx, ny)
     bitpix = card_count(header, "ZBITPIX", smallest=-64, largest=64)
     settings = _settings(header)
-    bytepix, blocksize = _rice(settings, bitpix) if codec == "RICE_1" else (abs(bitpix) // 8, 1)
-    items, quantised = _columns(header)
+    if codec == "RICE_1":
+        _check_rice(settings, bitpix)
+    _check_columns(header)
     _check_dither(header)
-    first, heap_bytes = _heap(header)
-    return Compression(codec, (ny, nx), tile, items, first, heap_bytes, bytepix, blocksize, quantised)
+    _check_heap(header)
+
+
+def may_hold_unwritten_memory(header: Header) -> bool:
+    """Whether astropy may give pixels that it did not write: scaled pixels that are stored with 8 bytes each."""
+    return card_text(header, "ZCMPTYPE") != "RICE_1" and any(
+        column.name == "ZSCALE" for column in read_columns(header)
+    )
 
 
 def _check_keywords(header: Header) -> None:
@@ -88,7 +72,7 @@ def _check_keywords(header: Header) -> None:
             )
 
 
-def _tile(header: Header, nx: int, ny: int) -> tuple[int, int]:
+def _check_tiling(header: Header, nx: int, ny: int) -> None:
     tile_x, tile_y = card_count(header, "ZTILE1", default=nx), card_count(header, "ZTILE2", default=1)
     if not (1 <= tile_x <= _LARGEST_INT and 1 <= tile_y <= _LARGEST_INT):
         wanted = f"expected tiles of 1 to {_LARGEST_INT} pixels on each axis"
@@ -100,7 +84,6 @@ def _tile(header: Header, nx: int, ny: int) -> tuple[int, int]:
         raise HeaderError("bad-tiles", message)
     if tiles > MOST_TILES:
         raise HeaderError("bad-tiles", f"expected at most {MOST_TILES} tiles; got {tiles}: use larger tiles")
-    return min(tile_y, ny), min(tile_x, nx)
 
 
 def _settings(header: Header) -> dict[str, object]:
@@ -121,25 +104,20 @@ def _settings(header: Header) -> dict[str, object]:
     return settings
 
 
-def _rice(settings: dict[str, object], bitpix: int) -> tuple[int, int]:
-    """BYTEPIX and BLOCKSIZE of RICE_1. Raises HeaderError "bad-card" if one of them is not a value of the standard."""
-    found: list[int] = []
+def _check_rice(settings: dict[str, object], bitpix: int) -> None:
     for name, allowed in (("BYTEPIX", _RICE_BYTEPIX), ("BLOCKSIZE", _RICE_BLOCKSIZE)):
-        value = settings.get(name, _RICE_DEFAULTS[name])
+        value = settings.get(name, allowed[0])
         if not isinstance(value, int) or value not in allowed:
             raise HeaderError("bad-card", f"expected {name} of {allowed} for RICE_1; got {value!r:.40}")
-        found.append(value)
-    bytepix, blocksize = found
-    if "BYTEPIX" in settings and bytepix > abs(bitpix) // 8:
-        wanted = (
-            f"expected BYTEPIX of at most {abs(bitpix) // 8}, the bytes of a pixel with ZBITPIX = {bitpix}"
+    most = abs(bitpix) // 8
+    if settings.get("BYTEPIX", 0) > most:  # type: ignore[operator]
+        raise HeaderError(
+            "bad-card",
+            f"expected BYTEPIX of at most {most}, the bytes of a pixel with ZBITPIX = {bitpix}; got {settings['BYTEPIX']}",
         )
-        raise HeaderError("bad-card", f"{wanted}; got {bytepix}")
-    return bytepix, blocksize
 
 
-def _columns(header: Header) -> tuple[dict[str, int], bool]:
-    """Bytes of a heap item by column, and whether the image is quantised."""
+def _check_columns(header: Header) -> None:
     columns = read_columns(header)
     for number, column in enumerate(columns, start=1):
         if column.name in _ITEMS_OF:
@@ -160,8 +138,6 @@ def _columns(header: Header) -> tuple[dict[str, int], bool]:
         raise HeaderError("bad-card", f"expected a column {COMPRESSED} in a compressed image; got none")
     if ("ZSCALE" in names) != ("ZZERO" in names):
         raise HeaderError("bad-card", "expected both columns ZSCALE and ZZERO, or neither; got one of them")
-    items = {column.name: ITEM_BYTES[column.item] for column in columns if column.in_heap}
-    return items, "ZSCALE" in names
 
 
 def _check_dither(header: Header) -> None:
@@ -177,14 +153,9 @@ def _check_dither(header: Header) -> None:
     card_count(header, "ZBLANK", smallest=-_LARGEST_INT - 1, largest=_LARGEST_INT, default=0)
 
 
-def _heap(header: Header) -> tuple[int, int]:
-    """Offset of the heap from the start of the table's data, and size of the heap, bytes (FITS standard, section
-    7.3.5)."""
+def _check_heap(header: Header) -> None:
+    """The heap of compressed tiles follows the rows of the table (FITS standard, section 7.3.5)."""
     for key, value in (("BITPIX", 8), ("NAXIS", 2), ("GCOUNT", 1)):
         card_count(header, key, smallest=value, largest=value)
-    table_bytes = card_count(header, "NAXIS1") * card_count(header, "NAXIS2")
-    after_rows = card_count(header, "PCOUNT")
-    first = card_count(
-        header, "THEAP", smallest=table_bytes, largest=table_bytes + after_rows, default=table_bytes
-    )
-    return first, table_bytes + after_rows - first
+    rows = card_count(header, "NAXIS1") * card_count(header, "NAXIS2")
+    card_count(header, "THEAP", smallest=rows, largest=rows + card_count(header, "PCOUNT"), default=rows)

@@ -1,1 +1,0 @@
-"""FITS images in compressed tiles: their parameters, and checks of the tiles before they are decoded."""

@@ -1,0 +1,225 @@
+"""Run a function on a file of strangers in a process of its own, with limited memory and time.
+
+C libraries that read such files may crash, hang, use much memory, or return memory that they did not write. Here they do so
+in a process that ends after one file. It is forked from a server process, which has read no file and was started with a new
+environment, so it holds neither other files nor passwords. A fork takes some milliseconds; a new interpreter would take half
+a second.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ctypes
+import gc
+import importlib
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from psfcore.errors import DataError, HeaderError
+
+MIB = 2**20
+SECONDS = 60  # of processor time; a child may take four times as long if the machine is busy
+_BYTES_A_PIXEL, _MORE_BYTES = 64, 128 * MIB  # of memory, in addition to the libraries
+_PRELOADED = ("psfcore.fits.hdus",)
+_KEPT_VARIABLES = ("HOME", "PATH", "LANG", "TMPDIR", "OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE")
+_M_PERTURB = -6  # option of mallopt(3): new memory is filled with this byte
+FILLING = 0x55
+
+Answer = dict[str, Any]
+_server: _Server | None = None
+_lock = threading.Lock()
+_is_child = False
+
+
+def run_limited(
+    function: Callable[..., Answer], path: str | Path, target: BinaryIO, *, pixels: int, **arguments: Any
+) -> Answer:
+    """Call ``function(target, path=path, **arguments)`` in a child process; returns its answer.
+
+    function: a function of a module that reads the file ``path``. target: an open file, to which it may write. arguments,
+    answer: values that JSON can hold. pixels: the number of pixels of the file, which limits the memory of the child. Raises
+    the DataError, HeaderError or OSError of the function; DataError "unreadable-pixels" if the child crashed, or needed more
+    memory or time than its pixels explain.
+    """
+    path = Path(path).absolute()
+    if _is_child:
+        return function(target, path=str(path), **arguments)
+    request = {
+        "function": f"{function.__module__}:{function.__qualname__}",
+        "memory_bytes": _BYTES_A_PIXEL * pixels + path.stat().st_size + _MORE_BYTES,
+        "filling": FILLING,
+        "arguments": {"path": str(path)} | arguments,
+    }
+    content = json.dumps(request).encode()
+    reply = _answered(content, target)
+    if not reply and _has_no_server():  # it was killed, and with it perhaps this request
+        reply = _answered(content, target)
+    if not reply:
+        raise DataError(
+            "unreadable-pixels",
+            f"expected readable pixels in {path.name}; reading {pixels} pixels crashed, or needed much more memory or time than "
+            "they explain: copy or make the file again",
+        )
+    return _result(reply)
+
+
+def _answered(request: bytes, target: BinaryIO) -> Answer:
+    """The answer of a child to a request; empty if the child ended without one."""
+    ours, theirs = socket.socketpair()
+    with ours:
+        with theirs:
+            _send(theirs.fileno(), target.fileno())
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            ours.sendall(request + b"\n")
+        with ours.makefile("rb") as stream, contextlib.suppress(ConnectionResetError):
+            return dict(json.loads(stream.readline() or b"{}"))
+    return {}
+
+
+def _result(reply: Answer) -> Answer:
+    if "answer" in reply:
+        return dict(reply["answer"])
+    if "errno" in reply:
+        raise OSError(reply["errno"], os.strerror(reply["errno"]))
+    if "fault" in reply:
+        raise RuntimeError(f"a function in a child process failed:\n{reply['fault']}")
+    error = HeaderError if reply["is_header_error"] else DataError
+    raise error(reply["code"], reply["message"], reply["fields"])
+
+
+class _Server:
+    """The process that forks the children of this process. It ends when this process ends."""
+
+    def __init__(self) -> None:
+        self.owner = os.getpid()
+        self.socket, theirs = socket.socketpair()
+        environment = {key: os.environ[key] for key in _KEPT_VARIABLES if key in os.environ}
+        environment |= {"PYTHONPATH": str(Path(__file__).parents[1]), "OPENBLAS_NUM_THREADS": "1"}
+        environment |= {"GLIBC_TUNABLES": "glibc.malloc.tcache_count=0"}  # small blocks are filled too
+        command = [sys.executable, "-P", "-m", "psfcore.limited"]
+        with theirs:
+            self._process = subprocess.Popen(
+                command,
+                stdin=theirs.fileno(),
+                stdout=subprocess.DEVNULL,
+                env=environment,
+                start_new_session=True,
+            )
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process has ended."""
+        return self._process.poll() is not None
+
+    def close(self) -> None:
+        self.socket.close()
+        if self.owner == os.getpid():
+            self._process.wait()
+
+
+def _send(*handles: int) -> None:
+    """Give open files to the server, which forks a child for them. Starts the server if there is none."""
+    global _server
+    with _lock:
+        if _server is not None and _server.owner == os.getpid():
+            with contextlib.suppress(OSError):  # the server was killed
+                socket.send_fds(_server.socket, [b"\n"], list(handles))
+                return
+        if _server is not None:
+            _server.close()
+        _server = _Server()
+        socket.send_fds(_server.socket, [b"\n"], list(handles))
+
+
+def _has_no_server() -> bool:
+    return _server is None or _server.ended
+
+
+@atexit.register
+def _end() -> None:
+    if _server is not None:
+        _server.close()
+
+
+def _serve() -> None:
+    """Fork a child for each pair of files that the owner of this process sends, until the owner has ended."""
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # ended children leave nothing behind
+    for name in _PRELOADED:
+        importlib.import_module(name)
+    gc.disable()
+    gc.freeze()  # a search for garbage would copy the memory that a child shares with this process
+    with socket.socket(fileno=0) as owner:
+        while True:
+            message, handles, _flags, _address = socket.recv_fds(owner, 1, 2)
+            if not message:
+                return
+            if os.fork() == 0:
+                owner.close()
+                _work(*handles)
+            for handle in handles:
+                os.close(handle)
+
+
+def _work(connection: int, target: int) -> None:
+    """Run one request and end this process."""
+    try:
+        with socket.socket(fileno=connection) as ours, ours.makefile("rwb") as stream:
+            request = json.loads(stream.readline())
+            stream.write(json.dumps(_reply(request, target)).encode() + b"\n")
+    finally:
+        os._exit(0)
+
+
+def _reply(request: Answer, target: int) -> Answer:
+    of_functions: Any = importlib.import_module("psfcore.limited")  # this module is __main__ here
+    of_functions._is_child = True
+    module, name = request["function"].split(":")
+    function = getattr(importlib.import_module(module), name)
+    _limit(request["memory_bytes"])
+    fill_new_memory(request["filling"])
+    try:
+        with os.fdopen(target, "wb") as file:
+            return {"answer": function(file, **request["arguments"])}
+    except DataError as error:
+        facts = {"code": error.code, "message": error.message, "fields": error.fields}
+        return facts | {"is_header_error": isinstance(error, HeaderError)}
+    except MemoryError:
+        return {}
+    except OSError as error:
+        return {"errno": error.errno} if error.errno else {"fault": traceback.format_exc()}
+    except Exception:  # noqa: BLE001  (the owner raises it)
+        return {"fault": traceback.format_exc()}
+
+
+def _limit(memory_bytes: int) -> None:
+    """Limit the memory and the time of this process."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+    signal.alarm(4 * SECONDS)
+    if sys.platform == "linux":
+        # RLIMIT_DATA also counts what the libraries hold; other systems do not enforce it.
+        held = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
+        _, most = resource.getrlimit(resource.RLIMIT_DATA)
+        limit = held + memory_bytes if most == resource.RLIM_INFINITY else min(most, held + memory_bytes)
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+
+
+def fill_new_memory(byte: int) -> None:
+    """Fill memory that is allocated from now on with this byte, so that what a C library does not write is known."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).mallopt(_M_PERTURB, byte)
+
+
+if __name__ == "__main__":
+    _serve()
