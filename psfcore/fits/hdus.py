@@ -55,6 +55,7 @@ PIXEL_TROUBLE = (
     AttributeError,
     ArithmeticError,
     RuntimeError,
+    re.error,  # astropy takes some keywords as patterns
     AssertionError,  # astropy raises it for the name of a column
     struct.error,
     zlib.error,

@@ -24,14 +24,9 @@ from service.cli.connection import (
     whole_id,
     whole_ids,
 )
-from service.cli.deconvolve import AGAIN
+from service.cli.fields import options_of
 from service.cli.options import (
-    METHOD,
-    NOISE,
-    OTHER_CHANNEL,
     OUTPUT,
-    SATURATION,
-    STEPS,
     fits_files,
     percent,
     progress_bar,
@@ -41,7 +36,9 @@ from service.cli.options import (
 from service.cli.progress import duration
 from service.cli.results.job import MOST, moment
 from service.client.errors import ServiceError
+from service.client.operations import treatment
 from service.client.outputs import written
+from workers.contract.requests import Treatment
 from workers.versions.status import PsfStatus
 
 if TYPE_CHECKING:
@@ -78,7 +75,6 @@ def bulk() -> None:
 @click.argument("patterns", nargs=-1)
 @psf_option("PSF for all images: an id or a file")
 @CONTEXT
-@OTHER_CHANNEL
 @click.option("--upload", "uploads", multiple=True, type=click.Path(exists=True, path_type=Path),
               help="FITS file, or folder of FITS files, to upload and deconvolve; can be repeated")  # fmt: skip
 @click.option(
@@ -99,11 +95,7 @@ def bulk() -> None:
     "--layout",
     help="Path of each product in the --output folder, for example {telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits",
 )
-@METHOD
-@STEPS
-@NOISE
-@SATURATION
-@AGAIN
+@options_of(Treatment, "method", "steps", "noise", "saturation_dn", "other_channel", "again")
 @click.option("--name", default="", help="Label of the bulk run")
 @click.option(
     "--dry-run", is_flag=True, help="Estimate the run and list inputs that it would refuse; start nothing"
@@ -114,22 +106,17 @@ def submit(
     patterns: tuple[str, ...],
     psf: str | None,
     context: str | None,
-    other_channel: bool,
     uploads: tuple[Path, ...],
     images: tuple[str, ...],
     conditions: tuple[tuple[str, str, Any], ...],
     output: str | None,
     only: bool,
     layout: str | None,
-    method: str,
-    steps: int | None,
-    noise: tuple[float, float] | None,
-    saturation_dn: float | None,
-    again: bool,
     name: str,
     dry_run: bool,
     wait: bool,
     server: str | None,
+    **parameters: Any,
 ) -> None:
     """Start a bulk run: deconvolve the files on the machine of the service that match PATTERNS.
 
@@ -148,7 +135,6 @@ def submit(
         raise click.UsageError(
             "--dry-run uploads and starts nothing: use it with PATTERNS or --image, without --upload and --wait"
         )
-    figures = {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]} if noise else None
     with user_errors(), remote(server) as service:
         sent, refused = _uploaded(service, fits_files(uploads))
         if refused and not (sent or images or patterns):
@@ -167,11 +153,7 @@ def submit(
             "only": only,
             "layout": layout,
             "name": name,
-            "method": {"name": method} | ({} if steps is None else {"steps": steps}),
-            "noise": figures,
-            "saturation_dn": saturation_dn,
-            "other_channel": other_channel or None,
-            "again": again or None,
+            **treatment(**parameters),
         }
         if dry_run:
             estimate = service.estimate_bulk(**asked)

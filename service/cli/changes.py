@@ -11,16 +11,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from psfcore.errors import DataError
-from service.cli.connection import CONTEXT, LOCAL, PSF, SERVER, connection, named_psf
-from service.cli.deconvolve import AGAIN
+from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
+from service.cli.fields import options_of
 from service.cli.options import (
-    METHOD,
-    NOISE,
-    OTHER_CHANNEL,
     OUTPUT_FOLDER,
     OVERWRITE,
-    SATURATION,
-    STEPS,
     counted,
     fits_files,
     limits,
@@ -32,6 +27,7 @@ from service.cli.options import (
 from service.client.errors import ServiceError
 from service.client.operations import Operations
 from service.client.outputs import check_output_folder, check_outputs, written
+from workers.contract.requests import Deconvolve
 
 if TYPE_CHECKING:
     from psfcore.deconvolve.assess.contact_sheet import Treated
@@ -46,16 +42,10 @@ FOR_ALL = (401, 403)
 @click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help=f"Folder for {TABLE} and {SHEET}")
 @PSF
-@OTHER_CHANNEL
-@CONTEXT
-@METHOD
-@STEPS
-@NOISE
-@SATURATION
+@options_of(Deconvolve, "other_channel", "context", "method", "steps", "noise", "saturation_dn", "again")
 @click.option(
     "--most", default=60, show_default=True, type=click.IntRange(1, 200), help="Images on the contact sheet"
 )
-@AGAIN
 @SERVER
 @LOCAL
 @OVERWRITE
@@ -63,17 +53,11 @@ def changes(
     images: tuple[Path, ...],
     output: Path,
     psf: str | None,
-    other_channel: bool,
-    context: str | None,
-    method: str,
-    steps: int | None,
-    noise: tuple[float, float] | None,
-    saturation_dn: float | None,
     most: int,
-    again: bool,
     server: str | None,
     local: bool,
     overwrite: bool,
+    **parameters: Any,
 ) -> None:
     """Deconvolve IMAGES (FITS files, or folders of them); write a table of what changed and a contact sheet.
 
@@ -90,16 +74,7 @@ def changes(
             psf_file = psf if psf and Path(psf).is_file() else None
             check_outputs((table_file, sheet_file), inputs=(*files, psf_file), overwrite=overwrite)
     with user_errors(), connection(server, local) as service, progress_bar() as report:
-        parameters = {
-            "psf_id": named_psf(service, psf),
-            "other_channel": other_channel,
-            "context": context,
-            "method": method,
-            "steps": steps,
-            "noise": noise or None,
-            "saturation_dn": saturation_dn,
-            "again": again,
-        }
+        parameters["psf_id"] = named_psf(service, psf)
         products: dict[str, dict[str, Any]] = {}
         treated, failures = treat_many(
             files,
@@ -108,7 +83,7 @@ def changes(
         )
         inputs = {row.name: _sha256(Path(row.name)) for row in treated}
         content = table(treated, failures) | {
-            "method": {"name": method, "steps": steps},
+            "method": {"name": parameters["method"], "steps": parameters["steps"]},
             "products": products,
             "inputs_sha256": inputs,
         }

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.shell_completion import CompletionItem
 
+from service.cli.fields import options_of
 from service.cli.progress import say
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
+from workers.contract.requests import Deconvolve
 from workers.contract.short_ids import FEWEST_DIGITS
 
 if TYPE_CHECKING:
@@ -114,9 +116,7 @@ SERVER_FOR_IDS = server_option("Address of the service, which is needed only if 
 PSF = psf_option(
     "PSF: an id or a file [default: the certified PSF for the image, else the PSF built for its instrument]"
 )
-CONTEXT = click.option(
-    "--context", help="Take PSFs from this context: its id or name; now: the PSFs that are certified now"
-)
+CONTEXT = options_of(Deconvolve, "context")
 
 
 def id_argument(name: str = "identity", *, several: bool = False) -> Callable[[Command], Command]:

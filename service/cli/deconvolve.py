@@ -8,16 +8,10 @@ from typing import Any
 
 import click
 
-from psfcore.deconvolve.box import Box
-from psfcore.errors import DataError
-from service.cli.connection import CONTEXT, LOCAL, PSF, SERVER, connection, named_psf, short
+from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf, short
+from service.cli.fields import options_of
 from service.cli.options import (
-    METHOD,
-    NOISE,
-    OTHER_CHANNEL,
     OUTPUT,
-    SATURATION,
-    STEPS,
     OutputPlace,
     Place,
     counted,
@@ -33,20 +27,7 @@ from service.client.many import Outcome, deconvolve_many
 from service.client.operations import Operations
 from service.client.outputs import check_output_folder, check_outputs
 from service.start import STARTED
-
-AGAIN = click.option(
-    "--again", is_flag=True, help="Deconvolve files whose header says that they are products or PSFs"
-)
-
-
-def _region(context: click.Context, parameter: click.Parameter, text: str | None) -> str | None:
-    """The text of a region, if it has the right form."""
-    if text is not None:
-        try:
-            Box.parse(text)
-        except DataError as error:
-            raise click.BadParameter(error.message, context, parameter) from error
-    return text
+from workers.contract.requests import Deconvolve
 
 
 @click.command()
@@ -60,50 +41,26 @@ def _region(context: click.Context, parameter: click.Parameter, text: str | None
     help="Write the deconvolved image (FITS) to this file; several images: to this folder",
 )
 @PSF
-@OTHER_CHANNEL
-@CONTEXT
-@METHOD
-@STEPS
-@click.option("--stop", type=click.Choice(["fixed", "discrepancy"]), help="When to stop [default: fixed]")
-@click.option(
-    "--edges",
-    type=click.Choice(["zero", "symmetric", "extended"]),
-    help="Assumed scene outside the image [default: depends on the method]",
-)
-@click.option("--hdu", type=click.IntRange(0), metavar="N", help="HDU of the image [default: first]")
-@click.option(
-    "--plate-scale",
+@options_of(
+    Deconvolve,
+    "other_channel",
+    "context",
+    "method",
+    "steps",
+    "stop",
+    "edges",
+    "hdu",
     "plate_scale_arcsec",
-    type=click.FloatRange(0, min_open=True),
-    metavar="ARCSEC",
-    help="Plate scale of a PSF without one",
-)
-@click.option(
-    "--region",
-    metavar="X0:X1,Y0:Y1",
-    callback=_region,
-    help="Deconvolve only this box, in pixels from 0 (X0 <= x < X1); the output is the box",
-)
-@click.option(
-    "--region-error",
-    type=click.FloatRange(0, 1, min_open=True),
-    metavar="SHARE",
-    help="Largest bound of the error of the region, as a share of its mean light; sets the rim [default: 0.05]",
-)
-@NOISE
-@SATURATION
-@click.option(
-    "--errors",
+    "region",
+    "region_error",
+    "noise",
+    "saturation_dn",
     "error_draws",
-    type=click.IntRange(0, 64),
-    default=0,
-    metavar="N",
-    help="Add an ERROR plane from N >= 2 noise realisations; each takes as long as one deconvolution",
+    "again",
 )
 @click.option("--plot", type=OUTPUT, help="Write the image before and after (PNG)")
 @click.option("--changes", type=OUTPUT, help="Write difference, ratio and histograms (PNG)")
 @click.option("--timings", is_flag=True, help="Print how long each stage of the command took; needs --local")
-@AGAIN
 @SERVER
 @LOCAL
 @writes_files
@@ -111,53 +68,22 @@ def deconvolve(
     images: tuple[Path, ...],
     output: Place,
     psf: str | None,
-    other_channel: bool,
-    context: str | None,
-    method: str,
-    steps: int | None,
-    stop: str | None,
-    edges: str | None,
-    hdu: int | None,
-    plate_scale_arcsec: float | None,
-    region: str | None,
-    region_error: float | None,
-    noise: tuple[float, float] | None,
-    saturation_dn: float | None,
-    error_draws: int,
     plot: Path | None,
     changes: Path | None,
     timings: bool,
-    again: bool,
     server: str | None,
     local: bool,
     overwrite: bool,
+    **parameters: Any,
 ) -> None:
     """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with the PSF that you name.
 
     The output is a folder if there are several images, or if its name ends in /. Images whose product is in the folder
-    are skipped. At most four jobs are open on a service at the same time. If an image fails, the command continues with
-    the others and lists the failures at the end; the exit status is then 1.
+    are skipped. Failures are listed at the end; the exit status is then 1.
     """
     files = fits_files(images)
     if not files:
         raise click.UsageError("expected FITS files; the folders that you named contain none")
-    parameters: dict[str, Any] = {
-        "context": context,
-        "method": method,
-        "noise": noise or None,
-        "saturation_dn": saturation_dn,
-        "error_draws": error_draws,
-        "steps": steps,
-        "stop": stop,
-        "edges": edges,
-        "hdu": hdu,
-        "plate_scale_arcsec": plate_scale_arcsec,
-        "region": region,
-        "region_error": region_error,
-        "other_channel": other_channel,
-        "again": again,
-        "overwrite": overwrite,
-    }
     if timings and not local:
         raise click.UsageError(
             "--timings: expected --local, because a service measures the stages of all jobs together; see its /metrics"
@@ -178,7 +104,7 @@ def deconvolve(
         connection(server, local, previews=plot is not None) as service,
         progress_bar() as report,
     ):
-        parameters["psf_id"] = named_psf(service, psf)
+        parameters |= {"psf_id": named_psf(service, psf), "overwrite": overwrite}
         if not into_folder:
             lines = _one(service, files[0], output.path, plot, changes, report, parameters)
             failures: list[Outcome] = []

@@ -12,16 +12,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from pydantic import ValidationError
 
 from psfcore.errors import DataError
+from service.cli.fields import options_of
 from service.cli.progress import progress_bar as progress_bar
 from service.client.errors import ServiceError, error_lines
 from service.client.outputs import check_output_folder, check_outputs, written
-from workers.contract.methods import Method
+from workers.contract.requests import Deconvolve
 
 if TYPE_CHECKING:
     from psfcore.fits.header import FitsLimits
@@ -101,16 +102,6 @@ class OutputFolder(click.Path):
 OUTPUT = OutputFile(dir_okay=False, path_type=Path)
 OUTPUT_PLACE = OutputPlace()
 OUTPUT_FOLDER = OutputFolder(file_okay=False, path_type=Path)
-METHODS = [get_args(kind.model_fields["name"].annotation)[0] for kind in get_args(get_args(Method)[0])]
-
-METHOD = click.option(
-    "--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True, help="Deconvolution method"
-)
-STEPS = click.option(
-    "--steps",
-    type=click.IntRange(1, 200),
-    help="Number of iterations [default: depends on the method; Richardson-Lucy: 20]",
-)
 NOISE = click.option(
     "--noise",
     nargs=2,
@@ -118,18 +109,7 @@ NOISE = click.option(
     metavar="GAIN READ",
     help="Photon gain (DN per photon) and read noise (DN rms) of the camera",
 )
-SATURATION = click.option(
-    "--saturation",
-    "saturation_dn",
-    type=float,
-    metavar="DN",
-    help="Pixels at or above this level are saturated and are ignored [default: the level of the header or the instrument file]",
-)
-OTHER_CHANNEL = click.option(
-    "--other-channel",
-    is_flag=True,
-    help="Use the PSF even if it is of another telescope, channel or filter than the image",
-)
+SATURATION = options_of(Deconvolve, "saturation_dn")
 CENTRE = click.option(
     "--centre",
     nargs=2,

@@ -5,21 +5,21 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import click
 
 from service.cli.connection import LOCAL, SERVER, connection, named_psf, psf_option
+from service.cli.fields import options_of
 from service.cli.options import (
     JSON,
-    NOISE,
     OUTPUT,
     PLOT,
-    SATURATION,
-    SEED,
     progress_bar,
     user_errors,
     writes_files,
 )
+from workers.contract.requests import Report
 
 
 @click.command()
@@ -28,19 +28,7 @@ from service.cli.options import (
 @JSON
 @PLOT
 @psf_option("PSF to test: an id or a file [default: fit a PSF to TRANSIT]")
-@click.option(
-    "--dark-offsets/--no-dark-offsets",
-    default=True,
-    help="Also fit with wrong dark levels, ±3 and ±5 DN (slow)",
-)
-@click.option(
-    "--shapes",
-    is_flag=True,
-    help="Also compare shapes of the scatter kernel by their residuals on held-out images (slow); not with --psf",
-)
-@SEED
-@NOISE
-@SATURATION
+@options_of(Report, "dark_offsets", "shapes", "seed", "noise", "saturation_dn")
 @SERVER
 @LOCAL
 @writes_files
@@ -50,14 +38,10 @@ def report(
     json_file: Path | None,
     plot: Path | None,
     psf: str | None,
-    dark_offsets: bool,
-    shapes: bool,
-    seed: int,
-    noise: tuple[float, float] | None,
-    saturation_dn: float | None,
     server: str | None,
     local: bool,
     overwrite: bool,
+    **parameters: Any,
 ) -> None:
     """Fit a PSF to TRANSIT, or test a PSF on it: compare simulated and observed light in the occulter's disc.
 
@@ -68,7 +52,7 @@ def report(
         raise click.UsageError(
             "expected an output: -o PAGE.html, --json FILE or --plot FILE; got none of them"
         )
-    if shapes and psf is not None:
+    if parameters["shapes"] and psf is not None:
         raise click.UsageError(
             "--shapes fits every shape to TRANSIT, so it cannot be used with --psf: remove one of the two"
         )
@@ -85,13 +69,9 @@ def report(
             page=output,
             preview=plot,
             progress=say,
-            noise=noise or None,
             psf_id=named_psf(service, psf),
-            seed=seed,
-            dark_offsets=dark_offsets,
-            shapes=shapes or None,
-            saturation_dn=saturation_dn,
             overwrite=overwrite,
+            **parameters,
         )
         told = json.loads(numbers.read_text("utf-8"))
     from psfcore.evaluation.summary_lines import summary_lines

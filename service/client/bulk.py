@@ -64,38 +64,32 @@ class BulkClient(ABC):
         *,
         images: Sequence[str] = (),
         files: Sequence[str | Mapping[str, Any]] = (),
-        psf_id: str | None = None,
-        context: str | None = None,
         output: str | None = None,
         only: bool = False,
         layout: str | None = None,
-        name: str = "",
-        **parameters: Any,
+        **fields: Any,
     ) -> dict[str, Any]:
         """Start a bulk run and return its description. If a bulk run of an identical request is open, return the description of that run.
 
         images: ids of uploaded images. files: patterns of paths on the machine of the service, or {"glob": pattern,
-        "where": conditions on the header}. Give either psf_id or context (id or name). output: folder on that machine for the
-        products. only: write the products only to this folder. layout: names of the products in this folder, for example
-        ``{telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits``. parameters: ``method={"name": ..., "steps": ...}``, ``noise``, ``saturation_dn``,
-        ``error_draws``, ``other_channel``.
+        "where": conditions on the header}. output: folder on that machine for the products. only: write the products only to
+        this folder. layout: names of the products in this folder, for example ``{telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits``.
+        fields: ``name``, either ``psf_id`` or ``context`` (id or name), and the fields of
+        ``workers.contract.requests.Treatment``, such as ``method={"name": ..., "steps": ...}`` or ``saturation_dn``.
         """
-        asked = _asked(images, files, psf_id, context, output, only, layout, name, parameters)
-        return self._json("POST", "/v1/bulk", json=asked)
+        wanted = _bulk_request(images, files, output, only, layout, fields)
+        return self._json("POST", "/v1/bulk", json=wanted)
 
     def estimate_bulk(
         self,
         *,
         images: Sequence[str] = (),
         files: Sequence[str | Mapping[str, Any]] = (),
-        psf_id: str | None = None,
-        context: str | None = None,
         output: str | None = None,
         only: bool = False,
         layout: str | None = None,
-        name: str = "",
         sample: int | None = None,
-        **parameters: Any,
+        **fields: Any,
     ) -> dict[str, Any]:
         """Estimate a bulk run without starting it. The other arguments and the errors are those of ``submit_bulk``.
 
@@ -103,9 +97,9 @@ class BulkClient(ABC):
         were found, "seconds" the expected time of the run with the workers of now, "output_bytes" the expected size of the
         products; "refused" has the examined images that the run would refuse, with the reasons.
         """
-        asked = _asked(images, files, psf_id, context, output, only, layout, name, parameters)
+        wanted = _bulk_request(images, files, output, only, layout, fields)
         query = {} if sample is None else {"sample": str(sample)}
-        return self._json("POST", "/v1/bulk/estimate", json=asked, params=query)
+        return self._json("POST", "/v1/bulk/estimate", json=wanted, params=query)
 
     def bulk(self, bulk_id: str) -> dict[str, Any]:
         """The current description of a bulk run."""
@@ -231,25 +225,22 @@ class BulkClient(ABC):
             time.sleep(wait_s)
 
 
-def _asked(
+def _bulk_request(
     images: Sequence[str],
     files: Sequence[str | Mapping[str, Any]],
-    psf_id: str | None,
-    context: str | None,
     output: str | None,
     only: bool,
     layout: str | None,
-    name: str,
-    parameters: Mapping[str, Any],
+    fields: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The body of a request for a bulk run."""
+    given = {name: value for name, value in fields.items() if value is not None}
+    own: dict[str, Any] = {name: given.pop(name) for name in ("name", "psf_id", "context") if name in given}
     return {
-        "name": name,
+        **own,
         "images": list(images),
         "files": [{"glob": one} if isinstance(one, str) else dict(one) for one in files],
-        "psf_id": psf_id,
-        "context": context,
-        "parameters": {key: value for key, value in parameters.items() if value is not None},
+        "parameters": given,
         "output": None if output is None else {"folder": output, "only": only, "layout": layout},
     }
 

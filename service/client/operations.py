@@ -16,6 +16,7 @@ from typing import Any
 from service.client.errors import ServiceError
 from service.client.outputs import check_outputs
 from service.client.versions import Progress
+from workers.contract.requests import Deconvolve
 
 
 class Operations(ABC):
@@ -100,54 +101,23 @@ class Operations(ABC):
         image: str | Path,
         output: str | Path | None = None,
         *,
-        psf_id: str | None = None,
-        method: str = "richardson-lucy",
         preview: str | Path | None = None,
-        progress: Progress | None = None,
-        noise: tuple[float, float] | None = None,
-        saturation_dn: float | None = None,
-        error_draws: int = 0,
         changes: str | Path | None = None,
-        context: str | None = None,
-        other_channel: bool = False,
-        again: bool = False,
-        hdu: int | None = None,
-        plate_scale_arcsec: float | None = None,
-        region: str | None = None,
-        region_error: float | None = None,
+        progress: Progress | None = None,
         overwrite: bool = False,
-        **method_parameters: Any,
+        **parameters: Any,
     ) -> dict[str, Any]:
         """Upload an image, deconvolve it and download the product to ``output``; returns the description of the product.
 
-        psf_id: default: the certified PSF for the image in ``context`` (id or name; default: the default context), else
-        the PSF that is built for the instrument. noise: photon gain (DN per photon) and read noise (DN rms). error_draws: number of noise
-        realisations for an ERROR plane, 0 or at least 2. preview, changes: where to write the picture of the image
-        before and after, and the picture of difference, ratio and histograms (PNG). other_channel: whether the PSF may be of
-        another telescope, channel or filter than the image. again: deconvolve the file even if its header says that it is a
-        product or a PSF. hdu: number of the HDU with the image (default: the first image). plate_scale_arcsec: plate scale of a PSF
-        whose file gives none, arcsec/px. region: deconvolve only this box, "x0:x1,y0:y1" in pixels from 0; region_error: largest bound of
-        its error, as a share of its mean light (default 0.05). ``details["warnings"]`` of the product says what may be wrong with it. method_parameters: for example
-        ``steps=20``, ``stop="discrepancy"``, ``edges="zero"``.
+        preview, changes: where to write the picture of the image before and after, and the picture of difference, ratio and
+        histograms (PNG). parameters: the fields of ``workers.contract.requests.Deconvolve``, such as ``psf_id``, ``error_draws``
+        or ``region``; ``method="richardson-lucy"`` and the parameters of this method, such as ``steps=20``,
+        ``stop="discrepancy"`` or ``edges="zero"``; ``noise``: photon gain (DN per photon) and read noise (DN rms).
+        ``details["warnings"]`` of the product says what may be wrong with it.
         """
         check_outputs((output, preview, changes), inputs=(image,), overwrite=overwrite)
-        wanted = deconvolution(
-            self.upload_image(image)["id"],
-            psf_id=psf_id,
-            method=method,
-            noise=noise,
-            saturation_dn=saturation_dn,
-            error_draws=error_draws,
-            changes_picture=changes is not None,
-            context=context,
-            other_channel=other_channel,
-            again=again,
-            hdu=hdu,
-            plate_scale_arcsec=plate_scale_arcsec,
-            region=region,
-            region_error=region_error,
-            **method_parameters,
-        )
+        image_id = self.upload_image(image)["id"]
+        wanted = deconvolution(image_id, changes_picture=changes is not None, **parameters)
         job = self.submit("deconvolve", **wanted)
         product = self.get(self.wait(job, progress=progress)["result"])
         self._fetch(product, output, preview, overwrite)
@@ -344,39 +314,19 @@ class Operations(ABC):
         return job
 
 
-def deconvolution(
-    image_id: str,
-    *,
-    psf_id: str | None = None,
-    method: str = "richardson-lucy",
-    noise: tuple[float, float] | None = None,
-    saturation_dn: float | None = None,
-    error_draws: int = 0,
-    changes_picture: bool = False,
-    context: str | None = None,
-    other_channel: bool = False,
-    again: bool = False,
-    hdu: int | None = None,
-    plate_scale_arcsec: float | None = None,
-    region: str | None = None,
-    region_error: float | None = None,
-    **method_parameters: Any,
-) -> dict[str, Any]:
+def deconvolution(image_id: str, **parameters: Any) -> dict[str, Any]:
     """The parameters of a request to deconvolve an uploaded image, from the arguments of ``Operations.deconvolve``."""
-    return {
-        "image_id": image_id,
-        "psf_id": psf_id,
-        "method": {"name": method, **_given(method_parameters)},
-        "saturation_dn": saturation_dn,
-        "error_draws": error_draws,
-        "changes_picture": changes_picture,
-        **({} if context is None else {"context": context}),
-        **({"other_channel": True} if other_channel else {}),
-        **({"again": True} if again else {}),
-        **_given({"hdu": hdu, "plate_scale_arcsec": plate_scale_arcsec}),
-        **_given({"region": region, "region_error": region_error}),
-        **_noise(noise),
-    }
+    return {"image_id": image_id, **treatment(**parameters)}
+
+
+def treatment(
+    *, method: str = "richardson-lucy", noise: tuple[float, float] | None = None, **parameters: Any
+) -> dict[str, Any]:
+    """The fields of a request to deconvolve, from the arguments of ``Operations.deconvolve``."""
+    given = _given(parameters)
+    fields = {name: value for name, value in given.items() if name in Deconvolve.model_fields}
+    of_method = {name: value for name, value in given.items() if name not in fields}
+    return {"method": {"name": method, **of_method}, **fields, **_noise(noise)}
 
 
 def _given(parameters: dict[str, Any]) -> dict[str, Any]:
@@ -386,4 +336,4 @@ def _given(parameters: dict[str, Any]) -> dict[str, Any]:
 
 def _noise(noise: tuple[float, float] | None) -> dict[str, Any]:
     """The parameter of a job for photon gain (DN per photon) and read noise (DN rms), if given."""
-    return {} if noise is None else {"noise": {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}}
+    return {} if not noise else {"noise": {"photon_gain_dn": noise[0], "read_noise_dn": noise[1]}}

@@ -58,20 +58,31 @@ def recipe_of(build: PsfBuild) -> Recipe:
 PRODUCT_FORMAT = 2
 
 
+_ALWAYS_HASHED = (
+    "image_id",
+    "psf_id",
+    "method",
+    "noise",
+    "saturation_dn",
+    "error_draws",
+    "changes_picture",
+    "region_error",
+)
+
+
 def product_identity(request: ResolvedDeconvolve) -> str:
     """Identity of a deconvolved image: bytes of the input, PSF, method with all parameters, versions of algorithm and file."""
     # The id of the PSF determines the PSF. The recipe and the interpolation only say how to make the PSF, and the context
-    # where it was found.
-    # `again` only permits a second deconvolution; the image itself determines whether this deconvolution is a second
-    # one.
-    excluded = {"psf_recipe", "psf_interpolation", "context_id", "again"} | (
-        {"picked_for"} if request.picked_for is None else set()
-    )
+    # where it was found. `again` only permits a second deconvolution; the image itself determines whether this deconvolution
+    # is a second one.
+    excluded = {"psf_recipe", "psf_interpolation", "context_id", "again"}
+    # A field that is not given leaves the identities as they were before there was this field.
+    fields = type(request).model_fields
+    excluded |= {
+        name for name, value in request if name not in _ALWAYS_HASHED and value == fields[name].default
+    }
     if request.region is None:
-        excluded |= {"region", "region_error"}
-    excluded |= {name for name in ("hdu", "plate_scale_arcsec") if getattr(request, name) is None}
-    if not request.other_channel:
-        excluded.add("other_channel")
+        excluded.add("region_error")
     hashed = request.model_dump(mode="json", exclude=excluded)
     # This parameter was called effects_picture when the first products were made. Hashing it under that name keeps
     # the ids of existing products valid.

@@ -5,7 +5,7 @@ To add a method, write a class here, a file in ``psfcore/deconvolve/methods`` an
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -25,11 +25,10 @@ class _Method(Parameters):
 
     stop: Literal["fixed", "discrepancy"] = Field(
         "fixed",
-        description="`fixed`: stop after `steps` iterations; `discrepancy`: stop earlier, when the residual is as small "
-        "as the noise (needs noise figures)",
+        description="`fixed`: do all `steps`; `discrepancy`: stop once the residual is like the noise",
     )
     edges: Literal["zero", "symmetric", "extended"] | None = Field(
-        None, description="the assumed scene beyond the field of view; null: the method's default"
+        None, description="assumed scene beyond the field of view; null: depends on the method"
     )
     margin_px: int | None = Field(
         None,
@@ -44,7 +43,7 @@ class RichardsonLucy(_Method):
 
     algorithm_version: ClassVar[int] = 2
     name: Literal["richardson-lucy"] = "richardson-lucy"
-    steps: int = Field(20, ge=1, le=200, description="iterations; the paper uses 20")
+    steps: int = Field(20, ge=1, le=200, description="number of iterations; the paper uses 20")
 
 
 class RichardsonLucyAccelerated(_Method):
@@ -99,4 +98,7 @@ Method = Annotated[
     | BasicIterative
     | Linear,
     Field(discriminator="name"),
+]
+METHODS: list[str] = [
+    get_args(one.model_fields["name"].annotation)[0] for one in get_args(get_args(Method)[0])
 ]

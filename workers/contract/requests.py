@@ -11,11 +11,12 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from psfcore.built.recipe import BUILD_VERSION
-from psfcore.deconvolve.box import BOX, LARGEST_ERROR, region_without_discrepancy, region_without_errors
+from psfcore.deconvolve.box import BOX, LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise_figures import NoiseFigures
 from workers.contract.methods import Method, Parameters, RichardsonLucy
+from workers.contract.option import Option
 from workers.versions.validity import TIME, iso, seconds
 
 ContextName = Annotated[
@@ -25,24 +26,22 @@ Identity = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256,
 TransitId = Annotated[Identity, Field(description="id returned by the upload of the transit")]
 TransitNoise = Annotated[
     NoiseFigures | None,
-    Field(
-        description="noise figures to use instead of the noise figures in transit.json; null: use transit.json"
-    ),
+    Field(description="photon gain (DN per photon), read noise (DN rms); null: those of transit.json"),
 ]
 Saturation = Annotated[
     float | None,
+    Option("--saturation", "DN"),
     Field(
         gt=0,
         allow_inf_nan=False,
-        description="saturation level in DN of one exposure; null: the level is taken from the header or the instrument file, "
-        "if known there",
+        description="pixels at or above this level are not used; null: the level of the header or instrument file",
     ),
 ]
 Component = Literal["airy", "entrance_mesh", "mount", "entrance", "filter_wheel", "diffraction", "scatter"]
 OtherChannel = Annotated[
     bool,
     Field(
-        description="whether the PSF may be of another telescope, channel or filter than the image; false: such an image is refused"
+        description="use a PSF of another telescope, channel or filter than the image; false: such an image is refused"
     ),
 ]
 ShapeName = Literal[
@@ -90,24 +89,17 @@ class Treatment(Parameters):
     method: Method = Field(default_factory=lambda: RichardsonLucy())
     noise: NoiseFigures | None = Field(
         None,
-        description="noise figures of the image's gain mode; null: the noise figures of the instrument, if known",
+        description="photon gain (DN per photon), read noise (DN rms); null: those of the instrument",
     )
-    saturation_dn: float | None = Field(
-        None,
-        gt=0,
-        allow_inf_nan=False,
-        description="saturation level in DN of one exposure; null: the saturation level of the instrument, if known",
-    )
-    error_draws: int = Field(
+    saturation_dn: Saturation = None
+    error_draws: Annotated[int, Option("--errors", "N")] = Field(
         0,
         ge=0,
         le=64,
-        description="number of noise realisations for an ERROR plane: 0, or 2 or more; each realisation takes as long as one deconvolution",
+        description="noise realisations for an ERROR plane, 0 or at least 2 (slow)",
     )
     other_channel: OtherChannel = False
-    again: bool = Field(
-        False, description="also deconvolve a file whose header says that it is a product or a PSF"
-    )
+    again: bool = Field(False, description="deconvolve even a product or a PSF")
 
     @model_validator(mode="after")
     def _a_spread(self) -> Treatment:
@@ -129,33 +121,31 @@ class Deconvolve(Treatment):
     )
     context: ContextName | None = Field(
         None,
-        description="the context from which the PSF is chosen: its id, its name, or `now`; null: the default context",
+        description="take the PSF from this context: id, name or `now`; null: the default context",
     )
     changes_picture: bool = Field(
         False, description="also draw the difference, the ratio and the histogram of the changes"
     )
 
-    hdu: int | None = Field(
-        None, ge=0, le=999, description="number of the HDU with the image; null: the first image of the file"
+    hdu: Annotated[int | None, Option(metavar="N")] = Field(
+        None, ge=0, le=999, description="number of the HDU with the image; null: the first image"
     )
-    plate_scale_arcsec: float | None = Field(
+    plate_scale_arcsec: Annotated[float | None, Option("--plate-scale", "ARCSEC")] = Field(
         None,
         gt=0,
         allow_inf_nan=False,
-        description="plate scale of a PSF whose file gives none, arcsec/px; null: the scales are then not compared",
+        description="plate scale of a PSF whose file gives none, arcsec/px; null: not compared",
     )
-    region: str | None = Field(
+    region: Annotated[str | None, Option(metavar="X0:X1,Y0:Y1", check=Box.parse)] = Field(
         None,
         pattern=BOX,
-        description="deconvolve only this box of the image, `x0:x1,y0:y1` in pixels counted from 0 (x0 <= x < x1); null: the whole "
-        "image. Not with `error_draws` or `stop` = `discrepancy`",
+        description="deconvolve only this box, px from 0 (x0 <= x < x1); null: the whole image",
     )
-    region_error: float = Field(
+    region_error: Annotated[float, Option(metavar="SHARE")] = Field(
         LARGEST_ERROR,
         gt=0,
         le=1,
-        description="largest bound of the difference between the region and the same pixels of the whole deconvolved image, as a share "
-        "of the mean light of the region; the rim around the region is made as wide as this needs",
+        description="largest error of the region by its rim, as a share of its mean light",
     )
 
     @model_validator(mode="after")

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from psfcore.deconvolve.box import LARGEST_ERROR
-from psfcore.noise_figures import NoiseFigures
-from workers.contract.methods import Method, Parameters
+from pydantic import Field
+
 from workers.contract.requests import (
     CrossValidate,
+    Deconvolve,
     GapDiagnose,
     Identity,
     PsfBuild,
@@ -22,27 +22,16 @@ from workers.contract.requests import (
 )
 
 
-class ResolvedDeconvolve(Parameters):
+class ResolvedDeconvolve(Deconvolve):
     """A deconvolution with the id of its PSF. If the PSF may still have to be built or interpolated, the parameters
     also say how."""
 
-    image_id: Identity
     psf_id: Identity
+    context: None = Field(None, exclude=True)  # the PSF is chosen; context_id says from which context
     psf_recipe: PsfBuild | None = None
     psf_interpolation: PsfInterpolate | None = None
     picked_for: str | None = None  # the instrument of the image, if the service chose the PSF
     context_id: str | None = None  # the context from which the service chose the PSF
-    method: Method
-    noise: NoiseFigures | None = None
-    saturation_dn: float | None = None
-    error_draws: int = 0
-    changes_picture: bool = False
-    hdu: int | None = None
-    plate_scale_arcsec: float | None = None
-    region: str | None = None
-    region_error: float = LARGEST_ERROR
-    other_channel: bool = False
-    again: bool = False
 
 
 class ResolvedPsfFit(PsfFit):

@@ -10,19 +10,18 @@ from typing import Any
 import click
 
 from service.cli.connection import LOCAL, SERVER, connection, named_psf, psf_option
+from service.cli.fields import options_of
 from service.cli.gap.blind import blind
 from service.cli.gap.plan import plan
 from service.cli.options import (
     JSON,
-    NOISE,
     OUTPUT,
     PLOT,
-    SATURATION,
-    SEED,
     progress_bar,
     user_errors,
     writes_files,
 )
+from workers.contract.requests import GapDiagnose
 
 SHOWN = 6
 
@@ -65,16 +64,7 @@ def gap() -> None:
     metavar="FILE.py|MODULE[,...]",
     help="Also test the effects in these files, whose code is executed. Only with --local; in a service set HELIOPSF_GAP_EFFECTS",
 )
-@click.option(
-    "--coverage",
-    default=0.9,
-    show_default=True,
-    type=click.FloatRange(0.5, 0.95),
-    help="Probability with which the answer set contains the true cause",
-)
-@SEED
-@NOISE
-@SATURATION
+@options_of(GapDiagnose, "coverage", "seed", "noise", "saturation_dn")
 @SERVER
 @LOCAL
 @writes_files
@@ -86,13 +76,10 @@ def diagnose(
     psf: str | None,
     corrected_file: Path | None,
     effects: str | None,
-    coverage: float,
-    seed: int,
-    noise: tuple[float, float] | None,
-    saturation_dn: float | None,
     server: str | None,
     local: bool,
     overwrite: bool,
+    **parameters: Any,
 ) -> None:
     """Diagnose the gap between TRANSIT and the model fitted to it: which effect explains the residuals.
 
@@ -115,14 +102,11 @@ def diagnose(
             page=output,
             preview=plot,
             progress=say,
-            noise=noise or None,
             psf_id=named_psf(service, psf),
-            saturation_dn=saturation_dn,
-            seed=seed,
-            coverage=coverage,
             # A service always makes the corrected PSF and keeps it, so that later requests find it.
             correct=corrected_file is not None or not local,
             overwrite=overwrite,
+            **parameters,
         )
         report = json.loads(numbers.read_text("utf-8"))
         corrected = found["details"]["corrected_psf_id"]

@@ -6,33 +6,27 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, get_args
+from typing import Any
 
 import click
 
 from service.cli.connection import LOCAL, SERVER, connection, short
+from service.cli.fields import options_of
 from service.cli.options import (
     FILE,
     JSON,
-    NOISE,
     OUTPUT,
     PLOT,
-    SATURATION,
     limits,
     progress_bar,
     user_errors,
     writes_files,
 )
 from service.client.outputs import written
-from workers.contract.requests import Component, ShapeName
+from workers.contract.requests import CrossValidate, PsfBuild, PsfFit
 
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 11.5, 20, 50, 100, 200, 500, 1000)
 TRANSIT = click.argument("transit", type=click.Path(exists=True, path_type=Path))
-SHAPE = click.option(
-    "--shape",
-    type=click.Choice(get_args(ShapeName)),
-    help="Shape of the scatter kernel [default: softened-power-law]",
-)
 
 
 @click.command("build")
@@ -42,12 +36,7 @@ SHAPE = click.option(
     metavar="NAME|FILE",
     help="An instrument that `psf instruments` lists, such as hri_euv, or an instrument file (TOML)",
 )
-@click.option("--size", default=2048, show_default=True, help="Width and height of the array, px")
-@click.option(
-    "--component",
-    type=click.Choice(get_args(Component)),
-    help="Build only this component [default: the total PSF]",
-)
+@options_of(PsfBuild, "size", "component")
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the PSF (FITS)")
 @PLOT
 @SERVER
@@ -55,13 +44,12 @@ SHAPE = click.option(
 @writes_files
 def build(
     instrument: str,
-    size: int,
-    component: str | None,
     output: Path,
     plot: Path | None,
     server: str | None,
     local: bool,
     overwrite: bool,
+    **parameters: Any,
 ) -> None:
     """Compute the PSF of an instrument."""
     with (
@@ -73,12 +61,11 @@ def build(
         built = service.build_psf(
             instrument,
             output,
-            size=size,
-            component=component,
             mask=mask,
             preview=plot,
             progress=report,
             overwrite=overwrite,
+            **parameters,
         )
     click.echo(f"{output}: {built['name']} {built['version']} ({built['status']}), id {short(built['id'])}")
     for radius, beyond_pct in built["details"]["cumulative_curve_pct"].items():
@@ -90,12 +77,7 @@ def build(
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the PSF (FITS)")
 @JSON
 @PLOT
-@SHAPE
-@click.option(
-    "--as-published", is_flag=True, help="Also run the published recipe and measure its biases (slow)"
-)
-@NOISE
-@SATURATION
+@options_of(PsfFit, "shape", "as_published", "noise", "saturation_dn")
 @SERVER
 @LOCAL
 @writes_files
@@ -104,13 +86,10 @@ def fit(
     output: Path,
     json_file: Path | None,
     plot: Path | None,
-    shape: str | None,
-    as_published: bool,
-    noise: tuple[float, float] | None,
-    saturation_dn: float | None,
     server: str | None,
     local: bool,
     overwrite: bool,
+    **parameters: Any,
 ) -> None:
     """Fit the scattered light in TRANSIT: a folder with a transit.json, or a .zip or .tar file of such a folder."""
     with user_errors(), connection(server, local) as service, progress_bar() as say:
@@ -120,11 +99,8 @@ def fit(
             report=json_file,
             preview=plot,
             progress=say,
-            noise=noise or None,
-            shape=shape,
-            as_published=as_published,
-            saturation_dn=saturation_dn,
             overwrite=overwrite,
+            **parameters,
         )
     found = fitted["details"]["fit"]
     click.echo(
@@ -151,18 +127,7 @@ def say_fit(fit: dict[str, Any]) -> None:
 @TRANSIT
 @click.option("--json", "json_file", required=True, type=OUTPUT, help="Write all numbers to this file (JSON)")
 @PLOT
-@click.option(
-    "--scheme",
-    type=click.Choice(["shared", "exact"]),
-    help="exact: each fold makes its own reconstructions (slow); shared: all folds use the same [default: shared]",
-)
-@click.option(
-    "--runs",
-    type=click.IntRange(1, 50),
-    help="Number of runs; each run holds out every block once [default: 10]",
-)
-@SHAPE
-@NOISE
+@options_of(CrossValidate, "scheme", "runs", "shape", "noise")
 @SERVER
 @LOCAL
 @writes_files
@@ -170,13 +135,10 @@ def crossval(
     transit: Path,
     json_file: Path,
     plot: Path | None,
-    scheme: str | None,
-    runs: int | None,
-    shape: str | None,
-    noise: tuple[float, float] | None,
     server: str | None,
     local: bool,
     overwrite: bool,
+    **parameters: Any,
 ) -> None:
     """Estimate the uncertainty of the fit to TRANSIT: hold out blocks of images and bootstrap the other images, in many runs."""
     with user_errors(), connection(server, local) as service, progress_bar() as report:
@@ -185,11 +147,8 @@ def crossval(
             json_file,
             preview=plot,
             progress=report,
-            noise=noise or None,
-            scheme=scheme,
-            runs=runs,
-            shape=shape,
             overwrite=overwrite,
+            **parameters,
         )
     click.echo(f"{json_file}: {found['details']['sentence']}")
 
