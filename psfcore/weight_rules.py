@@ -28,12 +28,6 @@ def check_weights(smallest: float, largest: float, total: float) -> None:
         )
 
 
-def check_finite(total: float) -> None:
-    """Raise DataError "psf-nonfinite" if a sum of weights is not finite."""
-    if not math.isfinite(total):
-        raise DataError("psf-nonfinite", "expected finite weights; got weights that are NaN or infinite")
-
-
 LARGEST_OFFSET_PX = 0.05  # a PSF moves every image by the offset of its core
 
 
