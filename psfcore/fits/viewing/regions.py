@@ -26,12 +26,16 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.hdus import readable_pixels
-from psfcore.fits.header import FitsLimits, check_all_headers
+from psfcore.fits.header import FitsLimits, check_all_headers, read_summary
+from psfcore.limited import run_limited
 
 Frame = Literal["pixel", "helioprojective"]
 Points = NDArray[np.float64]
 EDGE = 64
 _ARCSEC_PER_DEG = 3600.0
+_OF_TWO_AXES = re.compile(
+    r"C(TYPE|UNIT|RPIX|RVAL|DELT|ROTA)[12]|(PC|CD)[12]_[12]|PV[12]_[0-4]|LONPOLE|LATPOLE|RADESYS|DATE-OBS"
+)
 _MOVED = re.compile(r"CRPIX([12])([A-Z]?)")
 # Cards that describe the whole image, or the part of the detector that was read, and would be wrong in a cut-out.
 _DROPPED = (
@@ -68,13 +72,20 @@ class Region:
         return cls(frame, np.concatenate([start + steps * (end - start) for start, end in pairwise(points)]))
 
 
-def write_cutout(path: str | Path, region: Region, limits: FitsLimits, target: BinaryIO) -> tuple[int, int]:
-    """Write the cut-out of a product to ``target``; returns its shape (ny, nx).
+def write_cutout(path: str | Path, region: Region, limits: FitsLimits, target: BinaryIO) -> None:
+    """Write the cut-out of a product to ``target``, in a process of its own.
 
     Raises HeaderError for an unusable header, and DataError "region-outside" if the region contains no pixel of the image,
     "no-helioprojective" if the header gives no helioprojective coordinates, and "unreadable-pixels".
     """
     check_all_headers(path, limits)
+    pixels = math.prod(read_summary(path, limits).shape)
+    run_limited(cut_out, path, target, pixels=pixels, frame=region.frame, edge=region.edge.tolist())
+
+
+def cut_out(target: BinaryIO, *, path: str, frame: Frame, edge: list[list[float]]) -> dict[str, Any]:
+    """Write the cut-out of a product to ``target``. Call it in a limited process (`psfcore.limited`)."""
+    region = Region(frame, np.asarray(edge))
     with readable_pixels(path, "the region"), fits.open(path, memmap=False) as hdus:
         image = hdus[0]
         ny, nx = image.shape
@@ -86,7 +97,7 @@ def write_cutout(path: str | Path, region: Region, limits: FitsLimits, target: B
             f"{nx} x {ny} px"
         )
         fits.HDUList(parts).writeto(target, checksum=True)
-    return rows.stop - rows.start, columns.stop - columns.start
+    return {}
 
 
 def _window(region: Region, header: fits.Header, shape: tuple[int, int]) -> tuple[slice, slice]:
@@ -110,7 +121,9 @@ def _window(region: Region, header: fits.Header, shape: tuple[int, int]) -> tupl
 
 def _pixels_of(points: Points, header: fits.Header) -> Points:
     """Helioprojective coordinates in arcsec as pixels, counted from 0."""
-    wcs = WCS(header, fix=False)
+    # The cards of a file go into a C library, so it gets those of the two axes of the image alone.
+    own = fits.Header([card for card in header.cards if _OF_TWO_AXES.fullmatch(card.keyword)])
+    wcs = WCS(own, fix=False)
     axes = [str(name)[:4] for name in wcs.wcs.ctype]
     if axes != ["HPLN", "HPLT"]:
         got = ", ".join(filter(None, axes)) or "none"

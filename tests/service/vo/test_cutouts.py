@@ -12,6 +12,8 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from fastapi.testclient import TestClient
 
+from psfcore.fits.header import FitsLimits
+from psfcore.fits.viewing.regions import Region, write_cutout
 from tests.service.keyed import Keyed
 from tests.service.vo.made import SHAPE, add_product, pixels
 from workers.settings import Settings
@@ -79,6 +81,25 @@ def test_a_region_on_the_sky_is_inside_its_cutout(shared_api: TestClient, produc
         assert set(pixels().ravel()[inside]) <= set(hdus[0].data.ravel())
         diagonal = math.hypot(width, height) / 0.5
         assert max(hdus[0].shape) <= diagonal + 2
+
+
+def test_cards_of_many_axes_do_not_reach_the_library_of_coordinates(tmp_path: Path) -> None:
+    """A header with WCSAXES = 99999999 made it fill the memory, and then end its process."""
+    good = {
+        "CTYPE1": "HPLN-TAN",
+        "CTYPE2": "HPLT-TAN",
+        "CDELT1": 0.5,
+        "CDELT2": 0.5,
+        "CRPIX1": 32.5,
+        "CRPIX2": 32.5,
+    }
+    units = {"CUNIT1": "arcsec", "CUNIT2": "arcsec"}
+    bad = {"WCSAXES": 99_999_999, "CTYPE9": "HPLN-TAN", "PV2_999": 1.0, "CD1_900": 2.0}
+    fits.PrimaryHDU(pixels()[:64, :64], fits.Header(good | units | bad)).writeto(tmp_path / "p.fits")
+    region = Region.circle("helioprojective", 0.0, 0.0, 1.9)
+    with (tmp_path / "cut.fits").open("wb") as target:
+        write_cutout(tmp_path / "p.fits", region, FitsLimits(max_pixels=4096), target)
+    assert fits.getdata(tmp_path / "cut.fits").shape == (8, 8)
 
 
 BAD: list[tuple[dict[str, str], int, str]] = [
