@@ -3,7 +3,7 @@
 Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sections 3.3, 4.4 and 10.1.
 `walk` reads headers in blocks of 2880 bytes and skips the data of each HDU. The size of the data follows from the
 cards NAXISn, BITPIX, PCOUNT and GCOUNT. heliopsf uses the first two-dimensional image of a file: a plain image HDU, or
-a tile-compressed image in a binary table with ZIMAGE = T. `first_image` ignores everything after that image.
+a tile-compressed image in a binary table with ZIMAGE = T.
 
 If the whole file is compressed (.fits.gz), the reader must decompress data in order to skip them. The reader therefore
 checks every declared size first and limits the number of decompressed bytes.
@@ -68,10 +68,28 @@ class FitsLimits:
     max_hdus: int = 64
 
 
+@dataclass(frozen=True)
+class Hdu:
+    """The header of an HDU, its number, its kind (see `_kind`), and where its data start in the file, bytes."""
+
+    header: Header
+    number: int
+    kind: str
+    start: int
+
+    @property
+    def end(self) -> int:
+        """Where the data end, by their declared size. Raises HeaderError "bad-card" or "random-groups"."""
+        return self.start + _data_bytes(self.header, self.number)
+
+
 class Source(Protocol):
-    """A stream of bytes that can be read or skipped, only forwards."""
+    """A stream of bytes that can be read or skipped, only forwards. position: bytes that were read or skipped."""
 
     gzipped: bool
+
+    @property
+    def position(self) -> int: ...
 
     def read(self, count: int) -> bytes: ...
 
@@ -84,6 +102,10 @@ class _PlainSource:
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self._size = os.fstat(file.fileno()).st_size
+
+    @property
+    def position(self) -> int:
+        return self._file.tell()
 
     def read(self, count: int) -> bytes:
         return self._file.read(count)
@@ -100,17 +122,17 @@ class _GzipSource:
 
     def __init__(self, file: BinaryIO, budget_bytes: int) -> None:
         self._stream = gzip.GzipFile(fileobj=file, mode="rb")
-        self._left = budget_bytes
+        self._budget_bytes = budget_bytes
+        self.position = 0
 
     def read(self, count: int) -> bytes:
-        self._left -= count
-        if self._left < 0:
+        if self.position + count > self._budget_bytes:
             raise HeaderError(
                 "too-many-bytes",
                 "expected decompressed data within the size limit; got more bytes: use a smaller file",
             )
         try:
-            return self._stream.read(count)
+            content = self._stream.read(count)
         except EOFError:
             raise HeaderError(
                 "truncated-gzip", "expected a complete gzip stream; it ends too early: copy the file again"
@@ -119,15 +141,15 @@ class _GzipSource:
             raise HeaderError(
                 "bad-gzip", f"expected a readable gzip stream; got: {error}: copy the file again"
             ) from None
+        self.position += len(content)
+        return content
 
     def skip(self, count: int) -> int:
-        there = 0
-        while there < count:
-            chunk = self.read(min(_SKIP_BYTES, count - there))
-            if not chunk:
+        start = self.position
+        while self.position < start + count:
+            if not self.read(min(_SKIP_BYTES, start + count - self.position)):
                 break
-            there += len(chunk)
-        return there
+        return self.position - start
 
 
 @contextmanager
@@ -144,89 +166,61 @@ def open_source(path: Path, limits: FitsLimits) -> Iterator[Source]:
             yield _PlainSource(file)
 
 
-def first_image(source: Source, limits: FitsLimits, hdu: int | None = None) -> tuple[Header, int]:
-    """Header and HDU number of the first 2-D image, or of the image in HDU `hdu`.
+def walk(source: Source, limits: FitsLimits) -> Iterator[Hdu]:
+    """Each HDU of a file. Its data come next in ``source``; what is left of them is skipped when the next HDU is requested.
+
+    Raises HeaderError.
+    """
+    header_bytes = 0
+    for number in range(limits.max_hdus + 1):
+        raw = _read_header(source, limits.max_header_bytes - header_bytes, limits, first=number == 0)
+        if raw is None:
+            return
+        if number == limits.max_hdus:
+            break
+        header_bytes += len(raw)
+        header = _parse(raw, number)
+        hdu = Hdu(header, number, _kind(header, number), source.position)
+        yield hdu
+        skip_data(source, hdu, limits)
+        source.skip(-hdu.end % BLOCK_BYTES)
+    message = f"expected at most {limits.max_hdus} HDUs, and an image in one of them; got more HDUs"
+    raise HeaderError("too-many-hdus", message)
+
+
+def first_image(hdus: Iterator[Hdu], limits: FitsLimits, number: int | None = None) -> Hdu:
+    """The first 2-D image of the HDUs, or the image in HDU ``number``. Its data come next in the source.
 
     Raises HeaderError if there is none, or if an image of more axes comes first.
     """
     kinds: list[str] = []
-    for header, number, kind in walk(source, limits, to_the_end=False, hdu=hdu):
-        kinds.append(kind)
-        if kind == "image" and hdu in (None, number):
-            return header, number
-        if kind.startswith("cube") and hdu in (None, number):
-            raise _no_image(kinds)
-    if hdu is not None and kinds and len(kinds) <= hdu:
-        raise HeaderError("no-image", f"expected an HDU of the file, 0 to {len(kinds) - 1}; got {hdu}")
+    for hdu in hdus:
+        kinds.append(hdu.kind)
+        if number not in (None, hdu.number):
+            continue
+        if hdu.kind == "image":
+            _check_image(hdu.header, limits)
+            return hdu
+        if number is not None or hdu.kind.startswith("cube"):
+            break
+    if number is not None and len(kinds) <= number:
+        raise HeaderError("no-image", f"expected an HDU of the file, 0 to {len(kinds) - 1}; got {number}")
     raise _no_image(kinds)
 
 
-def following(
-    source: Source, header: Header, hdu: int, limits: FitsLimits
-) -> Iterator[tuple[Header, int, str]]:
-    """Header, number and kind of each HDU after the one that `first_image` found, up to the first that cannot be read.
-
-    What follows an image is not needed to use it, so damage there is no error.
-    """
-    source.skip(-_data_bytes(header, hdu) % BLOCK_BYTES)
-    header_bytes = 0
-    try:
-        for number in range(hdu + 1, limits.max_hdus):
-            raw = _read_header(source, limits.max_header_bytes - header_bytes, limits, first=False)
-            if raw is None:
-                return
-            header_bytes += len(raw)
-            header = _parse(raw, number)
-            yield header, number, _kind(header, number)
-            _pass_data(source, header, number, limits, last=False)
-    except HeaderError:
-        return
-
-
-def enter_data(source: Source, hdu: int, limits: FitsLimits) -> Header:
-    """Read up to the data of an HDU that `first_image` found; returns its header. ``source`` must be at its start.
-
-    Afterwards, the next byte of ``source`` is the first byte of the data of this HDU. Raises HeaderError.
-    """
-    for number in range(hdu + 1):
-        raw = _read_header(source, limits.max_header_bytes, limits, first=number == 0)
-        if raw is None:
-            raise HeaderError(
-                "truncated-data",
-                f"expected {hdu + 1} HDUs; the file ends after {number}: copy the file again",
-            )
-        header = _parse(raw, number)
-        if number < hdu:
-            _pass_data(source, header, number, limits, last=False)
-    return header
-
-
-def walk(
-    source: Source, limits: FitsLimits, *, to_the_end: bool, hdu: int | None = None
-) -> Iterator[tuple[Header, int, str]]:
-    """Yield header, number and kind (see `_kind`) of each HDU.
-
-    to_the_end: continue to the end of the file instead of stopping at the first image. hdu: stop at this HDU instead. Raises
-    HeaderError.
-    """
-    header_bytes = 0
-    for number in range(limits.max_hdus):
-        raw = _read_header(source, limits.max_header_bytes - header_bytes, limits, first=number == 0)
-        if raw is None:
-            return
-        header_bytes += len(raw)
-        header = _parse(raw, number)
-        kind = _kind(header, number)
-        last = not to_the_end and (kind == "image" if hdu is None else number == hdu)
-        if last and kind == "image":
-            _check_image(header, limits)
-        _pass_data(source, header, number, limits, last=last)
-        yield header, number, kind
-        if last:
-            return
-    if not to_the_end or source.read(1):
-        message = f"expected at most {limits.max_hdus} HDUs, and an image in one of them; got more HDUs"
-        raise HeaderError("too-many-hdus", message)
+def skip_data(source: Source, hdu: Hdu, limits: FitsLimits) -> None:
+    """Skip what is left of the data of an HDU. Raises HeaderError if the file does not hold all of them."""
+    size = hdu.end - source.position
+    if source.gzipped and size > limits.max_pixels * 16:
+        message = (
+            f"expected at most {limits.max_pixels * 16} bytes of data in an HDU; HDU {hdu.number} declares "
+            f"{size}"
+        )
+        raise HeaderError("too-many-bytes", message)
+    there = source.skip(size)
+    if there < size:
+        wanted = f"expected {size} bytes of data in HDU {hdu.number}, as its header declares"
+        raise HeaderError("truncated-data", f"{wanted}; got {there}: copy the file again")
 
 
 def _counted(kinds: list[str]) -> str:
@@ -359,22 +353,6 @@ def _check_plain(header: Header) -> None:
     """Raise HeaderError if the data of an image contain more than its pixels (FITS standard 4.0, section 7.1.1)."""
     for key, value in (("PCOUNT", 0), ("GCOUNT", 1)):
         card_count(header, key, smallest=value, largest=value, default=value)
-
-
-def _pass_data(source: Source, header: Header, hdu: int, limits: FitsLimits, *, last: bool) -> None:
-    size = _data_bytes(header, hdu)
-    if source.gzipped and size > limits.max_pixels * 16:
-        message = (
-            f"expected at most {limits.max_pixels * 16} bytes of data in an HDU; HDU {hdu} declares {size}"
-        )
-        raise HeaderError("too-many-bytes", message)
-    there = source.skip(size)
-    if there < size:
-        wanted = f"expected {size} bytes of data in HDU {hdu}, as its header declares"
-        message = f"{wanted}; got {there}: copy the file again"
-        raise HeaderError("truncated-data", message)
-    if not last:
-        source.skip(-size % BLOCK_BYTES)
 
 
 def _data_bytes(header: Header, hdu: int) -> int:

@@ -24,7 +24,7 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.fits.blocks import FitsLimits, Source, enter_data, open_source
+from psfcore.fits.blocks import FitsLimits, Source, first_image, open_source, walk
 from psfcore.fits.compression import may_hold_unwritten_memory
 from psfcore.fits.header import HeaderSummary, optional_number
 from psfcore.limited import fill_new_memory, run_limited
@@ -71,7 +71,7 @@ def read_pixels(
     is that of the image. Raises HeaderError, DataError "unreadable-pixels", and OSError if the disk fails.
     """
     with open_source(Path(path), limits) as source:
-        header = enter_data(source, summary.hdu, limits)
+        header = first_image(walk(source, limits), limits, summary.hdu).header
         if summary.codec is None:
             return _plain_pixels(source, header, summary), header
     twice = may_hold_unwritten_memory(header)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits, first_image, following, open_source, walk
+from psfcore.errors import DataError, HeaderError
+from psfcore.fits.blocks import FitsLimits, first_image, open_source, skip_data, walk
 from psfcore.fits.cards import (
     Cards,
     card_count,
@@ -117,9 +118,7 @@ def read_summary(
 
     Raises HeaderError if the file has no usable image there.
     """
-    with open_source(Path(path), limits) as source:
-        header, number = first_image(source, limits, hdu)
-        return _summary(header, number, source.gzipped)
+    return read_contents(path, limits, hdu=hdu)[0]
 
 
 @dataclass(frozen=True)
@@ -132,22 +131,29 @@ class Neighbour:
 
 
 def read_contents(
-    path: str | os.PathLike[str], limits: FitsLimits, *, hdu: int | None = None
+    path: str | os.PathLike[str], limits: FitsLimits, *, hdu: int | None = None, whole: bool = False
 ) -> tuple[HeaderSummary, list[Neighbour]]:
-    """As `read_summary`, with the images that follow in the file. Planes of products are left out."""
+    """As `read_summary`. whole: also the images that follow in the file. Planes of products are left out."""
+    neighbours: list[Neighbour] = []
     with open_source(Path(path), limits) as source:
-        header, number = first_image(source, limits, hdu)
-        neighbours = []
-        for other, k, kind in following(source, header, number, limits):
-            if kind == "image" and lenient_value(other, "PLANE") is not True:
-                neighbours.append(Neighbour(k, optional_text(other, "EXTNAME") or "", _shape(other)))
-        return _summary(header, number, source.gzipped), neighbours
+        hdus = walk(source, limits)
+        image = first_image(hdus, limits, hdu)
+        skip_data(source, image, limits)
+        # What follows an image is not needed to use it, so damage there is no error.
+        with suppress(HeaderError):
+            for other in hdus if whole else ():
+                if other.kind == "image" and lenient_value(other.header, "PLANE") is not True:
+                    name = optional_text(other.header, "EXTNAME") or ""
+                    neighbours.append(Neighbour(other.number, name, _shape(other.header)))
+        return _summary(image.header, image.number, source.gzipped), neighbours
 
 
 def first_image_header(path: str | os.PathLike[str], limits: FitsLimits) -> Header:
     """Unchanged header of the first 2-D image of a file. Raises HeaderError if the file has no usable image."""
     with open_source(Path(path), limits) as source:
-        return first_image(source, limits)[0]
+        image = first_image(walk(source, limits), limits)
+        skip_data(source, image, limits)
+        return image.header
 
 
 def check_all_headers(path: str | os.PathLike[str], limits: FitsLimits) -> None:
@@ -156,7 +162,7 @@ def check_all_headers(path: str | os.PathLike[str], limits: FitsLimits) -> None:
     Call this before reading HDUs other than the first image.
     """
     with open_source(Path(path), limits) as source:
-        for _header, _hdu, _kind in walk(source, limits, to_the_end=True):
+        for _ in walk(source, limits):
             pass
 
 

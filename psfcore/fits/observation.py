@@ -48,7 +48,7 @@ def read_observation(
     2-D image. Raises HeaderError for an unusable header; DataError "unreadable-pixels", and the errors of
     `observation_of`.
     """
-    summary, neighbours = read_contents(path, limits, hdu=hdu)
+    summary, neighbours = read_contents(path, limits, hdu=hdu, whole=True)
     pixels, header = read_pixels(path, summary, limits)
     ours = {one.name.upper(): one for one in neighbours if one.shape == summary.shape}
     if summary.content == IMAGE and "MASK" in ours:  # as CCDData writes it

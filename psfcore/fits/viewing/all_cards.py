@@ -34,7 +34,7 @@ def all_cards(path: str | os.PathLike[str], limits: FitsLimits) -> list[ListedHe
     that contains it. Raises HeaderError if a header is unusable or exceeds the limits.
     """
     with open_source(Path(path), limits) as source:
-        return [_listed(header, hdu) for header, hdu, _kind in walk(source, limits, to_the_end=True)]
+        return [_listed(hdu.header, hdu.number) for hdu in walk(source, limits)]
 
 
 def _listed(header: fits.Header, hdu: int) -> ListedHeader:

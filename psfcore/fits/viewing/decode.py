@@ -49,9 +49,9 @@ def _number_of_plane(path: str | Path, name: str, limits: FitsLimits) -> int:
     """The HDU of a plane of a product. Raises DataError "no-such-plane"."""
     planes = {}
     with open_source(Path(path), limits) as source:
-        for header, hdu, kind in walk(source, limits, to_the_end=True):
-            if hdu > 0 and kind == "image" and lenient_value(header, "PLANE") is True:
-                planes[optional_text(header, "EXTNAME") or ""] = hdu
+        for hdu in walk(source, limits):
+            if hdu.number > 0 and hdu.kind == "image" and lenient_value(hdu.header, "PLANE") is True:
+                planes[optional_text(hdu.header, "EXTNAME") or ""] = hdu.number
     if name not in planes:
         there = ", ".join([IMAGE, *map(str.lower, planes)])
         advice = ": submit the deconvolution with error_draws" if name == "ERROR" else ""
