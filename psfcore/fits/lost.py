@@ -22,6 +22,8 @@ _FILLED_WITH = (-32768.0, -32767.0, -2147483648.0, -2147483647.0, -9999.0, -999.
 _COUNTS = ("NMISSING", "MISSVALS")
 # Cards that name the kind of a frame, and the words of frames without the light of the Sun.
 _KIND_CARDS = ("IMG_TYPE", "IMGTYPE", "IMAGETYP", "EC_IMTYP", "FRAMETYP", "OBS_TYPE")
+# Cards with the value that says that the Earth, the Moon or the pointing hid the Sun (SDO; SWAP).
+_HIDDEN = {"ACS_ECLP": "YES", "ACS_SUNP": "NO", "ECLIPSE": "1"}
 _NO_SUN = ("dark", "bias", "led", "flat", "calib", "offset", "pinhole")
 
 
@@ -46,10 +48,14 @@ def count_of_lost(header: Cards) -> int:
 
 
 def check_exposure(header: Cards) -> None:
-    """Raise DataError "not-an-exposure" if a card says that the frame does not show the Sun: a dark, an LED frame, ..."""
-    for key in _KIND_CARDS:
-        kind = optional_text(header, key)
-        if kind is not None and any(word in kind.lower().replace("_", " ").split() for word in _NO_SUN):
+    """Raise DataError "not-an-exposure" if a card says that the frame does not show the Sun: a dark, an eclipse, ..."""
+    for key in (*_KIND_CARDS, *_HIDDEN):
+        number = optional_number(header, key)
+        kind = optional_text(header, key) if number is None else f"{number:g}"
+        if kind is None:
+            continue
+        words = kind.lower().replace("_", " ").split()
+        if kind.upper() == _HIDDEN.get(key) or (key in _KIND_CARDS and any(one in words for one in _NO_SUN)):
             raise DataError(
                 "not-an-exposure",
                 f"expected an exposure of the Sun; the header says {key} = {kind!r:.40}: use another image, or allow it to be "

@@ -297,6 +297,9 @@ def test_what_is_no_exposure_is_refused() -> None:
     for cards, code in (
         ({"IMG_TYPE": "DARK"}, "not-an-exposure"),
         ({"IMGTYPE": "LED image"}, "not-an-exposure"),
+        ({"ACS_ECLP": "YES"}, "not-an-exposure"),
+        ({"ACS_SUNP": "NO"}, "not-an-exposure"),
+        ({"ECLIPSE": 1}, "not-an-exposure"),
         ({"BUNIT": "log(DN)"}, "bad-unit"),
         ({"BUNIT": "sqrt(DN/s)"}, "bad-unit"),
         ({"HISTORY": "XRT_DECONVOLVE v2017: Deconvolved with XRT.PSF560.fits"}, "already-deconvolved"),
@@ -307,6 +310,7 @@ def test_what_is_no_exposure_is_refused() -> None:
             check_exposure_of_sun(header(**cards))
         assert caught.value.code == code, cards
     check_exposure_of_sun(header(IMG_TYPE="LIGHT", IMGTYPE="solar image", HISTORY="not deconvolved"))
+    check_exposure_of_sun(header(ACS_ECLP="NO", ACS_SUNP="YES", ECLIPSE=0))
 
 
 def test_times() -> None:
