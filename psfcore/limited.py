@@ -87,6 +87,12 @@ def _answered(request: bytes, target: BinaryIO) -> Answer:
     return {}
 
 
+def prepare() -> None:
+    """Start the server if there is none, so that it loads its libraries while this process loads its own."""
+    with _lock:
+        _running()
+
+
 def _result(reply: Answer) -> Answer:
     if "answer" in reply:
         return dict(reply["answer"])
@@ -119,8 +125,8 @@ class _Server:
 
     @property
     def ended(self) -> bool:
-        """Whether the process has ended."""
-        return self._process.poll() is not None
+        """Whether the process has ended. Only its owner can tell."""
+        return self.owner == os.getpid() and self._process.poll() is not None
 
     def close(self) -> None:
         self.socket.close()
@@ -130,16 +136,21 @@ class _Server:
 
 def _send(*handles: int) -> None:
     """Give open files to the server, which forks a child for them. Starts the server if there is none."""
-    global _server
     with _lock:
-        if _server is not None and _server.owner == os.getpid():
-            with contextlib.suppress(OSError):  # the server was killed
-                socket.send_fds(_server.socket, [b"\n"], list(handles))
-                return
-        if _server is not None:
-            _server.close()
+        try:
+            socket.send_fds(_running().socket, [b"\n"], list(handles))
+        except OSError:  # the server has just been killed
+            _stop()
+            socket.send_fds(_running().socket, [b"\n"], list(handles))
+
+
+def _running() -> _Server:
+    """The server of this process; a new one if there is none, or if it was killed."""
+    global _server
+    if _server is None or _server.owner != os.getpid() or _server.ended:
+        _stop()
         _server = _Server()
-        socket.send_fds(_server.socket, [b"\n"], list(handles))
+    return _server
 
 
 def _has_no_server() -> bool:
@@ -147,9 +158,11 @@ def _has_no_server() -> bool:
 
 
 @atexit.register
-def _end() -> None:
+def _stop() -> None:
+    global _server
     if _server is not None:
         _server.close()
+        _server = None
 
 
 def _serve() -> None:

@@ -16,6 +16,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from psfcore import limited
 from psfcore.built.cache import PsfCache
 from psfcore.deconvolve.memory import MIB, check_memory
 from psfcore.errors import DataError
@@ -178,6 +179,8 @@ class LocalService(Operations):
         """Add an image, after the same check of its header as in a service."""
         source = Path(path)
         summary = read_summary(source, FitsLimits(max_pixels=self._settings.max_pixels))
+        if summary.codec is not None:
+            limited.prepare()
         sha256 = self._store.add_file(source)
         row = image_row(DEFAULT_OWNER, sha256, source.stat().st_size, source.name, summary)
         self._catalogue.add(row)

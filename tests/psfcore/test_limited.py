@@ -91,7 +91,7 @@ def test_a_process_that_was_forked_has_a_server_of_its_own(path: Path) -> None:
     reader, writer = os.pipe()
     if os.fork() == 0:
         os.write(writer, str(answer(path, "read")[0]["parent"]).encode())
-        limited._end()
+        limited._stop()
         os._exit(0)
     assert 0 < int(os.read(reader, 20)) != server
     os.wait()
