@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import threading
 import time
 from pathlib import Path
 from queue import Empty
@@ -169,3 +171,19 @@ def test_what_was_cut_in_the_folder_when_the_power_went_stops_nobody(settings: S
         (broker / "queue" / f"1_x.{broker_name(Queue.BULK)}.msg.ab.part").write_text("")
         assert queue.submit(queue.make_app(settings), "second", Queue.BULK)
         assert take() == ["second"]
+
+
+def test_a_process_that_binds_a_queue_waits_for_another_that_does(settings: Settings) -> None:
+    """Two that write the table of bindings at once would lose the binding of one."""
+    assert queue.submit(queue.make_app(settings), "first", Queue.BULK)
+    lock = settings.data_dir / "broker" / "control" / "lock"
+    FolderTransport.global_state.clear()
+    pools.reset()
+    submitting = threading.Thread(target=lambda: queue.submit(queue.make_app(settings), "second", Queue.BULK))
+    with lock.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_SH)
+        submitting.start()
+        submitting.join(0.3)
+        assert submitting.is_alive()
+    submitting.join(10.0)
+    assert not submitting.is_alive()

@@ -90,3 +90,12 @@ def test_a_flickering_block_changes_as_measured_if_some_pixels_are_clipped() -> 
     assert not any(
         flicker.change(n, view.expected)[bright].any() for n in range(len(frames)) if n not in here
     )
+
+
+def test_a_loss_of_faint_light_takes_light_away() -> None:
+    [effect] = [one for one in LIBRARY if one.name == "nonlinearity"]
+    images = view().expected
+    for change in effect.changes(view()):
+        lost = change.change(0, images)
+        assert lost.min() < 0 and lost.max() <= 0
+        assert abs(lost).max() <= images[0].max()
