@@ -1,7 +1,7 @@
 """Compare the revision of the database with the revision that this version of heliopsf needs, and upgrade the database.
 
 A revision is a numbered state of the tables. The revisions are in ``workers/catalogue/migrations/versions``. Alembic runs
-them; it is imported only when needed. Any number of processes may start at the same moment. The first process that gets
+them; it is imported only when needed. A new database gets the present tables at once, without running revisions. Any number of processes may start at the same moment. The first process that gets
 the lock of the database upgrades the database in one transaction. The others wait, and then find that it is upgraded.
 """
 
@@ -10,11 +10,11 @@ from __future__ import annotations
 import logging
 import threading
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sqlalchemy import Connection, MetaData, inspect, text
+from sqlalchemy import Connection, inspect, text
 
 from workers.catalogue.database import Database, make_missing
 from workers.catalogue.tables import Base
@@ -29,7 +29,8 @@ LOCK = 0x68656C696F  # PostgreSQL's advisory lock for upgrades: "helio"
 _ONE_AT_A_TIME = threading.Lock()
 
 log = logging.getLogger(__name__)
-State = Literal["empty", "unversioned", "older", "current", "newer"]
+# unversioned: tables without a revision. obsolete: a revision before the first one that this version knows.
+State = Literal["empty", "unversioned", "obsolete", "older", "current", "newer"]
 
 
 class SchemaError(Exception):
@@ -43,6 +44,28 @@ class SchemaStatus:
     revision: str | None  # None: the database has no revision
     wanted: str
     state: State
+
+    @property
+    def refusal(self) -> str | None:
+        """Why this version can neither use nor upgrade the database, and what to do; None if it can."""
+        match self.state:
+            case "newer":
+                return (
+                    f"the database is at revision {self.revision}, which this version does not know: heliopsf "
+                    f"{software_version()} knows revisions up to {self.wanted}; use the version that made the database"
+                )
+            case "obsolete":
+                return (
+                    f"the database is at revision {self.revision} of a development version, which heliopsf "
+                    f"{software_version()} cannot upgrade: upgrade it first with the last version that can (see Upgrading "
+                    "in docs/operating.md), or use an empty database"
+                )
+            case "unversioned":
+                return (
+                    "expected an empty database or one of heliopsf; this one has tables with names of heliopsf's tables, but "
+                    "without a revision: use an empty database"
+                )
+        return None
 
 
 @dataclass(frozen=True)
@@ -58,13 +81,16 @@ class SchemaFaults:
 class Schema:
     """Inspects the tables of the database and upgrades them."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, revisions: Path = REVISIONS) -> None:
+        """revisions: a folder with an ``env.py`` and a folder ``versions``, as Alembic expects them."""
         self._database = database
+        self._revisions = revisions
 
     def upgrade(self) -> None:
-        """Upgrade a database that is empty, has an older revision, or was made before revisions existed.
+        """Make the tables of an empty database, or upgrade a database that has an older revision.
 
-        Raises ``SchemaError`` if the database belongs to a later version, or if its tables are not those of heliopsf.
+        Raises ``SchemaError`` if the database belongs to a later version or to a development version that cannot be
+        upgraded, or if its tables are not those of heliopsf.
         """
         from alembic import command
 
@@ -73,18 +99,20 @@ class Schema:
         with _ONE_AT_A_TIME, self._database.engine.begin() as connection:
             if not self._database.sqlite:  # on SQLite the transaction already holds the write lock
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": LOCK})
-            status = _status(connection)
-            if status.state == "newer":
-                raise SchemaError(_too_new(status))
-            if status.state == "unversioned":
-                _check_baseline(connection)
-            config = _config()
+            status = self._status(connection)
+            if status.refusal:
+                raise SchemaError(status.refusal)
+            config = _config(self._revisions)
             config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+            if status.state == "empty":
+                Base.metadata.create_all(connection)
+                command.stamp(config, "head")
+            else:
+                command.upgrade(config, "head")  # does nothing if another process has upgraded the database
         if status.state == "empty":
             log.info("database: created, revision %s", status.wanted)
-        else:
-            log.info("database: upgraded from %s to %s", status.revision or "no revision", status.wanted)
+        elif status.state == "older":
+            log.info("database: upgraded from %s to %s", status.revision, status.wanted)
 
     def create(self) -> None:
         """Create all tables of an empty database that only this process uses.
@@ -97,14 +125,12 @@ class Schema:
     def check(self) -> None:
         """Raise ``SchemaError`` if the database is not at the revision of this version. The message says what to do."""
         status = self.status()
-        if status.state == "newer":
-            raise SchemaError(_too_new(status))
+        if status.refusal:
+            raise SchemaError(status.refusal)
         if status.state != "current":
-            found = {"empty": "empty", "unversioned": "without a revision"}.get(
-                status.state, f"at revision {status.revision}"
-            )
+            there = "empty" if status.state == "empty" else f"at revision {status.revision}"
             raise SchemaError(
-                f"expected a database at revision {status.wanted}, which heliopsf {software_version()} needs; it is {found}: "
+                f"expected a database at revision {status.wanted}, which heliopsf {software_version()} needs; it is {there}: "
                 "upgrade it with `heliopsf database upgrade`, or start a server of this version"
             )
 
@@ -116,78 +142,54 @@ class Schema:
     def status(self) -> SchemaStatus:
         """The revision of the database. Does not change the database."""
         with self._database.engine.execution_options(read_only=True).connect() as connection:
-            return _status(connection)
+            return self._status(connection)
 
     def faults(self) -> SchemaFaults:
         """The missing tables, columns and indexes. Does not change the database."""
         with self._database.engine.execution_options(read_only=True).connect() as connection:
-            return _faults(Base.metadata, connection)
+            return _faults(connection)
+
+    def _status(self, connection: Connection) -> SchemaStatus:
+        from alembic.runtime.migration import MigrationContext
+
+        *earlier, wanted = _numbers(self._revisions)
+        revision = MigrationContext.configure(connection).get_current_revision()
+        state: State
+        if revision is None:
+            state = "empty" if _faults(connection).empty else "unversioned"
+        elif revision == wanted:
+            state = "current"
+        elif revision in earlier:
+            state = "older"
+        else:
+            state = "newer" if revision > wanted else "obsolete"
+        return SchemaStatus(revision, wanted, state)
 
 
-def _config() -> Config:
+def _config(revisions: Path) -> Config:
     from alembic.config import Config
 
     config = Config()
-    config.set_main_option("script_location", str(REVISIONS).replace("%", "%%"))
+    config.set_main_option("script_location", str(revisions).replace("%", "%%"))
     config.set_main_option("path_separator", "os")
     return config
 
 
-@lru_cache(maxsize=1)
-def _revisions() -> tuple[str, frozenset[str]]:
-    """The revision that this version needs, and all revisions that it knows."""
+@cache
+def _numbers(revisions: Path) -> tuple[str, ...]:
+    """The numbers of all revisions in a folder; this version needs the last one."""
     from alembic.script import ScriptDirectory
 
-    script = ScriptDirectory.from_config(_config())
-    wanted = script.get_current_head()
-    assert wanted is not None
-    return wanted, frozenset(one.revision for one in script.walk_revisions())
-
-
-def _status(connection: Connection) -> SchemaStatus:
-    from alembic.runtime.migration import MigrationContext
-
-    wanted, known = _revisions()
-    revision = MigrationContext.configure(connection).get_current_revision()
-    state: State
-    if revision is None:
-        from workers.catalogue.migrations.versions.r0001_baseline import METADATA as BASELINE
-
-        state = "empty" if _faults(BASELINE, connection).empty else "unversioned"
-    elif revision not in known:
-        state = "newer"
-    else:
-        state = "current" if revision == wanted else "older"
-    return SchemaStatus(revision, wanted, state)
-
-
-def _too_new(status: SchemaStatus) -> str:
-    return (
-        f"the database is at revision {status.revision}, which this version does not know: heliopsf "
-        f"{software_version()} knows revisions up to {status.wanted}; use the version that made the database"
+    return tuple(
+        sorted(one.revision for one in ScriptDirectory.from_config(_config(revisions)).walk_revisions())
     )
 
 
-def _check_baseline(connection: Connection) -> None:
-    """Check a database that has tables but no revision: the tables must have all columns of the first revision.
-
-    Raises ``SchemaError``. Missing tables and indexes are allowed, because the first revision creates them.
-    """
-    from workers.catalogue.migrations.versions.r0001_baseline import METADATA as BASELINE
-
-    lacking = _faults(BASELINE, connection).columns
-    if lacking:
-        raise SchemaError(
-            "expected an empty database or one of heliopsf; this one has tables without a revision and without the columns "
-            f"{', '.join(lacking)}: give this version an empty database"
-        )
-
-
-def _faults(metadata: MetaData, connection: Connection) -> SchemaFaults:
+def _faults(connection: Connection) -> SchemaFaults:
     found: Any = inspect(connection)
     there = set(found.get_table_names())
     tables, columns, indexes = [], [], []
-    for table in metadata.sorted_tables:
+    for table in Base.metadata.sorted_tables:
         if table.name not in there:
             tables.append(table.name)
             continue
@@ -195,5 +197,5 @@ def _faults(metadata: MetaData, connection: Connection) -> SchemaFaults:
         columns += [f"{table.name}.{column.name}" for column in table.columns if column.name not in has]
         known = {index["name"] for index in found.get_indexes(table.name)}
         indexes += [str(index.name) for index in table.indexes if index.name not in known]
-    ours = len(metadata.sorted_tables)
-    return SchemaFaults(tuple(tables), tuple(columns), tuple(sorted(indexes)), len(tables) == ours)
+    empty = len(tables) == len(Base.metadata.tables)
+    return SchemaFaults(tuple(tables), tuple(columns), tuple(sorted(indexes)), empty)

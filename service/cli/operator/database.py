@@ -17,7 +17,8 @@ from workers.files.modes import keep_private, private_folder
 
 SENTENCES = {
     "empty": "the database is empty; the first start of a server makes its tables at revision {wanted}",
-    "unversioned": "the database has tables without a revision, as early versions made them; this version needs revision {wanted}",
+    "unversioned": "the database has tables without a revision; this version needs revision {wanted}",
+    "obsolete": "the database is at revision {revision} of a development version, which this version cannot upgrade; it needs {wanted}",
     "older": "the database is at revision {revision}; this version needs {wanted}",
     "current": "the database is at revision {revision}, which this version needs",
     "newer": "the database is at revision {revision} of a later version of heliopsf; this version knows revisions up to {wanted}",

@@ -230,7 +230,9 @@ def schema(_settings: Settings, catalogue: Catalogue) -> Finding:
             return Finding("schema", "warning", said, "the first `heliopsf serve` makes them")
         case "newer":
             return Finding("schema", "broken", said, "run the version of heliopsf that upgraded it")
-        case "unversioned" | "older":
+        case "unversioned" | "obsolete":
+            return Finding("schema", "broken", said, status.refusal or "")
+        case "older":
             advice = "copy the database, then run `heliopsf database upgrade` (or start `heliopsf serve`, which also upgrades it)"
             return Finding("schema", "warning", said, advice)
         case "current":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,15 +19,17 @@ from tests.tables import RUN_REVISIONS
 from tests.whole.stack import Missing, postgres_database
 from tests.workers.databases import change, database, rows
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.migrations.versions.r0001_baseline import METADATA as BASELINE
-from workers.catalogue.schema import Schema, SchemaError
-from workers.catalogue.tables import Base, PsfRow
+from workers.catalogue.schema import REVISIONS, Schema, SchemaError
+from workers.catalogue.tables import Base, WorkerRow
 from workers.settings import Settings
 
-OLD_PSF = {
-    "owner": "local", "id": "b" * 64, "created_at": 1.0, "name": "hri", "version": "1.0.0+0", "instrument": "hri_euv",
-    "status": "draft", "origin": "built", "file_sha256": "f" * 64, "bytes": 7, "details": {"shape": [4, 4]},
-}  # fmt: skip
+LATER = """
+import sqlalchemy as sa
+from alembic import op
+revision, down_revision = "0020", "0019"
+def upgrade():
+    op.add_column("workers", sa.Column("host", sa.String, server_default="-here"))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -57,12 +60,6 @@ def catalogue(
 
 
 sqlite_alone = pytest.mark.parametrize("catalogue", ["sqlite"], indirect=True)
-
-
-def make_as_before_revisions(catalogue: Catalogue) -> None:
-    """The tables of the versions before revisions, with a PSF."""
-    BASELINE.create_all(database(catalogue).engine)
-    change(catalogue, insert(BASELINE.tables["psfs"]).values(OLD_PSF))
 
 
 def differences(catalogue: Catalogue) -> list[object]:
@@ -105,46 +102,52 @@ def test_an_empty_database_gets_the_tables_that_the_code_works_with(
 
 
 def test_an_older_database_is_upgraded_with_its_data(
-    catalogue: Catalogue, caplog: pytest.LogCaptureFixture
+    catalogue: Catalogue, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    make_as_before_revisions(catalogue)
-    change(
-        catalogue, text("DROP TABLE workers"), text("DROP INDEX jobs_tallied")
-    )  # as an even earlier version
-    assert catalogue.schema.status().state == "unversioned"
+    catalogue.upgrade()
+    worker = {"name": "w", "started_at": 1.0, "heartbeat_at": 2.0, "version": "0.1.0"}
+    change(catalogue, insert(WorkerRow).values(worker))
+    shutil.copytree(REVISIONS, tmp_path / "later")
+    (tmp_path / "later" / "versions" / "r0020_later.py").write_text(LATER)
+    later = Schema(database(catalogue), tmp_path / "later")
+    assert later.status().state == "older"
+    with pytest.raises(SchemaError, match=r"at revision 0020.*it is at revision 0019.*database upgrade"):
+        later.check()
     caplog.set_level(logging.INFO, "workers.catalogue.schema")
-    catalogue.upgrade()
-    catalogue.upgrade()
-    status = catalogue.schema.status()
-    assert status.state == "current" and differences(catalogue) == []
-    assert said(caplog) == [f"database: upgraded from no revision to {status.wanted}"]
-    psf = catalogue.get(PsfRow, "b" * 64, "local")
-    assert psf is not None and psf.version == "1.0.0+0" and psf.details["shape"] == [4, 4]
-    assert catalogue.owners.recount() == []
-    change(catalogue, text("UPDATE alembic_version SET version_num = '0001'"))
-    assert catalogue.schema.status().state == "older"
+    caplog.clear()
+    later.upgrade()
+    later.upgrade()
+    assert later.status().state == "current" and catalogue.schema.status().state == "newer"
+    assert said(caplog) == ["database: upgraded from 0019 to 0020"]
+    assert rows(catalogue, text("SELECT name || host FROM workers")) == ["w-here"]
 
 
 @sqlite_alone
-def test_a_newer_or_foreign_database_is_refused_and_left_alone(catalogue: Catalogue) -> None:
+def test_a_database_that_cannot_be_upgraded_is_refused_and_left_alone(catalogue: Catalogue) -> None:
     change(catalogue, text("CREATE TABLE images (id VARCHAR(64) PRIMARY KEY, pixels TEXT)"))
-    with pytest.raises(SchemaError, match=r"without a revision.*images\.owner.*images\.summary"):
+    assert catalogue.schema.status().state == "unversioned"
+    with pytest.raises(SchemaError, match=r"without a revision: use an empty database"):
         catalogue.upgrade()
     assert inspect(database(catalogue).engine).get_table_names() == ["images"]
     change(catalogue, text("DROP TABLE images"))
     catalogue.upgrade()
-    change(catalogue, text("UPDATE alembic_version SET version_num = '9999'"))
-    with pytest.raises(SchemaError, match=r"at revision 9999.*knows revisions up to 0"):
-        catalogue.upgrade()
-    assert catalogue.schema.status().revision == "9999"
+    for revision, state, words in (
+        ("9999", "newer", "at revision 9999.*knows revisions up to 0"),
+        ("0018", "obsolete", "at revision 0018 of a development version.*upgrade it first"),
+    ):
+        change(catalogue, text(f"UPDATE alembic_version SET version_num = '{revision}'"))
+        assert catalogue.schema.status().state == state
+        with pytest.raises(SchemaError, match=words):
+            catalogue.upgrade()
+        assert catalogue.schema.status().revision == revision
 
 
 def test_an_upgrade_that_fails_leaves_nothing_behind(catalogue: Catalogue) -> None:
-    """Revisions are one transaction: tables that an earlier one made go where a later one fails."""
-    change(catalogue, text("CREATE TABLE keys (id INTEGER PRIMARY KEY)"))  # in the way
-    with pytest.raises(DatabaseError, match="exists"):
+    """An upgrade is one transaction: tables that it made go if a later statement fails."""
+    change(catalogue, text("CREATE TABLE jobs_tallied (id INTEGER PRIMARY KEY)"))  # the name of an index
+    with pytest.raises(DatabaseError, match="already"):
         catalogue.upgrade()
-    assert inspect(database(catalogue).engine).get_table_names() == ["keys"]
+    assert inspect(database(catalogue).engine).get_table_names() == ["jobs_tallied"]
 
 
 STARTS = """

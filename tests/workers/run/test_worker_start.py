@@ -30,8 +30,8 @@ def test_what_is_wrong_with_a_revision_and_what_to_do(catalogue: Catalogue, tmp_
     empty = Catalogue(f"sqlite:///{tmp_path / 'empty.sqlite'}")
     for schema, revision, words in (
         (catalogue.schema, "9999", ("at revision 9999", "does not know", "version that made the database")),
-        (catalogue.schema, "0001", ("at revision 0001", "`heliopsf database upgrade`")),
-        (catalogue.schema, None, ("without a revision", "`heliopsf database upgrade`")),
+        (catalogue.schema, "0001", ("at revision 0001", "upgrade it first")),
+        (catalogue.schema, None, ("without a revision", "use an empty database")),
         (empty.schema, None, ("is empty", "`heliopsf database upgrade`")),
     ):
         put_at(catalogue, revision)

@@ -130,12 +130,12 @@ def test_room(subtests: pytest.Subtests, monkeypatch: pytest.MonkeyPatch) -> Non
         ("ALTER TABLE jobs DROP COLUMN worker", "broken", "jobs.worker", ""),
         ("DROP INDEX jobs_tallied", "warning", "jobs_tallied", ""),
         ("DROP TABLE workers", "warning", "workers", ""),
-        ("DROP TABLE alembic_version", "warning", "without a revision", "heliopsf database upgrade"),
+        ("DROP TABLE alembic_version", "broken", "without a revision", "use an empty database"),
         (
             "UPDATE alembic_version SET version_num = '0001'",
-            "warning",
+            "broken",
             "at revision 0001",
-            "database upgrade",
+            "upgrade it first",
         ),
         (
             "UPDATE alembic_version SET version_num = '9999'",
