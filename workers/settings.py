@@ -11,13 +11,13 @@ from ipaddress import ip_network
 from pathlib import Path
 from typing import Literal
 
+from platformdirs import user_data_path
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from psfcore.fits.product.version import software_version as software_version
 from psfcore.transit.archive import ArchiveLimits
 from workers.contract.queues import Queue, queues_named
-from workers.data_folder import default_data_dir
 from workers.machine import cores, memory_bytes
 
 EMBEDDED_BROKER = "filesystem://"
@@ -30,9 +30,9 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="HELIOPSF_", frozen=True)
 
     data_dir: Path = Field(
-        default_factory=default_data_dir,
+        default_factory=lambda: user_data_path("heliopsf", appauthor=False),
         description="folder of stored files and, by default, of the SQLite database; default: the user's data folder, on Linux "
-        "`~/.local/share/heliopsf`; if `heliopsf-data` in the working folder holds data of an earlier version, that folder",
+        "`~/.local/share/heliopsf`",
     )
     store_url: str | None = Field(
         None,

@@ -270,18 +270,6 @@ def read_settings(data: Path | None = None) -> Settings:
         raise click.ClickException("; ".join(faults)) from error
 
 
-def data_settings(data: Path | None) -> Settings:
-    """The settings of a command that opens the data folder. If this is the folder of an earlier version, a note is
-    printed."""
-    from workers.data_folder import told
-
-    settings = read_settings(data)
-    note = None if "data_dir" in settings.model_fields_set else told()
-    if note is not None:
-        click.echo(note, err=True)
-    return settings
-
-
 def limits() -> FitsLimits:
     """The limits on FITS files that a command reads, from HELIOPSF_MAX_PIXELS."""
     from psfcore.fits.header import FitsLimits

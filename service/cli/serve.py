@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import click
 
-from service.cli.options import DATA, data_settings
+from service.cli.options import DATA, read_settings
 from workers.contract.queues import Queue, queues_named
 
 
@@ -38,7 +38,7 @@ def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
     from workers.catalogue.schema import SchemaError
     from workers.files.modes import keep_private, private_folder
 
-    settings = data_settings(data)
+    settings = read_settings(data)
     where = settings.data_dir.resolve()
     keep_private()
     try:
@@ -98,7 +98,7 @@ def worker(
             queues_named(queues)
         except ValueError as error:
             raise click.BadParameter(str(error), param_hint="--queues") from error
-    settings = data_settings(data)
+    settings = read_settings(data)
     if stop_with_parent is None:  # otherwise the server that started this worker has printed the folder
         click.echo(f"heliopsf worker (data in {settings.data_dir.resolve()})", err=True)
     os.environ |= environment(settings.model_copy(update=given))

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 from psfcore.errors import DataError
-from service.cli.main import main
-from workers import data_folder
 from workers.cache_folder import psf_cache
 from workers.settings import Settings
 
@@ -64,60 +60,9 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "home"
 
 
-def earlier(folder: Path) -> Path:
-    """A data folder as earlier versions made it, with something in it."""
-    (folder / "heliopsf-data" / "blobs").mkdir(parents=True)
-    return folder / "heliopsf-data"
-
-
 def test_the_catalogue_does_not_depend_on_the_working_folder(
     home: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     first = Settings().data_dir
     monkeypatch.chdir(tmp_path)
     assert first == Settings().data_dir == home / "my data" / "heliopsf"
-    assert data_folder.told() is None
-
-
-def test_data_of_an_earlier_version_go_on_being_used(home: Path, tmp_path: Path) -> None:
-    old = earlier(tmp_path / "work")
-    assert Settings().data_dir == old
-    told = data_folder.told()
-    assert told is not None and str(old) in told
-    subprocess.run(told.rpartition("run: ")[2], shell=True, check=True)
-    assert (home / "my data" / "heliopsf" / "blobs").is_dir() and not old.exists()
-    assert Settings().data_dir == home / "my data" / "heliopsf" and data_folder.told() is None
-
-
-def test_the_command_to_move_fills_an_empty_folder_and_spares_a_full_one(home: Path, tmp_path: Path) -> None:
-    old, new = earlier(tmp_path / "work"), home / "my data" / "heliopsf"
-    new.mkdir(parents=True)
-    told = data_folder.told()
-    assert told is not None and "rmdir" in told
-    (new / "catalogue.sqlite").touch()
-    told = data_folder.told()
-    assert told is not None and "mv " not in told and str(new) in told and str(old) in told
-
-
-def test_a_folder_that_is_empty_or_of_another_user_is_not_used(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "work" / "heliopsf-data").mkdir()
-    assert data_folder.earlier_data_dir() is None
-    (tmp_path / "work" / "heliopsf-data").rmdir()
-    earlier(tmp_path / "work")
-    monkeypatch.setattr(os, "geteuid", lambda: 12345)
-    assert data_folder.earlier_data_dir() is None
-    assert Settings().data_dir == home / "my data" / "heliopsf"
-
-
-def test_commands_tell_it_unless_a_folder_was_named(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    old = earlier(tmp_path / "work")
-    told = CliRunner().invoke(main, ["database", "status"])
-    assert "earlier versions kept data there" in told.stderr and (old / "catalogue.sqlite").exists()
-    named = CliRunner().invoke(main, ["database", "status", "--data", str(tmp_path / "named")])
-    assert "earlier" not in named.output
-    monkeypatch.setenv("HELIOPSF_DATA_DIR", str(old))
-    assert "earlier" not in CliRunner().invoke(main, ["database", "status"]).output

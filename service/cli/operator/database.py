@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
-from service.cli.options import DATA, data_settings
+from service.cli.options import DATA, read_settings
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.schema import SchemaError, SchemaStatus
@@ -66,7 +66,7 @@ def sentence(found: SchemaStatus) -> str:
 @contextmanager
 def opened_catalogue(data: Path | None) -> Iterator[Catalogue]:
     """The catalogue of a data folder. Its database is not upgraded; an error of the database becomes a ``ClickException``."""
-    settings = data_settings(data)
+    settings = read_settings(data)
     keep_private()
     if settings.database_url is None:
         private_folder(settings.data_dir)

@@ -26,7 +26,7 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from service.cli.operator.database import sentence
-from service.cli.options import DATA, data_settings
+from service.cli.options import DATA, read_settings
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.files.opened import open_store
@@ -57,7 +57,7 @@ class Finding:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def doctor(data: Path | None, as_json: bool) -> None:
     """Check versions, settings, disk, database, broker and workers, and say what to do. If something is broken, the exit status is 1."""
-    findings = examine(data_settings(data))
+    findings = examine(read_settings(data))
     broken = any(finding.state == "broken" for finding in findings)
     if as_json:
         click.echo(json.dumps({"ok": not broken, "findings": [asdict(one) for one in findings]}, indent=1))
