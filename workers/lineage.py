@@ -15,7 +15,6 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow, TransitRow
 from workers.contract.kinds import kind_of_origin
 from workers.contract.resolved import ResolvedRerun
-from workers.contract.suggestions import FORMER_NAMES
 from workers.versions.series import INTERPOLATED
 
 MOST_DEEP = 16
@@ -105,13 +104,10 @@ def _job_of(row: ProductRow | PsfRow, parameters: dict[str, Any]) -> ResolvedRer
     origin = _origin(row)
     kind = kind_of_origin(origin)
     assert kind.resolved is not None
-    # Parameters that were renamed since the thing was made.
-    whole = {FORMER_NAMES.get(name, name): value for name, value in parameters.items()}
-    if (
-        origin != "built"
-    ):  # a build also requires the text of the instrument file, which is in the file of the built PSF
-        whole = kind.resolved.model_validate(whole).model_dump(mode="json")
-    return ResolvedRerun(of=of, id=row.id, kind=kind.name, parameters=whole)
+    # A build also requires the text of the instrument file, which is in the file of the built PSF.
+    if origin != "built":
+        parameters = kind.resolved.model_validate(parameters).model_dump(mode="json")
+    return ResolvedRerun(of=of, id=row.id, kind=kind.name, parameters=parameters)
 
 
 def _origin(row: ProductRow | PsfRow) -> str:

@@ -31,21 +31,13 @@ class Lazy(NamedTuple):
 class LazyGroup(click.Group):
     """Commands under headings. A command's file is imported when the command is called.
 
-    sections: the commands under each heading, by name. renamed: the new names of commands and options, by their former
-    names. If a user gives a former name, the error states the new one.
+    sections: the commands under each heading, by name.
     """
 
-    def __init__(
-        self,
-        *args: Any,
-        sections: Mapping[str, Mapping[str, Lazy]],
-        renamed: Mapping[str, str] | None = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, *args: Any, sections: Mapping[str, Mapping[str, Lazy]], **options: Any) -> None:
         super().__init__(*args, **options)
         self.sections = sections
         self.rows = {name: row for rows in sections.values() for name, row in rows.items()}
-        self._renamed = renamed or {}
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names in the order of the headings."""
@@ -75,27 +67,18 @@ class LazyGroup(click.Group):
         """The command that the arguments call. If there is none, the ``UsageError`` names the command that the user may mean."""
         wanted = args[0]
         if wanted not in self.rows and not wanted.startswith("-"):
-            meant = self._renamed.get(wanted) or next(iter(get_close_matches(wanted, self.rows, n=1)), None)
-            hint = "" if meant is None else f" Did you mean `{meant}`?"
+            close = get_close_matches(wanted, self.rows, n=1)
+            hint = f" Did you mean `{close[0]}`?" if close else ""
             ctx.fail(f"there is no command '{wanted}'.{hint}")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command. If the user gives the former name of an option, the error names the new option.
-
-        Control-C ends the command with status 130. If its job continues, a message says how to return to the job.
-        """
+        """Run a command. Control-C ends it with status 130; if its job continues, a message says how to return to the job."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as stop:
             click.echo(_interrupted(stop), err=True)
             ctx.exit(INTERRUPTED)
-        except click.NoSuchOption as error:
-            if error.option_name not in self._renamed:
-                raise
-            meant = self._renamed[error.option_name]
-            said = f"there is no option '{error.option_name}'. Did you mean `{meant}`?"
-            raise click.UsageError(said, error.ctx) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the commands under their headings, without importing them."""

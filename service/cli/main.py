@@ -44,23 +44,9 @@ SECTIONS = {
         "design": Lazy("service.cli.diffraction", "design", "Tabulate diffraction for mesh designs."),
     },
 }  # fmt: skip
-RENAMED = {
-    "evaluate": "report",
-    "effects": "changes",
-    "--preview": "--plot",
-    "--effects": "--changes",
-    "--html": "--output",
-    "--force": "--overwrite",
-    "--before": "--background",
-}
 
 
-@click.group(
-    cls=LazyGroup,
-    sections=SECTIONS,
-    renamed=RENAMED,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+@click.group(cls=LazyGroup, sections=SECTIONS, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(None, "-V", "--version", package_name="heliopsf", prog_name="heliopsf")
 def main() -> None:
     """Determine the point-spread functions (PSFs) of solar EUV telescopes, and deconvolve images.

@@ -84,8 +84,7 @@ def product_identity(request: ResolvedDeconvolve) -> str:
     if request.region is None:
         excluded.add("region_error")
     hashed = request.model_dump(mode="json", exclude=excluded)
-    # This parameter was called effects_picture when the first products were made. Hashing it under that name keeps
-    # the ids of existing products valid.
+    # The ids of products depend on this name of the parameter.
     hashed["effects_picture"] = hashed.pop("changes_picture")
     return canonical_hash(
         {

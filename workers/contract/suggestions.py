@@ -10,16 +10,12 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
-# Former names that are too different from the present names to be guessed.
-FORMER_NAMES = {"evaluate": "report", "effects_picture": "changes_picture"}
 SHOWN = 60
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """``; did you mean 'x'?``, or an empty text if no known name is close."""
-    names = list(known)
-    former = FORMER_NAMES.get(name)
-    close = [former] if former in names else get_close_matches(name, names, n=1)
+    close = get_close_matches(name, list(known), n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 

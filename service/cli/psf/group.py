@@ -39,6 +39,6 @@ SECTIONS = {
 }
 
 
-@click.group(cls=LazyGroup, sections=SECTIONS, renamed={"--preview": "--plot"})
+@click.group(cls=LazyGroup, sections=SECTIONS)
 def psf() -> None:
     """Build, fit, inspect, certify and list PSFs."""

@@ -133,15 +133,8 @@ def test_a_row_of_the_table_is_the_command_of_that_name() -> None:
         assert all(row.summary.endswith(".") for row in group.rows.values())
 
 
-def test_an_old_name_is_answered_with_the_new_one(subtests: pytest.Subtests) -> None:
-    for arguments, meant in (
-        (["evaluate", "T"], "`report`"),
-        (["effects", "I"], "`changes`"),
-        (["deconvolv"], "`deconvolve`"),
-        (["psf", "sho"], "`show`"),
-        (["deconvolve", "x", "--preview", "y"], "`--plot`"),
-        (["deconvolve", "x", "--effects", "y"], "`--changes`"),
-    ):
+def test_a_misspelt_command_is_answered_with_the_close_one(subtests: pytest.Subtests) -> None:
+    for arguments, meant in ((["deconvolv"], "`deconvolve`"), (["psf", "sho"], "`show`")):
         with subtests.test(str((arguments, meant))):
             refused = CliRunner().invoke(main, arguments)
             assert refused.exit_code == 2 and f"Did you mean {meant}" in refused.output

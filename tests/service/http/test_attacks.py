@@ -125,8 +125,7 @@ def test_a_bad_file_is_refused_wherever_and_however_it_is_sent(service: Keyed) -
 
 def test_an_unknown_name_gets_the_known_one(service: Keyed) -> None:
     for kind, parameters, known in (
-        ("evaluate", {"transit_id": "0" * 64}, "report"),
-        ("deconvolve", {"image_id": "0" * 64, "effects_picture": True}, "changes_picture"),
+        ("reprot", {"transit_id": "0" * 64}, "report"),
         ("psf-build", {"instrumnt": "hri_euv"}, "instrument"),
     ):
         answer = service.client("ann").post("/v1/jobs", json={"kind": kind, "parameters": parameters})

@@ -205,8 +205,8 @@ BAD_CREATIONS = [
     ("no image there", {"KIND": "deconvolve", "PHASE": "RUN", "image_id": "0" * 64}, "the id of an uploaded image"),
     ("incomplete and RUN", {"KIND": "deconvolve", "PHASE": "RUN"}, "image_id: expected a value"),
     ("neither of two", {"KIND": "psf-build", "PHASE": "RUN"}, "expected exactly one of instrument"),
-    ("a former KIND", {"KIND": "evaluate"}, "did you mean 'report'?"),
-    ("a former name", {"KIND": "deconvolve", "effects_picture": "true"}, "did you mean 'changes_picture'?"),
+    ("a misspelt KIND", {"KIND": "reprot"}, "did you mean 'report'?"),
+    ("a misspelt name", {"KIND": "deconvolve", "chnges_picture": "true"}, "did you mean 'changes_picture'?"),
 ]  # fmt: skip
 
 

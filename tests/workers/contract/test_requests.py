@@ -123,16 +123,10 @@ def messages(model: Any, body: object) -> str:
 def test_only_a_close_name_is_suggested() -> None:
     assert did_you_mean("stepz", ["name", "steps"]) == "; did you mean 'steps'?"
     assert did_you_mean("zzz", ["name", "steps"]) == ""
-    assert did_you_mean("evaluate", ["report"]) == "; did you mean 'report'?"
-    assert did_you_mean("evaluate", ["name"]) == "", (
-        "a former name is suggested only where the new one is known"
-    )
 
 
 CHANGES: tuple[tuple[dict[str, Any], str], ...] = (
-    ({"kind": "evaluate"}, "report"),
     ({"kind": "deconvolv"}, "deconvolve"),
-    ({"parameters": {"image_id": A, "effects_picture": True}}, "changes_picture"),
     ({"parameters": {"image_id": A, "eror_draws": 4}}, "error_draws"),
     ({"parameters": {"image_id": A, "method": {"name": "linar"}}}, "linear"),
     ({"parameters": {"image_id": A, "method": {"name": "linear", "stepz": 4}}}, "steps"),
