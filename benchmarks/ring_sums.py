@@ -1,8 +1,7 @@
 """`python -m benchmarks.ring_sums [--quick]`: time three methods for sums of images over shells, as ratios to 1 F.
 
 The sums are computed about 51,660 target pixels: the 410 pixels nearest to each of 126 positions of the occulter along
-a transit, in images of 2048 px. Sums are over the 50 published shells, over the same shells divided into 12 sectors,
-and over fine shells. 1 F is defined in `benchmarks.timing`. Two of the methods, the plain look-up and one
+a transit, in images of 2048 px. Sums are over the 50 published shells. 1 F is defined in `benchmarks.timing`. Two of the methods, the plain look-up and one
 convolution for each shell, are too slow for all targets. They are timed on a part of the targets, and the times are
 scaled to all targets. On that part, their sums are compared with those of the third method, the running sums.
 """
@@ -17,15 +16,11 @@ from numpy.typing import NDArray
 
 from benchmarks.timing import THREADS, reference, seconds
 from psfcore.scatter.as_published.ring_sums import segment_sums
-from psfcore.scatter.as_published.segments import Segments, fine_shells, shells_as_published
+from psfcore.scatter.as_published.segments import Segments, shells_as_published
 from tests.psfcore.scatter.as_published.ring_sum_references import segment_sums_fft, segment_sums_plain
 
 IMAGES, TARGETS_AN_IMAGE, SIZE_PX = 126, 410, 2048
-KINDS = (
-    ("50 shells", shells_as_published(), 1),
-    ("50 shells in 12 sectors", shells_as_published(), 12),
-    ("fine shells", fine_shells(), 1),
-)
+EDGES_PX = tuple(shells_as_published())
 
 
 def transit_targets() -> list[NDArray[np.int64]]:
@@ -56,23 +51,21 @@ def ring_sums_bench(*, quick: bool = False) -> None:
     used = range(0, IMAGES, 10) if quick else range(IMAGES)
     scale = IMAGES / len(used)
     scaled = f"{len(used)} images, scaled" if quick else ""
-    for name, edges, sectors in KINDS:
-        segments = Segments(tuple(edges), sectors)
-        report(f"{name} ({segments.size}): preparation", seconds(lambda s=segments: s.runs), f_s)
+    segments = Segments(EDGES_PX)
+    report(f"50 shells ({segments.size}): preparation", seconds(lambda: segments.runs), f_s)
 
-        def one(n: int, segments: Segments = segments, threads: int = 1) -> NDArray[np.float64]:
-            return segment_sums(images[n % len(images)], targets[n], segments, threads=threads)
+    def one(n: int, threads: int = 1) -> NDArray[np.float64]:
+        return segment_sums(images[n % len(images)], targets[n], segments, threads=threads)
 
-        def side_by_side(one=one) -> None:  # type: ignore[no-untyped-def]
-            with ThreadPoolExecutor(THREADS) as pool:
-                list(pool.map(one, used))
+    def side_by_side() -> None:
+        with ThreadPoolExecutor(THREADS) as pool:
+            list(pool.map(one, used))
 
-        one(0)
-        report("  running sums, one thread", scale * seconds(lambda o=one: [o(n) for n in used]), f_s, scaled)
-        took = scale * seconds(lambda o=one: [o(n, threads=THREADS) for n in used])
-        report(f"  running sums, {THREADS} threads on each image", took, f_s, scaled)
-        report(f"  running sums, {THREADS} images in parallel", scale * seconds(side_by_side), f_s, scaled)
-    segments = Segments(tuple(KINDS[0][1]))
+    one(0)
+    report("  running sums, one thread", scale * seconds(lambda: [one(n) for n in used]), f_s, scaled)
+    took = scale * seconds(lambda: [one(n, threads=THREADS) for n in used])
+    report(f"  running sums, {THREADS} threads on each image", took, f_s, scaled)
+    report(f"  running sums, {THREADS} images in parallel", scale * seconds(side_by_side), f_s, scaled)
     sums = segment_sums(images[0], targets[0], segments)
     some = slice(0, TARGETS_AN_IMAGE, 100 if quick else 40)
     part = targets[0][some]
@@ -85,7 +78,7 @@ def ring_sums_bench(*, quick: bool = False) -> None:
     took = 0.0
     differences = []
     for k in shells:
-        shell = Segments(tuple(KINDS[0][1][k : k + 2]))
+        shell = Segments(EDGES_PX[k : k + 2])
         took += seconds(
             lambda s=shell: result.append(segment_sums_fft(images[0], targets[0], s, threads=THREADS))
         )

@@ -15,7 +15,7 @@ is not a bootstrap sample. The 30 fits with the largest misfit are dropped, and 
 
 | symbol | name | unit |
 |---|---|---|
-| S | segment of the PSF: a shell around the centre, or a sector of a shell | - |
+| S | segment of the PSF: a shell around the centre | - |
 | A_S | ring_sums: sum of the scene over the segment S around the pixel | DN/s px^2 |
 | B | unscattered: the scene convolved with the diffraction PSF, at the pixel | DN/s |
 | n_S | counts: number of pixels in S | px^2 |

@@ -345,7 +345,7 @@ def _radii_of(segments: Segments) -> list[tuple[Vector, Vector]]:
     radius = np.sqrt(squares)
     shell = np.searchsorted(segments.edges_px, radius, side="right") - 1
     out = []
-    for k in range(segments.shells):
+    for k in range(segments.size):
         here = shell == k
         r, n = radius[here], count[here].astype(np.float64)
         if r.size > 40:

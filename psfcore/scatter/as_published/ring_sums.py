@@ -25,11 +25,10 @@ while all strips use them.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
 from psfcore.errors import DataError
@@ -78,21 +77,6 @@ def segment_sums(
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, _parts(len(strip_yx), threads, largest)))
     return out
-
-
-def ring_sums(
-    image: NDArray[np.floating], targets: NDArray[np.integer], edges_px: ArrayLike, *, threads: int = 1
-) -> Sums:
-    """A_S of rings without sectors, (n, shells): the result of `segment_sums` for `Segments(edges_px)`.
-
-    The segments are cached for the next image.
-    """
-    return segment_sums(image, targets, _rings(tuple(np.asarray(edges_px, float).tolist())), threads=threads)
-
-
-@lru_cache(maxsize=4)
-def _rings(edges_px: tuple[float, ...]) -> Segments:
-    return Segments(edges_px)
 
 
 def _check(image: NDArray[np.floating], targets: NDArray[np.integer]) -> None:
