@@ -53,8 +53,7 @@ def recipe_of(build: PsfBuild) -> Recipe:
     )
 
 
-# Version of the content of product files. 1: planes are tables. 2: planes are images, QUALITY is 0 for good pixels, and
-# saturated pixels are also found in the pixels themselves.
+# Version of the content of product files.
 PRODUCT_FORMAT = 2
 
 

@@ -17,8 +17,8 @@ Plane = NDArray[np.float64]
 class QualityBit(IntFlag):
     """Bits of the quality plane; a pixel without a bit is good. The bits of `psfcore.image.MaskBit` have the same values.
 
-    A negative pixel has no bit. Noise makes some dark pixels negative, and a mean over the other pixels only would be
-    too large. Products of earlier versions mark negative pixels with the value 16, which has no meaning now.
+    A negative pixel has no bit: noise makes some dark pixels negative, and a mean over the other pixels only would be
+    too large. The value 16 is not used.
     """
 
     NONFINITE = 1

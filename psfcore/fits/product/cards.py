@@ -75,7 +75,7 @@ def described(source: Header, *, filename: str, creator: str, sha256: str) -> De
 
 
 def passes_of(source: Header) -> int:
-    """How often the input was deconvolved. A product without the card was deconvolved once."""
+    """How often the input was deconvolved; at least once if it is a product."""
     if content_of(source) != PRODUCT:
         return 0
     return int(optional_number(source, CARD_OF_PASS) or 1)

@@ -2,8 +2,7 @@
 
 A plane is a plain image HDU with the name of the plane as EXTNAME and with the world coordinates of the image. Its
 header has the card PLANE = T. A plane of bits has a card QBITn for each bit n of its values; the card names the bit,
-and its comment says what the bit means. Products of earlier versions hold each plane in a binary table with one row;
-`read_planes` reads both forms.
+and its comment says what the bit means.
 """
 
 from __future__ import annotations
@@ -71,15 +70,11 @@ def check_plane(name: str, plane: NDArray[Any], shape: tuple[int, ...], *, taken
 
 
 def read_planes(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Read the planes [y, x] of a product, by name. Floats are float32.
-
-    The MASK of a product of an earlier version is left out: its bits are also bits of QUALITY.
-    """
+    """Read the planes [y, x] of a product, by name. Floats are float32."""
     planes: dict[str, NDArray[Any]] = {}
     with fits.open(path, memmap=False) as hdus:
         for hdu in hdus[1:]:
-            if hdu.header.get("PLANE") is not True:
-                continue
-            data = np.asarray(hdu.data[hdu.name][0] if isinstance(hdu, fits.BinTableHDU) else hdu.data)
-            planes[hdu.name] = data.astype(data.dtype.newbyteorder("="))
+            if hdu.is_image and hdu.header.get("PLANE") is True:
+                data = np.asarray(hdu.data)
+                planes[hdu.name] = data.astype(data.dtype.newbyteorder("="))
     return planes

@@ -128,9 +128,7 @@ OPTIONS: dict[str, Any] = {
     "method": {"name": "linear", "steps": 7, "edges": "zero"},
 }  # fmt: skip
 FIT: dict[str, Any] = {"noise": NOISE, "seed": 3, "shape": "knee", "as_published": True, "saturation_dn": 1.5}
-# Computed by commit c86f564, whose catalogues must stay valid: the id of a result that exists must not change. The ids of
-# gap diagnoses are newer: they contain the hash of the library of effects. Those of products changed with product format 2,
-# because the content of the files changed. The first 16 digits of each.
+# The first 16 digits of ids. The id of a result that exists must not change.
 FROZEN: list[tuple[Callable[[], str], str]] = [
     (identity, "17e6708fd0c2995c"),
     (lambda: identity(changes_picture=True), "c43f1b57e5b41dcd"),

@@ -100,33 +100,6 @@ def test_sunpy_shows_the_image_first_and_every_plane_at_the_same_place(
     assert all(np.array_equal(place, corner[0]) for place in corner)
 
 
-def test_planes_of_earlier_versions_are_read(tmp_path: Path) -> None:
-    """Until format 1, a plane was a table with one row, and the mask was a plane of its own."""
-    planes = example_planes((20, 24))
-    hdus: list[object] = [fits.PrimaryHDU(ramp().astype(np.float32))]
-    formats = {"u1": "B", "u2": "I", "f4": "E"}
-    for name, plane in {"MASK": np.zeros((20, 24), np.uint8), **planes}.items():
-        stored = plane.astype(np.float32) if plane.dtype.kind == "f" else plane
-        column = fits.Column(
-            name=name,
-            format=f"{plane.size}{formats[stored.dtype.str[1:]]}",
-            dim="(24,20)",
-            bzero=2**15 if stored.dtype == np.uint16 else None,
-            array=stored[None],
-        )
-        hdu = fits.BinTableHDU.from_columns([column], name=name)
-        if name != "MASK":
-            hdu.header["PLANE"] = True
-        hdus.append(hdu)
-    fits.HDUList(hdus).writeto(tmp_path / "old.fits")
-    back = read_planes(tmp_path / "old.fits")
-    assert list(back) == list(planes)
-    for name, plane in planes.items():
-        np.testing.assert_array_equal(
-            back[name], plane.astype(np.float32) if plane.dtype.kind == "f" else plane
-        )
-
-
 def test_a_product_without_planes_has_none(tmp_path: Path, limits: FitsLimits) -> None:
     image = read_observation(save(tmp_path / "in.fits", ramp()), limits)
     write_image(tmp_path / "out.fits", image, cards=CARDS)
@@ -178,7 +151,7 @@ def test_what_the_input_does_not_say_is_not_invented() -> None:
 
 
 def test_passes_are_counted() -> None:
-    assert made(PSFID="x")[1]["DCNVPASS"] == 2, "a product of an earlier version has no count"
+    assert made(PSFID="x")[1]["DCNVPASS"] == 2, "a product whose count was lost"
     assert made(PSFID="x", DCNVPASS=2)[1]["DCNVPASS"] == 3
     assert made(DCNVPASS=2)[1]["DCNVPASS"] == 1, "the card alone makes no product"
     assert made(PSFSUM=1.0)[1]["DCNVPASS"] == 1
