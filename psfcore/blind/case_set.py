@@ -3,7 +3,7 @@
 DIR/set.json                  the plan of the set: seed, sizes, number of cases
 DIR/cases/NNNN/transit/       the input of the diagnosis of case NNNN
 DIR/cases/NNNN/expected/      images without noise, the input of the ideal observer; the diagnosis does not see them
-DIR/cases/NNNN/report.json    the report of this diagnosis (gap/1 or gap/2)
+DIR/cases/NNNN/report.json    the report of this diagnosis (gap/2)
 DIR/cases/NNNN/ideal.json     what an ideal observer could know (gap-ideal/1)
 DIR/cases/NNNN/run.json       time and memory of the diagnosis, and the reason if it gave no report
 DIR/truth/NNNN.json           salt and truth
@@ -217,12 +217,7 @@ def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
     about = json.loads(json.dumps(asdict(plan) | own))
     file = made.folder / "set.json"
     if file.is_file():
-        older: dict[str, Any] = {
-            "scenes": [],
-            "draw": 1,
-            "simulator": "",
-        }  # the plans of earlier versions do not contain these values
-        before = older | json.loads(file.read_text("utf-8"))
+        before = json.loads(file.read_text("utf-8"))
         same = {key: value for key, value in before.items() if key != "cases"}
         if same != {key: value for key, value in about.items() if key != "cases"}:
             raise DataError(

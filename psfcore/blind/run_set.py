@@ -28,7 +28,7 @@ from psfcore.blind.scoring import Judged
 from psfcore.errors import DataError
 from psfcore.whole_files import write_whole
 
-REPORT_SCHEMAS = ("gap/1", "gap/2")
+REPORT_SCHEMA = "gap/2"
 IDEAL_SCHEMA = "gap-ideal/1"
 LONGEST_S = 1800.0
 _KIB = 1024
@@ -150,13 +150,17 @@ def judged_cases(made: BlindSet, numbers: Sequence[int]) -> tuple[list[Judged], 
 
 
 def _checked_report(file: Path) -> dict[str, Any]:
-    wanted = " or ".join(REPORT_SCHEMAS)
     try:
         report = json.loads(file.read_text("utf-8"))
     except (OSError, ValueError) as error:
-        raise DataError("bad-report", f"expected a report of schema {wanted}; got {error!s:.120}") from error
-    if not isinstance(report, dict) or report.get("schema") not in REPORT_SCHEMAS or "verdict" not in report:
-        raise DataError("bad-report", f"expected schema {wanted} and a verdict; got {report!s:.80}")
+        raise DataError(
+            "bad-report", f"expected a report of schema {REPORT_SCHEMA}; got {error!s:.120}"
+        ) from error
+    whole = isinstance(report, dict) and {"verdict", "set"} <= report.keys()
+    if not whole or report.get("schema") != REPORT_SCHEMA:
+        raise DataError(
+            "bad-report", f"expected schema {REPORT_SCHEMA}, a verdict and a set; got {report!s:.80}"
+        )
     return report
 
 

@@ -20,7 +20,7 @@ refit of the PSF. The answer of a report is the set of effects that the verdict 
 | strongest axis is right | single known effects that have axes in `scoring.AXES`, 2 % or more, verdict not `none` | the first axis of the report's `where` is an axis of the effect |
 | time | all | wall time of the slowest case, s |
 
-`set_rows` explains the rows that judge the set of hypotheses in reports of schema gap/2. The interval of a fraction is the Wilson
+`set_rows` explains the rows that judge the set of hypotheses in reports. The interval of a fraction is the Wilson
 interval (`rows`).
 """
 
@@ -254,7 +254,7 @@ def _case(case: Judged) -> dict[str, Any]:
         "verdict": case.verdict,
         "answer": list(case.answer),
         "first": case.first,
-        "set": None if case.members is None else [list(member) for member in case.members],
+        "set": [list(member) for member in case.members],
         "noncentrality": None if known is None else known.noncentrality,
         "rival": None if known is None else known.rival,
         "ideal_alone": None if known is None else known.alone,

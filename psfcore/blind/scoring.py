@@ -8,7 +8,7 @@ sampling of the image on pixels causes it. n_i is the noise of the residual. The
 model of the effect does not remove s_i. The library and the
 blind set describe the same effect by different formulas; this difference counts as an error of the diagnosis.
 
-A report of schema gap/2 also states a set of hypotheses. A hypothesis is a list of effects that act together;
+A report also states a set of hypotheses. A hypothesis is a list of effects that act together;
 `["unknown"]` is an unknown cause, and `[]` is no gap. A hypothesis covers the truth if it names every required effect
 (`Judged.required_names`); it may also name other effects. An effect that is not in the library is covered only by
 `["unknown"]`, and clean data only by `[]`. The second effect of a pair is not required if this effect alone leaves less
@@ -115,10 +115,9 @@ class Judged:
         return math.nan if self.known is None else self.known.noncentrality
 
     @property
-    def members(self) -> tuple[tuple[str, ...], ...] | None:
-        """The hypotheses in the set of the report; None if the report has no set."""
-        stated = self.report.get("set")
-        return None if stated is None else tuple(tuple(member) for member in stated["members"])
+    def members(self) -> tuple[tuple[str, ...], ...]:
+        """The hypotheses in the set of the report."""
+        return tuple(tuple(member) for member in self.report["set"]["members"])
 
     @property
     def verdict(self) -> str:
@@ -175,12 +174,12 @@ def covers(case: Judged, hypothesis: tuple[str, ...]) -> bool:
 
 def set_covers_truth(case: Judged) -> bool:
     """Whether a member of the set covers the truth."""
-    return any(covers(case, member) for member in case.members or ())
+    return any(covers(case, member) for member in case.members)
 
 
 def is_right_and_alone(case: Judged) -> bool:
     """Whether the set has only one member, and this member covers the truth and names no wrong effect."""
-    if case.members is None or len(case.members) != 1 or not covers(case, case.members[0]):
+    if len(case.members) != 1 or not covers(case, case.members[0]):
         return False
     return case.kind == FOREIGN or set(case.members[0]) <= set(case.true_names)
 
@@ -200,7 +199,7 @@ def verdict_is_right(case: Judged) -> bool:
 
 def has_only_wrong_effects(case: Judged) -> bool:
     """Whether the set has only one member, and this member names one or more effects, none of which is true."""
-    if case.members is None or len(case.members) != 1:
+    if len(case.members) != 1:
         return False
     (member,) = case.members
     return member not in (NOTHING, UNKNOWN_HYPOTHESIS) and not set(member) & set(case.true_names)

@@ -1,4 +1,4 @@
-"""The rows of the table that judge the set of hypotheses in reports of schema gap/2.
+"""The rows of the table that judge the set of hypotheses in reports.
 
 "Covers", "right and alone" and the members of a set are explained in `scoring`. "Noncentrality" and "rival" are numbers
 of the ideal observer (`bounds.Known`): the chi2 of the gap that remains in noise-free images after the PSF is refitted,
@@ -41,18 +41,15 @@ KIND_WORDS = {CLEAN: "clean", SINGLE: "one effect", PAIR: "two effects", FOREIGN
 
 
 def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
-    """The rows. Empty if no report states a set."""
-    stated = [case for case in judged if case.members is not None]
-    if not stated:
-        return ()
-    seen = [case for case in stated if case.noncentrality >= SEEN]
-    foreign = [case for case in stated if case.kind == FOREIGN]
+    """The rows."""
+    seen = [case for case in judged if case.noncentrality >= SEEN]
+    foreign = [case for case in judged if case.kind == FOREIGN]
     return (
-        share("set covers the truth", stated, set_covers_truth, "0.86 - 0.94", lambda p: 0.86 <= p <= 0.94),
+        share("set covers the truth", judged, set_covers_truth, "0.86 - 0.94", lambda p: 0.86 <= p <= 0.94),
         *(
             share(
                 f"the same, {words}",
-                [case for case in stated if case.kind == kind],
+                [case for case in judged if case.kind == kind],
                 set_covers_truth,
                 ">= 0.80",
                 lambda p: p >= 0.8,
@@ -61,7 +58,7 @@ def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
         ),
         of_values(
             "mean number of members of the set",
-            [_size(case) for case in stated],
+            [_size(case) for case in judged],
             mean,
             "<= 3",
             lambda value: value <= 3,
@@ -73,23 +70,23 @@ def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
             "<= 1.5",
             lambda value: value <= 1.5,
         ),
-        _against_ideal("right and alone / ideal observer", stated, is_right_and_alone),
+        _against_ideal("right and alone / ideal observer", judged, is_right_and_alone),
         _against_ideal(
             "the same, without clean data",
-            [case for case in stated if case.kind != CLEAN],
+            [case for case in judged if case.kind != CLEAN],
             is_right_and_alone,
         ),
-        _against_ideal("right verdict / ideal observer", stated, verdict_is_right),
+        _against_ideal("right verdict / ideal observer", judged, verdict_is_right),
         share(
             "clean data: set without []",
-            [case for case in stated if case.kind == CLEAN],
-            lambda case: NOTHING not in (case.members or ()),
+            [case for case in judged if case.kind == CLEAN],
+            lambda case: NOTHING not in case.members,
             "<= 0.01",
             lambda p: p <= 0.01,
         ),
         share(
             "one wrong effect alone in the set",
-            stated,
+            judged,
             has_only_wrong_effects,
             "<= 0.02",
             lambda p: p <= 0.02,
@@ -108,7 +105,7 @@ def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
         ),
         share(
             "set covers the truth, >= 10 % left",
-            [case for case in stated if case.left_pct >= STRONG_PCT],
+            [case for case in judged if case.left_pct >= STRONG_PCT],
             set_covers_truth,
             ">= 0.95",
             lambda p: p >= 0.95,
@@ -117,7 +114,7 @@ def set_rows(judged: Sequence[Judged]) -> tuple[Row, ...]:
 
 
 def _size(case: Judged) -> float:
-    return float(len(case.members or ()))
+    return float(len(case.members))
 
 
 def _against_ideal(figure: str, cases: Sequence[Judged], holds: Callable[[Judged], bool]) -> Row:

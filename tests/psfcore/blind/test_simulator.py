@@ -147,7 +147,7 @@ def test_the_kind_follows_from_the_names() -> None:
         assert checked_truth("mine.py", {"effects": [{"name": name} for name in names]})["kind"] == kind
     # Effects with other names have a row in the confusion matrix.
     truth = checked_truth("mine.py", {"effects": [{"name": "my_glow"}], "left_after_refit_pct": 4.0})
-    found = score([Judged(0, truth, {"verdict": "unknown"}, 1.0)])
+    found = score([Judged(0, truth, {"verdict": "unknown", "set": {"members": [["unknown"]]}}, 1.0)])
     assert found.confusion == {"my_glow": {"unknown": 1}}
     rows = {row.figure: row for row in found.rows}
     assert rows["unknown effects called unknown or inconclusive"].value == 1.0
