@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow, TransitRow
+from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, TransitRow
 from workers.contract.kinds import kind_of_origin
 from workers.contract.resolved import ResolvedRerun
 from workers.versions.series import INTERPOLATED
@@ -73,9 +73,6 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
     "parameters-outdated" if this version of the software does not accept them.
     """
     parameters = _parameters(row)
-    if parameters is None and row.details.get("job_id"):
-        job = catalogue.jobs.get(row.details["job_id"])
-        parameters = job.parameters if job is not None and _made(job, row) else None
     if isinstance(row, PsfRow) and row.origin == "uploaded":
         raise DataError(
             "not-made-here",
@@ -84,8 +81,8 @@ def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
     if parameters is None:
         raise DataError(
             "parameters-unknown",
-            f"expected the parameters that {row.id} was made with; these parameters were not recorded, and the job was "
-            "deleted: submit a new request instead",
+            f"expected the parameters that {row.id} was made with; these parameters were not recorded: submit a new request "
+            "instead",
         )
     try:
         return _job_of(row, parameters)
@@ -117,10 +114,6 @@ def _origin(row: ProductRow | PsfRow) -> str:
     if row.origin in ("built", INTERPOLATED):
         return row.origin
     return "corrected" if "parents" in row.details else "fitted"
-
-
-def _made(job: JobRow, row: ProductRow | PsfRow) -> bool:
-    return job.owner == row.owner and job.result_id == row.id
 
 
 def _parameters(row: ProductRow | PsfRow) -> dict[str, Any] | None:

@@ -52,8 +52,7 @@ def get_product(product_id: Identity, caller: Reading, state: Shared) -> Product
 def get_product_file(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the product; its hash is the ETag."""
     row = find(state, caller, product_id)
-    # Products of earlier versions have no stored file name.
-    name = row.details.get("filename", f"heliopsf-{product_id[:12]}.fits")
+    name = row.details["filename"]
     return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, name, size=row.bytes)
 
 

@@ -157,7 +157,7 @@ def _one(
 
 def _told_region(details: dict[str, Any]) -> list[str]:
     """The line about the region that was deconvolved."""
-    found = details.get("region")  # products of earlier versions have no such detail
+    found = details["region"]
     if found is None:
         return []
     return [

@@ -17,7 +17,7 @@ from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.parts import options
 from service.pages.parts.sentences import of_problem
-from service.pages.rendering import number, page, short
+from service.pages.rendering import number, page
 from service.pages.visitors import PageReading, PageSubmitting
 from service.views.products import ProductView
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow
@@ -43,7 +43,7 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         request,
         "product.html",
         product=ProductView.of(row),
-        name=(image and image.filename) or row.details.get("filename") or short(row.id),
+        name=(image and image.filename) or row.details["filename"],
         image=image,
         psf=psf,
         lost=lost,
@@ -52,7 +52,7 @@ def product(product_id: Identity, request: Request, caller: PageReading, state: 
         deprecated=deprecated,
         redo=_again(row, psf_id="" if better is None else better.id),
         changed=_changed(row.details),
-        look_at=(_score(row.details) or 0.0) >= LOOK_FROM,
+        look_at=row.details["changes"]["artefacts"]["score"] >= LOOK_FROM,
         look_from=LOOK_FROM,
         again=_again(row),
         made=_made(row.details),
@@ -96,58 +96,46 @@ def _lost(state: State, digest: str, size: int) -> str | None:
 
 def _warnings(details: dict[str, Any], *, without: str | None) -> list[str]:
     """The warnings of a product. without: the code of a warning that the page shows in another way."""
-    return [one["message"] for one in details.get("warnings", []) if one["code"] != without]
+    return [one["message"] for one in details["warnings"] if one["code"] != without]
 
 
 def _again(row: ProductRow, *, psf_id: str | None = None) -> str:
     """The page of the image, with the options of the product. psf_id: another PSF; empty: the one that the service chooses."""
-    known = row.details.get("parameters") or {}
-    made = {"image_id": row.image_id, "psf_id": row.psf_id, "method": row.details["method"]}
     other = {} if psf_id is None else {"psf_id": psf_id, "picked_for": None, "psf_recipe": None}
-    return options.address_of({**known, **made, **other})
-
-
-def _score(details: dict[str, Any]) -> float | None:
-    """The artefact score; None if the version that made the product did not measure it."""
-    artefacts = (details.get("changes") or {}).get("artefacts") or {}
-    score: float | None = artefacts.get("score")
-    return score
+    return options.address_of({**row.details["parameters"], **other})
 
 
 def _changed(details: dict[str, Any]) -> list[tuple[str, str]]:
-    """What the deconvolution changed in the image. Products of earlier versions lack some figures."""
+    """What the deconvolution changed in the image, as far as it was measured."""
     shown = {
-        "Total flux": _percent(details.get("flux_change_pct")),
-        "Brightest 1 % of the pixels": _percent(details.get("bright_change_pct")),
-        "Darkest 1 % of the pixels": _percent(details.get("dark_change_pct")),
-        "Noise, compared with the input": _factor(details.get("noise_amplification")),
-        "Chi-squared per pixel": number(details.get("chi2_per_pixel")),
-        "Negative pixels": _count(details.get("negative_pixels")),
-        "Saturated pixels": _count((details.get("masked_pixels") or {}).get("saturated")),
-        "Score of artefacts": number(_score(details)),
+        "Total flux": _percent(details["flux_change_pct"]),
+        "Brightest 1 % of the pixels": _percent(details["bright_change_pct"]),
+        "Darkest 1 % of the pixels": _percent(details["dark_change_pct"]),
+        "Noise, compared with the input": _factor(details["noise_amplification"]),
+        "Chi-squared per pixel": number(details["chi2_per_pixel"]),
+        "Negative pixels": _count(details["negative_pixels"]),
+        "Saturated pixels": _count(details["masked_pixels"]["saturated"]),
+        "Score of artefacts": number(details["changes"]["artefacts"]["score"]),
     }
     return [(name, text) for name, text in shown.items() if text != "-"]
 
 
 def _made(details: dict[str, Any]) -> list[tuple[str, str]]:
     """How the product was made."""
-    method = details.get("method") or {}
-    own = {
-        name: value
+    method = details["method"]
+    own = [
+        f"{name} {value}"
         for name, value in method.items()
         if value is not None and name not in ("name", "algorithm_version")
-    }
-    shown = {
-        "Method": str(method.get("name", "-")),
-        "Options": ", ".join(f"{name} {value}" for name, value in own.items()) or "-",
-        "Steps": str(details.get("steps_done", "-")),
-        "Stopped because": str(details.get("stopped_because", "-")),
-        "Edges": f"{details['edges']}, a band of {details.get('edge_band_px')} px depends on them"
-        if details.get("edges")
-        else "-",
-        "Software": str(details.get("software_version", "-")),
-    }
-    return [(name, text) for name, text in shown.items() if text != "-"]
+    ]
+    return [
+        ("Method", method["name"]),
+        *([("Options", ", ".join(own))] if own else []),
+        ("Steps", str(details["steps_done"])),
+        ("Stopped because", details["stopped_because"]),
+        ("Edges", f"{details['edges']}, a band of {details['edge_band_px']} px depends on them"),
+        ("Software", details["software_version"]),
+    ]
 
 
 def _percent(value: float | None) -> str:
@@ -158,5 +146,5 @@ def _factor(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g} times"
 
 
-def _count(value: int | None) -> str:
-    return "-" if value is None else f"{value:,}".replace(",", " ")
+def _count(value: int) -> str:
+    return f"{value:,}".replace(",", " ")

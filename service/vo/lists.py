@@ -88,14 +88,12 @@ def list_vo_psfs(request: Request, caller: Reading, state: Shared, fields: Field
 def product_record(row: ProductRow, image: ImageRow | None, base: str) -> dict[str, Any]:
     """The values of a product's columns. image: the input; None if the service does not keep it (bulk runs over an archive)."""
     seen: Mapping[str, Any] = {} if image is None else image.summary
-    shape, cards = seen.get("shape") or (None, None), seen.get("cards") or {}
+    shape, cards = seen.get("shape", (None, None)), seen.get("cards", {})
     scales = [plate_scale_arcsec(cards, axis) for axis in (1, 2)]
     fov = [n * scale / 3600 for n, scale in zip(reversed(shape), scales, strict=True) if n and scale]
     start, exposure_s = _mjd(seen.get("date_obs")), seen.get("exposure_s")
     instrument = seen.get("detector") or seen.get("instrume") or seen.get("instrument")
-    method = row.details.get("method")
-    artefacts = (row.details.get("changes") or {}).get("artefacts") or {}
-    return _record(row, PRODUCT, row.details.get("filename"), base) | {
+    return _record(row, PRODUCT, row.details["filename"], base) | {
         "obs_id": row.image_id,
         "target_name": "Sun",
         "s_fov": max(fov) if len(fov) == 2 else None,
@@ -112,8 +110,8 @@ def product_record(row: ProductRow, image: ImageRow | None, base: str) -> dict[s
         "image_id": row.image_id,
         "psf_id": row.psf_id,
         "psf_version": row.psf_version,
-        "method": method.get("name") if isinstance(method, dict) else method,
-        "artefact_score": artefacts.get("score"),
+        "method": row.details["method"]["name"],
+        "artefact_score": row.details["changes"]["artefacts"]["score"],
     }
 
 

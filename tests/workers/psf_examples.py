@@ -102,7 +102,7 @@ def header_of(date: str | None, **cards: Any) -> dict[str, Any]:
     """What the upload of an image of HRI_EUV is kept with, as far as a PSF is found by it."""
     known = {
         "instrument": "hri_euv", "telescop": None, "instrume": "EUI", "detector": "HRI_EUV", "wavelnth": 174.0,
-        "gain_mode": None, "date_obs": date, "cards": {"DETECTOR": "HRI_EUV", "WAVELNTH": 174.0},
+        "gain_mode": None, "date_obs": date, "content": "image", "cards": {"DETECTOR": "HRI_EUV", "WAVELNTH": 174.0},
     }  # fmt: skip
     return known | cards
 

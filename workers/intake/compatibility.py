@@ -40,9 +40,9 @@ def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: Mapping[str, 
     psf: the row of the PSF; None: the PSF is not built yet. header: the header summary that is stored with the image. Codes:
     "channel-mismatch", "plate-scale-mismatch", "no-noise-figures".
     """
-    cards = header.get("cards") or {}
+    cards = header["cards"]
     origin = _origin(request, psf)
-    if cards and origin is not None:
+    if origin is not None:
         check_channel(origin, cards, other_channel=request.other_channel)
         binning_factor(origin, cards)
     if request.error_draws and noise_of(request, {"GAINCOMB": header["gain_mode"]}) is None:
@@ -69,7 +69,7 @@ def of_upload(row: PsfRow, instrument: str | None, angstrom: float | None) -> tu
 
 
 def _origin(request: ResolvedDeconvolve, psf: PsfRow | None) -> PsfOrigin | None:
-    """The known properties of the PSF of a request; None if the catalogue does not store enough of them."""
+    """The known properties of the PSF of a request; None if the user's own instrument file says them."""
     if psf is None:
         recipe = request.psf_recipe
         return None if recipe is None or recipe.instrument is None else _origin_of(recipe.instrument)
@@ -81,9 +81,7 @@ def _origin(request: ResolvedDeconvolve, psf: PsfRow | None) -> PsfOrigin | None
             psf.details.get("plate_scale_arcsec"),
             {},
         )
-    kept = psf.details.get("cards")
-    if kept is None:
-        return None
+    kept = psf.details["cards"]
     named, cards = origin_of(kept)
     instrument, angstrom = of_upload(psf, named, wavelength_angstrom(kept))
     return PsfOrigin(psf.name, instrument, angstrom, plate_scale_arcsec(kept), cards)

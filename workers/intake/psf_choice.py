@@ -185,8 +185,7 @@ def _seen_as(
         return instrument, channel
     pinned = catalogue.contexts.asked_for(context, owner)
     known = catalogue.series.variants(instrument, channel, kind, owner, None if pinned is None else pinned.id)
-    # The summaries of images that were uploaded by earlier versions contain no cards.
-    return instrument, variant_for(header.get("cards") or {}, known) or channel
+    return instrument, variant_for(header["cards"], known) or channel
 
 
 def _observed_at(header: Mapping[str, Any]) -> float | None:

@@ -9,7 +9,7 @@ from typing import Any
 from psfcore.deconvolve.box import Box
 from psfcore.errors import DataError
 from psfcore.fits.frame import frame_of
-from psfcore.fits.header import IMAGE, check_not_deconvolved
+from psfcore.fits.header import check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.instruments.files import instrument_names, turned_text
 from psfcore.instruments.model import parse_instrument
@@ -144,9 +144,8 @@ def resolved_deconvolution(
     wanted: Deconvolve, header: dict[str, Any], catalogue: Catalogue, owner: str
 ) -> ResolvedDeconvolve:
     """The resolved deconvolution of an image with this header, with its PSF. Raises the same ``DataError`` as ``resolve``."""
-    # The summaries of images that were uploaded by earlier versions lack "content"; the worker checks the header itself.
     if not wanted.again:
-        check_not_deconvolved(header.get("content", IMAGE))
+        check_not_deconvolved(header["content"])
     if wanted.region is not None:
         Box.parse(wanted.region).checked((header["shape"][0], header["shape"][1]))
     resolved = ResolvedDeconvolve(

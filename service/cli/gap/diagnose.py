@@ -124,8 +124,7 @@ def _lines(report: dict[str, Any]) -> list[str]:
     so_far = "most probable: " if report["verdict"] == "inconclusive" else ""
     answer = f" ({so_far}{', '.join(report['answer'])})" if report["answer"] else ""
     out = [report["sentence"], f"verdict: {report['verdict']}{answer}"]
-    together = report.get("together", ())  # reports of earlier versions lack this key
-    for effect in [*together, *report["effects"]][:SHOWN]:
+    for effect in [*report["together"], *report["effects"]][:SHOWN]:
         closure = effect["closure"]
         closed = "" if closure is None else f", held-out closure {100 * closure['value']:.0f} %"
         numbers = ", ".join(

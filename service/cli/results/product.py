@@ -35,11 +35,9 @@ def list_products(image_id: str | None, psf_id: str | None, most: int, server: s
     if not rows:
         click.echo("no such product" if filters else "no product yet; `heliopsf deconvolve` makes a product")
     for row in rows:
-        method = row["details"].get("method", {})
-        named = method.get("name", "") if isinstance(method, dict) else method
         click.echo(
             f"{short(row['id'])}  {moment(row['created_at'])}  image {short(row['image_id'])}  PSF {short(row['psf_id'])} "
-            f"{row['psf_version']}  {named}".rstrip()
+            f"{row['psf_version']}  {row['details']['method']['name']}"
         )
 
 
@@ -66,9 +64,7 @@ def get(
         raise click.UsageError("expected an output: -o FILE, --plot FILE or --changes FILE; got none of them")
     with user_errors(), remote(server) as service:
         found = service.product(identity)
-        # Products of earlier versions have no stored file name.
-        name = found["details"].get("filename", f"heliopsf-{short(found['id'])}.fits")
-        file = None if output is None else output.file(name)
+        file = None if output is None else output.file(found["details"]["filename"])
         parts = {"file": file, "preview": plot, "changes": changes}
         wanted = {part: path for part, path in parts.items() if path is not None}
         for part, path in wanted.items():

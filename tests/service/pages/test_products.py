@@ -27,7 +27,7 @@ def test_a_high_artefact_score_comes_with_advice(
     (product,) = api.get("/v1/products").json()["items"]
     again = f"/images/{image}?psf_id={psf}&amp;method=linear&amp;steps=2&amp;again=1"
     engine = create_engine(settings.catalogue_url)
-    for score, advised in ((0.99, False), (1.0, True), (None, False)):
+    for score, advised in ((0.99, False), (1.0, True)):
         details = product["details"] | {"changes": {"artefacts": {"score": score}}}
         with engine.begin() as connection:
             connection.execute(update(ProductRow).values(details=details))

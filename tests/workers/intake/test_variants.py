@@ -42,7 +42,6 @@ def test_the_header_chooses_the_variant(certified: Catalogue) -> None:
     assert chosen(certified, image("closed")) == "plain"
     assert chosen(certified, image("Open 2")) == "open_2"
     assert chosen(certified, image(None, 0.984)) == "binned"
-    assert chosen(certified, image("Open 2", cards={})) == "plain", "no cards of an earlier version's upload"
     with pytest.raises(DataError) as caught:
         chosen(certified, image("Open 2", 0.984))
     assert caught.value.code == "several-variants-fit"

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
-from sqlalchemy import update
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.images import read_plane
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image
-from tests.workers.databases import add, change
+from tests.workers.databases import add
 from tests.workers.psf_examples import OWNER, identity, product, psf
 from workers import lineage
 from workers.catalogue.catalogue import Catalogue
@@ -48,10 +47,6 @@ def made(local: LocalService, psf_file: Path, tmp_path: Path) -> dict[str, Any]:
     psf_id, noise = local.upload_psf(psf_file)["id"], {"noise": (6.0, 2.0), "error_draws": 4}
     write_image(tmp_path / "image.fits", shape=(64, 64))
     return local.deconvolve(tmp_path / "image.fits", tmp_path / "first.fits", psf_id=psf_id, steps=3, **noise)
-
-
-def change_details(catalogue: Catalogue, product: dict[str, Any], details: dict[str, Any]) -> None:
-    change(catalogue, update(ProductRow).where(ProductRow.id == product["id"]).values(details=details))
 
 
 def again(local: LocalService, of: str, identity: str, output: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -119,21 +114,6 @@ def test_a_rerun_finds_software_that_gives_other_values(
     assert (tmp_path / "kept.fits").read_bytes() == (tmp_path / "first.fits").read_bytes()
     local.download(row["output"], tmp_path / "again.fits")
     assert read_plane(tmp_path / "again.fits", LIMITS)[5, 7] != first[5, 7]
-
-
-def test_a_product_made_before_parameters_were_written_down_is_made_again_from_its_job(
-    local: LocalService, there: Catalogue, made: dict[str, Any], tmp_path: Path
-) -> None:
-    row = there.get(ProductRow, made["id"], OWNER)
-    assert row is not None
-    unwritten = ("parameters", "libraries")
-    change_details(there, made, {name: value for name, value in row.details.items() if name not in unwritten})
-    _, report = again(local, "product", made["id"], tmp_path / "r.json")
-    assert report["same"] and report["first"]["libraries"] is None
-    there.uws.destroy(made["details"]["job_id"])
-    with pytest.raises(DataError) as caught:
-        local.submit("rerun", of="product", id=made["id"])
-    assert caught.value.code == "parameters-unknown"
 
 
 def test_uploaded_and_unknown_psfs_cannot_be_rerun(local: LocalService, psf_file: Path) -> None:
@@ -274,16 +254,12 @@ def test_the_job_that_made_a_psf(catalogue: Catalogue) -> None:
         assert filled_in, "what was not said is filled in"
 
 
-def test_parameters_that_are_no_longer_valid_and_the_job_of_another_owner_are_refused(
-    catalogue: Catalogue,
-) -> None:
+def test_parameters_that_are_not_valid_or_not_recorded_are_refused(catalogue: Catalogue) -> None:
     row, _ = catalogue.add(product("x", "p", details={"parameters": {"image_id": "no id"}}))
     with pytest.raises(DataError, match="image_id") as caught:
         made_by(catalogue, row)
     assert caught.value.code == "parameters-outdated"
-    job, _ = catalogue.jobs.submit("deconvolve", {"secret": 1}, "k", "somebody")
-    lease = catalogue.jobs.claim(job.id, "w")
-    row, _ = catalogue.add(product("y", "p", details={"job_id": job.id}))
-    assert lease is not None and catalogue.jobs.complete(lease, row.id)
-    with pytest.raises(DataError, match="not recorded"):
+    row, _ = catalogue.add(product("y", "p"))
+    with pytest.raises(DataError) as caught:
         made_by(catalogue, row)
+    assert caught.value.code == "parameters-unknown"

@@ -170,7 +170,7 @@ def _cards(
         amplification=None if errors is None else errors.amplification,
         warnings=[one.code for one in warnings],
     )
-    # The cards have the same order as in earlier versions, because equal requests must give equal bytes.
+    # The order of the cards must not change, because equal requests must give equal bytes.
     ordered: dict[str, tuple[Any, str]] = {"PRODID": (identity, "")}
     for key, card in cards.items():
         if key == "SWHELIO":
