@@ -89,7 +89,7 @@ class Result(BaseModel):
         product = f"/v1/products/{row.product_id}"
         file = f"{product}/file" if row.kept else None
         provenance = f"{product}/provenance" if row.kept else None
-        thumbnail = f"{product}/thumbnail" if row.kept and told.get("has_thumbnail") else None
+        thumbnail = f"{product}/thumbnail" if row.kept and told["has_thumbnail"] else None
         return cls.model_validate(
             {**told, **own, "file": file, "thumbnail": thumbnail, "provenance": provenance}
         )

@@ -326,7 +326,7 @@ def _estimated(found: dict[str, Any]) -> list[str]:
         f"examined: {found['examined']} of {found['images']} images; {found['refused_images']} would be refused"
         + (f", {found['existing']} products exist already" if found["existing"] else ""),
     ]
-    if found.get("example_output"):
+    if found["example_output"]:
         lines.append(f"for example: {found['example_output']}")
     if not found["complete"]:
         lines.append(
@@ -355,8 +355,8 @@ def _said(found: dict[str, Any]) -> list[str]:
 
 
 def _total(found: dict[str, Any], total: int) -> str:
-    """The number of images of a run, as far as it is known. An older service lists all files before it starts."""
-    return str(total) if found.get("listed", True) else f"at least {total}"
+    """The number of images of a run, as far as it is known."""
+    return str(total) if found["listed"] else f"at least {total}"
 
 
 def _end_with_status(found: dict[str, Any]) -> None:
@@ -375,7 +375,7 @@ def _line(row: dict[str, Any]) -> str:
         for kind in ("bright", "dark")
         if row[kind] is not None
     )
-    warnings = f"  (warnings: {', '.join(row['warnings'])})" if row.get("warnings") else ""
+    warnings = f"  (warnings: {', '.join(row['warnings'])})" if row["warnings"] else ""
     return f"{row['score']:8.2f}  {changes}  {row['source']}{warnings}"
 
 

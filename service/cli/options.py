@@ -151,7 +151,7 @@ def user_errors() -> Iterator[None]:
 
 def say_warnings(product: dict[str, Any]) -> None:
     """Print the warnings of a product to standard error."""
-    for warning in product["details"].get("warnings", ()):
+    for warning in product["details"]["warnings"]:
         click.echo(f"warning: {warning['message']}", err=True)
 
 

@@ -157,7 +157,7 @@ class BulkClient(ABC):
             for bulk in self.follow(f"/v1/bulk/{bulk_id}"):
                 images = bulk["images"]
                 ended, total = images["done"] + images["failed"], images["total"]
-                if progress is not None and not bulk.get("listed", True):
+                if progress is not None and not bulk["listed"]:
                     progress(
                         f"{ended} of at least {total} images", 0, 1
                     )  # how many steps are left is unknown

@@ -179,7 +179,7 @@ class _Run:
         self._service.download(product["file"], begun.output, overwrite=self._overwrite)
         self._service.release(product)
         self._found[begun.key] = begun.output
-        warnings = tuple(one["message"] for one in product["details"].get("warnings", ()))
+        warnings = tuple(one["message"] for one in product["details"]["warnings"])
         return Outcome(begun.image, begun.output, warnings=warnings)
 
 

@@ -118,7 +118,7 @@ async def build(
 
 def product_line(product: ProductView) -> dict[str, Any]:
     """The entry of a product in the list of the products of an image."""
-    done = product.details.get("steps_done", product.details["method"]["steps"])
+    done = product.details["steps_done"]
     return {
         "id": product.id,
         "told": f"{product.details['method']['name']}, {done} step{'' if done == 1 else 's'}, PSF {product.psf_version}",

@@ -86,7 +86,7 @@ def details_now(catalogue: Catalogue, product: ProductRow) -> dict[str, Any]:
     message = None if psf is None else deprecated_warning(catalogue, psf)
     if message is None:
         return product.details
-    others = [one for one in product.details.get("warnings", ()) if one["code"] != CODE]
+    others = [one for one in product.details["warnings"] if one["code"] != CODE]
     return {**product.details, "warnings": [*others, {"code": CODE, "message": message}]}
 
 

@@ -116,9 +116,7 @@ def factor(kind: str, catalogue: Catalogue) -> float:
     if time.monotonic() < until:
         return value
     times = catalogue.stage_times.run_times(kind, MOST_JOBS)
-    ratios = [
-        took_s / estimated["start_s"] for estimated, took_s in times if estimated.get("start_s", 0.0) > 0
-    ]
+    ratios = [took_s / estimated["start_s"] for estimated, took_s in times if estimated["start_s"] > 0]
     ratios = [ratio for ratio in ratios if ratio > FOUND]
     value = min(max(median(ratios), BOUNDS[0]), BOUNDS[1]) if len(ratios) >= FEWEST_JOBS else 1.0
     known[kind] = value, time.monotonic() + KEEP_FACTOR_S

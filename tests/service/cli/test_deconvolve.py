@@ -110,7 +110,7 @@ def test_what_does_not_fit_together_is_refused(folder: Path) -> None:
 
 def test_a_bulk_run_with_failures_ends_with_status_1(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = {"total": 3, "reused": 0, "at_work": 0, "waiting": 0, "to_look_at": 0}
-    times = {"images_an_hour": None, "time_left_s": None, "error": None}
+    times = {"images_an_hour": None, "time_left_s": None, "error": None, "listed": True}
     service = MagicMock()
     service.__enter__.return_value = service
     service.psf.return_value = {"status": "draft"}
