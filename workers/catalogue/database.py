@@ -10,10 +10,8 @@ from typing import Any
 
 from sqlalchemy import (
     ColumnElement,
-    Connection,
     Double,
     Engine,
-    MetaData,
     Update,
     and_,
     create_engine,
@@ -141,11 +139,3 @@ def _write_ahead(connection: sqlite3.Connection) -> None:
 def strict_json(value: Any) -> str:
     """Write JSON. Raises ValueError for NaN and infinity: PostgreSQL refuses them, and clients cannot read them."""
     return json.dumps(value, allow_nan=False)
-
-
-def make_missing(metadata: MetaData, connection: Connection) -> None:
-    """Create the tables and indexes that are missing."""
-    metadata.create_all(connection)
-    for table in metadata.sorted_tables:
-        for index in table.indexes:
-            index.create(connection, checkfirst=True)

@@ -1,8 +1,10 @@
 """Compare the revision of the database with the revision that this version of heliopsf needs, and upgrade the database.
 
 A revision is a numbered state of the tables. The revisions are in ``workers/catalogue/migrations/versions``. Alembic runs
-them; it is imported only when needed. A new database gets the present tables at once, without running revisions. Any number of processes may start at the same moment. The first process that gets
-the lock of the database upgrades the database in one transaction. The others wait, and then find that it is upgraded.
+them; it is imported only when needed. A new database gets the present tables at once, without running revisions.
+
+Any number of processes may start at the same moment. The first process that gets the lock of the database makes or
+upgrades the tables in one transaction. The others wait, and then find that it is upgraded.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from sqlalchemy import Connection, inspect, text
 
-from workers.catalogue.database import Database, make_missing
+from workers.catalogue.database import Database
 from workers.catalogue.tables import Base
 from workers.settings import software_version
 
@@ -120,7 +122,7 @@ class Schema:
         This is quicker than ``upgrade``. The database gets no revision, so no other version can upgrade it.
         """
         with self._database.engine.begin() as connection:
-            make_missing(Base.metadata, connection)
+            Base.metadata.create_all(connection)
 
     def check(self) -> None:
         """Raise ``SchemaError`` if the database is not at the revision of this version. The message says what to do."""
@@ -137,7 +139,10 @@ class Schema:
     def mend(self) -> None:
         """Create the missing tables and indexes of a database that is at the revision of this version."""
         with self._database.engine.begin() as connection:
-            make_missing(Base.metadata, connection)
+            Base.metadata.create_all(connection)
+            for table in Base.metadata.sorted_tables:
+                for index in table.indexes:
+                    index.create(connection, checkfirst=True)
 
     def status(self) -> SchemaStatus:
         """The revision of the database. Does not change the database."""
