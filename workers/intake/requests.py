@@ -242,7 +242,7 @@ def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, o
     if header["instrument"] is None:
         raise no_psf(catalogue, header, owner)
     # The shipped instrument file at full size.
-    turn_deg = frame_of(header.get("cards") or {}).turn_to_build_deg
+    turn_deg = frame_of(header["cards"]).turn_to_build_deg
     recipe = (
         PsfBuild(instrument_file=turned_text(header["instrument"], turn_deg))
         if turn_deg
