@@ -29,6 +29,14 @@ from service.client.outputs import check_output_folder, check_outputs
 from service.start import STARTED
 from workers.contract.requests import Deconvolve
 
+# Every field of the request is an option, except what the command fills in itself.
+_FILLED_IN = ("image_id", "psf_id", "changes_picture")
+_OF_METHOD = ("method", "steps", "stop", "edges")
+OPTIONS = (
+    *_OF_METHOD,
+    *(name for name in Deconvolve.model_fields if name not in (*_FILLED_IN, *_OF_METHOD)),
+)
+
 
 @click.command()
 @click.argument("images", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
@@ -41,23 +49,7 @@ from workers.contract.requests import Deconvolve
     help="Write the deconvolved image (FITS) to this file; several images: to this folder",
 )
 @PSF
-@options_of(
-    Deconvolve,
-    "other_channel",
-    "context",
-    "method",
-    "steps",
-    "stop",
-    "edges",
-    "hdu",
-    "plate_scale_arcsec",
-    "region",
-    "region_error",
-    "noise",
-    "saturation_dn",
-    "error_draws",
-    "again",
-)
+@options_of(Deconvolve, *OPTIONS)
 @click.option("--plot", type=OUTPUT, help="Write the image before and after (PNG)")
 @click.option("--changes", type=OUTPUT, help="Write difference, ratio and histograms (PNG)")
 @click.option("--timings", is_flag=True, help="Print how long each stage of the command took; needs --local")
