@@ -13,13 +13,13 @@ from astropy.io import fits
 from psfcore.deconvolve import whole
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.errors import DataError
-from service.cli.options import METHODS
 from service.client.http import ServiceError
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
+from workers.contract.methods import METHODS
 from workers.contract.phases import Phase
 from workers.files.store import Store
 from workers.run import attempt
