@@ -42,7 +42,7 @@ from psfcore.whole_files import write_whole
 from service.client.errors import ServiceError
 from service.client.http import Client
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
-from tests.service.http.attacks import TABLE, Attack
+from tests.service.http.attacks import ARCHIVES, FILES, REQUESTS, Attack
 from tests.whole import stack as stacks
 from tests.whole.stack import Stack
 from workers.catalogue.access.keys import Scope
@@ -148,7 +148,7 @@ class Hostile:
 
     def from_the_table(self, http: httpx.Client, rng: random.Random) -> None:
         """Send a file or a request from the table of attacks in the tests."""
-        one: Attack = rng.choice(TABLE)
+        one: Attack = rng.choice((*FILES, *ARCHIVES, *REQUESTS))
         content = None if one.content is None else one.content()
         sent = http.request(one.method, one.address, headers=one.headers, content=content, json=one.json)
         self._note("from_the_table", sent)

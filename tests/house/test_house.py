@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import subprocess
 import sys
@@ -317,3 +318,12 @@ def test_the_page_of_settings_is_made_from_the_settings_class() -> None:
 
     kept = (HERE / "docs" / "settings.md").read_text("utf-8")
     assert kept == settings_table(), "`make settings` writes it anew"
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "studies"])
+def test_scripts_that_no_test_runs_can_be_imported(folder: str) -> None:
+    """`benchmarks/race` runs in environments of other packages."""
+    for path in sorted((HERE / folder).rglob("*.py")):
+        name = ".".join(path.relative_to(HERE).with_suffix("").parts)
+        if path.stem != "__main__" and ".race" not in name:
+            importlib.import_module(name.removesuffix(".__init__"))
