@@ -17,16 +17,14 @@ from psfcore.fits.header import FitsLimits
 from psfcore.fits.product.planes import read_planes
 from psfcore.fits.psfs import read_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
-from psfcore.scatter.inversion import invert
 from psfcore.simulate.scatter_truth import total_kernel
 from service.client.http import ServiceError
 from service.local import LocalService
 from tests.conftest import write_image
+from tests.fitted_transit import copied_data, counted_inversions, fitted_transit
 from tests.html_page import check_stands_alone, read_page
-from tests.transit_files import TRUTH, diffraction, write_simulated
-from workers.settings import Settings
+from tests.transit_files import TRUTH, diffraction
 from workers.tasks import report as report_task
-from workers.tasks.data import solutions
 
 LIMITS = FitsLimits(max_pixels=2**24)
 FILES = {f"{k:03d}.fits" for k in range(9)}
@@ -35,68 +33,61 @@ PNG = b"\x89PNG"
 
 
 @pytest.fixture(scope="module")
-def transit(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Nine bright images of 128 px."""
-    return write_simulated(tmp_path_factory.mktemp("simulated") / "transit")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the fit and of its first cross-validation."""
+    return fitted_transit(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalService]:
-    folder = tmp_path_factory.mktemp("service")
-    local = LocalService(Settings(data_dir=folder / "data", database_url=None, broker_url="filesystem://"))
+def transit(made: Path) -> Path:
+    """Nine bright images of 128 px."""
+    return made / "transit"
+
+
+@pytest.fixture(scope="module")
+def service(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalService]:
+    local = LocalService(copied_data(made, tmp_path_factory.mktemp("service") / "data"))
     yield local
     local.close()
 
 
 @pytest.fixture(scope="module")
 def inversions() -> Iterator[list[int]]:
-    """The number of images of each transit that a task inverted."""
+    """The number of images of each transit that a task inverted after the fit."""
     images: list[int] = []
-
-    def counted(transit: Any, shape: Any, **how: Any) -> Any:
-        solution = invert(transit, shape, **how)
-        images.append(len(transit.frames))
-        return solution
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(solutions, "invert", counted)
+    with counted_inversions(images):
         yield images
 
 
 @pytest.fixture(scope="module")
-def fitted(
-    service: LocalService, transit: Path, inversions: list[int], tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Any]:
-    """One fit, all of its files, and the steps that its progress told."""
-    out = tmp_path_factory.mktemp("fitted")
-    steps: list[tuple[str, int, int]] = []
-    psf = service.fit_psf(
-        transit,
-        out / "psf.fits",
-        report=out / "r.json",
-        preview=out / "p.png",
-        progress=lambda *step: steps.append(step),
-    )
-    return {"psf": psf, "report": json.loads((out / "r.json").read_text()), "folder": out, "steps": steps}
+def fitted(made: Path) -> dict[str, Any]:
+    """The fit, all of its files, the steps that its progress told, and what was inverted."""
+    rows = json.loads((made / "made.json").read_text())
+    return rows | {"report": json.loads((made / "psf.json").read_text()), "folder": made}
 
 
 @pytest.fixture(scope="module")
 def folds(
-    service: LocalService, transit: Path, fitted: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+    service: LocalService,
+    transit: Path,
+    fitted: dict[str, Any],
+    inversions: list[int],
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> dict[str, Any]:
     """A report of each scheme of cross-validation, of one run of three folds."""
-    out, reports = tmp_path_factory.mktemp("folds"), {}
-    for scheme in ("shared", "exact"):
-        file, picture = out / f"{scheme}.json", out / f"{scheme}.png"
-        row = service.cross_validate(transit, file, preview=picture, scheme=scheme, runs=1)
-        assert picture.read_bytes().startswith(PNG)
-        reports[scheme] = json.loads(file.read_text()) | {"row": row}
-    return reports
+    shared, file = fitted["folder"], tmp_path_factory.mktemp("folds") / "exact.json"
+    picture = file.with_suffix(".png")
+    row = service.cross_validate(transit, file, preview=picture, scheme="exact", runs=1)
+    assert picture.read_bytes().startswith(PNG) and (shared / "folds.png").read_bytes().startswith(PNG)
+    return {
+        "shared": json.loads((shared / "folds.json").read_text()) | {"row": fitted["folds"]},
+        "exact": json.loads(file.read_text()) | {"row": row},
+    }
 
 
 @pytest.fixture(scope="module")
 def report(
-    service: LocalService, transit: Path, fitted: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+    service: LocalService, transit: Path, inversions: list[int], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Any]:
     """One report of a fit without the slow dark offsets, all of its files, and what the comparison of shapes was given."""
     out, given = tmp_path_factory.mktemp("report"), []
@@ -115,7 +106,7 @@ def report(
 def test_one_inversion_serves_all_jobs(
     fitted: dict[str, Any], folds: dict[str, Any], report: dict[str, Any], inversions: list[int]
 ) -> None:
-    assert inversions.count(len(FILES)) == 1
+    assert fitted["inversions"] == [len(FILES)] and inversions.count(len(FILES)) == 0
 
 
 # The fit ----------------------------------------------------------------------------------------------
@@ -144,7 +135,7 @@ def test_the_product_says_what_it_was_made_of(fitted: dict[str, Any]) -> None:
     assert psf["details"]["fit"]["sentence"] == report["sentence"]
     with fits.open(fitted["folder"] / "psf.fits") as hdus:
         assert {"DIFFRACTION", "SCATTER", "PROFILE", "FIT"} <= {hdu.name for hdu in hdus}
-    assert (fitted["folder"] / "p.png").read_bytes().startswith(PNG)
+    assert (fitted["folder"] / "psf.png").read_bytes().startswith(PNG)
     shares = [
         step / steps for stage, step, steps in fitted["steps"] if stage not in ("reading", "building the PSF")
     ]

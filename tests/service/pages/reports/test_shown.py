@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,19 +10,13 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from psfcore.transit.archive import pack
+from service.app import create_app
 from tests.conftest import SMALL_INSTRUMENT
-from tests.service.conftest import upload
+from tests.fitted_transit import copied_data, fitted_transit
+from tests.service.conftest import result_of, settings_in
 from tests.service.pages.gap_report import GAP_ID, keep_gap_report
 from tests.service.pages.test_login import PERSON
-from tests.transit_files import write_simulated
 from workers.settings import Settings
-
-
-@pytest.fixture
-def settings(settings: Settings) -> Settings:
-    """Settings that allow PSFs of full size, which a rerun reads."""
-    return settings.model_copy(update={"max_pixels": 4096**2})
 
 
 @pytest.fixture
@@ -59,31 +54,31 @@ def test_a_gap_report_is_shown_with_its_sentence_map_sections_and_figures(
     assert api.get(f"/reports/{'0' * 64}", headers=PERSON).status_code == 404
 
 
-def test_a_fit_its_cross_validation_and_a_rerun_are_shown(
-    api: TestClient, run_jobs: Callable[[], None], tmp_path: Path
+def shown(api: TestClient, address: str, *texts: str) -> str:
+    """The page at this address, which contains these texts."""
+    page = api.get(address).text
+    assert [text for text in texts if text not in page] == []
+    return page
+
+
+def test_a_fit_and_its_cross_validation_are_shown(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    pack(write_simulated(tmp_path / "transit"), tmp_path / "t.tar")
-    transit_id = upload(api, tmp_path / "t.tar", "/v1/transits")
+    fitted = fitted_transit(tmp_path_factory)
+    made = json.loads((fitted / "made.json").read_text())
+    copied_data(fitted, tmp_path / "data")
+    psf, folds = f"/psfs/{made['psf']['id']}", f"/reports/{made['folds']['id']}"
+    with TestClient(create_app(settings_in(tmp_path / "data"))) as api:
+        shown(api, psf, "Fit to the transit", "Weight of the scatter without a formula", "000.fits, pointing")
+        shown(api, folds, "3 fits with held-out blocks", "Parameters over all folds", "run 0, fold 2")
+        shown(api, f"/transits/{made['folds']['transit_id']}", psf, folds)
 
-    def made(kind: str, **parameters: object) -> str:
-        job = api.post("/v1/jobs", json={"kind": kind, "parameters": parameters}).json()
-        run_jobs()
-        job = api.get(f"/v1/jobs/{job['id']}").json()
-        assert job["phase"] == "COMPLETED", job["error"]
-        return str(job["result"].removeprefix("/v1"))
 
-    def shown(address: str, *texts: str) -> str:
-        page = api.get(address).text
-        assert [text for text in texts if text not in page] == []
-        return page
-
-    psf = made("psf-fit", transit_id=transit_id)
-    shown(psf, "Fit to the transit", "Weight of the scatter without a formula", "000.fits, pointing")
-    folds = made("cross-validate", transit_id=transit_id, runs=1)
-    shown(folds, "3 fits with held-out blocks", "Parameters over all folds", "run 0, fold 2")
-    shown(f"/transits/{transit_id}", psf, folds)
-    built = made("psf-build", instrument_file=SMALL_INSTRUMENT, size=128)
-    rerun = made("rerun", of="psf", id=built.removeprefix("/psfs/"))
-    page = shown(rerun, "bit for bit", "<td>equal</td>", f'href="{built}"', "job_id")
+def test_a_rerun_is_shown(api: TestClient, run_jobs: Callable[[], None]) -> None:
+    built = result_of(api, run_jobs, "psf-build", instrument_file=SMALL_INSTRUMENT, size=128)["id"]
+    rerun = result_of(api, run_jobs, "rerun", of="psf", id=built)["id"]
+    page = shown(
+        api, f"/reports/{rerun}", "bit for bit", "<td>equal</td>", f'href="/psfs/{built}"', "job_id"
+    )
     assert "library numpy" not in page
-    shown(built, rerun)
+    shown(api, f"/psfs/{built}", f"/reports/{rerun}")
