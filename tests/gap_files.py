@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psfcore.gap.corrected_psf import corrected_psf
+from psfcore.gap import corrected_psf
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.library import added as added_effects
 from psfcore.gap.report import plot as gap_plot
-from psfcore.psf import Psf, crop_centred
+from psfcore.scatter import total_psf
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.simulate.transit_files import write
@@ -27,6 +27,8 @@ from workers.tasks import gap as gap_task
 
 SIZE_PX = 96
 GLOW_DN_S = 25.0
+REACH_PX = 513
+TWO = tuple(effect for effect in FEW if effect.name in ("dark_offset", "saturation_fill"))
 
 
 def glow() -> NDArray[np.float64]:
@@ -60,14 +62,21 @@ def write_gap(folder: Path, *, offset_dn: float = 0.0, light_dn_s: float = 0.0) 
 
 
 @contextmanager
+def small_reach() -> Iterator[None]:
+    """Make corrected PSFs of REACH_PX px: those of 2048 px take 200 MB. A fit to a field of up to 256 px is the same."""
+    with patch.object(corrected_psf, "REACH_GRID_PX", REACH_PX), patch.object(total_psf, "REACH_GRID_PX", REACH_PX):
+        yield
+
+
+@contextmanager
 def quick_diagnosis() -> Iterator[None]:
-    """Diagnose with a library of a few effects and fewer sign flips."""
-    with patch.object(added_effects, "LIBRARY", FEW), few_sign_flips():
+    """Diagnose with a library of two effects and fewer sign flips."""
+    with patch.object(added_effects, "LIBRARY", TWO), few_sign_flips():
         yield
 
 
 def answer_at_once(monkeypatch: pytest.MonkeyPatch, found: Diagnosis) -> list[dict[str, Any]]:
-    """Let jobs return a diagnosis made before, with small pictures and PSFs; the returned list records the jobs' arguments."""
+    """Let jobs return a diagnosis made before, with small pictures; the returned list records the jobs' arguments."""
     asked: list[dict[str, Any]] = []
 
     def diagnose(transit: object, **how: Any) -> Diagnosis:
@@ -75,13 +84,6 @@ def answer_at_once(monkeypatch: pytest.MonkeyPatch, found: Diagnosis) -> list[di
         return found
 
     monkeypatch.setattr(gap_task, "diagnose", diagnose)
-    monkeypatch.setattr(gap_task, "corrected_psf", _small_psf)
     monkeypatch.setattr(gap_plot, "PLOT_DPI", 40)
     return asked
 
-
-def _small_psf(*given: Any, **named: Any) -> Psf:
-    """The centre of the corrected PSF, which is quicker to write."""
-    psf = corrected_psf(*given, **named)
-    parts = {name: crop_centred(part, (257, 257)) for name, part in psf.components.items()}
-    return replace(psf, kernel=crop_centred(psf.kernel, (257, 257)), components=parts)

@@ -26,8 +26,12 @@ from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Transit
 from tests.psfcore.gap import small_gaps
-from tests.psfcore.gap.small_gaps import FEW, changed
+from tests.psfcore.gap.small_gaps import changed
 from tests.transit_files import TRUTH, diffraction
+
+# Without those that search for a position or a form, and without those of many parameters: they take most of the time.
+QUICK = tuple(effect for effect in LIBRARY if effect.held is None and len(effect.parameters) < 4)
+FEW = tuple(effect for effect in small_gaps.FEW if effect.held is None)
 
 
 @pytest.fixture(autouse=True)
@@ -67,11 +71,9 @@ def test_clean_images_have_no_gap_and_the_report_is_json(solution: Solution) -> 
 
 
 def test_a_read_pattern_is_not_attributed_to_an_effect(clean: Transit) -> None:
-    """Effects that search for a position or a form are left out, which is quicker."""
-    library = [effect for effect in LIBRARY if effect.held is None]
     stripes = 20 * np.sin(2 * np.pi * np.arange(clean.shape[1]) / 45) * np.ones((clean.shape[0], 1))
     found = diagnose(
-        changed(clean, lambda n, f: f.pixels + stripes / f.exposure_s), library=library, refit=False
+        changed(clean, lambda n, f: f.pixels + stripes / f.exposure_s), library=QUICK, refit=False
     )
     assert UNKNOWN in found.judgement.members
 
@@ -90,7 +92,7 @@ def test_a_dark_offset_is_found_with_its_size_and_taken_out() -> None:
     # A wrong dark level biases the fit of the PSF; with the effect in the model the bias is gone.
     bent, straight = (s.inversion.values["total"] for s in (full.solution, fit.solution))
     assert abs(straight - TRUTH.total) < abs(bent - TRUTH.total) - 0.005
-    plain = diagnose_solution(full.solution, noise=None, library=FEW, refit=False)
+    plain = diagnose_solution(full.solution, noise=None, library=small_gaps.FEW, refit=False)
     assert plain.corrected == () and plain.judgement.answer == ("dark_offset",)
     assert plain.p_value == full.p_value < 1e-10
     # The limit of the offset is that of the full refit, and above the truth.

@@ -15,7 +15,7 @@ from psfcore.gap.verdict.calibration import COVERAGE, shipped_calibration
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from service.client.http import ServiceError
 from service.local import LocalService
-from tests.gap_files import EDGE_GLOW, answer_at_once, write_gap
+from tests.gap_files import EDGE_GLOW, REACH_PX, answer_at_once, small_reach, write_gap
 from tests.html_page import check_stands_alone
 from tests.psfcore.gap import small_gaps
 from workers.catalogue.catalogue import Catalogue
@@ -24,6 +24,12 @@ from workers.contract.identities import corrected_psf_identity
 from workers.contract.requests import GapDiagnose
 from workers.settings import Settings
 from workers.tasks import gap as gap_task
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_reach() -> Iterator[None]:
+    with small_reach():
+        yield
 
 
 def settings_of(folder: Path, gap_effects: str = "") -> Settings:
@@ -119,7 +125,8 @@ def test_the_corrected_psf_is_a_new_draft_that_names_its_parents_effects_and_the
     assert made_by["gap_before_pct"] == report["gap"]["rms_pct"]
     assert made_by["gap_after_pct"] == report["gap"]["after_pct"]
     assert made_by["inputs_sha256"] == report["inputs_sha256"]
-    assert sum(details["shape"]) == 4096 and details["sum"] == pytest.approx(1, abs=1e-3)
+    # The rest of the light lies beyond the small reach of these tests.
+    assert details["shape"] == [REACH_PX, REACH_PX] and 0.9 < details["sum"] < 1
     # Questions about it can be answered at once.
     assert service.ask(psf["id"], "encircled", radius=10.0)
 

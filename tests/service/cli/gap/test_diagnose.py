@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -12,13 +15,19 @@ from astropy.io import fits
 from click.testing import CliRunner, Result
 from fastapi.testclient import TestClient
 
-from psfcore.gap.diagnose import Diagnosis
+from psfcore.gap.diagnose import Diagnosis, diagnose
 from psfcore.transit.archive import pack
 from service.cli.main import main
-from tests.gap_files import EDGE_GLOW, GLOW_DN_S, answer_at_once, quick_diagnosis, write_gap
+from tests.gap_files import EDGE_GLOW, GLOW_DN_S, answer_at_once, quick_diagnosis, small_reach, write_gap
 from tests.html_page import check_stands_alone, read_page
-from tests.psfcore.gap.report.judged import SHARES, with_shares
 from tests.service.conftest import upload
+from workers.tasks import gap as gap_task
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_reach() -> Iterator[None]:
+    with small_reach():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -27,26 +36,41 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_gap(tmp_path_factory.mktemp("simulated") / "transit", light_dn_s=GLOW_DN_S)
 
 
-def without_gap() -> Diagnosis:
-    return with_shares(SHARES["none"])
-
-
 def run(*arguments: object) -> Result:
     return CliRunner().invoke(main, ["gap", *(str(one) for one in arguments)])
 
 
-def test_an_effect_of_one_s_own_is_found_with_its_size(folder: Path, tmp_path: Path) -> None:
+@dataclass(frozen=True)
+class Diagnosed:
+    """A command, the folder of the files that it wrote, and the diagnosis that its job made."""
+
+    done: Result
+    out: Path
+    found: Diagnosis
+
+
+@pytest.fixture(scope="module")
+def diagnosed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Diagnosed:
     """Nothing is patched but the library's length; the light that the file describes is in the images."""
-    (tmp_path / "mine.py").write_text(EDGE_GLOW)
-    numbers, page, picture = tmp_path / "g.json", tmp_path / "g.html", tmp_path / "g.png"
-    corrected = tmp_path / "psf.fits"
-    with quick_diagnosis():
+    out, made = tmp_path_factory.mktemp("diagnosed"), []
+    (out / "mine.py").write_text(EDGE_GLOW)
+
+    def kept(*given: Any, **how: Any) -> Diagnosis:
+        made.append(diagnose(*given, **how))
+        return made[0]
+
+    with quick_diagnosis(), patch.object(gap_task, "diagnose", kept):
         done = run(
-            folder, "--local", "--effects", tmp_path / "mine.py", "--json", numbers, "-o", page,
-            "--plot", picture, "--corrected", corrected,
+            folder, "--local", "--effects", out / "mine.py", "--json", out / "g.json", "-o", out / "g.html",
+            "--plot", out / "g.png", "--corrected", out / "psf.fits",
         )  # fmt: skip
     assert done.exit_code == 0, done.output
-    report = json.loads(numbers.read_text())
+    return Diagnosed(done, out, made[0])
+
+
+def test_an_effect_of_one_s_own_is_found_with_its_size(diagnosed: Diagnosed) -> None:
+    done, out = diagnosed.done, diagnosed.out
+    report = json.loads((out / "g.json").read_text())
     assert report["verdict"] == "attributed" and report["answer"] == ["edge_glow"]
     height = report["effects"][0]["parameters"]["height"]
     assert height["value"] == pytest.approx(GLOW_DN_S, abs=4 * height["sigma"])
@@ -54,14 +78,14 @@ def test_an_effect_of_one_s_own_is_found_with_its_size(folder: Path, tmp_path: P
     said = done.stdout.splitlines()  # a slow machine reports progress on stderr
     assert said[:2] == [report["sentence"], "verdict: attributed (edge_glow)"]
     assert "  not testable: saturation_fill (no pixel was filled in)" in said
-    html = page.read_text("utf-8")
+    html = (out / "g.html").read_text("utf-8")
     check_stands_alone(html)
     assert "A lamp beside the detector lights its right edge." in html
     # Its code's hash is among what made the report.
     (digest,) = report["provenance"]["added_effects"].values()
     assert digest in [tag.text for tag in read_page(html) if tag.name == "dd"]
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    header = fits.getheader(corrected)
+    assert (out / "g.png").read_bytes().startswith(b"\x89PNG")
+    header = fits.getheader(out / "psf.fits")
     assert header["PSFNAME"] == "hri_euv-gap-corrected"
     assert "edge_glow" in "".join(header["HISTORY"]).replace("\n", "")
 
@@ -86,9 +110,10 @@ def test_a_psf_that_was_not_fitted_is_no_start(folder: Path, tmp_path: Path) -> 
 
 
 def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, diagnosed: Diagnosed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = answer_at_once(monkeypatch, without_gap())
+    judgement = replace(diagnosed.found.judgement, verdict="none", answer=())
+    asked = answer_at_once(monkeypatch, replace(diagnosed.found, judgement=judgement, corrected=()))
     psf, numbers = tmp_path / "psf.fits", tmp_path / "g.json"
     done = run(folder, "--local", "--corrected", psf, "--json", numbers, "--coverage", 0.8)
     assert [how["coverage"] for how in asked] == [0.8]
