@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import psutil
@@ -38,6 +39,12 @@ LONGEST_FIRST = (
     "psfcore/report/test_report.py",
     "psfcore/gap/evidence/test_search.py",
 )
+
+# Files that use the same fits and diagnoses: one process runs all files of a row, so that it computes these once.
+TOGETHER = {
+    "gap": ("tests/psfcore/gap/", "tests/workers/tasks/test_gap.py", "tests/service/pages/reports/test_shown.py"),
+    "fits": ("tests/psfcore/scatter/", "tests/psfcore/evaluation/", "tests/psfcore/report/"),
+}
 
 _CACHE = TemporaryDirectory(prefix="heliopsf-tests-")
 
@@ -80,6 +87,21 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     config.option.loadscopereorder = False
     os.environ["HELIOPSF_CACHE_DIR"] = _CACHE.name
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give a process of xdist whole files, and the files of TOGETHER to the same process."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByFilesTogether(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return next(
+                (name for name, paths in TOGETHER.items() if nodeid.startswith(paths)),
+                super()._split_scope(nodeid),
+            )
+
+    return ByFilesTogether(config, log) if config.getoption("dist") == "loadfile" else None
 
 
 @pytest.fixture(autouse=True)
