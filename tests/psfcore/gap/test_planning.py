@@ -21,11 +21,12 @@ from tests.transit_files import diffraction
 NAMES = ("dark_offset", "intensity_gradient", "gain_mismatch", "wide_halo", "scene_evolution")
 FEW = tuple(effect for effect in LIBRARY if effect.name in NAMES)
 ONE, LADDER = (1.8,), (0.6, 1.8, 5.0)
+IMAGES, SIZE_PX = 15, 96  # an effect of the scene needs five images of a pointing
 
 
-def plan_with(exposures_s: Sequence[float], images: int = 18) -> Plan:
+def plan_with(exposures_s: Sequence[float], images: int = IMAGES) -> Plan:
     """A plan whose images have these exposure times in turn, all with one gain mode."""
-    plan = default_plan(images, 128, oversampling=1, brightness=6.0)
+    plan = default_plan(images, SIZE_PX, oversampling=1, brightness=8.0)
     shots = (
         replace(shot, exposure_s=exposures_s[n % len(exposures_s)], gain_mode=HIGH)
         for n, shot in enumerate(plan.shots)
@@ -61,8 +62,8 @@ def test_a_ladder_of_exposures_separates_a_dark_offset_from_a_halo_and_from_a_le
 def test_a_plan_as_json() -> None:
     content = planned(LADDER).as_json()
     assert content["schema"] == "gap-plan/1"
-    assert content["plan"]["images"] == 18
-    first = {"pointing": 1, "view": "east_limb", "images": 6, "exposures_s": list(LADDER)}
+    assert content["plan"]["images"] == IMAGES
+    first = {"pointing": 1, "view": "east_limb", "images": IMAGES // 3, "exposures_s": list(LADDER)}
     assert content["plan"]["pointings"][0] == first
     strength = strength_of(planned(LADDER), "dark_offset")
     offset = {"parameter": "offset", "unit": "DN", "found_90": strength}
@@ -93,7 +94,7 @@ def test_text_and_page_name_every_effect_and_pair() -> None:
     assert f"{strength_of(plan, 'dark_offset'):.3g}" in text
     cells = [tag.text for tag in read_page(html) if tag.name == "td"]
     assert all(f"{distance:.1f}" in cells for distance in plan.limits.distances.values())
-    assert "18 images of 128 x 128 px" in page
+    assert f"{IMAGES} images of {SIZE_PX} x {SIZE_PX} px" in page
     assert "wide_halo*" in text and "searches for its position or form" in text
 
 
