@@ -42,7 +42,11 @@ LONGEST_FIRST = (
 
 # Files that use the same fits and diagnoses: one process runs all files of a row, so that it computes these once.
 TOGETHER = {
-    "gap": ("tests/psfcore/gap/", "tests/workers/tasks/test_gap.py", "tests/service/pages/reports/test_shown.py"),
+    "gap": (
+        "tests/psfcore/gap/",
+        "tests/workers/tasks/test_gap.py",
+        "tests/service/pages/reports/test_shown.py",
+    ),
     "fits": ("tests/psfcore/scatter/", "tests/psfcore/evaluation/", "tests/psfcore/report/"),
 }
 

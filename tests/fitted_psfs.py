@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from psfcore.fits.psfs import write_psf
-from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, crop_centred, crop_or_pad
+from psfcore.psf import FittedShape, Psf, crop_centred, crop_or_pad
+from psfcore.scatter import interpolation
 from psfcore.scatter.shapes import SHAPES
 from psfcore.scatter.total_psf import TotalPsf
 from tests.psfcore.small_transits import DIFFRACTION
 
 SIZE = 128
+GRID_PX = 512  # DIFFRACTION reaches 15 px, so a larger grid gives the same kernel
 EARLY = {"b_px": 6.15, "c": 2.53, "total": 0.411}
 LATE = {"b_px": 5.2, "c": 2.62, "total": 0.455}
 
@@ -29,7 +34,8 @@ def fitted_psf(
     """The PSF of these parameters, with the same error for each coordinate."""
     form = SHAPES[shape]
     at = form.coordinates(values)
-    whole = TotalPsf(DIFFRACTION, form, (REACH_GRID_PX, REACH_GRID_PX)).kernel(at)
+    grid = max(size, GRID_PX)
+    whole = TotalPsf(DIFFRACTION, form, (grid, grid)).kernel(at)
     known: dict[str, Any] = {
         "kernel": np.maximum(crop_centred(whole, (size, size)), 0.0),
         "name": "fitted",
@@ -43,6 +49,13 @@ def fitted_psf(
         ),
     }
     return Psf(**(known | changes))
+
+
+@contextmanager
+def interpolated_on_a_small_grid() -> Iterator[None]:
+    """Compute PSFs between two fits on 512 px instead of 2048 px: those of `fitted_psf` are the same, their curves end earlier."""
+    with patch.object(interpolation, "REACH_GRID_PX", GRID_PX):
+        yield
 
 
 def write_fitted(path: Path, values: dict[str, float], **changes: Any) -> Path:

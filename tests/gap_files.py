@@ -64,7 +64,10 @@ def write_gap(folder: Path, *, offset_dn: float = 0.0, light_dn_s: float = 0.0) 
 @contextmanager
 def small_reach() -> Iterator[None]:
     """Make corrected PSFs of REACH_PX px: those of 2048 px take 200 MB. A fit to a field of up to 256 px is the same."""
-    with patch.object(corrected_psf, "REACH_GRID_PX", REACH_PX), patch.object(total_psf, "REACH_GRID_PX", REACH_PX):
+    with (
+        patch.object(corrected_psf, "REACH_GRID_PX", REACH_PX),
+        patch.object(total_psf, "REACH_GRID_PX", REACH_PX),
+    ):
         yield
 
 
@@ -86,4 +89,3 @@ def answer_at_once(monkeypatch: pytest.MonkeyPatch, found: Diagnosis) -> list[di
     monkeypatch.setattr(gap_task, "diagnose", diagnose)
     monkeypatch.setattr(gap_plot, "PLOT_DPI", 40)
     return asked
-

@@ -31,11 +31,17 @@ from psfcore.scatter import fit as fit_module
 from psfcore.scatter.as_published.equations import free_fit
 from psfcore.simulate.transit_files import write
 from tests.conftest import write_image, write_psf
-from tests.fitted_psfs import EARLY, LATE, fitted_psf, write_fitted
+from tests.fitted_psfs import EARLY, LATE, fitted_psf, interpolated_on_a_small_grid, write_fitted
 from tests.psfcore.small_transits import SCATTER, observed, sky
 
 HEAVY = {"astropy", "celery", "fastapi", "httpx", "matplotlib", "numba", "numpy"}
 HEAVY |= {"pydantic", "scipy", "sqlalchemy"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_grid() -> Iterator[None]:
+    with interpolated_on_a_small_grid():
+        yield
 
 
 def loaded_by(code: str) -> set[str]:

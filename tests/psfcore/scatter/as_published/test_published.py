@@ -7,6 +7,7 @@ scatter in these tests is compact so that this effect is small: a hundredth of t
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -75,9 +76,7 @@ class _SeenEnough(Exception):
     """Raised when the equations of the first round exist."""
 
 
-def first_equations(
-    patch: pytest.MonkeyPatch, choices: Choices, transit: Transit | None = None
-) -> tuple[Equations, NDArray[np.float64]]:
+def equations_of(transit: Transit, choices: Choices) -> tuple[Equations, NDArray[np.float64]]:
     """The equations of the first round, and the number of pixels of each segment."""
     seen: list[tuple[Equations, NDArray[np.float64]]] = []
 
@@ -85,16 +84,20 @@ def first_equations(
         seen.append((equations, counts))
         raise _SeenEnough
 
-    patch.setattr(published, "free_fit", stop)
-    with pytest.raises(_SeenEnough):
-        invert_as_published(transit or faint(), choices, seed=1)
+    with pytest.MonkeyPatch.context() as patched, pytest.raises(_SeenEnough):
+        patched.setattr(published, "free_fit", stop)
+        invert_as_published(transit, choices, seed=1)
     return seen[0]
 
 
-def test_equations_are_of_all_occulted_pixels_and_some_unocculted_ones(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    equations, _ = first_equations(monkeypatch, AS_PUBLISHED)
+@cache
+def first_equations(choices: Choices) -> tuple[Equations, NDArray[np.float64]]:
+    """Those of the faint images."""
+    return equations_of(faint(), choices)
+
+
+def test_equations_are_of_all_occulted_pixels_and_some_unocculted_ones() -> None:
+    equations, _ = first_equations(AS_PUBLISHED)
     assert (equations.stratum == UNOCCULTED).sum() == 10 * IMAGES
     assert (equations.stratum != UNOCCULTED).sum() == pytest.approx(
         IMAGES * np.pi * (10.75 - SHRUNK_PX) ** 2, rel=0.03
@@ -104,9 +107,9 @@ def test_equations_are_of_all_occulted_pixels_and_some_unocculted_ones(
     assert equations.unscattered[~dark].mean() > 3 * equations.unscattered[dark].mean()
 
 
-def test_each_choice_changes_its_own_part_of_an_equation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_choice_changes_its_own_part_of_an_equation() -> None:
     assert [sum(dataclasses.astuple(choices)) for choices in CORRECTED_ALONE.values()] == [3, 3, 3, 3]
-    as_published, counts = first_equations(monkeypatch, AS_PUBLISHED)
+    as_published, counts = first_equations(AS_PUBLISHED)
     dark = as_published.stratum != UNOCCULTED
     first = as_published.observed[: int(np.argmin(dark))]  # the disc of the first image
     assert first.min() < 0.5 * first.mean()
@@ -115,14 +118,14 @@ def test_each_choice_changes_its_own_part_of_an_equation(monkeypatch: pytest.Mon
         as_published.scale[: first.size], np.maximum(first, 0.5 * first.mean()), rtol=1e-12
     )
 
-    weighed, _ = first_equations(monkeypatch, dataclasses.replace(AS_PUBLISHED, weighed_by_observed=False))
+    weighed, _ = first_equations(dataclasses.replace(AS_PUBLISHED, weighed_by_observed=False))
     assert np.unique(weighed.scale[dark]).size == IMAGES  # one for each disc
     np.testing.assert_array_equal(weighed.ring_sums, as_published.ring_sums)
     exposure_s = faint().frames[0].exposure_s
     noise = np.sqrt(6.0 * first.mean() * exposure_s + 2.0**2) / exposure_s
     np.testing.assert_allclose(weighed.scale[: first.size], noise)
 
-    convolved, _ = first_equations(monkeypatch, dataclasses.replace(AS_PUBLISHED, added=False))
+    convolved, _ = first_equations(dataclasses.replace(AS_PUBLISHED, added=False))
     np.testing.assert_array_equal(convolved.unscattered, as_published.unscattered)
     assert not np.allclose(convolved.ring_sums, as_published.ring_sums, rtol=1e-3)
     # Diffracted light is smoother, and its total is the same.
@@ -130,26 +133,24 @@ def test_each_choice_changes_its_own_part_of_an_equation(monkeypatch: pytest.Mon
     assert convolved.ring_sums[dark, near].sum() > as_published.ring_sums[dark, near].sum()
     assert convolved.ring_sums.sum() == pytest.approx(as_published.ring_sums.sum(), rel=0.02)
 
-    reaching, all_counts = first_equations(
-        monkeypatch, dataclasses.replace(AS_PUBLISHED, counted_on_array=False)
-    )
+    reaching, all_counts = first_equations(dataclasses.replace(AS_PUBLISHED, counted_on_array=False))
     assert counts.sum() == GRID_PX**2 - 1
     assert all_counts.sum() == REACH_GRID_PX**2 - 1
     np.testing.assert_array_equal(reaching.unscattered, as_published.unscattered)
 
-    fully, _ = first_equations(monkeypatch, dataclasses.replace(AS_PUBLISHED, whole_disc_blanked=False))
+    fully, _ = first_equations(dataclasses.replace(AS_PUBLISHED, whole_disc_blanked=False))
     assert (fully.ring_sums.sum(axis=1) >= as_published.ring_sums.sum(axis=1) * (1 - 1e-6)).all()
     assert fully.ring_sums.sum() > 1.0001 * as_published.ring_sums.sum()
 
 
-def test_filled_pixels_give_no_equations(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, _ = first_equations(monkeypatch, AS_PUBLISHED)
+def test_filled_pixels_give_no_equations() -> None:
+    whole, _ = first_equations(AS_PUBLISHED)
     place = faint().frames[4].place
     filled = np.zeros((SIZE_PX, SIZE_PX), bool)
     filled[round(place.y_px) - 1 : round(place.y_px) + 2, round(place.x_px)] = True
     frames = list(faint().frames)
     frames[4] = dataclasses.replace(frames[4], filled=filled)
-    fewer, _ = first_equations(monkeypatch, AS_PUBLISHED, dataclasses.replace(faint(), frames=tuple(frames)))
+    fewer, _ = equations_of(dataclasses.replace(faint(), frames=tuple(frames)), AS_PUBLISHED)
     assert len(fewer) == len(whole) - 3
 
 

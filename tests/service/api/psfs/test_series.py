@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,18 @@ from fastapi.testclient import TestClient
 from httpx import Response
 
 from tests.conftest import write_image
-from tests.fitted_psfs import EARLY, LATE, write_fitted
+from tests.fitted_psfs import EARLY, LATE, interpolated_on_a_small_grid, write_fitted
 from tests.service.conftest import job_after, refusal, result_of, upload
 
 SEEN = {"TELESCOP": "SOLO/EUI/HRI_EUV", "DETECTOR": "HRI_EUV", "WAVELNTH": 174.0}
 SERIES = "/v1/series/hri_euv/174/total"
 QUICK = {"name": "richardson-lucy", "steps": 2}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_grid() -> Iterator[None]:
+    with interpolated_on_a_small_grid():
+        yield
 
 
 def uploaded(api: TestClient, path: Path) -> str:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import pytest
 from astropy.io import fits
 
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.psfs import read_psf
 from tests.conftest import write_image
-from tests.fitted_psfs import EARLY, LATE, write_fitted
+from tests.fitted_psfs import EARLY, LATE, interpolated_on_a_small_grid, write_fitted
 
 Command = Callable[..., str]
 SERIES = "hri_euv/174/total"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_grid() -> Iterator[None]:
+    with interpolated_on_a_small_grid():
+        yield
 
 
 def two_psfs(command: Command, folder: Path) -> tuple[str, str]:

@@ -77,8 +77,6 @@ def test_a_fit_and_its_cross_validation_are_shown(
 def test_a_rerun_is_shown(api: TestClient, run_jobs: Callable[[], None]) -> None:
     built = result_of(api, run_jobs, "psf-build", instrument_file=SMALL_INSTRUMENT, size=128)["id"]
     rerun = result_of(api, run_jobs, "rerun", of="psf", id=built)["id"]
-    page = shown(
-        api, f"/reports/{rerun}", "bit for bit", "<td>equal</td>", f'href="/psfs/{built}"', "job_id"
-    )
+    page = shown(api, f"/reports/{rerun}", "bit for bit", "<td>equal</td>", f'href="/psfs/{built}"', "job_id")
     assert "library numpy" not in page
     shown(api, f"/psfs/{built}", f"/reports/{rerun}")
