@@ -52,8 +52,9 @@ def counted_inversions(images: list[int]) -> Iterator[None]:
     """Add the number of images of each transit that a task inverts to this list."""
 
     def counted(transit: Any, shape: Any, **how: Any) -> Any:
+        solution = invert(transit, shape, **how)
         images.append(len(transit.frames))
-        return invert(transit, shape, **how)
+        return solution
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(solutions, "invert", counted)
