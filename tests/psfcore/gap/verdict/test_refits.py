@@ -24,6 +24,12 @@ from tests.psfcore.gap.small_transits import clean, effect
 OFFSET = ("dark_offset",)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _found_before() -> None:
+    """Make the diagnosis that all files share before a test replaces a part of it."""
+    found()
+
+
 def refits_of_found() -> Refits:
     return Refits(View(found().solution), found().model)
 
