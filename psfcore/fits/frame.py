@@ -78,11 +78,10 @@ class Frame:
 
 def frame_of(header: Cards) -> Frame:
     """The frame that the cards of an image describe."""
-    matrix = _matrix(header)
+    units = _arcsec_per_unit(header)
+    matrix = _matrix(header, [1.0 if one is None else one for one in units])
     columns = [math.hypot(matrix[0][k], matrix[1][k]) for k in (0, 1)] if matrix else [0.0, 0.0]
-    factors = [_ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{k}") or "arcsec").lower()) for k in (1, 2)]
-    known = None not in factors
-    scale = tuple(length if known and length > 0 else None for length in columns)
+    scale = tuple(length if None not in units and length > 0 else None for length in columns)
     on_detector, roll_known = UNIT, False
     if matrix is not None and min(columns) > 0:
         roll = _detector_roll_deg(header)
@@ -102,11 +101,16 @@ def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
     return frame_of(header).scale_arcsec[axis - 1]
 
 
-def _matrix(header: Cards) -> Matrix | None:
-    """M of Eq. (1) in arcsec/px (in the unit of the header if it is no angle); None if there are no such cards."""
-    factor = [
-        _ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{k}") or "arcsec").lower(), 1.0) for k in (1, 2)
-    ]
+def _arcsec_per_unit(header: Cards) -> list[float | None]:
+    """The unit of each axis in arcsec; None for a unit that is no angle."""
+    return [_ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{k}") or "arcsec").lower()) for k in (1, 2)]
+
+
+def _matrix(header: Cards, factor: list[float]) -> Matrix | None:
+    """M of Eq. (1) in arcsec/px (in the unit of the header if it is no angle); None if there are no such cards.
+
+    factor: the unit of each axis in arcsec.
+    """
     cd = [[optional_number(header, f"CD{i}_{j}") for j in (1, 2)] for i in (1, 2)]
     step = [optional_number(header, f"CDELT{i}") for i in (1, 2)]
     if step == [None, None] and any(value is not None for row in cd for value in row):
