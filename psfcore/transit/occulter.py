@@ -98,12 +98,11 @@ def coverage(shape: tuple[int, int], place: Place) -> Plane:
     rows, columns = patch_window(shape, place, 1.0)  # no pixel outside this window is covered
     strip = (np.arange(rows.start * _STRIPS, rows.stop * _STRIPS) + 0.5) / _STRIPS - 0.5
     half = np.sqrt(np.maximum(place.radius_px**2 - (strip - place.y_px) ** 2, 0.0))
-    left = np.arange(columns.start, columns.stop)[None, :] - 0.5
-    low = np.maximum(left, (place.x_px - half)[:, None])
-    high = np.minimum(left + 1, (place.x_px + half)[:, None])
-    chord = np.maximum(high - low, 0.0)
+    edges = np.arange(columns.start, columns.stop + 1) - 0.5 - place.x_px
+    # The part of each chord that is left of an edge, from the middle of the chord; a pixel covers the part between its edges.
+    until = np.clip(edges, -half[:, None], half[:, None])
     out = np.zeros(shape)
-    out[rows, columns] = chord.reshape(-1, _STRIPS, chord.shape[1]).mean(axis=1)
+    out[rows, columns] = np.diff(until.reshape(-1, _STRIPS, edges.size).mean(axis=1), axis=1)
     return out
 
 
