@@ -13,7 +13,7 @@ from psfcore.errors import DataError
 from service.http.callers import Bulk, Caller, KeyFirst, Reading
 from service.http.paging import Cursor, Limit, Page, following, no_cursor, page, place, position
 from service.http.problems import RESPONSES, Problem, problem
-from service.http.quotas import check_room, rows_held
+from service.http.quotas import check_room, check_rows
 from service.http.state import Shared
 from workers.bulk import turns as bulk_turns
 from workers.bulk.dry_run import BUDGET_S, MOST_REFUSED, DryRun, dry_run
@@ -229,11 +229,10 @@ def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shar
 
     The PSF, or the context that pins a PSF for each image, is fixed when the run starts. An existing product is not made again.
     """
-    if body.keeps_products:
-        check_room(state, caller.owner)
+    check = check_room if body.keeps_products else check_rows
+    check(state, caller.owner, 1 + len(body.images))
     try:
-        with rows_held():
-            row, new = begin(body, state.catalogue, caller.owner, state.settings)
+        row, new = begin(body, state.catalogue, caller.owner, state.settings)
     except DataError as error:
         raise problem(error) from error
     if new:

@@ -12,7 +12,7 @@ from psfcore.errors import DataError
 from service.http.callers import Caller, KeyFirst, Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem, problem
-from service.http.quotas import check_room, rows_held
+from service.http.quotas import check_room
 from service.http.state import Shared
 from service.views.jobs import JobView
 from workers.catalogue.tables import JobRow
@@ -51,16 +51,9 @@ def submit_job(body: JobRequest, response: Response, caller: Submitting, state: 
     job was deleted or lost, the job is queued again."""
     parameters, request_key, estimate = prepared(body, caller, state)
     queue = None if body.queue is None else Queue(body.queue)
-    with rows_held():
-        row, new = state.catalogue.jobs.submit(
-            body.kind,
-            parameters,
-            request_key,
-            caller.owner,
-            queue=queue,
-            estimate=estimate,
-            quota_mib=state.settings.quota_mib,
-        )
+    row, new = state.catalogue.jobs.submit(
+        body.kind, parameters, request_key, caller.owner, queue=queue, estimate=estimate
+    )
     if new:
         log.info("job %s: %s, submitted", row.id, body.kind, extra={"fields": {"job": row.id}})
     if not new and reopened(row, state.catalogue, state.store):
@@ -80,7 +73,7 @@ def prepared(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str,
 
     Raises ``Problem`` if the request cannot be accepted.
     """
-    check_room(state, caller.owner)
+    check_room(state, caller.owner, more_rows=1)
     try:
         parameters, identity = resolve(
             body, state.catalogue, caller.owner, added_effects=state.settings.added_effects

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from service.http.callers import Caller
@@ -11,7 +9,7 @@ from service.http.problems import Problem
 from service.http.state import State
 from workers import checks
 from workers.catalogue.catalogue import Row
-from workers.catalogue.owners import MIB, NOT_KEPT, ROWS_NOT_KEPT, OverQuota, Usage, counted_bytes
+from workers.catalogue.owners import MIB, NOT_KEPT, ROWS_NOT_KEPT, OverQuota, Usage
 from workers.files.full_disk import STORAGE_FULL
 
 
@@ -21,14 +19,19 @@ class Allowed:
     def __init__(self, state: State, caller: Caller) -> None:
         self._state, self._caller = state, caller
         self._asked = 0
+        self._usage: Usage | None = None
 
     def __call__(self, count: int) -> None:
-        """Count further bytes. Raises ``Problem`` 429 if they exceed the rate limit, and 413 if they exceed the quota."""
+        """Count further bytes. Raises ``Problem`` 429 if they exceed the rate limit, and 413 if they exceed the quota.
+
+        The other files of the owner are added up once, at the first bytes; ``keep`` adds them up again.
+        """
+        if not self._asked:
+            self._usage = _limited(self._state, self._caller.owner)
         self._asked += count
         check_disk(self._state, self._asked)
-        usage = _usage(self._state, self._caller.owner)
-        if not usage.allows(self._asked):
-            raise _file_too_large(usage, self._asked)
+        if self._usage is not None and not self._usage.allows(self._asked):
+            raise _file_too_large(self._usage, self._asked)
         self._state.rates.take_bytes(self._caller.name, count)
 
     def keep(self, file: Path, digest: str, row: Row) -> tuple[Row, bool]:
@@ -41,14 +44,14 @@ class Allowed:
             try:
                 return self._state.catalogue.add(row, self._state.settings.quota_mib)
             except OverQuota as over:
-                raise _file_too_large(over.usage, counted_bytes(row)) from over
+                raise _file_too_large(over.usage, row.bytes) from over
 
 
 def check_length(state: State, caller: Caller, count: int) -> None:
     """Raise ``Problem`` 413 if a file of this many bytes exceeds the owner's quota, and 507 if the disk has no room for it."""
     check_disk(state, count)
-    usage = _usage(state, caller.owner)
-    if not usage.allows(count):
+    usage = _limited(state, caller.owner)
+    if usage is not None and not usage.allows(count):
         raise _file_too_large(usage, count)
 
 
@@ -66,36 +69,41 @@ def check_disk(state: State, more_bytes: int = 0) -> None:
         )
 
 
-def check_room(state: State, owner: str) -> None:
-    """Raise ``Problem`` 507 if the owner's quota or the disk is full, because no result could be stored."""
+def check_room(state: State, owner: str, more_rows: int = 0) -> None:
+    """Raise ``Problem`` 507 if the owner's quota or the disk is full, because no result could be stored.
+
+    more_rows: as for ``check_rows``.
+    """
     check_disk(state)
-    usage = _usage(state, owner)
-    if usage.full:
-        raise _exceeded(507, usage, NOT_KEPT)
+    usage = _limited(state, owner)
+    if usage is not None and usage.full:
+        raise _exceeded(507, usage, usage.no_room(NOT_KEPT))
+    _check_rows(usage, more_rows)
 
 
-@contextmanager
-def rows_held() -> Iterator[None]:
-    """Raise ``Problem`` 507 if the rows that the block adds do not fit into the owner's quota."""
-    try:
-        yield
-    except OverQuota as over:
-        raise _exceeded(507, over.usage, ROWS_NOT_KEPT) from over
+def check_rows(state: State, owner: str, more_rows: int = 1) -> None:
+    """Raise ``Problem`` 507 if the owner's quota does not allow this many more database rows without a file."""
+    _check_rows(_limited(state, owner), more_rows)
 
 
-def _usage(state: State, owner: str) -> Usage:
-    return state.catalogue.owners.usage(owner, state.settings.quota_mib)
+def _check_rows(usage: Usage | None, more_rows: int) -> None:
+    if usage is not None and not usage.allows_rows(more_rows):
+        raise _exceeded(507, usage, usage.too_many_rows(ROWS_NOT_KEPT))
+
+
+def _limited(state: State, owner: str) -> Usage | None:
+    return state.catalogue.owners.limited(owner, state.settings.quota_mib)
 
 
 def _file_too_large(usage: Usage, count: int) -> Problem:
-    return _exceeded(413, usage, f"this file needs at least {count} more")
+    return _exceeded(413, usage, usage.no_room(f"this file needs at least {count} more"))
 
 
-def _exceeded(status: int, usage: Usage, why: str) -> Problem:
+def _exceeded(status: int, usage: Usage, message: str) -> Problem:
     return Problem(
         status,
         "quota-exceeded",
-        usage.no_room(why),
+        message,
         used_bytes=usage.used_bytes,
         limit_bytes=usage.limit_bytes,
     )

@@ -19,7 +19,7 @@ from fastapi.responses import PlainTextResponse, RedirectResponse
 from service.api.jobs import check_own
 from service.http.callers import Caller, Reading, Submitting
 from service.http.problems import Problem
-from service.http.quotas import rows_held
+from service.http.quotas import check_rows
 from service.http.state import Shared, State
 from service.uws import documents
 from service.uws import plain_errors as routing
@@ -101,18 +101,17 @@ def create_uws_job(caller: Submitting, sent: SentForm, request: Request, state: 
         raise bad(f"expected PHASE=RUN or no PHASE; got {start[:40]!a}")
     form |= ids_of(sent, kind)
     check(kind, form)
+    check_rows(state, caller.owner)
     keep(state, caller, sent, kind)
     ready = resolved(state, caller.owner, kind, form) if start else None
-    with rows_held():
-        row = state.catalogue.uws.draft(
-            kind,
-            dict(form),
-            run_id=run_id,
-            execution_duration_s=_duration(state, duration or "0"),
-            destruction_at=_destruction(state, destruction),
-            owner=caller.owner,
-            quota_mib=state.settings.quota_mib,
-        )
+    row = state.catalogue.uws.draft(
+        kind,
+        dict(form),
+        run_id=run_id,
+        execution_duration_s=_duration(state, duration or "0"),
+        destruction_at=_destruction(state, destruction),
+        owner=caller.owner,
+    )
     if ready is not None and state.catalogue.uws.start(row.id, row.parameters, *ready):
         state.reconciler.wake()
     return _see(request, row.id)
@@ -282,9 +281,7 @@ def post_uws_parameters(
         check(row.kind, given | form)
         return given | form
 
-    with rows_held():
-        amended = state.catalogue.uws.amend(job_id, change, state.settings.quota_mib)
-    if not amended:
+    if not state.catalogue.uws.amend(job_id, change):
         raise _not_now(_find(state, caller, job_id), PENDING_ONLY)
     return _see(request, job_id)
 

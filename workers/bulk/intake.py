@@ -21,7 +21,7 @@ from workers.settings import Settings
 def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Settings) -> tuple[BulkRow, bool]:
     """A new bulk run, or the open bulk run of an identical request. Also returns whether it is new.
 
-    Raises ``DataError``: "no-such-psf", "no-such-context", "no-such-image", "bad-path", "path-not-allowed"; and ``OverQuota``.
+    Raises ``DataError``: "no-such-psf", "no-such-context", "no-such-image", "bad-path", "path-not-allowed".
     """
     psf_id, context_id = pinned(request, catalogue, owner)
     images = list(dict.fromkeys(request.images))
@@ -42,7 +42,7 @@ def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Sett
         running_since=now,
         listed=not request.files,
     )
-    return catalogue.bulks.create(row, images, settings.quota_mib)
+    return catalogue.bulks.create(row, images)
 
 
 def pinned(request: BulkRequest, catalogue: Catalogue, owner: str) -> tuple[str | None, str | None]:

@@ -23,7 +23,7 @@ LIST_AT_ONCE = 200
 ADD_EVERY_S = (
     0.5  # images are added after this time even if they are fewer, so that the first ones are processed soon
 )
-NOT_LISTED = "not all files that the patterns match could be listed"  # a reason for Usage.no_room
+NOT_LISTED = "not all files that the patterns match could be listed"  # a reason for Usage.too_many_rows
 
 
 def work_of(bulk: BulkRow) -> BulkWork:
@@ -54,7 +54,7 @@ def list_files(
         bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code=error.code, message=error.message))
         return
     except OverQuota as over:
-        message = f"{over.usage.no_room(NOT_LISTED)}, then resume the run"
+        message = f"{over.usage.too_many_rows(NOT_LISTED)}, then resume the run"
         bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code="quota-exceeded", message=message))
         return
     bulks.end_listing(bulk.id, lease)
@@ -78,7 +78,10 @@ def _add_all(
         batch.clear()
         if place is None:
             return True
-        if not bulks.add_listed(bulk.id, lease, images, place.stored(), context.settings.quota_mib):
+        usage = context.catalogue.owners.limited(context.owner, context.settings.quota_mib)
+        if usage is not None and not usage.allows_rows(len(images)):
+            raise OverQuota(usage)
+        if not bulks.add_listed(bulk.id, lease, images, place.stored()):
             return False
         added()
         return True

@@ -331,13 +331,13 @@ def _awaited(future: Future[Answer], report: Callable[[], None]) -> Answer:
 
 def _stopped_for_quota(context: Context, bulk: BulkRow) -> bool:
     """Stop the bulk run if its owner's quota is used up. Returns whether it was stopped. The run can be resumed when there is room."""
-    usage = context.catalogue.owners.usage(context.owner, context.settings.quota_mib)
-    if not usage.full or not work_of(bulk).keeps_products:
+    usage = context.catalogue.owners.limited(context.owner, context.settings.quota_mib)
+    if usage is None or not usage.full or not work_of(bulk).keeps_products:
         return False
     message = (
         f"expected room for more products; {usage.used_bytes} of {usage.limit_bytes} bytes of the quota are used: delete "
-        "products or other bulk runs that you no longer need (`heliopsf product delete`, `heliopsf bulk delete`), or ask "
-        "the operator for a larger quota; then resume the run"
+        "products that you no longer need (`heliopsf product delete`), or ask the operator for a larger quota; then "
+        "resume the run"
     )
     context.catalogue.bulks.stop_with(
         bulk.id, JobError(fault=Fault.USER, code="quota-exceeded", message=message)

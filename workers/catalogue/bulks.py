@@ -24,7 +24,7 @@ from workers.catalogue.bulk_progress import BATCH, BulkProgress
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.database import Database
 from workers.catalogue.jobs import Lease
-from workers.catalogue.owners import ROW_BYTES, add_bytes, add_held, check_fits, counted_bytes
+from workers.catalogue.owners import lock_owner
 from workers.catalogue.tables import JobRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError, Phase
@@ -79,23 +79,18 @@ class Bulks:
         with self._database.reading() as session:
             return sorted(session.scalars(query), key=lambda bulk: bulk.created_at)
 
-    def create(
-        self, row: BulkRow, uploaded: Sequence[str], quota_mib: int | None = None
-    ) -> tuple[BulkRow, bool]:
+    def create(self, row: BulkRow, uploaded: Sequence[str]) -> tuple[BulkRow, bool]:
         """Create a run whose first images are these uploads, or find the open run of an identical request.
 
-        Returns the run, and whether it is new. quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
+        Returns the run, and whether it is new.
         """
         row.total = len(uploaded)
         for _ in range(3):  # between the two statements, the identical run may end
             try:
                 with self._database.writing.begin() as session:
-                    check_fits(session, row.owner, counted_bytes(row), quota_mib)
                     session.add(row)
                     session.flush()
                     _add(session, row.id, 0, (Listed(one, True) for one in uploaded))
-                    # The bytes are added last, so that the owner's count is not locked while many images are added.
-                    add_held(session, row.owner, counted_bytes(row), quota_mib)
                 return row, True
             except IntegrityError:
                 existing = self._equal_open(row)
@@ -127,8 +122,8 @@ class Bulks:
         LISTING or RUNNING.
 
         The run is cancelled first, so that nobody resumes it. Then its images are deleted in batches, and finally the
-        run. Each batch is one transaction, which also subtracts the bytes of the batch from the owner's count. If
-        this process stops before the end, a cancelled run with fewer images remains; this run can be deleted again.
+        run. Each batch is one transaction. If this process stops before the end, a cancelled run with fewer images
+        remains; this run can be deleted again.
         """
         ended_at = func.coalesce(BulkRow.ended_at, time.time())
         if not self._set(bulk_id, DELETABLE, phase=BulkPhase.CANCELLED, ended_at=ended_at):
@@ -143,15 +138,14 @@ class Bulks:
         here = BulkItemRow.bulk_id == bulk_id
         next_ones = select(BulkItemRow.position).where(here).order_by(BulkItemRow.position).limit(BATCH)
         with self._database.writing.begin() as session:
-            # Locks are taken in this order: first the owner, as in all deletions; then the images; then the
-            # run, as in a worker that records a result.
-            add_bytes(session, owner, 0)
+            # Two deletions of the same run follow one another. Then the images are locked before the run, as in a
+            # worker that records a result.
+            lock_owner(session, owner)
             positions = session.scalars(next_ones).all()
             if not positions:
                 row = session.get(BulkRow, bulk_id, with_for_update=True)
                 if row is not None:  # no other request deleted it meanwhile
                     session.delete(row)
-                    add_bytes(session, owner, -counted_bytes(row))
                 return False
             batch = delete(BulkItemRow).where(here, BulkItemRow.position.between(positions[0], positions[-1]))
             told = batch.returning(BulkItemRow.state, BulkItemRow.reused)
@@ -164,7 +158,6 @@ class Bulks:
             }
             fewer = {name: getattr(BulkRow, name) - count for name, count in counts.items()}
             _changed(session, update(BulkRow).where(BulkRow.id == bulk_id).values(**fewer))
-            add_bytes(session, owner, -ROW_BYTES * len(deleted))
             return True
 
     def stop_with(self, bulk_id: str, error: JobError) -> bool:
@@ -245,19 +238,13 @@ class Bulks:
         states = session.scalars(told).all()
         bulk.total -= len(states)
         bulk.failed -= sum(state == ItemState.FAILED for state in states)
-        add_bytes(session, bulk.owner, -ROW_BYTES * len(states))
 
     def add_listed(
-        self,
-        bulk_id: str,
-        lease: Lease,
-        images: Sequence[Listed],
-        listed_to: Mapping[str, Any],
-        quota_mib: int | None = None,
+        self, bulk_id: str, lease: Lease, images: Sequence[Listed], listed_to: Mapping[str, Any]
     ) -> bool:
         """Add images to a run. Returns False if another lease now lists the files, or if the run is not LISTING.
 
-        listed_to: the place up to which the files are then listed. quota_mib: as for ``create``.
+        listed_to: the place up to which the files are then listed.
         """
         with self._database.writing.begin() as session:
             bulk = session.get(BulkRow, bulk_id, with_for_update=True)
@@ -265,9 +252,7 @@ class Bulks:
                 return False
             bulk.failed += sum(image.error is not None for image in images)
             bulk.listed_to = dict(listed_to)
-            added = _add(session, bulk_id, bulk.total, images)
-            bulk.total += added
-            add_held(session, bulk.owner, ROW_BYTES * added, quota_mib)
+            bulk.total += _add(session, bulk_id, bulk.total, images)
             return True
 
     def end_listing(self, bulk_id: str, lease: Lease) -> bool:

@@ -26,7 +26,7 @@ from workers.catalogue.followed.rows import followed_bulks, followed_jobs
 from workers.catalogue.interpolated.series import Series
 from workers.catalogue.jobs import Jobs
 from workers.catalogue.named_files import NamedFiles
-from workers.catalogue.owners import Owners, add_bytes, add_held, counted_bytes
+from workers.catalogue.owners import Owners, hold_to_quota, lock_owner
 from workers.catalogue.parts import Parts
 from workers.catalogue.psfs import Psfs
 from workers.catalogue.schema import Schema
@@ -111,16 +111,18 @@ class Catalogue:
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
         """Insert a content-addressed row; returns the row with this identity, and whether it is new.
 
-        quota_mib: the limit for owners who have no individual limit; None: no limit applies. If the row does not fit,
+        quota_mib: the limit for owners who have no individual limit; None: no limit applies. If the file does not fit,
         the owner's oldest kept solutions are removed until it fits. If it would not fit even without any kept solution,
         nothing is added or removed, and ``workers.catalogue.owners.OverQuota`` is raised.
         """
         try:
             with self._database.writing.begin() as session:
+                if quota_mib is not None:
+                    lock_owner(session, row.owner)
                 session.add(row)
                 session.flush()
-                removable = isinstance(row, SolutionRow)
-                add_held(session, row.owner, counted_bytes(row), quota_mib, removable=removable)
+                if quota_mib is not None:
+                    hold_to_quota(session, row, quota_mib)
             return row, True
         except IntegrityError:
             existing = self.get(type(row), row.id, row.owner)
@@ -134,17 +136,12 @@ class Catalogue:
         If there is no such row any more, ``row`` is added and returned.
         """
         with self._database.writing.begin() as session:
-            add_bytes(session, row.owner, 0)  # locks the owner first: no deadlock with a deletion
             there = session.get(type(row), (row.owner, row.id), with_for_update=True)
-            if there is None:  # it was deleted meanwhile
-                session.add(row)
-                add_bytes(session, row.owner, counted_bytes(row))
-                return row
-            before = counted_bytes(there)
-            there.file_sha256, there.bytes = row.file_sha256, row.bytes
-            there.preview_sha256, there.details = row.preview_sha256, row.details
-            add_bytes(session, row.owner, counted_bytes(there) - before)
-            return there
+            if there is not None:
+                there.file_sha256, there.bytes = row.file_sha256, row.bytes
+                there.preview_sha256, there.details = row.preview_sha256, row.details
+                return there
+        return self.add(row)[0]  # it was deleted meanwhile
 
     def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
         """The row with this identity, or None."""
@@ -168,7 +165,6 @@ class Catalogue:
         Raises ``DataError`` "no-such-psf", "not-a-draft" or "psf-in-use", and then deletes nothing.
         """
         with self._database.writing.begin() as session:
-            add_bytes(session, owner, 0)  # locks the owner first, as `hold_to_quota` does: no deadlock
             row = session.get(PsfRow, (owner, psf_id), with_for_update=True)
             if row is None:
                 raise DataError(
@@ -188,7 +184,6 @@ class Catalogue:
                     + _FIRST[user[0]].format(id=user[1][:SHOWN_DIGITS]),
                 )
             session.delete(row)
-            add_bytes(session, owner, -counted_bytes(row))
             _unshare_jobs(session, owner, psf_id)
             return row
 
@@ -211,12 +206,10 @@ class Catalogue:
         ``workers.files.collection`` removes them, because other rows may refer to the same files.
         """
         with self._database.writing.begin() as session:
-            add_bytes(session, owner, 0)  # locks the owner first, as `hold_to_quota` does: no deadlock
             row = session.get(ProductRow, (owner, identity), with_for_update=True)
             if row is None:
                 return False
             session.delete(row)
-            add_bytes(session, owner, -counted_bytes(row))
             _unshare_jobs(session, owner, identity)
             return True
 

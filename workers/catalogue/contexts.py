@@ -16,7 +16,6 @@ from sqlalchemy.orm import Session
 from psfcore.errors import DataError
 from workers.catalogue.database import Database, begins_with, several_ids_fit
 from workers.catalogue.interpolated.series import may_interpolate
-from workers.catalogue.owners import add_held, counted_bytes
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow, PsfRow
 from workers.contract.identities import canonical_hash
 from workers.contract.short_ids import SHORT_ID
@@ -52,13 +51,11 @@ class Contexts:
         *,
         reason: str = "",
         pins: Sequence[Pin] | None = None,
-        quota_mib: int | None = None,
     ) -> tuple[PsfContextRow, bool]:
         """Create a context of these pins; if ``pins`` is None, of all certified PSFs.
 
         The context also keeps, for each series, whether its PSFs may be interpolated now.
         Returns the context, and whether it is new. If the name exists with the same pins, that context is returned.
-        quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
 
         Raises ``DataError``: "bad-name", "name-taken", "no-such-psf", "no-line", "nothing-to-pin", "ranges-overlap".
         """
@@ -75,8 +72,6 @@ class Contexts:
                     row.interpolated = may_interpolate(session, row.series, owner)
                 made = _context(name, owner, by, reason, rows)
                 session.add_all((made, *rows))
-                session.flush()
-                add_held(session, owner, counted_bytes(made), quota_mib)
             return made, True
         except IntegrityError:
             existing = self.find(name, owner)
@@ -140,19 +135,15 @@ class Contexts:
             context_id = session.scalars(query.order_by(DefaultContextRow.number.desc()).limit(1)).first()
             return None if context_id is None else session.get(PsfContextRow, (owner, context_id))
 
-    def set_default(
-        self, id_or_name: str | None, owner: str, by: str, reason: str = "", quota_mib: int | None = None
-    ) -> None:
+    def set_default(self, id_or_name: str | None, owner: str, by: str, reason: str = "") -> None:
         """Set an owner's default context; None: use the PSFs that are certified now.
 
-        quota_mib: as for ``Catalogue.add``; every change adds a row, which counts in the quota. Raises ``OverQuota``,
-        and ``DataError`` "no-such-context".
+        Raises ``DataError`` "no-such-context".
         """
         context_id = None if id_or_name is None else self.named(id_or_name, owner).id
         row = DefaultContextRow(owner=owner, context_id=context_id, at=time.time(), by=by, reason=reason)
         with self._database.writing.begin() as session:
             session.add(row)
-            add_held(session, owner, counted_bytes(row), quota_mib)
 
     def default_changes(self, owner: str, limit: int = 200) -> Sequence[DefaultContextRow]:
         """The changes of an owner's default context, latest first."""

@@ -20,7 +20,6 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from workers.catalogue.database import Database
-from workers.catalogue.owners import add_held, counted_bytes
 from workers.catalogue.tables import JobRow, OwnerTurnRow, TermsRow
 from workers.contract.identities import canonical_hash
 from workers.contract.kinds import queue_of
@@ -61,7 +60,6 @@ class Jobs:
         *,
         queue: Queue | None = None,
         estimate: dict[str, Any] | None = None,
-        quota_mib: int | None = None,
     ) -> tuple[JobRow, bool]:
         """Queue a new job, or share the job of an identical request that is queued, executing or completed. Returns
         the job, and whether it is new.
@@ -69,7 +67,7 @@ class Jobs:
         queue: the queue of the new job; None: the default queue of the job's kind. A shared job that waits in a less
         urgent queue moves to ``queue``. A cancelled job or a job with UWS terms is not shared: the new job then gets
         a different key. The new job waits while the other job executes. If the other job has a result, the new job
-        then uses this result. quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
+        then uses this result.
         """
         queue = queue or queue_of(kind)
         for _ in range(3):  # between the two statements, the identical job may fail
@@ -90,7 +88,6 @@ class Jobs:
             )
             try:
                 with self._database.writing.begin() as session:
-                    add_held(session, owner, counted_bytes(row), quota_mib)
                     session.add(row)
                 return row, True
             except IntegrityError:

@@ -1,12 +1,12 @@
-"""The number of bytes that each owner keeps, and the owner's quota.
+"""The quota of each owner: the bytes of the files that the owner keeps, and the number of database rows without a file.
 
-The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The database
-rows count too, because a small file takes less room than its row. Rows without files also count: jobs, bulk runs and
-their images, contexts, and changes of a PSF's status or of a series. The count changes in the transaction that adds, changes or
-removes the row. Rows of which an owner has only a few (keys, turns) do not count.
+The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The sums are
+read from the rows, so they are always exact. A transaction that adds a file under a quota first locks the owner's
+row; therefore two transactions cannot use the same room.
 
-A transaction that changes jobs or PSFs first locks the owner's row, and then the rows of the jobs or PSFs. To lock the
-owner's row, it calls ``add_bytes``, with 0 bytes if nothing is added. So two transactions cannot wait for each other.
+Jobs, bulk runs with their images, contexts with their pins, and changes of PSFs, series and default contexts have no
+file. Their number is limited, so that one owner cannot fill the database: each MiB of the quota allows ROWS_PER_MIB of
+them. Requests that arrive at the same moment may exceed this number slightly.
 
 A kept solution can be made again, so it takes no room from other things: the oldest solutions are removed if an upload,
 a result or another solution needs their room.
@@ -18,19 +18,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import BigInteger, ColumnElement, String, cast, delete, func, literal, select, update
+from sqlalchemy import ColumnElement, Select, delete, func, select, update
 from sqlalchemy.dialects import postgresql, sqlite
-from sqlalchemy.engine import CursorResult
-from sqlalchemy.orm import InstrumentedAttribute, Session
+from sqlalchemy.orm import Session
 
 from workers.catalogue.bulk_tables import BulkRow
-from workers.catalogue.database import Database, strict_json
+from workers.catalogue.database import Database
 from workers.catalogue.tables import (
     DefaultContextRow,
     ImageRow,
     JobRow,
     OwnerRow,
-    PartRow,
     ProductRow,
     PsfChangeRow,
     PsfContextRow,
@@ -41,39 +39,36 @@ from workers.catalogue.tables import (
     TransitRow,
 )
 
-WITH_FILES = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 MIB = 2**20
-ROW_BYTES = 2**10  # the columns of a row without its JSON, and its entries in the indexes
-# Reasons for Usage.no_room:
+ROWS_PER_MIB = 256
+WITH_FILES = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
+# The tables without files, and how many rows each of their rows stands for.
+WITHOUT_FILES: dict[type[Any], ColumnElement[int]] = {
+    JobRow: func.count(),
+    BulkRow: func.sum(BulkRow.total + 1),
+    PsfContextRow: func.sum(PsfContextRow.pins + 1),
+    PsfChangeRow: func.count(),
+    SeriesChangeRow: func.count(),
+    DefaultContextRow: func.count(),
+}
+# Reasons for Usage.no_room and Usage.too_many_rows:
 NOT_KEPT = "the result of this job could not be kept"
 ROWS_NOT_KEPT = "what this request adds to the database could not be kept"
 
-CountedRow = (
-    ImageRow
-    | TransitRow
-    | PsfRow
-    | ProductRow
-    | ReportRow
-    | SolutionRow
-    | JobRow
-    | BulkRow
-    | PsfContextRow
-    | PsfChangeRow
-    | SeriesChangeRow
-    | DefaultContextRow
-    | PartRow
-)
+FileRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | SolutionRow
 
 
 @dataclass(frozen=True)
 class Usage:
-    """The bytes that an owner keeps, and the limit; limit_bytes None: no limit.
+    """What an owner keeps, and the limit; limit_bytes None: no limit.
 
-    removable_bytes: the part of used_bytes that kept solutions take.
+    used_rows: the number of database rows without a file. removable_bytes: the part of used_bytes that kept solutions
+    take.
     """
 
     owner: str
     used_bytes: int
+    used_rows: int
     limit_bytes: int | None
     removable_bytes: int = 0
 
@@ -88,18 +83,35 @@ class Usage:
         """Whether no byte can be added without exceeding the limit."""
         return not self.allows(1)
 
+    def allows_rows(self, more_rows: int) -> bool:
+        """Whether ``more_rows`` more rows without a file may be added."""
+        return self.limit_bytes is None or self.used_rows + more_rows <= self._limit_rows
+
     def no_room(self, why: str) -> str:
         """The message for a full quota. why: a clause that says what could not be done."""
         assert self.limit_bytes is not None
         return (
             f"expected free room in your quota; {self.used_bytes / MIB:.1f} of {self.limit_bytes / MIB:.1f} MiB are used, and "
-            f"{why}: delete products or bulk runs that you no longer need (`heliopsf product delete`, "
-            "`heliopsf bulk delete`), or ask the operator for a larger quota"
+            f"{why}: delete products that you no longer need (`heliopsf product delete`), or ask the operator for a larger "
+            "quota"
         )
+
+    def too_many_rows(self, why: str) -> str:
+        """The message for too many rows. why: a clause that says what could not be done."""
+        return (
+            f"expected free room in your quota; it allows {self._limit_rows} database rows, {self.used_rows} are there (jobs, "
+            f"bulk runs with their images, contexts and changes of PSFs), and {why}: delete bulk runs and ended jobs that you "
+            "no longer need (`heliopsf bulk delete`), or ask the operator for a larger quota"
+        )
+
+    @property
+    def _limit_rows(self) -> int:
+        assert self.limit_bytes is not None
+        return self.limit_bytes // MIB * ROWS_PER_MIB
 
 
 class OverQuota(Exception):
-    """A file or a row does not fit into the owner's quota. usage: the owner's usage without this file or row."""
+    """A file or rows do not fit into the owner's quota. usage: the owner's usage without them."""
 
     def __init__(self, usage: Usage) -> None:
         super().__init__(usage.owner)
@@ -107,7 +119,7 @@ class OverQuota(Exception):
 
 
 class Owners:
-    """The table of owners; each method is one transaction."""
+    """The limits of owners, and what they keep; each method is one transaction."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -115,42 +127,24 @@ class Owners:
     def usage(self, owner: str, quota_mib: int) -> Usage:
         """The usage of an owner. quota_mib: the limit if the owner has no individual limit; 0: unlimited."""
         with self._database.reading() as session:
-            return _usage(session, owner, quota_mib)
+            return _usage(session, owner, _limit_mib(session, owner, quota_mib))
+
+    def limited(self, owner: str, quota_mib: int) -> Usage | None:
+        """The usage of an owner who has a limit; None if there is no limit. quota_mib: as for ``usage``."""
+        with self._database.reading() as session:
+            return _limited(session, owner, quota_mib)
 
     def all(self, quota_mib: int) -> list[Usage]:
-        """The usage of all owners who keep files or have an individual limit. quota_mib: as for ``usage``."""
+        """The usage of all owners who keep files, made a key or have an individual limit. quota_mib: as for ``usage``."""
         with self._database.reading() as session:
-            names = session.scalars(select(OwnerRow.owner).order_by(OwnerRow.owner)).all()
-        return [self.usage(name, quota_mib) for name in names]
+            owners = {name for row in (OwnerRow, *WITH_FILES) for name in session.scalars(_names(row))}
+        return [self.usage(name, quota_mib) for name in sorted(owners)]
 
     def set_quota(self, owner: str, quota_mib: int | None) -> None:
         """Set the individual limit of an owner. 0: unlimited. None: the default limit is used."""
         with self._database.writing.begin() as session:
-            add_bytes(session, owner, 0)
+            lock_owner(session, owner)
             session.execute(update(OwnerRow).where(OwnerRow.owner == owner).values(quota_mib=quota_mib))
-
-    def recount(self) -> Sequence[str]:
-        """Count the bytes of all files and rows again and correct the counts; returns the owners whose count was wrong."""
-        wrong = []
-        with self._database.writing.begin() as session:
-            # Another transaction that adds a row now waits for these locks before it changes the count.
-            rows = session.scalars(select(OwnerRow).with_for_update()).all()
-            truth: dict[str, int] = {}
-            for table, counted in COUNTED.items():
-                sums = select(table.owner, func.sum(counted)).group_by(table.owner)
-                for owner, total in session.execute(sums):
-                    truth[owner] = truth.get(owner, 0) + int(total)
-            for row in rows:
-                right = truth.pop(row.owner, 0)
-                if row.bytes != right:
-                    wrong.append(row.owner)
-                    row.bytes = right
-            for owner, total in truth.items():
-                # While this transaction waited, another one may have added this owner's row with its bytes.
-                add_bytes(session, owner, 0)
-                session.execute(update(OwnerRow).where(OwnerRow.owner == owner).values(bytes=total))
-                wrong.append(owner)
-        return sorted(wrong)
 
     def solutions_before(self, time: float) -> Sequence[SolutionRow]:
         """The kept solutions of all owners that were made before this time."""
@@ -161,106 +155,34 @@ class Owners:
         """Remove these kept solutions. Their files stay until ``workers.files.collection`` removes them."""
         for row in rows:
             with self._database.writing.begin() as session:
-                add_bytes(
-                    session, row.owner, 0
-                )  # locks the owner first, as `hold_to_quota` does: no deadlock
                 _forget(session, row)
 
 
-def counted_bytes(row: CountedRow) -> int:
-    """The bytes that a row adds to the count of its owner: the file and the row itself; for a kept solution only the
-    file.
+def lock_owner(session: Session, owner: str) -> None:
+    """Let other transactions that call this function for the owner wait until this transaction ends.
 
-    A bulk run counts together with its images, a context with its pins, and a job with its UWS terms. The progress, the
-    estimate and the error of a job are short: they are part of ROW_BYTES.
-    """
-    match row:
-        case SolutionRow():
-            return row.bytes
-        case ImageRow() | TransitRow():
-            return row.bytes + ROW_BYTES + len(strict_json(row.summary))
-        case PsfRow() | ProductRow() | ReportRow():
-            return row.bytes + ROW_BYTES + len(strict_json(row.details))
-        case JobRow():
-            return ROW_BYTES + len(strict_json(row.parameters))
-        case BulkRow():
-            return (row.total + 1) * ROW_BYTES + len(strict_json(row.request))
-        case PsfContextRow():
-            return (row.pins + 1) * ROW_BYTES
-        case _:
-            return ROW_BYTES
-
-
-def _length(column: InstrumentedAttribute[dict[str, Any]]) -> ColumnElement[int]:
-    return func.length(cast(column, String))
-
-
-# ``counted_bytes`` of the rows of each table, in SQL.
-COUNTED: dict[type[Any], ColumnElement[int]] = {
-    **{row: row.bytes + ROW_BYTES + _length(row.summary) for row in (ImageRow, TransitRow)},
-    **{row: row.bytes + ROW_BYTES + _length(row.details) for row in (PsfRow, ProductRow, ReportRow)},
-    SolutionRow: SolutionRow.bytes.expression,
-    JobRow: ROW_BYTES + _length(JobRow.parameters),
-    BulkRow: cast(BulkRow.total + 1, BigInteger) * ROW_BYTES + _length(BulkRow.request),
-    PsfContextRow: (PsfContextRow.pins + 1) * ROW_BYTES,
-    **{row: literal(ROW_BYTES) for row in (PsfChangeRow, SeriesChangeRow, DefaultContextRow, PartRow)},
-}
-
-
-def add_bytes(session: Session, owner: str, count: int) -> None:
-    """Add bytes to an owner's count, and lock the count.
-
-    Call this in the transaction that adds, changes or removes the row.
+    On SQLite, a writing transaction already excludes all others.
     """
     insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
-    row = insert(OwnerRow).values(owner=owner, bytes=count)
-    session.execute(
-        row.on_conflict_do_update(index_elements=["owner"], set_={"bytes": OwnerRow.bytes + count})
-    )
+    session.execute(insert(OwnerRow).values(owner=owner).on_conflict_do_nothing())
+    session.execute(select(OwnerRow.owner).where(OwnerRow.owner == owner).with_for_update())
 
 
-def add_held(
-    session: Session, owner: str, count: int, quota_mib: int | None, *, removable: bool = False
-) -> None:
-    """Add bytes to an owner's count, and raise OverQuota if they do not fit. quota_mib, removable: as for ``hold_to_quota``.
+def hold_to_quota(session: Session, row: FileRow, quota_mib: int) -> None:
+    """Check the file of a row that this transaction has just added. Call ``lock_owner`` before the row is added.
 
-    quota_mib None: no limit applies. A change that adds no bytes is never refused.
+    If the file does not fit, the owner's oldest kept solutions are removed until it fits. If it would not fit even
+    without any kept solution, raises OverQuota. If several uploads fit one by one but not together, the last ones are
+    refused. quota_mib: as for ``Owners.usage``.
     """
-    add_bytes(session, owner, count)
-    if quota_mib is not None and count > 0:
-        hold_to_quota(session, owner, count, quota_mib, removable=removable)
-
-
-def check_fits(session: Session, owner: str, count: int, quota_mib: int | None) -> None:
-    """Raise OverQuota if ``count`` more bytes would exceed the quota now, even without the kept solutions.
-
-    Nothing is locked, so the quota may fill up later: ``add_held`` decides when the bytes are added.
-    """
-    if quota_mib is None:
+    now = _limited(session, row.owner, quota_mib)
+    if now is None or now.limit_bytes is None:
         return
-    usage = _usage(session, owner, quota_mib)
-    if not usage.allows(count):
-        raise OverQuota(usage)
-
-
-def hold_to_quota(session: Session, owner: str, count: int, quota_mib: int, *, removable: bool) -> None:
-    """Check ``count`` bytes that this transaction has just added to the count.
-
-    If these bytes do not fit, the oldest kept solutions are removed until they fit. If they would not fit even
-    without any kept solution, raises OverQuota. removable: whether the bytes are those of a solution. Other
-    transactions of the owner wait until this one ends. If several uploads fit one by one but not together, the last
-    ones are refused.
-    """
-    counted = _usage(session, owner, quota_mib)
-    before = replace(
-        counted,
-        used_bytes=counted.used_bytes - count,
-        removable_bytes=counted.removable_bytes - (count if removable else 0),
-    )
-    if not before.allows(count):
+    removable_bytes = now.removable_bytes - (row.bytes if isinstance(row, SolutionRow) else 0)
+    before = replace(now, used_bytes=now.used_bytes - row.bytes, removable_bytes=removable_bytes)
+    if not before.allows(row.bytes):
         raise OverQuota(before)
-    if counted.limit_bytes is not None:
-        _make_room(session, owner, counted.used_bytes - counted.limit_bytes)
+    _make_room(session, row.owner, now.used_bytes - now.limit_bytes)
 
 
 def _make_room(session: Session, owner: str, missing_bytes: int) -> None:
@@ -276,26 +198,41 @@ def _make_room(session: Session, owner: str, missing_bytes: int) -> None:
 
 
 def _forget(session: Session, row: SolutionRow) -> None:
-    """Remove a solution, and subtract its bytes from the count. If another transaction removed or replaced it, do
-    nothing."""
+    """Remove a solution. If another transaction removed or replaced it, do nothing."""
     same = (
         SolutionRow.owner == row.owner,
         SolutionRow.id == row.id,
         SolutionRow.created_at == row.created_at,
     )
-    result = session.execute(delete(SolutionRow).where(*same))
-    assert isinstance(result, CursorResult)
-    if result.rowcount:
-        add_bytes(session, row.owner, -row.bytes)
+    session.execute(delete(SolutionRow).where(*same))
 
 
-def _usage(session: Session, owner: str, quota_mib: int) -> Usage:
-    # populate_existing: an object that this session read earlier does not contain the changes that `add_bytes` made.
-    row = session.get(OwnerRow, owner, populate_existing=True)
-    own = None if row is None else row.quota_mib
-    limit_mib = quota_mib if own is None else own
-    removable = session.scalar(
-        select(func.coalesce(func.sum(SolutionRow.bytes), 0)).where(SolutionRow.owner == owner)
+def _names(row: type[Any]) -> Select[str]:
+    """A query for the owners of the rows of a table."""
+    return select(row.owner).distinct()
+
+
+def _limit_mib(session: Session, owner: str, quota_mib: int) -> int:
+    """The individual limit of an owner, or else ``quota_mib``. 0: unlimited."""
+    own = session.scalar(select(OwnerRow.quota_mib).where(OwnerRow.owner == owner))
+    return quota_mib if own is None else own
+
+
+def _limited(session: Session, owner: str, quota_mib: int) -> Usage | None:
+    """The usage of an owner who has a limit; None if there is no limit. Without a limit, no sum is read."""
+    limit_mib = _limit_mib(session, owner, quota_mib)
+    return _usage(session, owner, limit_mib) if limit_mib else None
+
+
+def _usage(session: Session, owner: str, limit_mib: int) -> Usage:
+    sums = {**{row: func.sum(row.bytes) for row in WITH_FILES}, **WITHOUT_FILES}
+    queries = (select(total).where(row.owner == owner).scalar_subquery() for row, total in sums.items())
+    row_of_sums = session.execute(select(*queries)).one()
+    totals = {table: int(total or 0) for table, total in zip(sums, row_of_sums, strict=True)}
+    return Usage(
+        owner,
+        used_bytes=sum(totals[row] for row in WITH_FILES),
+        used_rows=sum(totals[row] for row in WITHOUT_FILES),
+        limit_bytes=limit_mib * MIB if limit_mib else None,
+        removable_bytes=totals[SolutionRow],
     )
-    used = 0 if row is None else row.bytes
-    return Usage(owner, used, limit_mib * MIB if limit_mib else None, int(removable or 0))

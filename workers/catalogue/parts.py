@@ -10,7 +10,6 @@ from typing import Any
 from sqlalchemy import and_, or_, select, update
 
 from workers.catalogue.database import Database
-from workers.catalogue.owners import ROW_BYTES, add_bytes
 from workers.catalogue.tables import PartRow
 
 
@@ -43,8 +42,6 @@ class Parts:
             )
             missing = [number for number in range(count) if number not in there]
             session.add_all(PartRow(owner=owner, request_key=request_key, number=one) for one in missing)
-            session.flush()
-            add_bytes(session, owner, ROW_BYTES * len(missing))
 
     def take(self, owner: str, request_key: str, lease_s: float) -> Part | None:
         """Take an open part, or a part whose worker has been silent for ``lease_s`` seconds; None if there is no such part."""

@@ -18,7 +18,6 @@ from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.database import Database
-from workers.catalogue.owners import ROW_BYTES, add_bytes, add_held, counted_bytes
 from workers.catalogue.tables import PsfChangeRow, PsfPinRow, PsfRow, PsfSeriesRow
 from workers.versions.series import INTERPOLATED, UPLOADED, series_of
 from workers.versions.status import PsfStatus, check_transition, check_version
@@ -73,12 +72,9 @@ class Psfs:
     def describe(self, psf_id: str, owner: str, *, tables_sha256: str, preview_sha256: str) -> None:
         """Store the hashes of the tables and of the picture that were made from a PSF's file."""
         with self._database.writing.begin() as session:
-            add_bytes(session, owner, 0)  # locks the owner first: no deadlock with a deletion
             row = session.get(PsfRow, (owner, psf_id), with_for_update=True)
             if row is not None:
-                before = counted_bytes(row)
                 row.details = {**row.details, "tables_sha256": tables_sha256}
-                add_bytes(session, owner, counted_bytes(row) - before)
                 row.preview_sha256 = preview_sha256
 
     # Searches -----------------------------------------------------------------------------------------
@@ -127,9 +123,7 @@ class Psfs:
         with self._database.reading() as session:
             return session.scalars(_released(series, owner)).all()
 
-    def change(
-        self, psf_id: str, owner: str, asked: StatusAsked, by: str, quota_mib: int | None = None
-    ) -> PsfRow:
+    def change(self, psf_id: str, owner: str, asked: StatusAsked, by: str) -> PsfRow:
         """Change the status of a PSF.
 
         The request certifies a draft, changes the range of a certified PSF, deprecates a certified PSF, or names the
@@ -137,14 +131,10 @@ class Psfs:
 
         Raises ``DataError`` and changes nothing: "no-such-psf", "no-line", "line-known", "wrong-transition",
         "not-of-this-change", "ranges-overlap", "not-to-supersede", "no-such-successor", "successor-named",
-        "changed-meanwhile", and the errors of ``check_version``. quota_mib: as for ``Catalogue.add``; raises ``OverQuota``. A
-        deprecation is never refused for the quota, because a wrong PSF must not stay certified; each PSF has at most two.
+        "changed-meanwhile", and the errors of ``check_version``.
         """
-        recorded = ROW_BYTES * (1 + len(asked.supersedes))  # a row for each change of a status
-        held = quota_mib if asked.status == PsfStatus.CERTIFIED else None
         with self._database.writing.begin() as session:
             row = _found(session, psf_id, owner)
-            add_held(session, owner, recorded, held)
             series = _series(row, asked)
             self._lock(session, series, owner)
             row = _found(session, psf_id, owner, lock=True)  # it may have been deleted meanwhile
@@ -402,10 +392,8 @@ def _deprecate_interpolated(session: Session, end: PsfRow, reason: str, by: str)
     said = f"it was interpolated from PSF {end.id[:12]}, which is deprecated" + (
         f": {reason}" if reason else ""
     )
-    rows = session.scalars(query.order_by(PsfRow.id).with_for_update()).all()
-    for row in rows:
+    for row in session.scalars(query.order_by(PsfRow.id).with_for_update()).all():
         _write(session, row, said[:MOST_REASON], by, status=PsfStatus.DEPRECATED)
-    add_bytes(session, end.owner, ROW_BYTES * len(rows))
 
 
 def _refuse(asked: StatusAsked, other: str, **given: object) -> None:

@@ -37,13 +37,18 @@ def _listed(table: str, *by: str) -> Index:
     return Index("_".join((table, "listed", *(("by", *by) if by else ()))), "owner", *by, "created_at", "id")
 
 
+def _summed(table: str) -> Index:
+    """An index with which the bytes of an owner's files are added up without reading the rows."""
+    return Index(f"{table}_summed", "owner", "bytes")
+
+
 class Uploaded:
     """Columns of an upload; its id is the SHA-256 of its bytes."""
 
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
     created_at: Mapped[float]
-    bytes: Mapped[int] = mapped_column(BigInteger, index=True)
+    bytes: Mapped[int] = mapped_column(BigInteger)
     filename: Mapped[str | None]
     summary: Mapped[dict[str, Any]]
 
@@ -52,14 +57,14 @@ class ImageRow(Uploaded, Base):
     """An uploaded image."""
 
     __tablename__ = "images"
-    __table_args__ = (_listed("images"),)
+    __table_args__ = (_listed("images"), _summed("images"))
 
 
 class TransitRow(Uploaded, Base):
     """An uploaded transit: the archive, unchanged."""
 
     __tablename__ = "transits"
-    __table_args__ = (_listed("transits"),)
+    __table_args__ = (_listed("transits"), _summed("transits"))
 
 
 class PsfRow(Base):
@@ -90,6 +95,7 @@ class PsfRow(Base):
     details: Mapped[dict[str, Any]]
 
     __table_args__ = (
+        _summed("psfs"),
         Index("psfs_bytes", "origin", "bytes"),
         *(
             _listed("psfs", *by.split())
@@ -232,11 +238,16 @@ class ProductRow(Base):
     psf_id: Mapped[str] = mapped_column(String(64))
     psf_version: Mapped[str]
     file_sha256: Mapped[str] = mapped_column(String(64))
-    bytes: Mapped[int] = mapped_column(BigInteger, index=True)
+    bytes: Mapped[int] = mapped_column(BigInteger)
     preview_sha256: Mapped[str] = mapped_column(String(64))
     details: Mapped[dict[str, Any]]
 
-    __table_args__ = (_listed("products"), _listed("products", "image_id"), _listed("products", "psf_id"))
+    __table_args__ = (
+        _listed("products"),
+        _listed("products", "image_id"),
+        _listed("products", "psf_id"),
+        _summed("products"),
+    )
 
 
 class JobRow(Base):
@@ -339,11 +350,16 @@ class ReportRow(Base):
     transit_id: Mapped[str | None] = mapped_column(String(64))
     about_id: Mapped[str | None] = mapped_column(String(64))  # the PSF or product of a rerun
     file_sha256: Mapped[str] = mapped_column(String(64))
-    bytes: Mapped[int] = mapped_column(BigInteger, index=True)
+    bytes: Mapped[int] = mapped_column(BigInteger)
     preview_sha256: Mapped[str | None] = mapped_column(String(64))
     details: Mapped[dict[str, Any]]
 
-    __table_args__ = (_listed("reports"), _listed("reports", "transit_id"), _listed("reports", "about_id"))
+    __table_args__ = (
+        _listed("reports"),
+        _listed("reports", "transit_id"),
+        _listed("reports", "about_id"),
+        _summed("reports"),
+    )
 
 
 class SolutionRow(Base):
@@ -398,11 +414,10 @@ class StageTimeRow(Base):
 
 
 class OwnerRow(Base):
-    """The bytes that an owner keeps, and the individual limit of the owner. quota_mib None: the default limit."""
+    """The individual limit of an owner. quota_mib None: the default limit."""
 
     __tablename__ = "owners"
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
-    bytes: Mapped[int] = mapped_column(BigInteger, default=0)
     quota_mib: Mapped[int | None]  # 0: unlimited
 
 

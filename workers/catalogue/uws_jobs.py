@@ -14,7 +14,6 @@ from sqlalchemy.orm import Session
 
 from workers.catalogue.database import Database
 from workers.catalogue.jobs import Jobs
-from workers.catalogue.owners import add_bytes, add_held, counted_bytes
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.contract.identities import canonical_hash
 from workers.contract.kinds import queue_of
@@ -47,12 +46,8 @@ class UwsJobs:
         run_id: str | None = None,
         execution_duration_s: int = 0,
         destruction_at: float | None = None,
-        quota_mib: int | None = None,
     ) -> JobRow:
-        """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it.
-
-        quota_mib: as for ``Catalogue.add``; raises ``OverQuota``.
-        """
+        """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it."""
         row = JobRow(
             id=uuid.uuid4().hex,
             owner=owner,
@@ -70,24 +65,16 @@ class UwsJobs:
             destruction_at=destruction_at,
         )
         with self._database.writing.begin() as session:
-            add_held(session, owner, counted_bytes(row), quota_mib)
             session.add_all((row, terms))
         return row
 
-    def amend(
-        self,
-        job_id: str,
-        change: Callable[[dict[str, Any]], dict[str, Any]],
-        quota_mib: int | None = None,
-    ) -> bool:
-        """Change the parameters of a PENDING job. In any other phase, nothing changes; returns False. quota_mib: as for ``draft``."""
+    def amend(self, job_id: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> bool:
+        """Change the parameters of a PENDING job. In any other phase, nothing changes; returns False."""
         with self._database.writing.begin() as session:
             row = _locked(session, job_id)
             if row is None or row.phase != Phase.PENDING:
                 return False
-            before = counted_bytes(row)
             row.parameters = change(dict(row.parameters))
-            add_held(session, row.owner, counted_bytes(row) - before, quota_mib)
             return True
 
     def start(
@@ -110,10 +97,8 @@ class UwsJobs:
                     row = _locked(session, job_id)
                     if row is None or row.phase != Phase.PENDING or row.parameters != given:
                         return False
-                    before = counted_bytes(row)
                     row.phase, row.parameters, row.request_key = Phase.QUEUED, parameters, key
                     row.work_key, row.estimate = request_key, estimate
-                    add_bytes(session, row.owner, counted_bytes(row) - before)
                 return True
             except IntegrityError:
                 continue
@@ -127,7 +112,6 @@ class UwsJobs:
             if row is None:
                 return False
             session.delete(row)
-            add_bytes(session, row.owner, -counted_bytes(row))
             return True
 
     def terms(self, job_id: str) -> TermsRow:
@@ -184,12 +168,5 @@ class UwsJobs:
 
 
 def _locked(session: Session, job_id: str) -> JobRow | None:
-    """Lock the count of a job's owner, then the row of the job; returns the row. None if there is no such job.
-
-    Both stay locked until the transaction ends.
-    """
-    owner = session.scalar(select(JobRow.owner).where(JobRow.id == job_id))
-    if owner is None:
-        return None
-    add_bytes(session, owner, 0)
+    """Lock the row of a job until the transaction ends; returns the row. None if there is no such job."""
     return session.get(JobRow, job_id, with_for_update=True)

@@ -248,8 +248,8 @@ class Runner:
         """
         if not KINDS[job.kind].needs_room:
             return
-        usage = self._catalogue.owners.usage(job.owner, self._settings.quota_mib)
-        if usage.full and not self._is_there(job):
+        usage = self._catalogue.owners.limited(job.owner, self._settings.quota_mib)
+        if usage is not None and usage.full and not self._is_there(job):
             raise DataError("quota-exceeded", usage.no_room(NOT_KEPT))
 
     def _is_there(self, job: JobRow) -> bool:

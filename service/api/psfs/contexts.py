@@ -12,7 +12,7 @@ from service.api.psfs.filters import TEXT
 from service.http.callers import Certifying, KeyFirst, Reading
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, problem
-from service.http.quotas import rows_held
+from service.http.quotas import check_rows
 from service.http.state import Shared
 from service.views.changes import PastChange
 from workers.catalogue.contexts import NAME, Pin
@@ -149,17 +149,10 @@ class DefaultView(BaseModel):
 def create_context(body: ContextAsked, response: Response, caller: Certifying, state: Shared) -> WholeContext:
     """Pin PSFs under a name: the given PSFs, or all PSFs that are certified now."""
     contexts = state.catalogue.contexts
+    check_rows(state, caller.owner, 1 + len(body.pins or ()))
     try:
         pins = None if body.pins is None else [_pin(asked) for asked in body.pins]
-        with rows_held():
-            row, new = contexts.create(
-                body.name,
-                caller.owner,
-                caller.name,
-                reason=body.reason,
-                pins=pins,
-                quota_mib=state.settings.quota_mib,
-            )
+        row, new = contexts.create(body.name, caller.owner, caller.name, reason=body.reason, pins=pins)
     except DataError as error:
         raise problem(error) from error
     response.status_code = 201 if new else 200
@@ -190,11 +183,9 @@ def get_default_context(caller: Reading, state: Shared) -> DefaultView:
 @router.put("/default", summary="Change the default context")
 def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) -> DefaultView:
     """Set the default context. If `context` is null, there is no default. The history of changes is kept."""
+    check_rows(state, caller.owner)
     try:
-        with rows_held():
-            state.catalogue.contexts.set_default(
-                body.context, caller.owner, caller.name, body.reason, state.settings.quota_mib
-            )
+        state.catalogue.contexts.set_default(body.context, caller.owner, caller.name, body.reason)
     except DataError as error:
         raise problem(error) from error
     return get_default_context(caller, state)

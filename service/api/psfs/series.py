@@ -13,7 +13,7 @@ from service.api.psfs.filters import TEXT
 from service.http.callers import Caller, Certifying, KeyFirst, Reading
 from service.http.paging import Page
 from service.http.problems import RESPONSES, problem
-from service.http.quotas import rows_held
+from service.http.quotas import check_rows
 from service.http.state import Shared, State
 from service.views.changes import PastChange
 from workers.catalogue.tables import SeriesChangeRow
@@ -101,11 +101,11 @@ def change_series(
     PSFs. Both PSFs must have been fitted with the same shape and the same diffraction PSF. Existing contexts do not change.
     """
     series = f"{instrument}/{channel}/{kind}"
+    check_rows(state, caller.owner)
     try:
-        with rows_held():
-            state.catalogue.series.set_interpolated(
-                series, caller.owner, body.interpolated, caller.name, body.reason, state.settings.quota_mib
-            )
+        state.catalogue.series.set_interpolated(
+            series, caller.owner, body.interpolated, caller.name, body.reason
+        )
         log.info("series %s: interpolated %s, by %s", series, body.interpolated, caller.name)
         return _view(state, caller, series)
     except DataError as error:

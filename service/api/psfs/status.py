@@ -12,7 +12,7 @@ from psfcore.errors import DataError
 from service.api.psfs.filters import TEXT
 from service.http.callers import Caller, Certifying, KeyFirst, Reading
 from service.http.problems import RESPONSES, problem
-from service.http.quotas import rows_held
+from service.http.quotas import check_rows
 from service.http.state import Shared, State
 from service.views.changes import PastChange
 from service.views.psfs import was_certified
@@ -136,11 +136,11 @@ def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, 
     The time ranges of the certified PSFs of a series must not overlap. If the range in the request overlaps the range
     of another certified PSF, the answer is 409; the message names this PSF.
     """
+    # A deprecation is never refused for the quota, because a wrong PSF must not stay certified.
+    if body.status == PsfStatus.CERTIFIED:
+        check_rows(state, caller.owner)
     try:
-        with rows_held():
-            row = state.catalogue.psfs.change(
-                psf_id, caller.owner, _asked(body), caller.name, state.settings.quota_mib
-            )
+        row = state.catalogue.psfs.change(psf_id, caller.owner, _asked(body), caller.name)
     except DataError as error:
         raise problem(error) from error
     log.info("PSF %s: %s, version %s, by %s", row.id, row.status, row.version, caller.name)

@@ -56,7 +56,6 @@ def collect_command(dry_run: bool, older_than_s: float, even_most: bool, data: P
                 "`heliopsf database status`"
             )
         found = collect(catalogue, open_store(settings), older_than_s, dry_run=dry_run, even_most=even_most)
-        recounted = [] if dry_run else catalogue.owners.recount()
     if dry_run:
         for blob in found.removed:
             click.echo(f"{blob.digest}  {blob.bytes:>12}")
@@ -64,8 +63,6 @@ def collect_command(dry_run: bool, older_than_s: float, even_most: bool, data: P
         f"{len(found.removed)} of {found.files} files {'would be' if dry_run else 'were'} removed, "
         f"{found.removed_bytes / MIB:.1f} of {found.bytes / MIB:.1f} MiB"
     )
-    if recounted:
-        click.echo(f"corrected the byte count of {', '.join(recounted)}")
 
 
 @store.command("check", short_help="Find lost and damaged files.")

@@ -1,4 +1,4 @@
-"""What an owner may keep: refused before it is sent or worked on, by figures that are those of the rows."""
+"""What an owner may keep: refused before it is sent or worked on, with the figures of the owner's files and rows."""
 
 from __future__ import annotations
 
@@ -12,16 +12,14 @@ import pytest
 from astropy.io import fits
 from click.testing import CliRunner
 from fastapi.testclient import TestClient
-from sqlalchemy import text
 
 from service.cli.main import main
-from service.local import LocalService
 from tests.conftest import write_image
-from tests.service.conftest import execute, refusal, upload
+from tests.service.conftest import refusal, upload
 from workers.bulk.turns import keep_turns
+from workers.catalogue import owners
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import ROW_BYTES, counted_bytes
-from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow
+from workers.catalogue.tables import ImageRow
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
@@ -47,10 +45,9 @@ def counted(catalogue: Catalogue) -> int:
 
 
 def fill(catalogue: Catalogue, left_bytes: int) -> None:
-    """Add a row that leaves this much of the quota."""
-    last = ImageRow(owner="local", id="b" * 64, created_at=1.0, bytes=0, summary={})
-    last.bytes = 2**20 - counted(catalogue) - left_bytes - counted_bytes(last)
-    catalogue.add(last)
+    """Add a file that leaves this much of the quota."""
+    size = 2**20 - counted(catalogue) - left_bytes
+    catalogue.add(ImageRow(owner="local", id="b" * 64, created_at=1.0, bytes=size, summary={}))
 
 
 def work(catalogue: Catalogue, settings: Settings) -> None:
@@ -66,7 +63,7 @@ def test_an_upload_over_the_quota_is_refused_with_figures(
 ) -> None:
     upload(api, large(tmp_path / "a.fits", 600))
     used = counted(catalogue)
-    assert 0 < used - (tmp_path / "a.fits").stat().st_size < 2000, "the file and its row"
+    assert used == (tmp_path / "a.fits").stat().st_size
     for where in ("/v1/images", "/v1/psfs"):
         content = large(tmp_path / f"{where[-4:]}.fits", 500).read_bytes()
         # With a length that is said before, and without.
@@ -79,8 +76,12 @@ def test_an_upload_over_the_quota_is_refused_with_figures(
     upload(api, large(tmp_path / "small.fits", 300))
 
 
-def test_work_and_rows_are_refused_where_they_do_not_fit(
-    api: TestClient, catalogue: Catalogue, image_file: Path, psf_file: Path
+def test_rows_over_their_number_are_refused_and_add_nothing(
+    api: TestClient,
+    catalogue: Catalogue,
+    image_file: Path,
+    psf_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
     series = {"instrument": "i", "channel": "1", "kind": "total"}
@@ -97,29 +98,39 @@ def test_work_and_rows_are_refused_where_they_do_not_fit(
         ("PUT", "/v1/contexts/default", {"context": None}),
         ("POST", f"/v1/psfs/{psf_id}/status", {"status": "certified", "reason": "again"}),
     ]
-    fill(catalogue, left_bytes=10)  # the quota is not full, but no row fits
+    there = catalogue.owners.usage("local", 1).used_rows
+    monkeypatch.setattr(owners, "ROWS_PER_MIB", there)
     for method, where, body in requests:
         answer = api.request(method, where, json=body)
         detail = refusal(answer, 507, "quota-exceeded")
-        assert "what this request adds to the database could not be kept" in detail, where
-        assert (answer.json()["used_bytes"], answer.json()["limit_bytes"]) == (2**20 - 10, 2**20)
+        assert f"it allows {there} database rows, {there} are there" in detail, where
+        assert (answer.json()["used_bytes"], answer.json()["limit_bytes"]) == (counted(catalogue), 2**20)
     build = {"KIND": "psf-build", "instrument": "hri_euv"}
-    uws = (
-        ("/uws/jobs", build),
-        ("/uws/jobs", build | {"PHASE": "RUN"}),
-        (f"/uws/jobs/{drafts[0]}/parameters", build),
-    )
-    for where, form in uws:
-        answer = api.post(where, data=form)
-        assert answer.status_code == 507 and "expected free room in your quota" in answer.text, (where, form)
-    assert counted(catalogue) == 2**20 - 10 and catalogue.owners.recount() == []
+    for form in (build, build | {"PHASE": "RUN"}):
+        answer = api.post("/uws/jobs", data=form)
+        assert answer.status_code == 507 and "expected free room in your quota" in answer.text, form
+    assert catalogue.owners.usage("local", 1).used_rows == there
     for draft in drafts:
         assert api.delete(f"/uws/jobs/{draft}", follow_redirects=False).status_code == 303
     assert api.post(requests[0][1], json=requests[0][2]).status_code == 202, "deleted jobs make room"
-    catalogue.add(ImageRow(owner="local", id="c" * 64, created_at=1.0, bytes=2**20, summary={}))
-    other = {"image_id": image_id, "psf_id": psf_id, "method": {"name": "linear"}}
-    for where, body in (("/v1/jobs", {"kind": "deconvolve", "parameters": other}), requests[1][1:]):
-        refusal(api.post(where, json=body), 507, "quota-exceeded")  # nothing of a result could be kept
+    wrong = {"status": "deprecated", "reason": "wrong"}
+    monkeypatch.setattr(owners, "ROWS_PER_MIB", 0)
+    assert api.post(f"/v1/psfs/{psf_id}/status", json=wrong).status_code == 200, "whatever the quota"
+
+
+def test_work_is_refused_where_nothing_of_its_result_could_be_kept(
+    api: TestClient, catalogue: Catalogue, image_file: Path, psf_file: Path
+) -> None:
+    image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+    fill(catalogue, left_bytes=0)
+    parameters = {"image_id": image_id, "psf_id": psf_id}
+    for where, body in (
+        ("/v1/jobs", {"kind": "deconvolve", "parameters": parameters}),
+        ("/v1/bulk", {"images": [image_id], "psf_id": psf_id}),
+    ):
+        answer = api.post(where, json=body)
+        assert "of 1.0 MiB are used" in refusal(answer, 507, "quota-exceeded")
+        assert (answer.json()["used_bytes"], answer.json()["limit_bytes"]) == (2**20, 2**20)
 
 
 def test_a_listing_that_fills_the_quota_stops_and_goes_on_with_room(
@@ -137,18 +148,17 @@ def test_a_listing_that_fills_the_quota_stops_and_goes_on_with_room(
     request = {"files": [{"glob": f"{tmp_path}/archive/*"}], "psf_id": upload(api, psf_file, "/v1/psfs")}
     here = f"/v1/bulk/{api.post('/v1/bulk', json=request).json()['id']}"
     keep_turns(catalogue, settings)
-    fill(catalogue, left_bytes=6 * ROW_BYTES)
+    there = catalogue.owners.usage("local", 1).used_rows
+    monkeypatch.setattr(owners, "ROWS_PER_MIB", there + 6)
     work(catalogue, settings)
     stopped = api.get(here).json()
     assert (stopped["phase"], stopped["error"]["code"]) == ("ERROR", "quota-exceeded")
     assert "not all files that the patterns match could be listed" in stopped["error"]["message"]
-    assert stopped["images"]["total"] == 4 and counted(catalogue) <= 2**20
+    assert stopped["images"]["total"] == 4
     catalogue.owners.set_quota("local", 2)
     assert api.post(f"{here}/resume").status_code == 200
     work(catalogue, settings)
     assert api.get(here).json()["images"]["total"] == 12
-    keep_turns(catalogue, settings)
-    assert catalogue.owners.recount() == []
 
 
 def test_jobs_that_were_queued_while_there_was_room_end_where_there_is_none(
@@ -208,25 +218,6 @@ def test_a_bulk_that_fills_the_quota_stops_and_goes_on_with_room(
     while catalogue.bulks.at_work():
         work(catalogue, settings)
     assert api.get(here).json()["images"]["done"] == 5
-
-
-def test_what_is_counted_is_what_the_rows_say(
-    settings: Settings, tmp_path: Path, image_file: Path, psf_file: Path
-) -> None:
-    local = LocalService(settings)
-    for _ in range(2):  # asked for twice, counted once
-        local.deconvolve(image_file, psf_id=local.upload_psf(psf_file)["id"], steps=1)
-    local.close()
-    catalogue = Catalogue(settings.catalogue_url)
-    tables = (ImageRow, PsfRow, ProductRow, JobRow)
-    rows = [row for table in tables for row in catalogue.page(table, owner="local", limit=9)]
-    used = counted(catalogue)
-    assert len(rows) == 4 and used == sum(counted_bytes(row) for row in rows)
-    assert catalogue.owners.recount() == []
-    for damage in ("UPDATE owners SET bytes = 7", "DELETE FROM owners"):
-        execute(catalogue, text(damage))
-        assert catalogue.owners.recount() == ["local"] and counted(catalogue) == used
-    catalogue.close()
 
 
 def test_the_command_line_tells_and_sets_quotas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

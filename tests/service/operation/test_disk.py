@@ -92,7 +92,7 @@ def test_a_job_that_finds_the_disk_full_says_so_and_can_be_submitted_again(
         assert "ask the operator to make room" in job["error"]["message"]
         assert ready.status_code == 503 and "0 MiB of free space" in ready.json()["parts"]["storage"]
         assert list((settings.data_dir / "tmp").iterdir()) == []
-        assert catalogue.page(ProductRow, owner="local", limit=1) == [] and catalogue.owners.recount() == []
+        assert catalogue.page(ProductRow, owner="local", limit=1) == []
         catalogue.check_pages()
     assert len(jobs) == 3
     product = result_of(api, run_jobs, "deconvolve", **parameters)

@@ -17,7 +17,7 @@ from psfcore.errors import DataError
 from tests.conftest import write_image
 from tests.whole.many_rows import plan, statements
 from tests.workers.databases import BOTH, change, database, rows
-from tests.workers.jobs import bulk_row, claimed, job_row
+from tests.workers.jobs import bulk_row, claimed
 from tests.workers.psf_examples import product
 from workers.bulk import listing, matching
 from workers.catalogue import bulk_progress
@@ -26,7 +26,6 @@ from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.bulks import Listed, Taken, new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.owners import ROW_BYTES, counted_bytes
 from workers.catalogue.tables import ImageRow
 from workers.contract.bulk import DELETABLE, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError
@@ -167,14 +166,8 @@ def test_released_paused_resumed_cancelled(catalogue: Catalogue) -> None:
 
 
 def used(catalogue: Catalogue) -> int:
-    """What the owner's files and rows count now; a recount agrees."""
-    assert catalogue.owners.recount() == []
-    return catalogue.owners.usage("o", 0).used_bytes
-
-
-def turn_bytes(catalogue: Catalogue, lease: Lease) -> int:
-    """What the job of a turn counts."""
-    return counted_bytes(job_row(catalogue, lease.job_id))
+    """How many rows without a file the owner has now."""
+    return catalogue.owners.usage("o", 0).used_rows
 
 
 def images_of(catalogue: Catalogue, bulk_id: str) -> int:
@@ -198,7 +191,7 @@ def in_phase(catalogue: Catalogue, bulk_id: str, phase: BulkPhase) -> None:
     assert row(catalogue, bulk_id).phase == phase
 
 
-def test_a_deleted_run_gives_all_its_bytes_back_and_leaves_other_runs(
+def test_a_deleted_run_gives_all_its_rows_back_and_leaves_other_runs(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bulk_rows, "BATCH", 2)
@@ -209,7 +202,7 @@ def test_a_deleted_run_gives_all_its_bytes_back_and_leaves_other_runs(
         in_phase(catalogue, bulk_id, phase)
         for job in catalogue.jobs.of_kind("bulk"):
             catalogue.uws.destroy(job.id)  # turns are jobs, which count by themselves
-        assert used(catalogue) == before + counted_bytes(row(catalogue, bulk_id)) > before + 4 * ROW_BYTES
+        assert used(catalogue) == before + 4, "the run and its images"
         assert catalogue.bulks.delete(bulk_id), phase
         assert catalogue.bulks.get(bulk_id) is None and images_of(catalogue, bulk_id) == 0
         assert used(catalogue) == before
@@ -231,7 +224,8 @@ def test_each_transaction_deletes_a_batch_and_an_interrupted_deletion_leaves_a_c
     bulk_id, lease = made(catalogue, 7), turn(catalogue)
     first, second, *_ = all_taken(catalogue, bulk_id, lease)
     done(catalogue, first, reused=True), catalogue.bulks.fail(second, BAD), catalogue.bulks.pause(bulk_id)
-    with_turn, deleted = used(catalogue) - counted_bytes(row(catalogue, bulk_id)), []
+    assert used(catalogue) == before + 9, "the run, its images and the turn"
+    deleted: list[str] = []
 
     @event.listens_for(database(catalogue).engine, "after_cursor_execute")
     def killed_in_the_third(*given: Any) -> None:
@@ -245,7 +239,7 @@ def test_each_transaction_deletes_a_batch_and_an_interrupted_deletion_leaves_a_c
     left = row(catalogue, bulk_id)
     assert (left.phase, left.total, left.done, left.reused, left.failed) == ("CANCELLED", 3, 0, 0, 0)
     check_counts(catalogue, bulk_id)
-    assert used(catalogue) == with_turn + counted_bytes(left)
+    assert used(catalogue) == before + 5
     assert not catalogue.bulks.resume(bulk_id) and catalogue.bulks.retry(bulk_id) is None
     assert catalogue.bulks.delete(bulk_id) and len(deleted) == 5
     catalogue.uws.destroy(lease.job_id)
@@ -356,7 +350,7 @@ def test_a_second_worker_continues_the_listing_of_a_lost_one(catalogue: Catalogu
     assert not bulks.end_listing(bulk_id, lost) and bulks.end_listing(bulk_id, other)
     assert [one.source[-2:] for one in all_taken(catalogue, bulk_id, other)] == ["00", "/a", "/c"]
     assert row(catalogue, bulk_id).failed == 1
-    assert used(catalogue) == before + 3 * ROW_BYTES + 2 * turn_bytes(catalogue, other)
+    assert used(catalogue) == before + 3 + 2, "three images and two turns"
 
 
 def test_images_are_taken_while_others_are_listed_and_the_run_ends_after_all(catalogue: Catalogue) -> None:

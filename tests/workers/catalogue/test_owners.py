@@ -1,33 +1,25 @@
-"""What counts in an owner's quota, and that it is kept when several transactions add rows at the same moment."""
+"""What counts in an owner's quota, and that it is kept when several transactions add files at the same moment."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import pytest
-from sqlalchemy import select
 
-from tests.whole.many_rows import statements
-from tests.workers.databases import BOTH, rows
-from tests.workers.jobs import bulk_row, claimed, job_row
-from tests.workers.psf_examples import OWNER, certify, identity, psf
+from tests.workers.databases import BOTH
+from tests.workers.jobs import bulk_row, claimed
+from tests.workers.psf_examples import OWNER, certify, identity, product, psf
 from workers.catalogue.bulks import Listed, new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
-from workers.catalogue.owners import COUNTED, MIB, ROW_BYTES, OverQuota, counted_bytes
-from workers.catalogue.psfs import StatusAsked
-from workers.catalogue.tables import ImageRow, JobRow, SolutionRow
-from workers.versions.status import PsfStatus
-
-ROW = ROW_BYTES + len("{}")  # what the row of such an image counts, besides its file
+from workers.catalogue.owners import MIB, ROWS_PER_MIB, OverQuota
+from workers.catalogue.tables import ImageRow, SolutionRow
 
 
-def image(number: int, counted: int, owner: str = "o") -> ImageRow:
-    """An image that counts this number of bytes: its file and its row."""
-    return ImageRow(owner=owner, id=f"{number:064x}", created_at=1.0, bytes=counted - ROW, summary={})
+def image(number: int, size_bytes: int, owner: str = "o") -> ImageRow:
+    return ImageRow(owner=owner, id=f"{number:064x}", created_at=1.0, bytes=size_bytes, summary={})
 
 
 def send(catalogue: Catalogue, row: ImageRow, quota_mib: int = 1) -> bool:
@@ -36,7 +28,7 @@ def send(catalogue: Catalogue, row: ImageRow, quota_mib: int = 1) -> bool:
         return catalogue.add(row, quota_mib)[1]
     except OverQuota as over:
         assert over.usage.limit_bytes is not None
-        assert over.usage.limit_bytes < over.usage.used_bytes + counted_bytes(row)
+        assert over.usage.limit_bytes < over.usage.used_bytes + row.bytes
         return False
 
 
@@ -45,19 +37,19 @@ def test_simultaneous_uploads_are_accepted_up_to_the_quota(catalogue: Catalogue)
     with ThreadPoolExecutor(8) as pool:
         came_in = list(pool.map(lambda n: send(catalogue, image(n, MIB // 4)), range(12)))
     assert sum(came_in) == 4
-    assert catalogue.owners.usage("o", 1).used_bytes == MIB and catalogue.owners.recount() == []
+    assert catalogue.owners.usage("o", 1).used_bytes == MIB
     assert [catalogue.get(ImageRow, f"{n:064x}", "o") is not None for n in range(12)] == came_in
 
 
 def test_an_owner_s_own_limit_counts_and_results_of_jobs_are_not_held_to_it(catalogue: Catalogue) -> None:
     catalogue.owners.set_quota("o", 2)
-    assert send(catalogue, image(1, 2 * MIB)) and not send(catalogue, image(2, ROW))
+    assert send(catalogue, image(1, 2 * MIB)) and not send(catalogue, image(2, 1))
     catalogue.owners.set_quota("o", 0)
-    assert send(catalogue, image(2, ROW))
+    assert send(catalogue, image(2, 1))
     catalogue.owners.set_quota("o", None)
-    assert not send(catalogue, image(3, ROW)) and send(catalogue, image(3, ROW), quota_mib=0)
+    assert not send(catalogue, image(3, 1)) and send(catalogue, image(3, 1), quota_mib=0)
     assert catalogue.add(image(4, MIB))[1]
-    assert catalogue.owners.usage("o", 1).used_bytes == 3 * MIB + 2 * ROW
+    assert catalogue.owners.usage("o", 1).used_bytes == 3 * MIB + 2
 
 
 def solution(number: int, size_bytes: int, owner: str = "o") -> SolutionRow:
@@ -81,7 +73,7 @@ def test_the_oldest_solutions_make_room_for_an_upload(catalogue: Catalogue) -> N
     assert send(catalogue, image(9, MIB // 2)) and kept(catalogue) == ["o2", "o3", "p1"]
     assert not send(catalogue, image(8, MIB)) and kept(catalogue) == ["o2", "o3", "p1"]
     assert send(catalogue, image(7, MIB // 2)) and kept(catalogue) == ["p1"]
-    assert catalogue.owners.usage("o", 1).full and catalogue.owners.recount() == []
+    assert catalogue.owners.usage("o", 1).full
 
 
 def test_a_new_solution_takes_the_room_of_older_ones_only_and_is_forgotten_once(catalogue: Catalogue) -> None:
@@ -92,7 +84,7 @@ def test_a_new_solution_takes_the_room_of_older_ones_only_and_is_forgotten_once(
     assert not catalogue.owners.usage("o", 1).full, "jobs run: a solution is no file that must stay"
     with pytest.raises(OverQuota):
         catalogue.add(solution(3, MIB), 1)
-    assert kept(catalogue) == ["o2"] and catalogue.owners.recount() == []
+    assert kept(catalogue) == ["o2"]
     assert catalogue.owners.solutions_before(2.0) == []
     old = catalogue.owners.solutions_before(3.0)
     for _ in range(2):
@@ -100,14 +92,16 @@ def test_a_new_solution_takes_the_room_of_older_ones_only_and_is_forgotten_once(
     assert kept(catalogue) == [] and catalogue.owners.usage("o", 0).used_bytes == MIB // 2
 
 
-def test_the_json_of_a_row_counts_too_and_when_it_changes(catalogue: Catalogue) -> None:
-    row = psf("a", bytes=5, details={"text": "sun \u2609" * 100})
-    assert catalogue.add(row)[1]
-    before = catalogue.owners.usage(OWNER, 0).used_bytes
-    assert before == 5 + ROW_BYTES + len(json.dumps(row.details))
-    catalogue.psfs.describe(row.id, OWNER, tables_sha256="b" * 64, preview_sha256="c" * 64)
-    assert catalogue.owners.usage(OWNER, 0).used_bytes == before + len(', "tables_sha256": ""') + 64
-    assert catalogue.owners.recount() == []
+@BOTH
+def test_the_files_of_each_kind_count_and_nobody_else_s(catalogue: Catalogue) -> None:
+    for new in (True, False):
+        rows = [psf("a", bytes=5), product("p", "a"), image(1, 7, OWNER), solution(2, 11, OWNER)]
+        assert [catalogue.add(row)[1] for row in rows] == [new] * 4
+    catalogue.add(image(1, 13, "somebody"))
+    usage = catalogue.owners.usage(OWNER, 1)
+    assert usage.used_bytes == sum(row.bytes for row in rows) and usage.removable_bytes == 11
+    assert [one.owner for one in catalogue.owners.all(1)] == sorted([OWNER, "somebody"])
+    assert catalogue.owners.limited(OWNER, 1) == usage and catalogue.owners.limited(OWNER, 0) is None
 
 
 # Rows without files -----------------------------------------------------------------------------------
@@ -115,140 +109,42 @@ def test_the_json_of_a_row_counts_too_and_when_it_changes(catalogue: Catalogue) 
 
 @contextmanager
 def counting(catalogue: Catalogue, expected: int) -> Iterator[None]:
-    """Check that the block changes the count of the owner by so much, and that a recount agrees."""
-    before = catalogue.owners.usage(OWNER, 0).used_bytes
+    """Check that the block changes the number of rows of the owner by so much."""
+    before = catalogue.owners.usage(OWNER, 0).used_rows
     yield
-    assert catalogue.owners.usage(OWNER, 0).used_bytes - before == expected
-    assert catalogue.owners.recount() == []
+    assert catalogue.owners.usage(OWNER, 0).used_rows - before == expected
 
 
-def ids(count: int) -> list[str]:
-    return [f"{number:064x}" for number in range(count)]
-
-
-def test_jobs_count_with_their_present_parameters_until_they_are_destroyed(catalogue: Catalogue) -> None:
-    parameters = {"instrument_file": "sun \u2609" * 100}
-    with counting(catalogue, ROW_BYTES + len(json.dumps(parameters))):
-        job, _ = catalogue.jobs.submit("psf-build", parameters, "k", OWNER)
-    with counting(catalogue, 0):  # a shared job, and what a job goes through
-        assert not catalogue.jobs.submit("psf-build", parameters, "k", OWNER)[1]
-        lease = claimed(catalogue, job.id)
-        assert catalogue.jobs.complete(lease, "r")
-    with counting(catalogue, -ROW_BYTES - len(json.dumps(parameters))):
-        assert catalogue.uws.destroy(job.id) and not catalogue.uws.destroy(job.id)
-    with counting(catalogue, ROW_BYTES + len('{"size": "64"}')):
-        job = catalogue.uws.draft("psf-build", {"size": "64"}, owner=OWNER)
-    with counting(catalogue, len(', "a": "bc"')):
-        assert catalogue.uws.amend(job.id, lambda given: given | {"a": "bc"})
-    given = {"size": "64", "a": "bc"}
-    with counting(catalogue, len('{"size": 64}') - len(json.dumps(given))):
-        assert catalogue.uws.start(job.id, given, {"size": 64}, "k")
-    with counting(catalogue, 0):
-        assert not catalogue.uws.amend(job.id, lambda given: given | {"more": "x" * 100})
-        assert not catalogue.uws.start(job.id, given, {"size": 128}, "k")
-    with counting(catalogue, -ROW_BYTES - len('{"size": 64}')):
-        assert catalogue.uws.destroy(job.id)
-
-
-def test_bulk_runs_parts_contexts_and_changes_count(catalogue: Catalogue) -> None:
-    turn, _ = catalogue.jobs.submit("bulk", {}, new_id(), OWNER)
-    lease = claimed(catalogue, turn.id)
+def test_jobs_bulk_runs_contexts_and_changes_count_until_they_are_deleted(catalogue: Catalogue) -> None:
+    with counting(catalogue, 1):
+        turn, _ = catalogue.jobs.submit("bulk", {}, new_id(), OWNER)
+        lease = claimed(catalogue, turn.id)
     row = bulk_row(OWNER, listed=False)
-    with counting(catalogue, ROW_BYTES * (1 + 3) + len("{}")):
-        assert catalogue.bulks.create(row, ids(3))[1]
-    with counting(catalogue, 0):
-        assert not catalogue.bulks.create(bulk_row(OWNER, listed=False), ids(3))[1], "the same run"
-    with counting(catalogue, 2 * ROW_BYTES):
+    with counting(catalogue, 1 + 3):
+        assert catalogue.bulks.create(row, [f"{number:064x}" for number in range(3)])[1]
+    with counting(catalogue, 1):
         assert catalogue.bulks.begin_listing(row.id, lease)
-        listed = [Listed("/a", False), Listed("/b", False)]
-        assert catalogue.bulks.add_listed(row.id, lease, listed, {"pattern": 0, "names": ["b"]})
-    with counting(catalogue, 0):
-        assert catalogue.bulks.begin_listing(row.id, lease)
-    with counting(catalogue, 4 * ROW_BYTES):
-        catalogue.parts.open(OWNER, "k", 3)
-        catalogue.parts.open(OWNER, "k", 4)
+        assert catalogue.bulks.add_listed(
+            row.id, lease, [Listed("/a", False)], {"pattern": 0, "names": ["a"]}
+        )
     for name in ("a", "b"):
         catalogue.add(psf(name))
-    with counting(catalogue, ROW_BYTES):
+    with counting(catalogue, 1):
         certify(catalogue, "a", "1.0.0")
-    with counting(catalogue, 2 * ROW_BYTES):  # of both PSFs
+    with counting(catalogue, 2):  # of both PSFs
         certify(catalogue, "b", "2.0.0", supersedes=(identity("a"),))
-    for new, expected in ((True, 2 * ROW_BYTES), (False, 0)):
+    for new, expected in ((True, 2), (False, 0)):
         with counting(catalogue, expected):
             assert catalogue.contexts.create("first", OWNER, "x", pins=[Pin(identity("b"))])[1] == new
-    with counting(catalogue, ROW_BYTES):
+    with counting(catalogue, 1):
         catalogue.contexts.set_default("first", OWNER, "x")
+    with counting(catalogue, -1 - 5):
+        catalogue.uws.destroy(turn.id)
+        assert catalogue.bulks.cancel(row.id) and catalogue.bulks.delete(row.id)
 
 
-def certification(**more: str) -> StatusAsked:
-    return StatusAsked(PsfStatus.CERTIFIED, "tested", **more)
-
-
-ADDED: dict[str, Callable[[Catalogue], object]] = {
-    "job": lambda catalogue: catalogue.jobs.submit("psf-build", {}, "new", OWNER, quota_mib=1),
-    "uws": lambda catalogue: catalogue.uws.draft("psf-build", {}, owner=OWNER, quota_mib=1),
-    "bulk": lambda catalogue: catalogue.bulks.create(bulk_row(OWNER), ids(1), 1),
-    "context": lambda catalogue: catalogue.contexts.create("c", OWNER, "x", quota_mib=1),
-    "default": lambda catalogue: catalogue.contexts.set_default(None, OWNER, "x", quota_mib=1),
-    "range": lambda catalogue: catalogue.psfs.change(identity("a"), OWNER, certification(), "x", 1),
-    "certification": lambda catalogue: catalogue.psfs.change(
-        identity("b"), OWNER, certification(version="2.0.0"), "x", 1
-    ),
-}
-
-
-def test_rows_over_the_quota_are_refused_and_add_nothing(catalogue: Catalogue) -> None:
-    catalogue.add(psf("a"))
-    certify(catalogue, "a", "1.0.0")
-    catalogue.add(psf("b", channel="304"))
-    draft = catalogue.uws.draft("psf-build", {}, owner=OWNER)
-    used = catalogue.owners.usage(OWNER, 1).used_bytes
-    catalogue.add(image(15, MIB - used - 100, OWNER))
-    there = {"psfs": 2, "psf_changes": 1, "images": 1, "jobs": 1}
-    with counting(catalogue, 0):
-        for name, add in ADDED.items():
-            with pytest.raises(OverQuota) as refused:
-                add(catalogue)
-            assert refused.value.usage.used_bytes == MIB - 100, name
-            counts = {table.__tablename__: len(rows(catalogue, select(table))) for table in COUNTED}
-            assert {table: count for table, count in counts.items() if count} == there, name
-        with pytest.raises(OverQuota):
-            catalogue.uws.amend(draft.id, lambda given: {"a": "b" * 100}, 1)
-        job = job_row(catalogue, draft.id)
-        assert job.parameters == {}, "a pending job does not grow either"
-    catalogue.owners.set_quota(OWNER, 2)
-    for add in ADDED.values():
-        add(catalogue)
-    assert catalogue.owners.usage(OWNER, 1).used_bytes > MIB
-    catalogue.owners.set_quota(OWNER, None)
-    with counting(catalogue, ROW_BYTES):
-        wrong = StatusAsked(PsfStatus.DEPRECATED, "wrong")
-        changed = catalogue.psfs.change(identity("a"), OWNER, wrong, "x", 1)
-        assert changed.status == "deprecated", "a wrong PSF is deprecated whatever the quota"
-
-
-@BOTH
-def test_simultaneous_jobs_are_accepted_up_to_the_quota(catalogue: Catalogue) -> None:
-    catalogue.add(image(15, MIB - 4 * ROW, OWNER))
-
-    def submit(number: int) -> bool:
-        try:
-            return catalogue.jobs.submit("psf-build", {}, str(number), OWNER, quota_mib=1)[1]
-        except OverQuota:
-            return False
-
-    with ThreadPoolExecutor(8) as pool:
-        assert sum(pool.map(submit, range(12))) == 4
-    assert catalogue.owners.usage(OWNER, 1).used_bytes == MIB and catalogue.owners.recount() == []
-    assert len(catalogue.page(JobRow, owner=OWNER, limit=99)) == 4
-
-
-def test_a_large_bulk_run_is_counted_in_one_statement_and_a_refused_one_adds_no_row(
-    catalogue: Catalogue,
-) -> None:
-    with statements() as sent, counting(catalogue, ROW_BYTES * 3001 + len("{}")):
-        catalogue.bulks.create(bulk_row(OWNER), ids(3000), 4)
-    assert sum(one.startswith(("INSERT INTO owners", "UPDATE owners")) for one, _ in sent) == 1
-    with statements() as sent, pytest.raises(OverQuota):
-        catalogue.bulks.create(bulk_row(OWNER, "other"), ids(3000), 4)
-    assert not [one for one, _ in sent if one.startswith("INSERT")], "nothing is written to be removed again"
+def test_a_quota_allows_so_many_rows_for_each_mib(catalogue: Catalogue) -> None:
+    catalogue.jobs.submit("psf-build", {}, "k", OWNER)
+    usage = catalogue.owners.usage(OWNER, 2)
+    assert usage.allows_rows(2 * ROWS_PER_MIB - 1) and not usage.allows_rows(2 * ROWS_PER_MIB)
+    assert catalogue.owners.usage(OWNER, 0).allows_rows(10**9)

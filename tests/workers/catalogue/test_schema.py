@@ -26,7 +26,7 @@ from workers.settings import Settings
 LATER = """
 import sqlalchemy as sa
 from alembic import op
-revision, down_revision = "0020", "0019"
+revision, down_revision = "0021", "0020"
 def upgrade():
     op.add_column("workers", sa.Column("host", sa.String, server_default="-here"))
 """
@@ -108,17 +108,17 @@ def test_an_older_database_is_upgraded_with_its_data(
     worker = {"name": "w", "started_at": 1.0, "heartbeat_at": 2.0, "version": "0.1.0"}
     change(catalogue, insert(WorkerRow).values(worker))
     shutil.copytree(REVISIONS, tmp_path / "later")
-    (tmp_path / "later" / "versions" / "r0020_later.py").write_text(LATER)
+    (tmp_path / "later" / "versions" / "r0021_later.py").write_text(LATER)
     later = Schema(database(catalogue), tmp_path / "later")
     assert later.status().state == "older"
-    with pytest.raises(SchemaError, match=r"at revision 0020.*it is at revision 0019.*database upgrade"):
+    with pytest.raises(SchemaError, match=r"at revision 0021.*it is at revision 0020.*database upgrade"):
         later.check()
     caplog.set_level(logging.INFO, "workers.catalogue.schema")
     caplog.clear()
     later.upgrade()
     later.upgrade()
     assert later.status().state == "current" and catalogue.schema.status().state == "newer"
-    assert said(caplog) == ["database: upgraded from 0019 to 0020"]
+    assert said(caplog) == ["database: upgraded from 0020 to 0021"]
     assert rows(catalogue, text("SELECT name || host FROM workers")) == ["w-here"]
 
 

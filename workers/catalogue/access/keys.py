@@ -18,7 +18,7 @@ from sqlalchemy import Select, delete, func, or_, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from workers.catalogue.database import Database
-from workers.catalogue.owners import add_bytes
+from workers.catalogue.owners import lock_owner
 from workers.catalogue.tables import KeyRow
 
 OWNER = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
@@ -196,9 +196,7 @@ def _make_room(session: Session, owner: str, most: int) -> None:
 
     Otherwise keep only the newest ``most`` of the owner's revoked and expired keys, and delete the older ones.
     """
-    add_bytes(
-        session, owner, 0
-    )  # locks the owner, so that simultaneous requests are counted one after the other
+    lock_owner(session, owner)  # simultaneous requests are counted one after the other
     good = good_keys().where(KeyRow.owner == owner)
     if len(session.scalars(good.limit(most)).all()) >= most:
         raise TooManyKeys

@@ -16,7 +16,6 @@ from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.database import Database
-from workers.catalogue.owners import add_held, counted_bytes
 from workers.catalogue.tables import PsfPinRow, PsfRow, PsfSeriesRow, SeriesChangeRow
 from workers.versions.series import TOTAL
 from workers.versions.status import PsfStatus
@@ -95,12 +94,10 @@ class Series:
         interpolated: bool,
         by: str,
         reason: str = "",
-        quota_mib: int | None = None,
     ) -> None:
         """Say whether the PSFs of a series may be interpolated. If this changes nothing, no change is recorded.
 
-        quota_mib: as for ``Catalogue.add``; every change adds a row, which counts in the quota. Raises ``OverQuota``,
-        and ``DataError`` "no-such-series" or "series-not-total".
+        Raises ``DataError`` "no-such-series" or "series-not-total".
         """
         with self._database.writing.begin() as session:
             _check_known(session, series, owner)
@@ -116,7 +113,6 @@ class Series:
                 owner=owner, series=series, interpolated=interpolated, at=time.time(), by=by, reason=reason
             )
             session.add(row)
-            add_held(session, owner, counted_bytes(row), quota_mib)
 
     def ends(self, series: str, at: float, owner: str, context_id: str | None) -> Ends | None:
         """The PSFs between which a time lies, if the series may be interpolated.
