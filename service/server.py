@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -21,7 +22,6 @@ from fastapi import FastAPI
 
 from service.app import create_app
 from service.http.access import check_can_serve
-from service.http.connections import ACCEPTED_AT_ONCE, LISTEN, ConnectionLimits, bounded
 from workers import logs
 from workers.catalogue.catalogue import Catalogue
 from workers.files.modes import private_folder
@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 
 # Clients such as httpx reuse an idle connection for up to 5 s. A server that closes it at the same moment resets the request.
 IDLE_CONNECTION_S = 15
+MOST_OPEN_FILES = 65_536  # each connection and each file that is sent needs one
 
 
 def serve(
@@ -55,15 +56,15 @@ def serve(
                 server_header=False,
                 timeout_keep_alive=IDLE_CONNECTION_S,
                 timeout_graceful_shutdown=ceil(settings.stop_s),
-                http=bounded(ConnectionLimits.of(settings)),
+                http="h11",
                 ws="none",
-                backlog=ACCEPTED_AT_ONCE,
                 # Without this setting, headers about the address of the client are ignored: a client could write any address.
                 proxy_headers=bool(settings.proxies),
                 forwarded_allow_ips=list(settings.proxies),
             )
         )
         _prepare(settings, host)
+        _allow_open_files()
         # After its shutdown the server raises the signal again. This handler turns the signal into an
         # exception, so that the worker is stopped too.
         signal.signal(signal.SIGTERM, _raise_exit)
@@ -106,15 +107,20 @@ def _prepare(settings: Settings, host: str) -> None:
         catalogue.close()
 
 
+def _allow_open_files() -> None:
+    """Raise the number of files that this process may open, up to MOST_OPEN_FILES or the limit of the system."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MOST_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_OPEN_FILES)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+
+
 class _Server(uvicorn.Server):
     """Tells the application about a shutdown. Requests that wait for a job are then answered at once."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen. The event loop accepts ``backlog`` connections at once; the system keeps up to ``LISTEN`` connections
-        waiting."""
+        """Listen, and keep the objects that the start has made."""
         await super().startup(sockets)
-        for listener in sockets or []:
-            listener.listen(LISTEN)
         # All modules are loaded now. Their objects stay, so the garbage collector need not look at them again: this took
         # up to 0.2 s, in which no request was answered.
         gc.collect()

@@ -149,32 +149,10 @@ class Settings(BaseSettings):
         "",
         description="addresses or networks of reverse proxies, separated by commas; the service believes their headers X-Forwarded-For and X-Forwarded-Proto",
     )
-    max_connections: int = Field(
-        1024,
-        ge=8,
-        le=100_000,
-        description="largest number of connections that are open on one server at a time",
-    )
-    header_s: float = Field(
-        10.0, gt=0, description="longest time that a client may take to send the header of a request, s"
-    )
-    stalled_s: float = Field(
-        60.0,
-        gt=0,
-        description="time after which a connection is closed if its client reads nothing of the answer, s",
-    )
     max_body_kib: int = Field(
         256, ge=16, le=1_048_576, description="largest request that is neither an upload nor a bulk run, KiB"
     )
     max_bulk_body_mib: int = Field(16, ge=1, le=1024, description="largest request for a bulk run, MiB")
-    body_s: float = Field(
-        30.0,
-        gt=0,
-        description="longest time in which a client may send the body of a request, s; a large body gets the additional time that it needs at the smallest allowed speed",
-    )
-    body_kib_per_s: int = Field(
-        16, ge=1, description="smallest speed of the body of a request after the first body_s seconds, KiB/s"
-    )
     reads_per_minute: int = Field(
         12_000, ge=0, description="largest number of read requests of one caller per minute; 0: unlimited"
     )

@@ -1,17 +1,15 @@
-"""Bounds on the body of a request: its size, its time, and the number of values in it.
+"""Bounds on the body of a request: its size, and the number of values in it.
 
-A body costs memory and time before its content is known. Therefore its size is bounded while it arrives, a client
-that sends too slowly gets an error, and the values in JSON are counted before Python makes objects of these values.
+A body costs memory and time before its content is known. Therefore its size is bounded while it arrives, and the values
+in JSON are counted before Python makes objects of these values. The proxy in front of the server bounds the time.
 """
 
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import dataclass
 from typing import Any
 
-import anyio
 from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
@@ -29,48 +27,34 @@ MOST_OF = {b"[": 25_000, b"{": 25_000, b":": 25_000, b",": 200_000}
 
 @dataclass(frozen=True)
 class BodyLimits:
-    """Largest bodies, and the longest time for a body: n bytes may take ``seconds`` + n / ``bytes_per_s``."""
+    """The largest body of a usual request, and the largest body of a bulk run."""
 
     usual_bytes: int
     bulk_bytes: int
-    seconds: float
-    bytes_per_s: int
 
     @classmethod
     def of(cls, settings: Settings) -> BodyLimits:
         """The limits in the settings."""
-        return cls(
-            settings.max_body_kib * 2**10,
-            settings.max_bulk_body_mib * 2**20,
-            settings.body_s,
-            settings.body_kib_per_s * 2**10,
-        )
+        return cls(settings.max_body_kib * 2**10, settings.max_bulk_body_mib * 2**20)
 
     def received(self, path: str, headers: Headers, receive: Receive) -> Receive:
         """The body of a request, within these limits. Uploads have their own limits on the size, in ``service.http.uploads``.
 
-        The reader of the body gets ``Problem`` 413 at once if the declared length is too large, 413 as soon as too many
-        bytes have arrived, and 408 as soon as the client is too slow.
+        The reader of the body gets ``Problem`` 413 at once if the declared length is too large, and as soon as too many
+        bytes have arrived.
         """
         own = has_own_limit(path, headers.get("content-type", ""))
         most = None if own else self.bulk_bytes if path in BULK else self.usual_bytes
         declared = headers.get("content-length", "")
-        got, waited_s, more = 0, 0.0, True
+        got, more = 0, True
 
         async def limited() -> Message:
-            nonlocal got, waited_s, more
+            nonlocal got, more
             if not more:  # the body is complete; the next message is the end of the connection
                 return await receive()
             if most is not None and declared.isdecimal() and int(declared) > most:
                 raise _too_large(path, most)
-            # Only the time in which the server waits for the client counts, not the time of processing the body.
-            allowed_s = self.seconds + got / self.bytes_per_s
-            started = time.monotonic()
-            with anyio.move_on_after(allowed_s - waited_s) as waiting:
-                message = await receive()
-            if waiting.cancelled_caught:
-                raise _too_slow(got, allowed_s)
-            waited_s += time.monotonic() - started
+            message = await receive()
             got += len(message.get("body", b""))
             more = message.get("more_body", False)
             if most is not None and got > most:
@@ -104,13 +88,4 @@ def _too_large(path: str, most: int) -> Problem:
         "too-large",
         f"expected a request of at most {most} bytes; got more: send less in one request, or ask the operator to raise "
         f"{setting}",
-    )
-
-
-def _too_slow(got: int, allowed_s: float) -> Problem:
-    return Problem(
-        408,
-        "body-too-slow",
-        f"expected more of the body of the request within {allowed_s:.0f} s; got {got} bytes: send the request again over "
-        "a faster connection",
     )

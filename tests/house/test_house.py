@@ -228,20 +228,19 @@ def test_the_compose_file_fits_the_settings_and_the_commands() -> None:
 
     compose = yaml.safe_load((HERE / "docker-compose.yml").read_text())
     services = compose["services"]
-    assert set(services) == {"api", "worker", "redis", "postgres"}
+    assert set(services) == {"proxy", "api", "worker", "redis", "postgres"}
     known = {f"HELIOPSF_{name.upper()}" for name in Settings.model_fields}
     for name, service in services.items():
         assert service["healthcheck"]["test"], name
-        assert set(service.get("volumes", [])) <= {
-            f"{v}:{p}" for v in compose["volumes"] for p in ("/data", "/var/lib/postgresql/data")
-        }
+        mounts = {f"{v}:{p}" for v in compose["volumes"] for p in ("/data", "/var/lib/postgresql/data")}
+        assert set(service.get("volumes", [])) <= mounts | {"./deploy/nginx.conf:/etc/nginx/nginx.conf:ro"}
         if name in ("api", "worker"):
             assert set(service["environment"]) <= known
             assert set(service["depends_on"]) == {"redis", "postgres"}
             command = service["command"].split()
             assert command[0] == "heliopsf"
             assert CliRunner().invoke(main, [command[1], "--help"]).exit_code == 0
-    assert services["api"]["ports"][0].startswith("127.0.0.1:"), "reachable from this machine alone"
+    assert services["proxy"]["ports"][0].startswith("127.0.0.1:"), "reachable from this machine alone"
 
 
 def test_the_containers_have_no_more_rights_and_memory_than_they_need() -> None:

@@ -1,19 +1,15 @@
-"""A real server in hostile surroundings: a folder full of traps, few file descriptors, clients that hold connections."""
+"""A real server in hostile surroundings: a folder full of traps, and clients that are no clients."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import resource
 import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,8 +25,6 @@ from workers.catalogue.access.keys import Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
-DESCRIPTORS = 160
-IDLE = 300
 MIB = 2**20
 # Modules that a server or a worker imports only after its start, or that another program may have left in a folder.
 TRAPS = (
@@ -96,15 +90,13 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         "HELIOPSF_DATA_DIR": str(data),
         "HELIOPSF_BROKER_URL": "filesystem://",
         "HELIOPSF_ACCESS": "keys",
-        "HELIOPSF_HEADER_S": "1",
         "HELIOPSF_STOP_S": "1",
         "HELIOPSF_READS_PER_MINUTE": "0",
     }
     cleared = {name: value for name, value in os.environ.items() if not name.startswith("HELIOPSF_")}
 
-    def poor() -> None:
+    def as_usual() -> None:
         os.umask(0o022)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
 
     with log.open("w") as errors:
         process = subprocess.Popen(
@@ -115,7 +107,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
             stderr=errors,
             text=True,
             start_new_session=True,
-            preexec_fn=poor,
+            preexec_fn=as_usual,
         )
     assert process.stdout is not None
     try:
@@ -154,37 +146,6 @@ def test_other_users_of_the_machine_read_no_file_of_the_service(server: Server, 
     assert any(path.name == sent.json()["id"] for path in found)
     assert {path.name for path in found} >= {"catalogue.sqlite", "worker.log", "broker"}
     assert not {str(path): oct(mode) for path, mode in found.items() if mode & 0o077}
-
-
-def test_idle_connections_without_a_key_keep_nobody_out(server: Server) -> None:
-    """More idle connections than the server has file descriptors; some send half a header, some are renewed."""
-    ann, before = bearer(server.key()), server.log.stat().st_size
-    with ExitStack() as held:
-        for number in range(IDLE):
-            connection = held.enter_context(socket.create_connection(server.address, timeout=10))
-            if number % 3 == 0:
-                connection.sendall(b"GET /v1/jobs HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")
-        for _ in range(5):
-            answer = httpx.get(f"{server.url}/v1/jobs", headers=ann, timeout=10)
-            assert answer.status_code == 200
-    logged = server.log.read_text()[before:]
-    assert len(logged) < 20_000 and "out of system resource" not in logged
-    told = [line for line in logged.splitlines() if json.loads(line)["logger"] == "service.http.connections"]
-    assert len(told) <= 1
-
-
-def test_a_header_has_a_time_limit_however_slowly_it_comes(server: Server) -> None:
-    with socket.create_connection(server.address, timeout=10) as connection:
-        started = time.monotonic()
-        connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n")
-        while time.monotonic() - started < 8:  # guards against a hang; the limit is 1 s
-            try:
-                connection.sendall(b"X-A: b\r\n")
-                time.sleep(0.1)
-            except OSError:
-                break
-        else:
-            pytest.fail("the connection was kept")
 
 
 def test_requests_that_are_not_http_do_not_fill_the_log(server: Server) -> None:
