@@ -51,6 +51,7 @@ from workers.intake.deprecated import details_now
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 from workers.machine import free_bytes
+from workers.rows import row_of
 from workers.run import runner
 from workers.run.runner import Runner
 from workers.settings import Settings
@@ -361,13 +362,10 @@ class LocalService(Operations):
         return tables
 
     def _psf(self, psf_id: str) -> PsfRow:
-        row = self._catalogue.get(PsfRow, psf_id, DEFAULT_OWNER)
-        if row is None:
-            raise ServiceError(
-                f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
-                code="no-such-psf",
-            )
-        return row
+        try:
+            return row_of(self._catalogue, PsfRow, psf_id, DEFAULT_OWNER)
+        except DataError as error:
+            raise ServiceError(error.message, code=error.code) from error
 
     def _row(self, address: str) -> ProductRow | PsfRow | ReportRow:
         _, collection, identity = address.rsplit("/", 2)

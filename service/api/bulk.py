@@ -21,6 +21,7 @@ from workers.bulk.intake import begin
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.contract.bulk import BulkPhase, BulkRequest, ItemState
 from workers.contract.phases import JobError
+from workers.rows import no_such
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES, route_class=KeyFirst)
@@ -345,11 +346,7 @@ def find(state: Shared, caller: Caller, bulk_id: str) -> BulkRow:
     """The row of a bulk run of the caller. Raises ``Problem`` 404."""
     row = state.catalogue.bulks.get(bulk_id)
     if row is None or row.owner != caller.owner:
-        raise Problem(
-            404,
-            "no-such-bulk",
-            f"expected the id of one of your bulk runs; got {bulk_id}: list your bulk runs",
-        )
+        raise problem(no_such("bulk", bulk_id))
     return row
 
 

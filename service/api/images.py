@@ -10,9 +10,9 @@ from pydantic import BaseModel, Field
 
 from service.http import downloads as files
 from service.http import uploads
-from service.http.callers import Caller, Reading, Submitting
+from service.http.callers import Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
-from service.http.problems import RESPONSES, Problem
+from service.http.problems import RESPONSES
 from service.http.quotas import Allowed
 from service.http.state import Shared
 from workers.catalogue.tables import ImageRow
@@ -70,26 +70,14 @@ def list_images(
 @router.get("/{image_id}", summary="One uploaded image")
 def get_image(image_id: Identity, caller: Reading, state: Shared) -> ImageView:
     """An uploaded image's metadata and a summary of its header."""
-    return ImageView.of(find(state, caller, image_id))
+    return ImageView.of(state.row(ImageRow, image_id, caller.owner))
 
 
 @router.get("/{image_id}/file", summary="The uploaded file", response_class=Response)
 def get_image_file(image_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the file as it was uploaded; its hash is the ETag."""
-    row = find(state, caller, image_id)
+    row = state.row(ImageRow, image_id, caller.owner)
     gzipped = bool(row.summary.get("gzipped"))
     name = row.filename or f"image-{image_id[:12]}.fits{'.gz' if gzipped else ''}"
     media_type = files.GZIP_TYPE if gzipped else files.FITS_TYPE
     return files.send(request, state.store, image_id, media_type, name, size=row.bytes)
-
-
-def find(state: Shared, caller: Caller, image_id: str) -> ImageRow:
-    """The row of an image. Raises ``Problem`` 404 if the caller has no such image."""
-    row = state.catalogue.get(ImageRow, image_id, caller.owner)
-    if row is None:
-        raise Problem(
-            404,
-            "no-such-image",
-            f"expected the id of an uploaded image; got {image_id}, which is not in the catalogue: upload the image, or list your images",
-        )
-    return row

@@ -22,6 +22,7 @@ from workers.contract.queues import Queue
 from workers.intake import estimates
 from workers.intake.again import reopened, without_results
 from workers.intake.requests import resolve
+from workers.rows import no_such
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES, route_class=KeyFirst)
@@ -154,7 +155,5 @@ def find(state: Shared, caller: Caller, job_id: str) -> JobRow:
     """The row of a job. Raises ``Problem`` 404 if the caller has no such job."""
     row = state.catalogue.jobs.get(job_id)
     if row is None or row.owner != caller.owner:
-        raise Problem(
-            404, "no-such-job", f"expected the id of one of your jobs; got {job_id}: list your jobs"
-        )
+        raise problem(no_such("job", job_id))
     return row

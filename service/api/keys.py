@@ -16,10 +16,11 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.http.callers import Caller, KeyFirst, Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
-from service.http.problems import RESPONSES, Problem
+from service.http.problems import RESPONSES, Problem, problem
 from service.http.state import Shared
 from workers.catalogue.access.keys import LABEL_LENGTH, OWNER, Scope, TooManyKeys
 from workers.catalogue.tables import KeyRow
+from workers.rows import no_such
 
 MOST_KEYS = 100  # an owner with this number of valid keys cannot make more
 DAY_S = 86_400.0
@@ -194,9 +195,7 @@ def _find(state: Shared, caller: Caller, key_id: str) -> KeyRow:
     _check_used(state)
     row = state.catalogue.keys.get(key_id)
     if row is None or (row.owner != caller.owner and Scope.ADMIN not in caller.scopes):
-        raise Problem(
-            404, "no-such-key", f"expected the id of one of your keys; got {key_id}: list your keys"
-        )
+        raise problem(no_such("key", key_id))
     return row
 
 

@@ -6,10 +6,9 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Response
 
-from psfcore.errors import DataError
 from service.api.jobs import submit_job
 from service.http.callers import Reading, Submitting
-from service.http.problems import RESPONSES, problem
+from service.http.problems import RESPONSES
 from service.http.state import Shared
 from service.views.jobs import JobView
 from workers.catalogue.tables import ProductRow, PsfRow
@@ -40,19 +39,13 @@ router = APIRouter(tags=["lineage"], responses=RESPONSES)
 def get_psf_lineage(psf_id: Identity, caller: Reading, state: Shared) -> Ancestor:
     """The inputs of the PSF (by hash), its parameters, the versions of software and libraries, and its job. The PSFs from which it
     was made are described in the same way."""
-    row = state.catalogue.get(PsfRow, psf_id, caller.owner)
-    if row is None:
-        raise _missing("psf", psf_id)
-    return lineage(state.catalogue, row)
+    return lineage(state.catalogue, state.row(PsfRow, psf_id, caller.owner))
 
 
 @router.get("/v1/products/{product_id}/lineage", summary="The lineage of a product")
 def get_product_lineage(product_id: Identity, caller: Reading, state: Shared) -> Ancestor:
     """The image, the parameters, the versions of software and libraries, and the job of the product; also the lineage of its PSF."""
-    row = state.catalogue.get(ProductRow, product_id, caller.owner)
-    if row is None:
-        raise _missing("product", product_id)
-    return lineage(state.catalogue, row)
+    return lineage(state.catalogue, state.row(ProductRow, product_id, caller.owner))
 
 
 @router.get("/v1/psfs/{psf_id}/provenance", summary="The lineage of a PSF as W3C PROV", **PROV)
@@ -60,7 +53,7 @@ def get_psf_provenance(
     psf_id: Identity, caller: Reading, state: Shared, format: Annotated[Format, FORMAT] = "json"
 ) -> Response:
     """The lineage in the terms of W3C PROV and of the IVOA Provenance Data Model."""
-    return _provenance(state, state.catalogue.get(PsfRow, psf_id, caller.owner), "psf", psf_id, format)
+    return _provenance(state, state.row(PsfRow, psf_id, caller.owner), "psf", format)
 
 
 @router.get("/v1/products/{product_id}/provenance", summary="The lineage of a product as W3C PROV", **PROV)
@@ -68,8 +61,7 @@ def get_product_provenance(
     product_id: Identity, caller: Reading, state: Shared, format: Annotated[Format, FORMAT] = "json"
 ) -> Response:
     """The lineage in the terms of W3C PROV and of the IVOA Provenance Data Model."""
-    row = state.catalogue.get(ProductRow, product_id, caller.owner)
-    return _provenance(state, row, "product", product_id, format)
+    return _provenance(state, state.row(ProductRow, product_id, caller.owner), "product", format)
 
 
 @router.post("/v1/psfs/{psf_id}/rerun", status_code=202, summary="Make a PSF again and compare")
@@ -91,21 +83,8 @@ def _rerun(
     return submit_job(asked, response, caller, state)
 
 
-def _provenance(
-    state: Shared, row: ProductRow | PsfRow | None, of: str, identity: str, form: Format
-) -> Response:
-    if row is None:
-        raise _missing(of, identity)
-    headers = {"Content-Disposition": f'attachment; filename="{of}-{identity[:12]}.{FILES[form]}"'}
+def _provenance(state: Shared, row: ProductRow | PsfRow, of: str, form: Format) -> Response:
+    headers = {"Content-Disposition": f'attachment; filename="{of}-{row.id[:12]}.{FILES[form]}"'}
     return Response(
         provenance_text(state.catalogue, row, form), media_type=MEDIA_TYPES[form], headers=headers
-    )
-
-
-def _missing(of: str, identity: str) -> Exception:
-    return problem(
-        DataError(
-            f"no-such-{of}",
-            f"expected the id of a {of} in the catalogue; got {identity}, which is not in it: list the {of}s",
-        )
     )

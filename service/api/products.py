@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from service.http import downloads as files
-from service.http.callers import Caller, Reading, Submitting
+from service.http.callers import Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem
 from service.http.state import Shared
@@ -44,14 +44,14 @@ def list_products(
 @router.get("/{product_id}", summary="One product")
 def get_product(product_id: Identity, caller: Reading, state: Shared) -> ProductView:
     """A product's metadata, with links to its files. If its PSF was deprecated since, `details.warnings` says so."""
-    row = find(state, caller, product_id)
+    row = state.row(ProductRow, product_id, caller.owner)
     return ProductView.of(row, details_now(state.catalogue, row))
 
 
 @router.get("/{product_id}/file", summary="The product as FITS", response_class=Response)
 def get_product_file(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the product; its hash is the ETag."""
-    row = find(state, caller, product_id)
+    row = state.row(ProductRow, product_id, caller.owner)
     name = row.details["filename"]
     return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, name, size=row.bytes)
 
@@ -63,13 +63,19 @@ def get_product_file(product_id: Identity, request: Request, caller: Reading, st
 )
 def get_product_preview(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The picture as PNG."""
-    return files.send(request, state.store, find(state, caller, product_id).preview_sha256, "image/png", None)
+    return files.send(
+        request,
+        state.store,
+        state.row(ProductRow, product_id, caller.owner).preview_sha256,
+        "image/png",
+        None,
+    )
 
 
 @router.get("/{product_id}/thumbnail", summary="Small picture of the product", response_class=Response)
 def get_product_thumbnail(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """A PNG of the deconvolved image, row 0 at the bottom, whose longer side has at most 192 px."""
-    digest = find(state, caller, product_id).details.get("thumbnail_sha256")
+    digest = state.row(ProductRow, product_id, caller.owner).details.get("thumbnail_sha256")
     if digest is None:
         raise Problem(
             404,
@@ -83,7 +89,7 @@ def get_product_thumbnail(product_id: Identity, request: Request, caller: Readin
 @router.get("/{product_id}/changes", summary="Picture of all changes", response_class=Response)
 def get_product_changes(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """A PNG that shows the image before and after, the change, difference, ratio and histogram, if the job had `changes_picture` true."""
-    digest = find(state, caller, product_id).details.get("changes_picture_sha256")
+    digest = state.row(ProductRow, product_id, caller.owner).details.get("changes_picture_sha256")
     if digest is None:
         raise Problem(
             404,
@@ -97,21 +103,9 @@ def get_product_changes(product_id: Identity, request: Request, caller: Reading,
 @router.delete("/{product_id}", status_code=204, summary="Delete a product", response_class=Response)
 def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> Response:
     """Remove the product from the catalogue and from your quota. The same request makes it again."""
-    row = find(state, caller, product_id)
+    row = state.row(ProductRow, product_id, caller.owner)
     state.catalogue.delete_product(product_id, caller.owner)
     # The files are deleted at once. Otherwise an owner who deletes products and submits jobs in turn could exceed the
     # quota.
     remove_unnamed(state.catalogue, state.store, [digest for digest, _ in files_of(row)])
     return Response(status_code=204)
-
-
-def find(state: Shared, caller: Caller, product_id: str) -> ProductRow:
-    """The row of a product. Raises ``Problem`` 404 if the caller has no such product."""
-    row = state.catalogue.get(ProductRow, product_id, caller.owner)
-    if row is None:
-        raise Problem(
-            404,
-            "no-such-product",
-            f"expected the id of a product in the catalogue; got {product_id}, which is not in it: list your products",
-        )
-    return row

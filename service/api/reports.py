@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from service.http import downloads as files
-from service.http.callers import Caller, Reading
+from service.http.callers import Reading
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem
 from service.http.state import Shared
@@ -45,13 +45,13 @@ def list_reports(
 @router.get("/{report_id}", summary="One report")
 def get_report(report_id: Identity, caller: Reading, state: Shared) -> ReportView:
     """A report's metadata, with links to its files."""
-    return ReportView.of(find(state, caller, report_id))
+    return ReportView.of(state.row(ReportRow, report_id, caller.owner))
 
 
 @router.get("/{report_id}/file", summary="The report as JSON", response_class=Response)
 def get_report_file(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the report; its hash is the ETag."""
-    row = find(state, caller, report_id)
+    row = state.row(ReportRow, report_id, caller.owner)
     return files.send(
         request,
         state.store,
@@ -65,7 +65,7 @@ def get_report_file(report_id: Identity, request: Request, caller: Reading, stat
 @router.get("/{report_id}/preview", summary="The report's picture", response_class=Response)
 def get_report_preview(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The figures of the report as PNG."""
-    row = find(state, caller, report_id)
+    row = state.row(ReportRow, report_id, caller.owner)
     if row.preview_sha256 is None:
         raise Problem(
             404,
@@ -79,7 +79,7 @@ def get_report_preview(report_id: Identity, request: Request, caller: Reading, s
 @router.get("/{report_id}/page", summary="The report as an HTML page", response_class=Response)
 def get_report_page(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The report as HTML with its figures inside. The headers of the answer forbid scripts and content from other addresses."""
-    digest = find(state, caller, report_id).details.get("page_sha256")
+    digest = state.row(ReportRow, report_id, caller.owner).details.get("page_sha256")
     if digest is None:
         raise Problem(
             404,
@@ -95,7 +95,7 @@ def get_report_page(report_id: Identity, request: Request, caller: Reading, stat
 @router.get("/{report_id}/output", summary="The file that a rerun made, as FITS", response_class=Response)
 def get_report_output(report_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """The product or PSF that the rerun made."""
-    digest = find(state, caller, report_id).details.get("output_sha256")
+    digest = state.row(ReportRow, report_id, caller.owner).details.get("output_sha256")
     if digest is None:
         raise Problem(
             404,
@@ -104,15 +104,3 @@ def get_report_output(report_id: Identity, request: Request, caller: Reading, st
             f"(/v1/reports/{report_id}/file)",
         )
     return files.send(request, state.store, digest, files.FITS_TYPE, f"again-{report_id[:12]}.fits")
-
-
-def find(state: Shared, caller: Caller, report_id: str) -> ReportRow:
-    """The row of a report. Raises ``Problem`` 404."""
-    row = state.catalogue.get(ReportRow, report_id, caller.owner)
-    if row is None:
-        raise Problem(
-            404,
-            "no-such-report",
-            f"expected the id of a report in the catalogue; got {report_id}, which is not in it: list the reports",
-        )
-    return row

@@ -8,7 +8,7 @@ from fastapi.concurrency import run_in_threadpool
 from service.http import uploads
 from service.http.callers import Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
-from service.http.problems import RESPONSES, Problem
+from service.http.problems import RESPONSES
 from service.http.quotas import Allowed
 from service.http.state import Shared
 from service.views.transits import TransitDetails, TransitView
@@ -60,11 +60,5 @@ def list_transits(
 @router.get("/{transit_id}", summary="One uploaded transit")
 def get_transit(transit_id: Identity, caller: Reading, state: Shared) -> TransitDetails:
     """An uploaded transit, with its files."""
-    row = state.catalogue.get(TransitRow, transit_id, caller.owner)
-    if row is None:
-        raise Problem(
-            404,
-            "no-such-transit",
-            f"expected the id of an uploaded transit; got {transit_id}, which is not in the catalogue: upload the transit, or list your transits",
-        )
+    row = state.row(TransitRow, transit_id, caller.owner)
     return TransitDetails.of(row)

@@ -6,13 +6,14 @@ import re
 
 from fastapi import Request
 
-from service.http.problems import STATUS_OF, Problem
+from service.http.problems import problem
 from service.http.state import State
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.catalogue import ListedRow
 from workers.catalogue.database import several_ids_fit
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow, ReportRow, TransitRow
-from workers.contract.short_ids import FEWEST_DIGITS, SHORT_ID
+from workers.contract.short_ids import SHORT_ID
+from workers.rows import no_such
 
 # The parts of addresses that are ids: the table, the name of the thing, and the digits of a whole id.
 IDS: dict[str, tuple[type[ListedRow], str, int]] = {
@@ -26,14 +27,6 @@ IDS: dict[str, tuple[type[ListedRow], str, int]] = {
     "bulk_id": (BulkRow, "bulk", 32),
 }
 _SHORT = re.compile(SHORT_ID)
-_NAMED = {"psf": "PSF", "bulk": "bulk run"}
-_LISTED = {
-    "psf": "; `heliopsf psf list` shows them",
-    "product": "; `heliopsf product list` shows them",
-    "job": "; `heliopsf job list` shows them",
-    "bulk": "; `heliopsf bulk list` shows them",
-}
-SHOWN = {"psf": "a PSF", "bulk": "a bulk run", "image": "an image"}
 
 
 def complete(request: Request, state: State, owner: str) -> None:
@@ -50,15 +43,8 @@ def complete(request: Request, state: State, owner: str) -> None:
         if len(text) >= digits:
             continue
         found = state.catalogue.ids_from(table, text, owner)
-        shown = SHOWN.get(thing, f"a {thing}")
         if not found:
-            raise Problem(
-                404,
-                f"no-such-{thing}",
-                f"expected the id of {shown}, or its first {FEWEST_DIGITS} or more digits; got {text}: no {_NAMED.get(thing, thing)} "
-                f"of yours has an id that begins with these digits{_LISTED.get(thing, '')}",
-            )
+            raise problem(no_such(thing, text, shortened=True))
         if len(found) > 1:
-            error = several_ids_fit(text, found)
-            raise Problem(STATUS_OF[error.code], error.code, error.message, candidates=found)
+            raise problem(several_ids_fit(text, found), candidates=found)
         path[part] = found[0]

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import anyio
 from fastapi import Depends, Request
 
+from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.viewing.planes import Planes
 from service.http.access import Access
+from service.http.problems import problem
 from service.http.rates import AtOnce, Rates
-from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.catalogue import Catalogue, Row
 from workers.files.store import Store
+from workers.rows import row_of
 from workers.settings import Settings
 
 if TYPE_CHECKING:
@@ -45,6 +48,13 @@ class State:
     def limits(self) -> FitsLimits:
         """Limits of accepted FITS files."""
         return FitsLimits(max_pixels=self.settings.max_pixels)
+
+    def row(self, table: type[Row], identity: str, owner: str) -> Row:
+        """The owner's row with this id. Raises ``Problem`` 404 if there is none."""
+        try:
+            return row_of(self.catalogue, table, identity, owner)
+        except DataError as error:
+            raise problem(error) from error
 
 
 def state_of(request: Request) -> State:

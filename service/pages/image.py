@@ -53,7 +53,7 @@ class Checked:
 @router.get("")
 def image(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The image, its PSF and the estimate for the options in the query."""
-    row = _find(state, caller, image_id)
+    row = state.row(ImageRow, image_id, caller.owner)
     asked = request.query_params
     checked = _checked(image_id, asked, caller, state)
     psfs = _psfs(text(asked, "psf_id"), caller, state)
@@ -76,7 +76,7 @@ def image(image_id: Identity, request: Request, caller: PageReading, state: Shar
 @router.get("/check")
 def check(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The check of the options in the query, for the script of the page."""
-    _find(state, caller, image_id)
+    state.row(ImageRow, image_id, caller.owner)
     found = _checked(image_id, request.query_params, caller, state)
     return JSONResponse(
         {"good": found.good, "lines": found.lines, "button": found.button, "code": found.code}
@@ -180,14 +180,3 @@ def _facts(row: ImageRow) -> list[tuple[str, str]]:
         "Id": row.id,
     }
     return list(facts.items())
-
-
-def _find(state: State, caller: Caller, image_id: str) -> ImageRow:
-    row = state.catalogue.get(ImageRow, image_id, caller.owner)
-    if row is None:
-        raise Problem(
-            404,
-            "no-such-image",
-            f"expected the id of one of your images; got {image_id}: upload the image, or list your images",
-        )
-    return row

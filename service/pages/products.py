@@ -11,7 +11,7 @@ from starlette.background import BackgroundTasks
 from service.api.bulk import LOOK_FROM
 from service.api.files.pixels import prepare_image
 from service.api.lineage import get_product_lineage, rerun_product
-from service.api.products import delete_product, find
+from service.api.products import delete_product
 from service.http import downloads
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -31,7 +31,7 @@ router = APIRouter(prefix="/products/{product_id}", include_in_schema=False)
 @router.get("")
 def product(product_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The product. If its file or the uploaded image is lost or deleted, the page says so."""
-    row = find(state, caller, product_id)
+    row = state.row(ProductRow, product_id, caller.owner)
     image = state.catalogue.get(ImageRow, row.image_id, row.owner)
     psf = state.catalogue.get(PsfRow, row.psf_id, row.owner)
     reruns = state.catalogue.page(ReportRow, owner=row.owner, limit=MOST_RERUNS, about_id=row.id)
@@ -79,7 +79,7 @@ def rerun(product_id: Identity, response: Response, caller: PageSubmitting, stat
 @router.post("/delete")
 def delete(product_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
     """Delete the product, and go to the page of its image, or to the first page if the image was deleted."""
-    row = find(state, caller, product_id)
+    row = state.row(ProductRow, product_id, caller.owner)
     delete_product(product_id, caller, state)
     there = state.catalogue.get(ImageRow, row.image_id, row.owner) is not None
     return RedirectResponse(f"/images/{row.image_id}" if there else "/", 303)

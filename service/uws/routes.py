@@ -16,9 +16,9 @@ from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, RedirectResponse
 
-from service.api.jobs import check_own
+from service.api.jobs import check_own, find
 from service.http.callers import Caller, Reading, Submitting
-from service.http.problems import Problem
+from service.http.problems import Problem, problem
 from service.http.quotas import check_rows
 from service.http.state import Shared, State
 from service.uws import documents
@@ -28,6 +28,7 @@ from service.uws.uploads import SentForm, ids_of, keep
 from service.views.jobs import time_left_s
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.contract.phases import JobError, Phase
+from workers.rows import no_such
 
 MAX_RUN_ID = 256
 MOST = 2**31 - 1
@@ -362,13 +363,9 @@ def _quote(row: JobRow) -> float | None:
 
 def _find(state: State, caller: Caller, job_id: str) -> JobRow:
     """The row of a job. Raises ``Problem`` 404 if the caller has no such job."""
-    known = len(job_id) == 32 and set(job_id) <= set("0123456789abcdef")
-    row = state.catalogue.jobs.get(job_id) if known else None
-    if row is None or row.owner != caller.owner:
-        raise Problem(
-            404, "no-such-job", f"expected the id of one of your jobs; got {job_id[:64]!a}: list your jobs"
-        )
-    return row
+    if len(job_id) != 32 or not set(job_id) <= set("0123456789abcdef"):
+        raise problem(no_such("job", f"{job_id[:64]!a}"))
+    return find(state, caller, job_id)
 
 
 def _terms(state: State, caller: Caller, job_id: str) -> tuple[JobRow, TermsRow]:

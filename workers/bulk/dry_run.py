@@ -18,7 +18,7 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, read_summary
-from workers.bulk.intake import check_places, check_uploaded, not_uploaded, pinned
+from workers.bulk.intake import check_places, check_uploaded, pinned
 from workers.bulk.matching import found_files
 from workers.bulk.targets import target_of
 from workers.catalogue.bulks import Listed
@@ -33,6 +33,7 @@ from workers.files import archive as archive_files
 from workers.files import beneath
 from workers.intake import estimates
 from workers.intake.requests import resolved_deconvolution
+from workers.rows import no_such
 from workers.settings import Settings
 
 BUDGET_S = 20.0  # a dry run stops after this time, and reports what it found
@@ -223,7 +224,7 @@ class _Asked:
         if image.uploaded:
             row = self._catalogue.get(ImageRow, image.source, self._owner)
             if row is None:  # it was deleted meanwhile
-                raise not_uploaded(image.source)
+                raise no_such("image", image.source)
             return row.id, row.summary | {"filename": row.filename or "image"}
         try:
             with beneath.opened(Path(image.source), archive_files.roots(self._settings.bulk_roots)) as file:

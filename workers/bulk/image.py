@@ -32,6 +32,7 @@ from workers.files.store import sha256_of
 from workers.intake import estimates
 from workers.intake.deprecated import details_now
 from workers.intake.requests import resolved_deconvolution
+from workers.rows import row_of
 from workers.tasks import deconvolve as deconvolve_task
 from workers.tasks.context import Context
 from workers.tasks.data import product
@@ -167,13 +168,7 @@ def _rest() -> None:
 @contextmanager
 def _source(context: Context, taken: Taken) -> Iterator[_Source]:
     if taken.uploaded:
-        row = context.catalogue.get(ImageRow, taken.source, context.owner)
-        if row is None:
-            raise DataError(
-                "no-such-image",
-                f"expected the id of an uploaded image; got {taken.source}, which is not in the catalogue: "
-                "upload the image first",
-            )
+        row = row_of(context.catalogue, ImageRow, taken.source, context.owner)
         yield _Source(None, None, row.id, row.summary, row.filename or "image")
         return
     allowed = archive_files.roots(context.settings.bulk_roots)

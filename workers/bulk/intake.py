@@ -15,6 +15,7 @@ from workers.catalogue.tables import PsfRow
 from workers.contract.bulk import BulkPhase, BulkRequest
 from workers.contract.identities import canonical_hash
 from workers.files import archive as archive_files
+from workers.rows import no_such, row_of
 from workers.settings import Settings
 
 
@@ -48,12 +49,7 @@ def begin(request: BulkRequest, catalogue: Catalogue, owner: str, settings: Sett
 def pinned(request: BulkRequest, catalogue: Catalogue, owner: str) -> tuple[str | None, str | None]:
     """The id of the PSF or of the context. Ids are fixed, so a later change of a name does not change the run."""
     if request.psf_id is not None:
-        if catalogue.get(PsfRow, request.psf_id, owner) is None:
-            raise DataError(
-                "no-such-psf",
-                f"expected the id of a PSF in the catalogue; got {request.psf_id}, which is not in it: "
-                "list the PSFs with `heliopsf psf list`",
-            )
+        row_of(catalogue, PsfRow, request.psf_id, owner)
         return request.psf_id, None
     assert request.context is not None
     return None, catalogue.contexts.named(request.context, owner).id
@@ -63,15 +59,7 @@ def check_uploaded(images: Sequence[str], catalogue: Catalogue, owner: str) -> N
     """Raise DataError "no-such-image" if one of the ids is not an uploaded image of the owner."""
     missing = catalogue.bulks.progress.first_not_uploaded(images, owner)
     if missing is not None:
-        raise not_uploaded(missing)
-
-
-def not_uploaded(image_id: str) -> DataError:
-    """The error about an id that is not an uploaded image of the owner."""
-    return DataError(
-        "no-such-image",
-        f"expected ids of uploaded images; got {image_id}, which is not in the catalogue: upload the image first",
-    )
+        raise no_such("image", missing)
 
 
 def check_places(request: BulkRequest, settings: Settings) -> None:

@@ -15,7 +15,7 @@ from psfcore.instruments.files import instrument_names, turned_text
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
 from psfcore.noise_figures import NoiseFigures
-from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
 from workers.contract.identities import (
     canonical_hash,
@@ -32,6 +32,7 @@ from workers.intake.deprecated import check_not_deprecated
 from workers.intake.no_psf import no_psf
 from workers.intake.psf_choice import Found, picked_for_image
 from workers.lineage import made_by
+from workers.rows import row_of
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,10 @@ class Asked:
         """The resolved model: the parameters of the request, and these further fields."""
         assert self.kind.resolved is not None
         return self.kind.resolved.model_validate(self.parameters.model_dump(mode="json") | more)
+
+    def row(self, table: type[Row], identity: str) -> Row:
+        """The owner's row with this id. Raises ``DataError`` "no-such-image", "no-such-psf", ... if there is none."""
+        return row_of(self.catalogue, table, identity, self.owner)
 
 
 def resolve(
@@ -79,13 +84,13 @@ def resolve_by_ids(asked: Asked) -> Parameters:
     """
     parameters = asked.parameters
     for name, identity in parameters:
-        for of, check in _CHECKS.items():
+        for of, table in _TABLES.items():
             if identity is not None and f"_{name}".endswith(f"_{of}_id"):
-                check(asked.catalogue, identity, asked.owner)
+                asked.row(table, identity)
     assert asked.kind.resolved is not None
     if "diffraction_recipe" not in asked.kind.resolved.model_fields:
         return asked.resolved()
-    summary = _transit(asked.catalogue, parameters.transit_id, asked.owner).summary
+    summary = asked.row(TransitRow, parameters.transit_id).summary
     return asked.resolved(diffraction_recipe=_diffraction_of(asked, summary))
 
 
@@ -95,7 +100,7 @@ def resolve_psf_build(asked: Asked) -> Parameters:
     label = build.instrument or "instrument_file"
     check_workload(parse_instrument(instrument_text(build), label), label)
     if build.mask_id is not None:
-        _image(asked.catalogue, build.mask_id, asked.owner)
+        asked.row(ImageRow, build.mask_id)
     return build
 
 
@@ -103,8 +108,8 @@ def resolve_report(asked: Asked) -> Parameters:
     """Resolve a report. A report on a given PSF needs no fit, and therefore no diffraction PSF and no dark offsets."""
     if asked.parameters.psf_id is None:
         return resolve_by_ids(asked)
-    summary = _transit(asked.catalogue, asked.parameters.transit_id, asked.owner).summary
-    _psf(asked.catalogue, asked.parameters.psf_id, asked.owner)
+    summary = asked.row(TransitRow, asked.parameters.transit_id).summary
+    asked.row(PsfRow, asked.parameters.psf_id)
     _check_noise(summary, asked.parameters.noise)
     # The ignored parameter is set to a fixed value, so that requests that differ only in it share one report.
     return asked.resolved(dark_offsets=False)
@@ -121,22 +126,13 @@ def resolve_gap_diagnose(asked: Asked) -> Parameters:
 def resolve_rerun(asked: Asked) -> Parameters:
     """Resolve a rerun: find the job that made the product or PSF."""
     again = asked.parameters
-    row: ProductRow | PsfRow | None
-    if again.of == "psf":
-        row = asked.catalogue.get(PsfRow, again.id, asked.owner)
-    else:
-        row = asked.catalogue.get(ProductRow, again.id, asked.owner)
-    if row is None:
-        raise DataError(
-            f"no-such-{again.of}",
-            f"expected the id of a {again.of} in the catalogue; got {again.id}, which is not in it: list the {again.of}s",
-        )
+    row = asked.row(PsfRow, again.id) if again.of == "psf" else asked.row(ProductRow, again.id)
     return made_by(asked.catalogue, row)
 
 
 def resolve_deconvolve(asked: Asked) -> Parameters:
     """Resolve a deconvolution: also choose its PSF."""
-    image = _image(asked.catalogue, asked.parameters.image_id, asked.owner)
+    image = asked.row(ImageRow, asked.parameters.image_id)
     return resolved_deconvolution(asked.parameters, image.summary, asked.catalogue, asked.owner)
 
 
@@ -160,39 +156,7 @@ def resolved_deconvolution(
     return resolved
 
 
-def _image(catalogue: Catalogue, image_id: str, owner: str) -> ImageRow:
-    row = catalogue.get(ImageRow, image_id, owner)
-    if row is None:
-        raise DataError(
-            "no-such-image",
-            f"expected the id of an uploaded image; got {image_id}, which is not in the catalogue: upload the image first",
-        )
-    return row
-
-
-def _transit(catalogue: Catalogue, transit_id: str, owner: str) -> TransitRow:
-    row = catalogue.get(TransitRow, transit_id, owner)
-    if row is None:
-        raise DataError(
-            "no-such-transit",
-            f"expected the id of an uploaded transit; got {transit_id}, which is not in the catalogue: "
-            "upload the transit first",
-        )
-    return row
-
-
-def _psf(catalogue: Catalogue, psf_id: str, owner: str) -> PsfRow:
-    row = catalogue.get(PsfRow, psf_id, owner)
-    if row is None:
-        raise DataError(
-            "no-such-psf",
-            f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: "
-            "list the PSFs with `heliopsf psf list`",
-        )
-    return row
-
-
-_CHECKS = {"image": _image, "psf": _psf, "transit": _transit}
+_TABLES: dict[str, Any] = {"image": ImageRow, "psf": PsfRow, "transit": TransitRow}
 
 
 def _check_noise(summary: dict[str, Any], noise: NoiseFigures | None) -> None:
@@ -230,7 +194,7 @@ def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, o
     """The PSF that the request names; else the certified PSF that fits the image, or the PSF that is interpolated between
     two certified PSFs; else the PSF that is built for the instrument."""
     if wanted.psf_id is not None:
-        _psf(catalogue, wanted.psf_id, owner)
+        row_of(catalogue, PsfRow, wanted.psf_id, owner)
         return {"psf_id": wanted.psf_id}
     found = picked_for_image(catalogue, header, owner, wanted.context)
     if found is not None:

@@ -13,7 +13,6 @@ from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.region import BoxWork, box_work
 from psfcore.deconvolve.whole import Work, input_warnings
-from psfcore.errors import DataError
 from psfcore.fits.gain import no_noise_figures
 from psfcore.fits.observation import check_exposure_of_sun, read_observation
 from psfcore.fits.psfs import read_psf
@@ -26,6 +25,7 @@ from workers.contract.identities import product_identity
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.intake.compatibility import noise_of, of_upload
 from workers.intake.deprecated import CODE, deprecated_warning
+from workers.rows import row_of
 from workers.tasks.context import Context
 from workers.tasks.data.prepared_psfs import PreparedPsfs
 from workers.tasks.data.product import Inputs, Made, Warned, details_of, keep, save_preview, write
@@ -56,13 +56,7 @@ def deconvolve(context: Context, parameters: Mapping[str, Any]) -> str:
 
 
 def _load_upload(context: Context, request: ResolvedDeconvolve) -> Image:
-    upload = context.catalogue.get(ImageRow, request.image_id, context.owner)
-    if upload is None:
-        raise DataError(
-            "no-such-image",
-            f"expected the id of an uploaded image; got {request.image_id}, which is not in the catalogue: upload the "
-            "image first",
-        )
+    row_of(context.catalogue, ImageRow, request.image_id, context.owner)
     return load(context, request, context.store.verified(request.image_id))
 
 

@@ -24,6 +24,7 @@ from workers.contract.identities import rerun_identity
 from workers.contract.kinds import KINDS
 from workers.contract.resolved import ResolvedRerun
 from workers.lineage import Made, lineage
+from workers.rows import row_of
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import named_psf
 from workers.tasks.data.reports import keep_report, write_json
@@ -69,13 +70,7 @@ def rerun(context: Context, parameters: Mapping[str, Any]) -> str:
 def _first(context: Context, request: ResolvedRerun) -> Thing:
     if request.of == "psf":
         return named_psf(context, request.id)
-    row = context.catalogue.get(ProductRow, request.id, context.owner)
-    if row is None:
-        raise DataError(
-            "no-such-product",
-            f"expected the id of a product in the catalogue; got {request.id}, which is not in it: list the products",
-        )
-    return row
+    return row_of(context.catalogue, ProductRow, request.id, context.owner)
 
 
 def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing:

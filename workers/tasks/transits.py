@@ -9,6 +9,7 @@ from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
 from workers.catalogue.tables import TransitRow
 from workers.contract.resolved import ResolvedOnTransit
+from workers.rows import row_of
 from workers.tasks.context import Context
 from workers.tasks.psf_build import built_psf
 
@@ -25,13 +26,7 @@ def load_transit(
 
     Raises DataError "no-such-transit", "no-known-psf", and the errors of unpacking and preparing.
     """
-    upload = context.catalogue.get(TransitRow, request.transit_id, context.owner)
-    if upload is None:
-        raise DataError(
-            "no-such-transit",
-            f"expected the id of an uploaded transit; got {request.transit_id}, which is not in the catalogue: upload "
-            "the transit first",
-        )
+    upload = row_of(context.catalogue, TransitRow, request.transit_id, context.owner)
     images = int(upload.summary["images"])
     context.report("reading", 0, images)
     with context.store.unpacked(request.transit_id, context.settings.archive_limits) as folder:

@@ -12,12 +12,11 @@ from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from psfcore.fits.viewing.all_cards import all_cards
-from service.api.images import find as find_image
-from service.api.products import find as find_product
 from service.http import downloads as files
 from service.http.callers import Reading
 from service.http.problems import RESPONSES, problem
 from service.http.state import Shared
+from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.requests import Identity
 
 # This number is part of every ETag. Increase it when a new version of the code gives another answer for the same file.
@@ -40,7 +39,7 @@ class HduHeader(BaseModel):
 )
 async def get_image_header(image_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Every card of every HDU, with COMMENT and HISTORY. A tile-compressed image has the header of the table that holds it."""
-    row = await run_in_threadpool(find_image, state, caller, image_id)
+    row = await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
     return await _headers(request, state, image_id, row.bytes)
 
 
@@ -51,7 +50,7 @@ async def get_product_header(
     product_id: Identity, request: Request, caller: Reading, state: Shared
 ) -> Response:
     """Every card of the image and of its planes, with COMMENT and HISTORY."""
-    row = await run_in_threadpool(find_product, state, caller, product_id)
+    row = await run_in_threadpool(state.row, ProductRow, product_id, caller.owner)
     return await _headers(request, state, row.file_sha256, row.bytes)
 
 

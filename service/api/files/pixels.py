@@ -19,13 +19,12 @@ from fastapi.responses import StreamingResponse
 
 from psfcore.errors import DataError
 from psfcore.fits.viewing.planes import Decoded, Plane
-from service.api.images import find as find_image
-from service.api.products import find as find_product
 from service.http import downloads as files
 from service.http.callers import Reading
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_disk
 from service.http.state import Shared, State
+from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.requests import Identity
 
 # This number is part of every ETag. Increase it when a new version of the code gives another answer for the same file.
@@ -107,7 +106,7 @@ async def get_image_pixels(
     plane: Annotated[Literal["image"], Query(description="an uploaded image has one plane")] = "image",
 ) -> Response:
     """The pixel values of the file, in DN or DN/s as they are stored (BSCALE and BZERO applied). Saturated pixels are not marked."""
-    await run_in_threadpool(find_image, state, caller, image_id)
+    await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
     return await _pixels(request, state, image_id, plane, asked)
 
 
@@ -132,7 +131,7 @@ async def get_product_pixels(
 ) -> Response:
     """The pixel values of a plane of the product. Values of `quality` are whole numbers, as in the file. 404: the product does not
     have this plane."""
-    row = await run_in_threadpool(find_product, state, caller, product_id)
+    row = await run_in_threadpool(state.row, ProductRow, product_id, caller.owner)
     return await _pixels(request, state, row.file_sha256, plane, asked)
 
 

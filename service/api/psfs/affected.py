@@ -7,11 +7,10 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
 
-from psfcore.errors import DataError
 from service.http import paging
 from service.http.callers import Reading
 from service.http.paging import Cursor, Limit, Page
-from service.http.problems import RESPONSES, problem
+from service.http.problems import RESPONSES
 from service.http.state import Shared
 from workers.catalogue.affected import Affected, Place
 from workers.catalogue.tables import PsfRow
@@ -75,14 +74,7 @@ def list_affected_by_psf(
     cursor: Cursor = None,
 ) -> Page[AffectedView]:
     """Products made with this PSF, which may have any status. The newest product is listed first."""
-    psf = state.catalogue.get(PsfRow, psf_id, caller.owner)
-    if psf is None:
-        raise problem(
-            DataError(
-                "no-such-psf",
-                f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
-            )
-        )
+    psf = state.row(PsfRow, psf_id, caller.owner)
     found = state.catalogue.affected.of_psf(psf, limit=limit + 1, after=paging.position(cursor))
     return _page(request, found, limit, whole=False)
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from psfcore.errors import DataError
 from service.api.psfs.filters import Filters, InContext
 from service.http.callers import Reading
-from service.http.problems import RESPONSES, Problem, problem
+from service.http.problems import RESPONSES, problem
 from service.http.state import Shared
 from service.views.psfs import PsfView
 from workers.catalogue.tables import ImageRow
@@ -60,13 +60,7 @@ def get_psf_for_image(
 
     `POST /v1/estimates` says which PSF a deconvolution would use, also if none is certified.
     """
-    row = state.catalogue.get(ImageRow, image_id, caller.owner)
-    if row is None:
-        raise Problem(
-            404,
-            "no-such-image",
-            f"expected the id of an uploaded image; got {image_id}, which is not in the catalogue: upload the image, or list your images",
-        )
+    row = state.row(ImageRow, image_id, caller.owner)
     return _choice(lambda: look_for_image(state.catalogue, row.summary, caller.owner, context, kind))
 
 

@@ -164,7 +164,7 @@ async def get_cutout(
     state: Shared,
 ) -> Response:
     """The central part of the PSF, not renormalised. Its centre is at [size // 2, size // 2]."""
-    row = await run_in_threadpool(_find, state, caller, psf_id)
+    row = await run_in_threadpool(state.row, PsfRow, psf_id, caller.owner)
     headers = _headers(f"{row.file_sha256} cutout {size}")
     if files.known(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
@@ -183,7 +183,7 @@ async def get_cutout(
 
 def tables_of(state: State, caller: Caller, psf_id: str) -> Mapping[str, Any]:
     """The tables of a PSF. Raises ``Problem`` 404 if there is no such PSF, 409 "no-tables" if it has no tables yet."""
-    row = _find(state, caller, psf_id)
+    row = state.row(PsfRow, psf_id, caller.owner)
     return _read(state, row, _tables_of(row))
 
 
@@ -191,7 +191,7 @@ def _answer(
     request: Request, caller: Caller, state: Shared, psf_ids: list[str], ask: Callable[..., dict[str, Any]]
 ) -> Response:
     """The answer from the tables of these PSFs, or 304 if the client already has this answer."""
-    rows = [_find(state, caller, psf_id) for psf_id in psf_ids]
+    rows = [state.row(PsfRow, psf_id, caller.owner) for psf_id in psf_ids]
     digests = [_tables_of(row) for row in rows]
     headers = _headers(f"{' '.join(digests)} {request.url.path} {request.url.query}")
     if files.known(request, headers["ETag"]):
@@ -240,14 +240,3 @@ def _numbers(text: str) -> list[float]:
             "bad-radius",
             f"radii: expected numbers separated by commas, such as 1,10,100; got {text!r:.60}",
         ) from error
-
-
-def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
-    row = state.catalogue.get(PsfRow, psf_id, caller.owner)
-    if row is None:
-        raise Problem(
-            404,
-            "no-such-psf",
-            f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
-        )
-    return row

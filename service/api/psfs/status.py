@@ -117,14 +117,7 @@ class StatusView(BaseModel):
 @router.get("/{psf_id}/status", summary="A PSF's status and its history")
 def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusView:
     """The status of a PSF, the changes that are allowed now, and the past changes: who made each change, when and why."""
-    row = state.catalogue.get(PsfRow, psf_id, caller.owner)
-    if row is None:
-        raise problem(
-            DataError(
-                "no-such-psf",
-                f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
-            )
-        )
+    row = state.row(PsfRow, psf_id, caller.owner)
     return _view(state, caller, row)
 
 

@@ -128,7 +128,7 @@ def list_psfs(
 @router.get("/{psf_id}", summary="One PSF version")
 def get_psf(psf_id: Identity, caller: Reading, state: Shared) -> PsfView:
     """A PSF's metadata, with links to its files."""
-    return PsfView.of(_find(state, caller, psf_id))
+    return PsfView.of(state.row(PsfRow, psf_id, caller.owner))
 
 
 @router.delete("/{psf_id}", summary="Delete a draft PSF that nothing uses")
@@ -151,7 +151,7 @@ def delete_psf(psf_id: Identity, caller: Submitting, state: Shared) -> PsfView:
 @router.get("/{psf_id}/file", summary="The PSF as FITS", response_class=Response)
 def get_psf_file(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Download the PSF; its hash is the ETag."""
-    row = _find(state, caller, psf_id)
+    row = state.row(PsfRow, psf_id, caller.owner)
     return files.send(
         request, state.store, row.file_sha256, files.FITS_TYPE, f"psf-{psf_id[:12]}.fits", size=row.bytes
     )
@@ -160,7 +160,7 @@ def get_psf_file(psf_id: Identity, request: Request, caller: Reading, state: Sha
 @router.get("/{psf_id}/preview", summary="The PSF's picture", response_class=Response)
 def get_psf_preview(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """A PNG that shows the PSF, its radial profile and its cumulative curve."""
-    row = _find(state, caller, psf_id)
+    row = state.row(PsfRow, psf_id, caller.owner)
     if row.preview_sha256 is None:
         raise Problem(
             404,
@@ -173,7 +173,7 @@ def get_psf_preview(psf_id: Identity, request: Request, caller: Reading, state: 
 @router.get("/{psf_id}/report", summary="The report of a fit, as JSON", response_class=Response)
 def get_psf_report(psf_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
     """Parameters with errors, curves with bands, the residual of every image, and the limits of the data."""
-    digest = _find(state, caller, psf_id).details.get("report_sha256")
+    digest = state.row(PsfRow, psf_id, caller.owner).details.get("report_sha256")
     if digest is None:
         raise Problem(
             404,
@@ -190,15 +190,3 @@ def _in_context(state: Shared, caller: Caller, filters: PsfFilter, context: str 
     if context == NOW:
         return replace(filters, status=PsfStatus.CERTIFIED)
     return replace(filters, context_id=state.catalogue.contexts.named(context, caller.owner).id)
-
-
-def _find(state: Shared, caller: Caller, psf_id: str) -> PsfRow:
-    """The PSF's row. Raises ``Problem`` 404."""
-    row = state.catalogue.get(PsfRow, psf_id, caller.owner)
-    if row is None:
-        raise Problem(
-            404,
-            "no-such-psf",
-            f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
-        )
-    return row

@@ -7,16 +7,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from service.http.problems import Problem
+from workers.rows import NAMES
 
-_THINGS = {
-    "no-such-bulk": "bulk run",
-    "no-such-image": "image",
-    "no-such-job": "job",
-    "no-such-product": "product",
-    "no-such-psf": "PSF",
-    "no-such-report": "report",
-    "no-such-transit": "transit",
-}
 # The labels in the forms, for fields whose label differs from their name.
 _FIELDS = {
     "error_draws": "Noise realisations",
@@ -41,7 +33,7 @@ def of_problem(problem: Problem) -> str:
 
 def of_error(code: str, message: str, fields: Mapping[str, Any] = _NO_FIELDS) -> str:
     """The sentence for an error. fields: the fields of its ``DataError``; empty for the stored error of a job."""
-    thing = _THINGS.get(code)
+    thing = NAMES.get(code.removeprefix("no-such-"))
     if thing is not None and message.startswith("expected the id"):
         return f"There is no such {thing} here. It was deleted, or it belongs to another owner, or its address is not complete."
     try:

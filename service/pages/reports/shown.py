@@ -9,7 +9,6 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
-from service.api.reports import find
 from service.http import downloads
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -34,7 +33,7 @@ router = APIRouter(prefix="/reports/{report_id}", include_in_schema=False)
 @router.get("")
 def report(report_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The report. It has the same sections as the HTML page that can be downloaded."""
-    row = find(state, caller, report_id)
+    row = state.row(ReportRow, report_id, caller.owner)
     stored = _stored(state, row)
     said = _said(state, row)
     view = ReportView.of(row)
@@ -58,7 +57,7 @@ def figure(
     report_id: Identity, number: int, request: Request, caller: PageReading, state: Shared
 ) -> Response:
     """A figure of the report as PNG; the first has the number 1."""
-    stored = _stored(state, find(state, caller, report_id))
+    stored = _stored(state, state.row(ReportRow, report_id, caller.owner))
     figures = () if stored is None else stored.figures
     if not 1 <= number <= len(figures):
         raise Problem(

@@ -43,7 +43,7 @@ def test_bad_files_are_named_and_the_run_starts_with_the_others(
     assert "CANCELLED" in command("bulk", "cancel", run["id"][:8])
     assert command("bulk", "delete", run["id"][:8]) == f"bulk run {run['id'][:12]} is deleted\n"
     assert "no bulk run yet" in command("bulk", "list")
-    assert "expected the id of a bulk run" in command("bulk", "delete", run["id"][:8], code=1)
+    assert "expected the id of one of your bulk runs" in command("bulk", "delete", run["id"][:8], code=1)
 
 
 def test_a_folder_of_bad_files_starts_nothing(

@@ -106,7 +106,7 @@ def test_a_job_s_life(
     assert missing.status_code == 400 and "image_id: expected a value" in missing.text
     post(api, f"{job}/parameters", image_id="0" * 64)
     unknown_image = post(api, f"{job}/phase", PHASE="RUN")
-    assert unknown_image.status_code == 400 and "the id of an uploaded image" in unknown_image.text
+    assert unknown_image.status_code == 400 and "the id of one of your images" in unknown_image.text
     assert unknown_image.headers["content-type"].startswith("text/plain")
     assert api.get(f"{job}/phase").text == "PENDING"
     method = '{"name": "linear", "steps": 2}'
@@ -202,7 +202,7 @@ BAD_CREATIONS = [
     ("ABORT at once", BUILD | {"PHASE": "ABORT"}, "expected PHASE=RUN"),
     ("duration", BUILD | {"EXECUTIONDURATION": "-1"}, "EXECUTIONDURATION"),
     ("destruction", BUILD | {"DESTRUCTION": "2001-01-01"}, "a time in the future"),
-    ("no image there", {"KIND": "deconvolve", "PHASE": "RUN", "image_id": "0" * 64}, "the id of an uploaded image"),
+    ("no image there", {"KIND": "deconvolve", "PHASE": "RUN", "image_id": "0" * 64}, "the id of one of your images"),
     ("incomplete and RUN", {"KIND": "deconvolve", "PHASE": "RUN"}, "image_id: expected a value"),
     ("neither of two", {"KIND": "psf-build", "PHASE": "RUN"}, "expected exactly one of instrument"),
     ("a misspelt KIND", {"KIND": "reprot"}, "did you mean 'report'?"),

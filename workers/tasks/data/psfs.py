@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf
 from psfcore.psf import Psf, cumulative_curve
 from workers.catalogue.tables import PsfRow
 from workers.files.store import Store
+from workers.rows import row_of
 from workers.tasks.context import Context
 from workers.versions.series import TOTAL, channel_of, series_of
 from workers.versions.status import PsfStatus
@@ -24,18 +24,7 @@ CURVE_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 def named_psf(context: Context, psf_id: str) -> PsfRow:
     """The catalogue's row of a PSF. Raises DataError "no-such-psf"."""
-    row = context.catalogue.get(PsfRow, psf_id, context.owner)
-    if row is None:
-        raise no_such_psf(psf_id)
-    return row
-
-
-def no_such_psf(psf_id: str) -> DataError:
-    """The error for an id that is not in the catalogue."""
-    return DataError(
-        "no-such-psf",
-        f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs, or upload your PSF",
-    )
+    return row_of(context.catalogue, PsfRow, psf_id, context.owner)
 
 
 def given_psf(context: Context, psf_id: str | None) -> Psf | None:

@@ -130,7 +130,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
         (["--json", "no/such/folder/g.json", "--local"], "there is no folder"),
         (["--corrected", "no/such/folder/p.fits", "--local"], "there is no folder"),
         (["--psf", "missing.fits", "--local"], "expected a PSF id (8 or more hexadecimal digits) or a file"),
-        (["--psf", "0" * 64, "--local"], "expected the id of a PSF in the catalogue"),
+        (["--psf", "0" * 64, "--local"], "expected the id of one of your PSFs"),
         (["--effects", "mine.py"], "--effects: expected --local with it"),
         (["--effects", "mine.py", "--local"], "effects of mine.py: expected a readable Python file"),
         (["--effects", "no_such_module_anywhere", "--local"], "No module named 'no_such_module_anywhere'"),
