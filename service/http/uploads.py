@@ -9,13 +9,10 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
-from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import MultipartParser, parse_options_header
-from starlette.requests import ClientDisconnect
 
 from psfcore.errors import DataError, HeaderError
 from psfcore.fits.header import FitsLimits, HeaderSummary, read_summary
@@ -28,11 +25,9 @@ from psfcore.transit.archive import (
     could_be_archive,
     list_archive,
 )
+from service.http.forms import FORM, FormPart, chunks_of, media_type_of, pieces_of
 from service.http.problems import Problem, problem
 from workers.files.store import Store
-
-if TYPE_CHECKING:
-    from python_multipart.multipart import MultipartCallbacks
 
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
 FORM_BYTES = 2**16  # largest size of a form without its file
@@ -151,10 +146,10 @@ async def _receive(
     if declared:  # if the length is declared, the upload can be refused before it is sent
         await run_in_threadpool(take, declared)
     with store.temporary() as path:
-        body = _Body(request, max_bytes)
-        digest, size, start = hashlib.sha256(), 0, b""
+        digest, size, start, filename = hashlib.sha256(), 0, b"", None
         with path.open("wb") as file:
-            async for chunk in body.chunks():
+            async for name, chunk in _file_of(request, max_bytes):
+                filename = name
                 if len(start) < expected.start_bytes:
                     start += chunk[: expected.start_bytes - len(start)]
                     expected.recognise(start, whole=False)
@@ -170,7 +165,7 @@ async def _receive(
             raise Problem(400, "empty-upload", f"expected {expected.what}; got 0 bytes: check the file")
         expected.recognise(start, whole=True)
         found = await run_in_threadpool(expected.inspect, path)
-        yield Upload(path, digest.hexdigest(), size, body.filename, found)
+        yield Upload(path, digest.hexdigest(), size, filename, found)
 
 
 class _Fits:
@@ -267,7 +262,7 @@ def _inspected(path: Path, expected: _Format[Found]) -> Found:
 
 def has_own_limit(address: str, content_type: str) -> bool:
     """Whether the route itself limits the size of a body of this type, because the body may contain files."""
-    form = content_type.lower().startswith("multipart/form-data")
+    form = content_type.lower().startswith(FORM)
     return (
         address in LARGE
         or address.startswith(PARTS)
@@ -283,97 +278,26 @@ def _too_large(max_bytes: int) -> Problem:
     )
 
 
-class _Body:
-    """The file in a request: the raw body, or the part named ``file`` of a form."""
-
-    def __init__(self, request: Request, max_bytes: int) -> None:
-        self._request, self._max_bytes = request, max_bytes
-        self.filename: str | None = None
-        self._ready: list[bytes] = []
-        self._name, self._value = b"", b""
-        self._in_file = self._seen_file = self._whole = False
-
-    async def chunks(self) -> AsyncIterator[bytes]:
-        kind, options = parse_options_header(self._request.headers.get("content-type", ""))
-        try:
-            if kind == b"multipart/form-data":
-                async for chunk in self._form(options):
-                    yield chunk
-            else:
-                self.filename = label(self._request.query_params.get("filename"))
-                async for chunk in self._request.stream():
-                    if chunk:
-                        yield chunk
-        except ClientDisconnect as error:
-            raise Problem(
-                400,
-                "upload-ended-early",
-                "expected the complete file; the connection closed before the end: upload it again",
-            ) from error
-
-    async def _form(self, options: dict[bytes, bytes]) -> AsyncIterator[bytes]:
-        if not options.get(b"boundary"):
-            raise Problem(
-                400,
-                "bad-form",
-                "expected a boundary in the multipart Content-Type; got none: correct the request",
-            )
-        callbacks: MultipartCallbacks = {
-            "on_part_begin": self._part_begin,
-            "on_header_field": self._header_field,
-            "on_header_value": self._header_value,
-            "on_header_end": self._header_end,
-            "on_part_data": self._part_data,
-            "on_end": self._end,
-        }
-        try:
-            parser = MultipartParser(options[b"boundary"], callbacks)
-            sent = 0
-            async for chunk in self._request.stream():
-                sent += len(chunk)
-                if sent > self._max_bytes + FORM_BYTES:  # the other parts of the form count too
-                    raise _too_large(self._max_bytes)
-                parser.write(chunk)
-                while self._ready:
-                    yield self._ready.pop(0)
-        except FormParserError as error:
-            raise Problem(400, "bad-form", f"expected multipart/form-data: {error}") from error
-        if not self._seen_file:
-            raise Problem(
-                400,
-                "bad-form",
-                "expected a form with a part named 'file'; got none: name the part with the file 'file'",
-            )
-        if not self._whole:
-            raise Problem(
-                400,
-                "upload-ended-early",
-                "expected the complete form; it ended before its last boundary: upload it again",
-            )
-
-    def _part_begin(self) -> None:
-        self._in_file = False
-
-    def _header_field(self, data: bytes, start: int, end: int) -> None:
-        self._name += data[start:end]
-
-    def _header_value(self, data: bytes, start: int, end: int) -> None:
-        self._value += data[start:end]
-
-    def _header_end(self) -> None:
-        if self._name.lower() == b"content-disposition":
-            _, options = parse_options_header(self._value)
-            if options.get(b"name") == b"file" and not self._seen_file:
-                self._in_file = self._seen_file = True
-                self.filename = label(options.get(b"filename", b"").decode("utf-8", "replace"))
-        self._name, self._value = b"", b""
-
-    def _part_data(self, data: bytes, start: int, end: int) -> None:
-        if self._in_file:
-            self._ready.append(data[start:end])
-
-    def _end(self) -> None:
-        self._whole = True
+async def _file_of(request: Request, max_bytes: int) -> AsyncIterator[tuple[str | None, bytes]]:
+    """The pieces of the file in a request, each with the label of the file: the raw body, or the part ``file`` of a form."""
+    if media_type_of(request) != FORM:
+        filename = label(request.query_params.get("filename"))
+        async for chunk in chunks_of(request):
+            yield filename, chunk
+        return
+    file: FormPart | None = None
+    async for pieces in pieces_of(request, max_bytes + FORM_BYTES):  # the other parts of the form count too
+        for part, piece in pieces:
+            if file is None and part.name == "file":
+                file = part
+            if part is file and piece:
+                yield label(file.filename), piece
+    if file is None:
+        raise Problem(
+            400,
+            "bad-form",
+            "expected a form with a part named 'file'; got none: name the part with the file 'file'",
+        )
 
 
 def label(filename: str | None) -> str | None:

@@ -19,6 +19,7 @@ from fastapi.responses import RedirectResponse
 from fastapi.security import SecurityScopes
 
 from service.http.callers import Caller, admit, cookie_name, names_its_site
+from service.http.forms import media_type_of
 from service.http.guard import SAFE_METHODS
 from service.http.problems import Problem
 from service.http.state import Shared
@@ -68,7 +69,7 @@ async def _form_token(request: Request) -> str | None:
         return None
     if cookie_name(request) not in request.cookies:
         return None
-    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != FORM:
+    if media_type_of(request) != FORM:
         return None
     sent = (await request.form()).get("form_token")
     return sent if isinstance(sent, str) else None

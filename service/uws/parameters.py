@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import AsyncGenerator, Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
 from fastapi import Depends, Request
+from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, from_json
-from python_multipart.exceptions import FormParserError
-from starlette.formparsers import MultiPartException, MultiPartParser
 
 from psfcore.errors import DataError
+from service.http.forms import FORM, FormPart, Piece, chunks_of, media_type_of, pieces_of
 from service.http.problems import Problem
 from service.http.quotas import check_room
 from service.http.state import State
@@ -45,11 +45,15 @@ async def read_form(request: Request) -> dict[str, str]:
 
 async def read_pairs(request: Request) -> list[tuple[str, str]]:
     """The names and values of the fields of the address and of a form. Raises ``Problem`` if the body is not a form."""
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if media_type == "multipart/form-data":
-        sent = await _multipart(request)
+    media_type = media_type_of(request)
+    if media_type == FORM:
+        sent = await multipart_pairs(request, MAX_FORM_BYTES)
     else:
-        body = b"".join([chunk async for chunk in _bounded(request)])
+        body = b""
+        async for chunk in chunks_of(request):
+            body += chunk
+            if len(body) > MAX_FORM_BYTES:
+                raise bad(f"expected a form of at most {MAX_FORM_BYTES} bytes, got more", 413)
         if body and media_type not in ("", "application/x-www-form-urlencoded"):
             raise bad(f"expected application/x-www-form-urlencoded, got {media_type}", 415)
         try:
@@ -206,26 +210,31 @@ def single(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
     return {name: value for name, value in found.items() if value}
 
 
-async def _bounded(request: Request) -> AsyncGenerator[bytes, None]:
-    """The body, up to the largest size of a form."""
+async def multipart_pairs(
+    request: Request, most_bytes: int, keep: Callable[[list[Piece]], None] | None = None
+) -> list[tuple[str, str]]:
+    """The names and values of the fields of a multipart form, in their order.
+
+    keep: a function that takes the pieces of the files, and is called in a thread; None: the form must not contain files.
+    Raises ``Problem`` if the form is broken or too large.
+    """
+    texts: dict[FormPart, bytearray] = {}
     got = 0
-    async for chunk in request.stream():
-        got += len(chunk)
+    async for pieces in pieces_of(request, most_bytes):
+        files = [one for one in pieces if one[0].filename is not None]
+        for part, piece in pieces:
+            if part.filename is None:
+                texts.setdefault(part, bytearray()).extend(piece)
+                got += len(piece)
+        if len(texts) > MAX_FIELDS:
+            raise bad(f"expected a form of at most {MAX_FIELDS} fields; got more")
         if got > MAX_FORM_BYTES:
-            raise bad(f"expected a form of at most {MAX_FORM_BYTES} bytes, got more", 413)
-        yield chunk
-
-
-async def _multipart(request: Request) -> list[tuple[str, str]]:
-    parser = MultiPartParser(
-        request.headers,
-        _bounded(request),
-        max_files=0,
-        max_fields=MAX_FIELDS,
-        max_part_size=MAX_FORM_BYTES,
-    )
+            raise bad(f"expected fields of at most {MAX_FORM_BYTES} bytes in all, got more", 413)
+        if files and keep is None:
+            raise bad("expected a form of fields without files; got a file")
+        if files and keep is not None:
+            await run_in_threadpool(keep, files)
     try:
-        form = await parser.parse()
-    except (MultiPartException, FormParserError) as error:
-        raise bad(f"expected a form of fields without files: {error or type(error).__name__}") from error
-    return [(name, value) for name, value in form.multi_items() if isinstance(value, str)]
+        return [(part.name, text.decode()) for part, text in texts.items()]
+    except UnicodeDecodeError as error:
+        raise bad(f"expected fields of the form in UTF-8: {error}") from error

@@ -18,17 +18,15 @@ from pathlib import Path
 from typing import Annotated, BinaryIO
 
 from fastapi import Depends, Request
-from fastapi.concurrency import run_in_threadpool
-from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import MultipartParser, parse_options_header
-from starlette.requests import ClientDisconnect
 
 from service.http import uploads
 from service.http.callers import Caller, Submitting
+from service.http.forms import FORM, FormPart, Piece, media_type_of
 from service.http.quotas import Allowed
 from service.http.state import Shared, State
-from service.uws.parameters import MAX_FIELDS, MAX_FORM_BYTES, bad, read_form, single
+from service.uws.parameters import MAX_FORM_BYTES, bad, multipart_pairs, read_form, single
 from workers.contract.kinds import KINDS
+from workers.files.store import Store
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 
 # The names in UPLOAD, and for each name the parameter that gets the id of the file.
@@ -64,18 +62,21 @@ class Sent:
 
 async def _sent(request: Request, caller: Submitting, state: Shared) -> AsyncIterator[Sent]:
     """The form of a request, with its files. The temporary files are removed after the answer."""
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if media_type != "multipart/form-data":
+    if media_type_of(request) != FORM:
         form = await read_form(request)
         upload = form.pop("upload", None)
         yield Sent(form, () if upload is None else tuple(upload.split(";")))
         return
     with ExitStack() as resources:
-        receiver = _Receiver(request, state, Allowed(state, caller), resources)
-        pairs = [*request.query_params.multi_items(), *await receiver.receive()]
+        files = _Files(state.store, Allowed(state, caller), resources)
+        most = MAX_FORM_BYTES + max(state.settings.max_upload_bytes, state.settings.max_transit_bytes)
+        pairs = [
+            *request.query_params.multi_items(),
+            *await multipart_pairs(request, most, files.write),
+        ]
         wanted = [value for name, value in pairs if name.lower() == "upload" and value]
         fields = single((name, value) for name, value in pairs if name.lower() != "upload")
-        yield Sent(fields, tuple(one for value in wanted for one in value.split(";")), receiver.parts)
+        yield Sent(fields, tuple(one for value in wanted for one in value.split(";")), files.parts)
 
 
 SentForm = Annotated[Sent, Depends(_sent)]
@@ -151,119 +152,36 @@ def _addition(
     return partial(keep, image_row(*file, uploads.fits_summary(part.path, state.limits)))
 
 
-class _Receiver:
-    """Receives a multipart form: fields into memory, files to temporary paths of the store."""
+class _Files:
+    """Writes the files of a form to temporary paths of the store, and counts their bytes.
 
-    def __init__(
-        self, request: Request, state: State, take: Callable[[int], None], resources: ExitStack
-    ) -> None:
-        self._request, self._store, self._take, self._resources = request, state.store, take, resources
-        self._most_bytes = MAX_FORM_BYTES + max(
-            state.settings.max_upload_bytes, state.settings.max_transit_bytes
-        )
+    parts: the files by the names of their parts.
+    """
+
+    def __init__(self, store: Store, take: Callable[[int], None], resources: ExitStack) -> None:
+        self._store, self._take, self._resources = store, take, resources
+        self._uncounted = 0
+        self._open: dict[FormPart, BinaryIO] = {}
         self.parts: dict[str, Part] = {}
-        self._fields: list[tuple[str, str]] = []
-        self._field_bytes, self._uncounted = 0, 0
-        self._header, self._value = b"", b""
-        self._name, self._text = "", b""
-        self._filename: str | None = None
-        self._file: BinaryIO | None = None
-        self._arrived: list[tuple[Part, BinaryIO, bytes]] = []
-        self._whole = False
 
-    async def receive(self) -> list[tuple[str, str]]:
-        """The fields of the form, in their order. Raises ``Problem`` if the form is broken or too large."""
-        _, options = parse_options_header(self._request.headers.get("content-type", ""))
-        if not options.get(b"boundary"):
-            raise bad("expected a boundary in the multipart Content-Type, got none")
-        parser = MultipartParser(
-            options[b"boundary"],
-            {
-                "on_part_begin": self._begin,
-                "on_header_field": self._header_name,
-                "on_header_value": self._header_value,
-                "on_header_end": self._header_end,
-                "on_headers_finished": self._headers_finished,
-                "on_part_data": self._data,
-                "on_part_end": self._part_end,
-                "on_end": self._end,
-            },
-        )
-        got = 0
-        try:
-            async for chunk in self._request.stream():
-                got += len(chunk)
-                if got > self._most_bytes:
-                    raise bad(f"expected a form of at most {self._most_bytes} bytes, got more", 413)
-                parser.write(chunk)
-                await run_in_threadpool(self._write)
-        except FormParserError as error:
-            raise bad(f"expected multipart/form-data: {error}") from error
-        except UnicodeDecodeError as error:
-            raise bad(f"expected names and fields of the form in UTF-8: {error}") from error
-        except ClientDisconnect as error:
-            raise bad(
-                "expected the complete form; the connection closed before its end: send it again"
-            ) from error
-        if not self._whole:
-            raise bad("expected the complete form; it ended before its last boundary: send it again")
-        return self._fields
-
-    def _write(self) -> None:
-        """Write the bytes of files that have arrived, and count them."""
-        arrived, self._arrived = self._arrived, []
-        for part, file, data in arrived:
+    def write(self, pieces: list[Piece]) -> None:
+        """Write the bytes of files that have arrived."""
+        for sent, data in pieces:
+            if sent not in self._open:
+                self._begin(sent)
             self._uncounted -= len(data)
             while self._uncounted < 0:
                 self._take(COUNTED_BYTES)
                 self._uncounted += COUNTED_BYTES
+            part, file = self.parts[sent.name], self._open[sent]
             part.digest.update(data)
             part.bytes += len(data)
             file.write(data)
             file.flush()
 
-    def _begin(self) -> None:
-        self._name, self._filename, self._text, self._file = "", None, b"", None
-
-    def _header_name(self, data: bytes, start: int, end: int) -> None:
-        self._header += data[start:end]
-
-    def _header_value(self, data: bytes, start: int, end: int) -> None:
-        self._value += data[start:end]
-
-    def _header_end(self) -> None:
-        if self._header.lower() == b"content-disposition":
-            _, options = parse_options_header(self._value)
-            self._name = options.get(b"name", b"").decode()
-            if b"filename" in options:
-                self._filename = options[b"filename"].decode()
-        self._header, self._value = b"", b""
-
-    def _headers_finished(self) -> None:
-        if not self._name:
-            raise bad("expected a name for every part of the form; got a part without one")
-        if self._filename is None:
-            return
-        if self._name in self.parts or len(self.parts) == MOST_FILES:
+    def _begin(self, sent: FormPart) -> None:
+        if sent.name in self.parts or len(self.parts) == MOST_FILES:
             raise bad(f"expected at most {MOST_FILES} files in parts of different names; got more")
         path = self._resources.enter_context(self._store.temporary())
-        self._file = self._resources.enter_context(path.open("wb"))
-        self.parts[self._name] = Part(uploads.label(self._filename), path)
-
-    def _data(self, data: bytes, start: int, end: int) -> None:
-        if self._file is not None:
-            self._arrived.append((self.parts[self._name], self._file, data[start:end]))
-            return
-        self._field_bytes += end - start
-        if self._field_bytes > MAX_FORM_BYTES:
-            raise bad(f"expected fields of at most {MAX_FORM_BYTES} bytes in all, got more", 413)
-        self._text += data[start:end]
-
-    def _part_end(self) -> None:
-        if self._file is None:
-            if len(self._fields) == MAX_FIELDS:
-                raise bad(f"expected a form of at most {MAX_FIELDS} fields; got more")
-            self._fields.append((self._name, self._text.decode()))
-
-    def _end(self) -> None:
-        self._whole = True
+        self._open[sent] = self._resources.enter_context(path.open("wb"))
+        self.parts[sent.name] = Part(uploads.label(sent.filename), path)

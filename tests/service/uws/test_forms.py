@@ -131,7 +131,6 @@ BROKEN: list[tuple[str, str, bytes, str]] = [
     ("no form", BOUNDARY, b"no boundary", "expected multipart/form-data"),
     ("twice", BOUNDARY, PART * 2 + b"--x--", "in parts of different names"),
     ("no name", BOUNDARY, PART.replace(b'name="f"; ', b"") + b"--x--", "expected a name for every part"),
-    ("name of a file", BOUNDARY, PART.replace(b'"a"', b'"\xff"') + b"--x--", "in UTF-8"),
     ("field", BOUNDARY, b'--x\r\nContent-Disposition: form-data; name="a"\r\n\r\n\xff\r\n--x--', "in UTF-8"),
 ]
 
