@@ -8,39 +8,70 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from dataclasses import field, replace
+from collections.abc import Sequence
+from dataclasses import field, is_dataclass, replace
+from decimal import Decimal
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self, get_args, get_type_hints
+
+from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
+from pydantic_core import ErrorDetails
+from typing_extensions import TypedDict
 
 from psfcore.errors import DataError
-from psfcore.instruments.checked import BadValues, Checked, Fault, Limit
 from psfcore.instruments.files import instrument_path
 
 _MOST_DOTS = 64  # a part of the file without brackets, commas or line ends may contain this number of dots
 
-Positive = Annotated[float, Limit(gt=0)]
+
+def _no_text(value: Any) -> Any:
+    """Refuse a text and a boolean, which pydantic would convert to a whole number."""
+    if isinstance(value, str | bool):
+        raise ValueError("expected a whole number")
+    return value
+
+
+# The schemas of the tables are built when the first instrument is read, because that takes longer than the import.
+_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, defer_build=True)
+Number = Annotated[float, Field(strict=True)]
+Whole = Annotated[int, BeforeValidator(_no_text)]
+Positive = Annotated[Number, Field(gt=0)]
 # The software multiplies and divides lengths. Within these limits no product or quotient overflows or becomes 0. All
 # telescopes from X-rays to the far infrared are well within these limits, in the units of the keys.
 _LEAST, _MOST = 1e-9, 1e9
-Size = Annotated[float, Limit(ge=_LEAST, le=_MOST)]
-SizeOrNone = Annotated[float, Limit(ge=0, le=_MOST)]
-Number = float
-Place = Annotated[float, Limit(ge=-_MOST, le=_MOST)]
-Count = Annotated[int, Limit(ge=1, le=100_000)]
+Size = Annotated[Number, Field(ge=_LEAST, le=_MOST)]
+SizeOrNone = Annotated[Number, Field(ge=0, le=_MOST)]
+Place = Annotated[Number, Field(ge=-_MOST, le=_MOST)]
+Count = Annotated[Whole, Field(ge=1, le=100_000)]
 # The numbers of parts of an instrument. Memory and time of a PSF grow with them; the shipped instruments have at most 3
 # meshes of 551 windows, 8 rays, 2 rings and 1 spectral line.
 MOST_BYTES = 65_536
 MOST_LINES, MOST_MIRRORS, MOST_MESHES, MOST_WINDOWS = 64, 16, 16, 10_000
 MOST_RAYS, MOST_RINGS, MOST_POLYGONS, MOST_CORNERS = 256, 64, 64, 1024
 MOST_KEYS = 64
-Windows = Annotated[int, Limit(ge=1, le=MOST_WINDOWS)]
-Name = Annotated[str, Limit(max_length=80)]
-Share = Annotated[float, Limit(gt=0, lt=1)]
-MatchKey = Literal["TELESCOP", "INSTRUME", "DETECTOR", "FILTER", "EC_FW1_", "EC_FW2_", "WAVELNTH", "CDELT1"]
-_NUMBERS = ("WAVELNTH", "CDELT1")
+Windows = Annotated[Whole, Field(ge=1, le=MOST_WINDOWS)]
+Name = Annotated[str, Field(max_length=80)]
+Share = Annotated[Number, Field(gt=0, lt=1)]
 
 
-class GainMode(Checked):
+class Match(TypedDict, total=False):
+    """The cards of the images of an instrument."""
+
+    __pydantic_config__ = _CONFIG  # type: ignore[misc]
+
+    TELESCOP: Name
+    INSTRUME: Name
+    DETECTOR: Name
+    FILTER: Name
+    EC_FW1_: Name
+    EC_FW2_: Name
+    WAVELNTH: Size
+    CDELT1: Size
+
+
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class GainMode:
     """Saturation and noise of one readout mode. ``basis``: the origin of the numbers."""
 
     saturation_dn: Positive | None = None
@@ -49,40 +80,44 @@ class GainMode(Checked):
     basis: Literal["published", "measured", "assumed"]
 
 
-class Detector(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Detector:
     """The sensor. The keys of ``gain_modes`` are the values of the header keyword GAINCOMB."""
 
     pixel_pitch_um: Size
     pixels: Count
     readout_pixels: Count
     plate_scale_arcsec: Size
-    gain_modes: Annotated[dict[Name, GainMode], Limit(max_length=MOST_KEYS)] = field(default_factory=dict)
+    gain_modes: Annotated[dict[Name, GainMode], Field(max_length=MOST_KEYS)] = field(default_factory=dict)
 
 
-class Aperture(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Aperture:
     """The entrance pupil: a disc, or a ring where the centre is obscured."""
 
     diameter_mm: Size
     obscuration_diameter_mm: SizeOrNone = 0.0
 
-    def check(self) -> str | None:
-        """The obscuration must be smaller than the aperture."""
-        if self.obscuration_diameter_mm < self.diameter_mm:
-            return None
-        return (
-            f"expected obscuration_diameter_mm less than diameter_mm ({self.diameter_mm}); "
-            f"got {self.obscuration_diameter_mm}"
-        )
+    @model_validator(mode="after")
+    def _obscuration_is_smaller(self) -> Self:
+        if self.obscuration_diameter_mm >= self.diameter_mm:
+            raise ValueError(
+                f"expected obscuration_diameter_mm less than diameter_mm ({self.diameter_mm}); "
+                f"got {self.obscuration_diameter_mm}"
+            )
+        return self
 
 
-class SpectralLine(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class SpectralLine:
     """A spectral line of the bandpass and its share of the light; the shares are normalised to sum 1."""
 
     wavelength_angstrom: Size
     weight: Size
 
 
-class Mirror(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Mirror:
     """A conic mirror. Its sag is r^2 / (R (1 + sqrt(1 - (1 + K) r^2 / R^2)))."""
 
     name: Name
@@ -92,7 +127,8 @@ class Mirror(Checked):
     figure: Literal["concave", "convex"]
 
 
-class Distances(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Distances:
     """Distances along the optical path, as the drawings give them."""
 
     aperture_to_primary_mm: Size
@@ -101,7 +137,8 @@ class Distances(Checked):
     filter_wheel_to_detector_mm: Size
 
 
-class Mesh(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Mesh:
     """A square mesh that supports a filter.
 
     ``windows``: number of windows of the diffraction series in each direction. At the entrance, this is the diameter of
@@ -115,65 +152,70 @@ class Mesh(Checked):
     wire_um: Size
     windows: Windows
     angle_deg: Number = 0.0
-    share: Annotated[float, Limit(gt=0, le=1)] = 1.0
+    share: Annotated[Number, Field(gt=0, le=1)] = 1.0
 
-    def check(self) -> str | None:
-        """The wires must be thinner than the pitch."""
-        if self.wire_um < self.pitch_um:
-            return None
-        return f"expected wire_um less than pitch_um ({self.pitch_um}); got {self.wire_um}"
+    @model_validator(mode="after")
+    def _wires_are_thinner_than_the_pitch(self) -> Self:
+        if self.wire_um >= self.pitch_um:
+            raise ValueError(f"expected wire_um less than pitch_um ({self.pitch_um}); got {self.wire_um}")
+        return self
 
 
-class Rays(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Rays:
     """Straight bars from the hub (or the centre) to the rim, at equal angles."""
 
-    count: Annotated[int, Limit(ge=1, le=MOST_RAYS)]
+    count: Annotated[Whole, Field(ge=1, le=MOST_RAYS)]
     width_mm: Size
     first_angle_deg: Number = 0.0
 
 
-class Ring(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Ring:
     """A circular bar; ``radius_mm`` is the radius of its centre line."""
 
     radius_mm: Size
     width_mm: Size
 
 
-class Polygon(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Polygon:
     """An opaque polygon with corners (x, y) in mm from the centre of the aperture."""
 
-    corners_mm: Annotated[tuple[tuple[Place, Place], ...], Limit(min_length=3, max_length=MOST_CORNERS)]
+    corners_mm: Annotated[tuple[tuple[Place, Place], ...], Field(min_length=3, max_length=MOST_CORNERS)]
 
 
-class MaskImage(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class MaskImage:
     """A mask as a FITS or PNG image centred on the aperture: 0 is opaque, the largest value is open.
 
     ``file`` is the name of a file in the folder of the instrument file.
     """
 
-    file: Annotated[str, Limit(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*\.(png|fits|fits\.gz)$")]
+    file: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*\.(png|fits|fits\.gz)$")]
     width_mm: Size
 
 
-class Mount(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Mount:
     """The mount of the entrance filter. ``basis``: the origin of its description."""
 
     basis: Literal["drawing", "assumed"]
-    rays: Annotated[tuple[Rays, ...], Limit(max_length=MOST_RAYS)] = ()
-    rings: Annotated[tuple[Ring, ...], Limit(max_length=MOST_RINGS)] = ()
+    rays: Annotated[tuple[Rays, ...], Field(max_length=MOST_RAYS)] = ()
+    rings: Annotated[tuple[Ring, ...], Field(max_length=MOST_RINGS)] = ()
     hub_diameter_mm: SizeOrNone = 0.0
-    polygons: Annotated[tuple[Polygon, ...], Limit(max_length=MOST_POLYGONS)] = ()
+    polygons: Annotated[tuple[Polygon, ...], Field(max_length=MOST_POLYGONS)] = ()
     mask_image: MaskImage | None = None
 
-    def check(self) -> str | None:
-        """The total number of rays, and of corners of polygons, is limited."""
+    @model_validator(mode="after")
+    def _parts_are_limited(self) -> Self:
         for most, got, parts in (
             (MOST_RAYS, self.ray_count, "rays"),
             (MOST_CORNERS, self.corner_count, "corners of polygons"),
         ):
             if got > most:
-                return f"expected at most {most} {parts} in all; got {got}"
-        return None
+                raise ValueError(f"expected at most {most} {parts} in all; got {got}")
+        return self
 
     @property
     def ray_count(self) -> int:
@@ -186,7 +228,8 @@ class Mount(Checked):
         return sum(len(polygon.corners_mm) for polygon in self.polygons)
 
 
-class Scatter(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Scatter:
     """The softened power law a / (b + r)^c; ``total`` is its sum over r > 0 on the full reach."""
 
     b_px: Positive
@@ -195,55 +238,41 @@ class Scatter(Checked):
     basis: Literal["published", "fitted", "inferred"]
 
 
-class Instrument(Checked):
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Instrument:
     """An instrument: all quantities from which a PSF is computed.
 
     ``turn_deg``: the angle from the +x axis of the detector to that of the images, degrees. The angles and corners of a read
     instrument are those on the images.
     """
 
-    name: Annotated[str, Limit(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
-    version: Annotated[str, Limit(pattern=r"^\d+\.\d+\.\d+$")]
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
+    version: Annotated[str, Field(pattern=r"^\d+\.\d+\.\d+$")]
     status: Literal["draft", "released"]
     wavelength_angstrom: Size
-    bandpass: Annotated[tuple[SpectralLine, ...], Limit(max_length=MOST_LINES)] = ()
+    bandpass: Annotated[tuple[SpectralLine, ...], Field(max_length=MOST_LINES)] = ()
     focal_length_mm: Size
     turn_deg: Number = 0.0
-    match: dict[MatchKey, Name | Size] = field(default_factory=dict)
+    match: Match = field(default_factory=Match)
     aperture: Aperture
-    mirrors: Annotated[tuple[Mirror, ...], Limit(max_length=MOST_MIRRORS)] = ()
+    mirrors: Annotated[tuple[Mirror, ...], Field(max_length=MOST_MIRRORS)] = ()
     distances: Distances | None = None
-    meshes: Annotated[tuple[Mesh, ...], Limit(max_length=MOST_MESHES)] = ()
+    meshes: Annotated[tuple[Mesh, ...], Field(max_length=MOST_MESHES)] = ()
     mount: Mount | None = None
     detector: Detector
     scatter: Scatter | None = None
 
-    def check(self) -> None:
-        """Check that WAVELNTH and CDELT1 of the table [match] are numbers and its other keys are texts.
-
-        Check also that no spectral line is so weak that its weight cannot be normalised.
-        """
-        wrong = [
-            Fault(("match", key), f"expected {'a number' if key in _NUMBERS else 'a text'}", value)
-            for key, value in self.match.items()
-            if isinstance(value, str) == (key in _NUMBERS)
-        ]
+    @model_validator(mode="after")
+    def _values_fit_together(self) -> Self:
         total = sum(line.weight for line in self.bandpass)
-        wrong += [
-            Fault(
-                ("bandpass", k, "weight"),
-                f"expected at least {_LEAST:g} of the sum of all weights",
-                line.weight,
-            )
-            for k, line in enumerate(self.bandpass)
-            if line.weight < _LEAST * total
-        ]
+        for k, line in enumerate(self.bandpass):
+            if line.weight < _LEAST * total:
+                raise ValueError(
+                    f"bandpass.{k}.weight: expected at least {_LEAST:g} of the sum of all weights; got {line.weight}"
+                )
         if self.turn_deg and self.mount is not None and self.mount.mask_image is not None:
-            wrong.append(
-                Fault(("turn_deg",), "expected 0, because a mask image is not turned", self.turn_deg)
-            )
-        if wrong:
-            raise BadValues(wrong)
+            raise ValueError(f"turn_deg: expected 0, because a mask image is not turned; got {self.turn_deg}")
+        return self
 
     def on_images(self) -> Instrument:
         """The instrument as images that are turned by ``turn_deg`` show it: a direction on them is smaller by this angle."""
@@ -319,28 +348,82 @@ def parse_instrument(text: str, label: str) -> Instrument:
     if len(text) > MOST_BYTES:
         raise DataError("bad-instrument-file", f"{label}: expected at most {MOST_BYTES} characters; got more")
     try:
-        return Instrument.read(_parse_toml(text)).on_images()
-    except BadValues as error:
+        instrument: Instrument = _FILE.validate_python(_parse_toml(text))
+    except ValidationError as error:
         raise DataError("bad-instrument-file", f"{label}: {_said(error)}") from None
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
         # An integer of thousands of digits raises ValueError; deeply nested lists raise RecursionError.
         deep = isinstance(error, RecursionError)
         reason = "too many levels of nesting" if deep else " ".join(str(error).split())
         raise DataError("bad-instrument-file", f"{label}: expected TOML; {reason:.200}") from None
+    return instrument.on_images()
 
 
-def _said(error: BadValues) -> str:
-    """The first fault in one line, and how many further faults there are."""
-    first, more = error.faults[0], len(error.faults) - 1
-    key = ".".join(map(str, first.key)) or "file"
-    # If the fault concerns a whole table, its text already says what was given. A missing key has no value.
-    if "; got " in first.expected:
-        got = ""
-    elif first.got is None:
-        got = "; got none"
-    else:
-        got = f"; got {first.got!r:.80}"
-    return f"{key}: {first.expected}{got}" + (f" (and {more} more)" if more else "")
+_FILE: TypeAdapter[Instrument] = TypeAdapter(Instrument)
+_UNKNOWN = ("unexpected_keyword_argument", "extra_forbidden")
+# What was expected, by the type of pydantic's error.
+_EXPECTED = {
+    "missing": "this key",
+    "float_type": "a finite number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "int_parsing_size": "a whole number of at most 19 digits",
+    "greater_than": "a number above {gt}",
+    "greater_than_equal": "a number of at least {ge}",
+    "less_than_equal": "a number of at most {le}",
+    "less_than": "a number below {lt}",
+    "string_type": "a text",
+    "string_too_long": "at most {max_length} characters",
+    "string_pattern_mismatch": "a text of the form {pattern}",
+    "literal_error": "one of {expected}",
+    "tuple_type": "a list",
+    "too_short": "at least {min_length} entries",
+    "too_long": "at most {max_length} entries",
+    "dict_type": "a table",
+    "dataclass_type": "a table",
+}
+
+
+def _said(error: ValidationError) -> str:
+    """The first fault in one line, and how many further faults there are.
+
+    A misspelt key is named before other faults: it is often the reason why another key is missing.
+    """
+    first, *more = sorted(error.errors(include_url=False), key=lambda one: one["type"] not in _UNKNOWN)
+    # pydantic marks the name of a gain mode itself, unlike its table, by one more step.
+    key = ".".join(str(step) for step in first["loc"] if step != "[key]")
+    expected = _expected(first)
+    if "; got " not in expected:  # a fault of several values says itself what was given
+        expected += "; got none" if first["type"] == "missing" else f"; got {first['input']!r:.80}"
+    return (f"{key}: {expected}" if key else expected) + (f" (and {len(more)} more)" if more else "")
+
+
+def _expected(fault: ErrorDetails) -> str:
+    context = fault.get("ctx", {})
+    if fault["type"] in _UNKNOWN:
+        return f"expected one of the keys {', '.join(_keys(fault['loc'][:-1]))}"
+    if fault["type"] == "missing" and isinstance(fault["loc"][-1], int):
+        return "expected this entry"
+    if fault["type"] == "value_error":
+        return str(context["error"])
+    bounds = {
+        name: f"{Decimal(repr(bound)).normalize():f}" if isinstance(bound, int | float) else bound
+        for name, bound in context.items()
+    }
+    return f"expected {_EXPECTED.get(fault['type'], 'another value').format(**bounds)}"
+
+
+def _keys(location: Sequence[str | int]) -> list[str]:
+    """The keys of the table at a location."""
+    table: Any = Instrument
+    for step in location:
+        kind = get_type_hints(table).get(
+            str(step)
+        )  # None: the number of an entry, or the name of a gain mode
+        if kind is not None:
+            table = next(one for one in (kind, *get_args(kind)) if is_dataclass(one) or one is Match)
+    return list(get_type_hints(table))
 
 
 def _parse_toml(text: str) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def test_the_functions_load_no_server() -> None:
 def test_the_core_needs_no_extra() -> None:
     loaded = loaded_by("from heliopsf import deconvolve, build_psf, psf_for, Psf, Deconvolution")
     assert "psfcore.build" in loaded
-    assert loaded & {"pydantic", "threadpoolctl", "matplotlib", "sunpy", "jinja2", "click"} == set()
+    assert loaded & {"threadpoolctl", "matplotlib", "sunpy", "jinja2", "click"} == set()
 
 
 def test_every_name_is_there_with_a_docstring_and_no_other() -> None:

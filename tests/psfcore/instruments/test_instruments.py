@@ -98,7 +98,7 @@ FAULTS = [
     (BASIS, BASIS + '\nmask_image = { file = "../secret.png", width_mm = 50.0 }', "mount.mask_image.file"),
     (BASIS, BASIS + "\npolygons = [{ corners_mm = [[0, 1], [1, 0]] }]", "corners_mm"),
     ('DETECTOR = "HRI_EUV"', "DETECTOR = 174", "match.DETECTOR: expected a text; got 174"),
-    ('DETECTOR = "HRI_EUV"', 'WAVELNTH = "174"', "match.WAVELNTH: expected a number; got '174'"),
+    ('DETECTOR = "HRI_EUV"', 'WAVELNTH = "174"', "match.WAVELNTH: expected a finite number; got '174'"),
     ('DETECTOR = "HRI_EUV"', 'OBJECT = "Sun"', "match.OBJECT"),
     ('name = "hri_euv"', "name = ", "TOML"),
 ]

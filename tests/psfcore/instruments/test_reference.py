@@ -6,11 +6,12 @@ import re
 import types
 import typing
 from collections.abc import Iterator
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from psfcore.instruments.checked import Checked, Limit, annotations_of
+from pydantic.fields import FieldInfo
+
 from psfcore.instruments.model import Instrument, parse_instrument
 
 REFERENCE = (Path(__file__).parents[3] / "docs" / "instruments.md").read_text("utf-8")
@@ -50,22 +51,22 @@ def inner(annotation: Any) -> Any:
     return annotation
 
 
-def models(annotation: Any) -> Iterator[tuple[str, type[Checked]]]:
+def models(annotation: Any) -> Iterator[tuple[str, Any]]:
     """The models inside an annotation, with how a key below them is written."""
     annotation = inner(annotation)
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
-    if isinstance(annotation, type) and issubclass(annotation, Checked):
+    if is_dataclass(annotation):
         yield ".", annotation
-    elif origin is tuple and isinstance(arguments[0], type) and issubclass(arguments[0], Checked):
+    elif origin is tuple and is_dataclass(arguments[0]):
         yield "[].", arguments[0]
-    elif origin is dict and isinstance(arguments[1], type) and issubclass(arguments[1], Checked):
+    elif origin is dict and is_dataclass(arguments[1]):
         yield ".MODE.", arguments[1]
 
 
-def accepted(model: type[Checked] = Instrument, before: str = "") -> Iterator[tuple[str, Key]]:
+def accepted(model: Any = Instrument, before: str = "") -> Iterator[tuple[str, Key]]:
     """Every key that the model accepts, as the reference writes it."""
-    annotations = annotations_of(model)
-    for field in fields(model):  # type: ignore[arg-type]
+    annotations = typing.get_type_hints(model, include_extras=True)
+    for field in fields(model):
         key, annotation = before + field.name, annotations[field.name]
         default = field.default if field.default_factory is MISSING else field.default_factory()
         yield key, Key(annotation, default)
@@ -98,10 +99,10 @@ def test_the_reference_states_the_limits_of_a_key() -> None:
     for key, field in KEYS.items():
         stated, low, high = documented()[key]["limits"], "", ""
         for limit in limits_of(field.annotation):
-            low = low if limit.ge is None else f"{limit.ge:g}"
-            low = low if limit.gt is None else f"> {limit.gt:g}"
-            high = high if limit.le is None else f"<= {limit.le:g}"
-            high = high if limit.lt is None else f"< {limit.lt:g}"
+            low = f"{limit.ge:g}" if hasattr(limit, "ge") else low
+            low = f"> {limit.gt:g}" if hasattr(limit, "gt") else low
+            high = f"<= {limit.le:g}" if hasattr(limit, "le") else high
+            high = f"< {limit.lt:g}" if hasattr(limit, "lt") else high
         if low and not low.startswith(">"):
             assert stated.startswith(plain(low) + " to " + plain(high.removeprefix("<= "))), key
         elif low:
@@ -110,9 +111,10 @@ def test_the_reference_states_the_limits_of_a_key() -> None:
             assert f"`{choice}`" in stated, key
 
 
-def limits_of(annotation: Any) -> list[Limit]:
+def limits_of(annotation: Any) -> list[Any]:
     """The limits of a value, also where the key may be left out."""
-    found = [one for one in getattr(annotation, "__metadata__", ()) if isinstance(one, Limit)]
+    infos = [one for one in getattr(annotation, "__metadata__", ()) if isinstance(one, FieldInfo)]
+    found = [limit for info in infos for limit in info.metadata]
     for argument in typing.get_args(annotation) if typing.get_origin(annotation) is types.UnionType else ():
         found += limits_of(argument)
     return found
