@@ -181,6 +181,8 @@ def walk(source: Source, limits: FitsLimits) -> Iterator[Hdu]:
         header_bytes += len(raw)
         header = _parse(raw, number)
         hdu = Hdu(header, number, _kind(header, number), source.position)
+        if hdu.kind != "image":  # the size of an image is checked by its pixels first
+            _check_size(source, hdu, limits)
         yield hdu
         skip_data(source, hdu, limits)
         source.skip(-hdu.end % BLOCK_BYTES)
@@ -210,17 +212,23 @@ def first_image(hdus: Iterator[Hdu], limits: FitsLimits, number: int | None = No
 
 def skip_data(source: Source, hdu: Hdu, limits: FitsLimits) -> None:
     """Skip what is left of the data of an HDU. Raises HeaderError if the file does not hold all of them."""
+    _check_size(source, hdu, limits)
     size = hdu.end - source.position
+    there = source.skip(size)
+    if there < size:
+        wanted = f"expected {size} bytes of data in HDU {hdu.number}, as its header declares"
+        raise HeaderError("truncated-data", f"{wanted}; got {there}: copy the file again")
+
+
+def _check_size(source: Source, hdu: Hdu, limits: FitsLimits) -> None:
+    """Raise HeaderError "too-many-bytes" if too many bytes would have to be decompressed to skip the data of an HDU."""
+    size = hdu.end - hdu.start
     if source.gzipped and size > limits.max_pixels * 16:
         message = (
             f"expected at most {limits.max_pixels * 16} bytes of data in an HDU; HDU {hdu.number} declares "
             f"{size}"
         )
         raise HeaderError("too-many-bytes", message)
-    there = source.skip(size)
-    if there < size:
-        wanted = f"expected {size} bytes of data in HDU {hdu.number}, as its header declares"
-        raise HeaderError("truncated-data", f"{wanted}; got {there}: copy the file again")
 
 
 def _counted(kinds: list[str]) -> str:
