@@ -34,7 +34,7 @@ Saturation = Annotated[
     Field(
         gt=0,
         allow_inf_nan=False,
-        description="pixels at or above this level are not used; null: the level of the header or instrument file",
+        description="pixels at or above this level (DN) are not used; null: the level of the header or instrument file",
     ),
 ]
 Component = Literal["airy", "entrance_mesh", "mount", "entrance", "filter_wheel", "diffraction", "scatter"]
