@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
 from psfcore.errors import DataError
@@ -26,7 +26,7 @@ def check_is_psf(path: str | Path, summary: HeaderSummary, limits: FitsLimits) -
             "expected a PSF; the header (PSFID) says that the file is a deconvolved image: name the file of a PSF",
         )
     most = [limits.max_pixels, limits.max_header_bytes, limits.max_hdus]
-    with TemporaryFile() as unused:
+    with open(os.devnull, "wb") as unused:
         run_limited(read_weights, path, unused, pixels=math.prod(summary.shape), most=most)
 
 
