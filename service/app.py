@@ -60,6 +60,7 @@ from workers.settings import Settings, software_version
 
 CUTOUTS_AT_ONCE = 2
 DECODED_AT_ONCE = 2
+INSPECTED_AT_ONCE = 2
 
 
 def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
@@ -95,6 +96,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
             requests,
             cutouts=anyio.CapacityLimiter(CUTOUTS_AT_ONCE),
             decoding=anyio.CapacityLimiter(DECODED_AT_ONCE),
+            inspecting=anyio.CapacityLimiter(INSPECTED_AT_ONCE),
             planes=Planes(store.temporary),
         )
         reconciler.start()

@@ -41,6 +41,8 @@ class State:
     cutouts: anyio.CapacityLimiter
     # The same for decoding planes and headers.
     decoding: anyio.CapacityLimiter
+    # The same for the inspection of uploads.
+    inspecting: anyio.CapacityLimiter
     planes: Planes
     started_at: float = field(default_factory=time.time)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+import anyio.to_thread
 from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
 
@@ -27,6 +28,7 @@ from psfcore.transit.archive import (
 )
 from service.http.forms import FORM, FormPart, chunks_of, media_type_of, pieces_of
 from service.http.problems import Problem, problem
+from service.http.state import state_of
 from workers.files.store import Store
 
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
@@ -164,7 +166,8 @@ async def _receive(
         if size == 0:
             raise Problem(400, "empty-upload", f"expected {expected.what}; got 0 bytes: check the file")
         expected.recognise(start, whole=True)
-        found = await run_in_threadpool(expected.inspect, path)
+        limiter = state_of(request).inspecting
+        found = await anyio.to_thread.run_sync(expected.inspect, path, limiter=limiter)
         yield Upload(path, digest.hexdigest(), size, filename, found)
 
 

@@ -8,6 +8,7 @@ import select
 import socket
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import takewhile
@@ -17,7 +18,10 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from psfcore.fits.header import FitsLimits, HeaderSummary
 from service.app import create_app
+from service.http import uploads
+from tests.conftest import write_image
 from tests.service.conftest import refusal, settings_in
 from tests.service.keyed import Keyed, bearer, keyed
 from tests.service.serving import serving
@@ -229,3 +233,26 @@ def test_a_caller_holds_only_so_many_requests(settings: Settings) -> None:
             assert ann.get(path).status_code in (200, 422)
         held.close(who)
         assert held.total() == 0
+
+
+def test_inspections_of_uploads_do_not_use_the_threads_of_other_requests(
+    api: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More files than the server has threads are inspected at once, and none of the inspections ends."""
+    write_image(tmp_path / "image.fits")
+    content = (tmp_path / "image.fits").read_bytes()
+    let_end = threading.Event()
+    inspect = uploads.read_summary
+
+    def slow(path: Path, limits: FitsLimits) -> HeaderSummary:
+        let_end.wait(60.0)
+        return inspect(path, limits)
+
+    monkeypatch.setattr(uploads, "read_summary", slow)
+    with ThreadPoolExecutor(64) as pool:
+        sent = [pool.submit(api.post, "/v1/images", content=content) for _ in range(60)]
+        try:
+            assert pool.submit(api.get, "/v1/images").exception(10.0) is None
+        finally:
+            let_end.set()
+        assert {one.result().status_code for one in sent} <= {200, 201}
