@@ -24,20 +24,22 @@ pytest_plugins = ("tests.chromium", "tests.shared_stack")
 # The files that take longest, so that they are begun first: begun last, one of them would leave a core idle.
 LONGEST_FIRST = (
     "psfcore/gap/test_diagnose.py",
-    "service/pages/browser/test_viewer.py",
+    "service/pages/browser/test_every_page.py",
     "psfcore/test_build.py",
-    "service/pages/browser/test_waiting.py",
+    "psfcore/scatter/test_fit.py",
     "whole/test_killed.py",
-    "service/pages/reports/test_shown.py",
-    "service/cli/gap/test_diagnose.py",
+    "service/pages/browser/test_viewer.py",
+    "service/pages/browser/test_waiting.py",
+    "service/pages/browser/test_login.py",
     "workers/tasks/test_transit_jobs.py",
-    "workers/tasks/test_gap.py",
-    "service/pages/browser/test_way_through.py",
-    "service/api/bulk/test_bulk.py",
+    "service/pages/browser/test_bulk.py",
+    "service/pages/browser/test_product.py",
+    "service/cli/gap/test_diagnose.py",
     "workers/files/test_collection.py",
-    "psfcore/gap/verdict/test_correction.py",
-    "psfcore/report/test_report.py",
-    "psfcore/gap/evidence/test_search.py",
+    "fuzz/test_fuzz.py",
+    "service/pages/browser/test_way_through.py",
+    "workers/run/test_stopping.py",
+    "service/api/bulk/test_bulk.py",
 )
 
 # Files that use the same fits and diagnoses: one process runs all files of a row, so that it computes these once.
