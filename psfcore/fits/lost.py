@@ -29,7 +29,9 @@ _NO_SUN = ("dark", "bias", "led", "flat", "calib", "offset", "pinhole")
 
 def lost_pixels(pixels: NDArray[np.float64], header: Cards) -> NDArray[np.bool_] | None:
     """True for the pixels [y, x] that hold the value of a lost pixel; None if there are none."""
-    smallest = float(np.min(pixels, where=np.isfinite(pixels), initial=np.inf))
+    smallest = float(pixels.min())
+    if not np.isfinite(smallest):
+        smallest = float(np.min(pixels, where=np.isfinite(pixels), initial=np.inf))
     blank = optional_number(header, "BLANK")
     if blank is not None and smallest == blank < 0:
         return pixels == smallest

@@ -131,8 +131,8 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
             "all-saturated",
             f"expected pixels below saturation; all finite pixels are at {level:g} or above: check the level",
         )
-    smallest = float(np.min(image.pixels, where=valid, initial=np.inf))
-    largest = float(np.max(image.pixels, where=valid, initial=-np.inf))
+    values = image.pixels if valid.all() else image.pixels[valid]
+    smallest, largest = float(values.min()), float(values.max())
     if smallest == largest <= 0:
         raise DataError("no-signal", f"expected light; all pixels are {largest:g}: use another image")
     if smallest == largest and stored_as_integer and largest in _FULL_SCALES:
