@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,14 +26,13 @@ def check_is_psf(path: str | Path, summary: HeaderSummary, limits: FitsLimits) -
             "image-as-psf",
             "expected a PSF; the header (PSFID) says that the file is a deconvolved image: name the file of a PSF",
         )
-    most = [limits.max_pixels, limits.max_header_bytes, limits.max_hdus]
     with open(os.devnull, "wb") as unused:
-        run_limited(read_weights, path, unused, pixels=math.prod(summary.shape), most=most)
+        run_limited(read_weights, path, unused, pixels=math.prod(summary.shape), limits=asdict(limits))
 
 
-def read_weights(target: BinaryIO, *, path: str, most: list[int]) -> dict[str, Any]:
+def read_weights(target: BinaryIO, *, path: str, limits: dict[str, int]) -> dict[str, Any]:
     """Read a PSF and check it. Nothing is written to ``target``. Raises the errors of `psfcore.fits.psfs.read_psf`."""
     from psfcore.fits.psfs import read_psf  # loads the numerical libraries
 
-    read_psf(path, FitsLimits(*most), parts=False)
+    read_psf(path, FitsLimits(**limits), parts=False)
     return {}

@@ -7,6 +7,7 @@ masked.
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,17 +30,16 @@ def decode_plane(path: str | Path, name: str, limits: FitsLimits, target: Binary
     """
     hdu = None if name == IMAGE else _number_of_plane(path, name.upper(), limits)
     shape = read_summary(path, limits, hdu=hdu).shape
-    most = [limits.max_pixels, limits.max_header_bytes, limits.max_hdus]
-    answer = run_limited(write_pixels, path, target, pixels=math.prod(shape), hdu=hdu, most=most)
+    answer = run_limited(write_pixels, path, target, pixels=math.prod(shape), hdu=hdu, limits=asdict(limits))
     return Decoded(shape, answer["unit"])
 
 
-def write_pixels(target: BinaryIO, *, path: str, hdu: int | None, most: list[int]) -> dict[str, Any]:
+def write_pixels(target: BinaryIO, *, path: str, hdu: int | None, limits: dict[str, int]) -> dict[str, Any]:
     """Write the pixels of an image to ``target`` as little-endian float32; returns its unit. Call it in a limited process."""
     from psfcore.fits.hdus import ascii_text, read_pixels  # loads the numerical libraries
 
-    limits = FitsLimits(*most)
-    pixels, header = read_pixels(path, read_summary(path, limits, hdu=hdu), limits)
+    most = FitsLimits(**limits)
+    pixels, header = read_pixels(path, read_summary(path, most, hdu=hdu), most)
     target.write(pixels.astype("<f4").data)
     unit = optional_text(header, "BUNIT")
     return {"unit": None if unit is None else ascii_text(unit)[:_LONGEST_UNIT]}
