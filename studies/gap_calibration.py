@@ -29,7 +29,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from heliopsf.psfs import LIMITS
 from psfcore.blind.case_set import BlindSet, SetPlan, make_set
-from psfcore.blind.score_table import wilson
+from psfcore.blind.score import wilson
 from psfcore.blind.scoring import required_names
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import linear_model_of

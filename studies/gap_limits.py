@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from heliopsf.psfs import LIMITS
-from psfcore.blind.score_table import wilson
+from psfcore.blind.score import wilson
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import linear_model_of
 from psfcore.gap.effect import Effect

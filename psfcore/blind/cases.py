@@ -111,7 +111,7 @@ def draw_case(
     glass = _glass(size_px, rng, built_diffraction)
     headroom = float(rng.uniform(1.2, 2.0)) if rng.random() < _SATURATING_SHARE else None
     own = np.random.default_rng([seed, number, _EFFECT_STREAM])
-    effects = [effect_named(name).drawn(effect_named(name).nominal, plan, own) for name in names]
+    effects = [effect_named(name).drawn(plan, own) for name in names]
     targets: list[float | None] = []
     for n, (low, high) in enumerate(ranges):
         value = float(np.exp(own.uniform(np.log(low), np.log(high))))

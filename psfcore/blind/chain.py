@@ -3,7 +3,7 @@
     fine light = spread(P (S - h))  ->  light()  ->  binned  ->  expected()  ->  photons, read noise  ->  read_out()  ->  whole DN
 
 S is the scene, h is the part of S that the occulter hides, and P is the convolution with the PSF. "binned" averages the fine
-pixels of each detector pixel; the other names are methods of `effects.effect.Effect`. Because P is linear, the scene of a
+pixels of each detector pixel; the other names are steps of `effects.effect.Kind`. Because P is linear, the scene of a
 pointing is convolved only once. For each image, only the difference between its scene with the occulter (S - h) and the
 scene of its pointing is convolved.
 """
@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.blind.effects.effect import Earlier, Effect, Moment, acts_on
+from psfcore.blind.effects.effect import Earlier, Effect, Moment, Window, acts_on, apply_effects
 from psfcore.blind.effects.fine_optics import FINE, FineOptics
 from psfcore.simulate.disc import behind, binned, covered_share
 from psfcore.simulate.plan import HIGH, Plan
@@ -62,7 +62,7 @@ class Chain:
     def __init__(self, clean: EffectFree, effects: Sequence[Effect]) -> None:
         self.clean, self.plan, self.effects = clean, clean.plan, tuple(effects)
         self._changes_sky = any(acts_on(effect, *_SKY_STEPS) for effect in self.effects)
-        self._varies = any(effect.varies for effect in self.effects)
+        self._varies = any(effect.kind.varies for effect in self.effects)
         self._optics: FineOptics | None = None
         self._seen: dict[int, Plane] = {}
 
@@ -70,11 +70,8 @@ class Chain:
         """The expected light on detector pixels [y, x], DN/s, before the readout. It contains no noise."""
         moment = Moment(self.plan, index)
         light = self._focal_plane(moment) if self._changes_sky else self.clean.clean_light(index)
-        for effect in self.effects:
-            light = effect.light(light, moment)
-        rate = binned(np.maximum(light, 0.0), FINE)
-        for effect in self.effects:
-            rate = effect.expected(rate, moment)
+        light = apply_effects(self.effects, "light", light, moment)
+        rate = apply_effects(self.effects, "expected", binned(np.maximum(light, 0.0), FINE), moment)
         return np.maximum(rate, 0.0)
 
     def all_expected(self) -> list[Plane]:
@@ -96,25 +93,19 @@ class Chain:
                 )
                 self._seen[pointing] = np.asarray(through, dtype=np.float64)
             seen = self._seen[pointing] + optics.through.apply(lit - self.clean.scenes[pointing])
-        for effect in self.effects:
-            seen = effect.spread(seen, lit, optics, moment)
-        return seen
+        return np.asarray(apply_effects(self.effects, "spread", seen, lit, optics, moment))
 
     def _telescope(self, moment: Moment) -> FineOptics:
         if self._optics is None or self._varies:
-            optics = self.clean.optics
-            for effect in self.effects:
-                optics = effect.optics(optics, moment)
-            self._optics = optics
+            self._optics = apply_effects(self.effects, "optics", self.clean.optics, moment)
         return self._optics
 
     def saturation_dn(self, expected: Sequence[Plane]) -> float | None:
         """The level (DN) at which high-only images clip. An effect may set it; otherwise it is the level of the plan."""
         exposures = [rate * shot.exposure_s for rate, shot in zip(expected, self.plan.shots, strict=True)]
         for effect in self.effects:
-            level = effect.saturation_dn(exposures, self.plan)
-            if level is not None:
-                return level
+            if effect.kind.saturation_dn is not None and effect.strength:
+                return effect.kind.saturation_dn(effect, exposures, self.plan)
         return self.plan.saturation_dn
 
     def read_out(self, expected: Sequence[Plane], seed: int) -> list[Plane]:
@@ -131,7 +122,7 @@ class Chain:
 
         If the change by an effect during the readout depends on noise, this change is averaged over noise realisations.
         """
-        realisations = max((effect.noise_realisations for effect in self.effects), default=0)
+        realisations = max((effect.kind.noise_realisations for effect in self.effects), default=0)
         exposures = [rate * shot.exposure_s for rate, shot in zip(expected, self.plan.shots, strict=True)]
         if not realisations:
             mean = self._through_readout(expected, exposures)
@@ -160,28 +151,21 @@ class Chain:
         out, earlier = [], list[Earlier]()
         for index, (rate, dn) in enumerate(zip(expected, exposures, strict=True)):
             moment = Moment(self.plan, index)
-            changed = dn
-            for effect in self.effects:
-                changed = effect.read_out(changed, moment, earlier)
-            out.append(changed)
+            out.append(apply_effects(self.effects, "read_out", dn, moment, earlier))
             earlier.append(Earlier(rate * moment.shot.exposure_s, moment.shot.time_s))
         return out
 
 
 def _lit(clean: EffectFree, effects: Sequence[Effect], moment: Moment) -> Plane:
     """The fine scene of an image, with its occulter in front [y, x], DN/s."""
-    scene = clean.scenes[moment.shot.pointing]
-    for effect in effects:
-        scene = effect.scene(scene, moment)
+    scene = apply_effects(effects, "scene", clean.scenes[moment.shot.pointing], moment)
     lit = scene.copy()
     place = clean.plan.place(moment.index)
     wide = Place(
         place.x_px, place.y_px, place.radius_px + _MOST_MOTION_PX
     )  # the patch must contain a moving disc
     around = behind(scene, wide, fine=FINE, margin_px=0)
-    share = None
-    for effect in effects:
-        share = effect.covered(share, place, around.first, around.shape, moment)
+    share = apply_effects(effects, "covered", None, Window(place, around.first, around.shape), moment)
     if share is None:
         share = covered_share(place, around.first, around.shape, FINE)
     rows, columns = (slice(s.start * FINE, s.stop * FINE) for s in around.window())

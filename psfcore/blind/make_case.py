@@ -121,8 +121,8 @@ def _at_target(
         short = target_pct / max(found.after_refit_pct, 1e-6)
         if max(short, 1 / short) < STRENGTH_WITHIN:
             break
-        wanted = tried.strength * short ** (1 / tried.power)
-        strength = float(min(wanted, tried.largest))
+        wanted = tried.strength * short ** (1 / tried.kind.power)
+        strength = float(min(wanted, tried.kind.largest))
         if strength == tried.strength:  # even the largest strength leaves less than the target
             break
         tried = tried.at(strength)

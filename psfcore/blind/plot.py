@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from psfcore.blind.cases import CLEAN, PAIR
 from psfcore.blind.effects.registry import KNOWN
-from psfcore.blind.score_table import Score
+from psfcore.blind.score import Score
 from psfcore.blind.scoring import INCONCLUSIVE, NONE, UNKNOWN_VERDICT
 from psfcore.drawing.plots import INK, write_png
 

@@ -1,4 +1,4 @@
-"""The base class of the effects of the blind set: a strength, a cause, and the steps of the simulation that it changes.
+"""An effect of the blind set: a strength, drawn parameters, and the steps of the simulation that it changes.
 
     scene -> occulter -> optics -> light on fine pixels -> light on detector pixels -> photons -> readout
 
@@ -7,9 +7,9 @@ An effect changes one or two of these steps. An effect of strength 0 changes not
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,96 +49,117 @@ class Earlier:
 
 
 @dataclass(frozen=True)
-class Effect:
-    """The base class of all effects. It changes no step of the simulation.
+class Window:
+    """The pixels around a disc. place: the position of the disc. first, shape: the first detector pixel (y, x), and the size."""
+
+    place: Place
+    first: tuple[int, int]
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of effect. Every step is a function of the effect and of what it changes; None: the kind does not change this step.
 
     unit: the unit of the strength. cause: the physical cause, as text. nominal: a strength whose change is visible in
-    the discs. largest: the largest plausible strength. power: the residual that the effect leaves is proportional to
-    strength**power. varies: whether its optics differ from image to image. noise_realisations: number of noise
+    the discs. largest: the largest plausible strength. draw: draws the parameters. power: the residual that the effect leaves is
+    proportional to strength**power. varies: whether its optics differ from image to image. noise_realisations: number of noise
     realisations over which its change is averaged; 0 if the change does not depend on noise.
+
+    scene: changes the fine scene [y, x], DN/s. covered: changes the fraction of each fine pixel of a window that the occulter
+    covers; None: the fraction that a disc at rest covers. optics: changes the telescope. spread: changes the fine light [y, x],
+    DN/s, if the PSF varies across the field; it also gets the fine scene with its occulter, and the telescope. light: changes the
+    fine light in the focal plane [y, x], DN/s. expected: changes the light on detector pixels [y, x], DN/s, before photon noise.
+    read_out: changes one exposure [y, x], in DN with noise; it also gets the images that were read before. saturation_dn: the level
+    in DN at which high-only images clip, from all exposures.
     """
 
+    name: str
+    stage: str
+    unit: str
+    cause: str
+    nominal: float
+    largest: float
+    draw: Callable[[Plan, np.random.Generator], dict[str, Any]] = lambda plan, rng: {}
+    power: float = 1.0
+    varies: bool = False
+    noise_realisations: int = 0
+    scene: Callable[[Effect, Plane, Moment], Plane] | None = None
+    covered: Callable[[Effect, Plane | None, Window, Moment], Plane | None] | None = None
+    optics: Callable[[Effect, FineOptics, Moment], FineOptics] | None = None
+    spread: Callable[[Effect, Plane, Plane, FineOptics, Moment], Plane] | None = None
+    light: Callable[[Effect, Plane, Moment], Plane] | None = None
+    expected: Callable[[Effect, Plane, Moment], Plane] | None = None
+    read_out: Callable[[Effect, Plane, Moment, list[Earlier]], Plane] | None = None
+    saturation_dn: Callable[[Effect, list[Plane], Plan], float] | None = None
+
+    def drawn(self, plan: Plan, rng: np.random.Generator) -> Effect:
+        """An effect of this kind at the nominal strength, with random parameters."""
+        return Effect(self, self.nominal, self.draw(plan, rng))
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An effect: its kind, its strength and its parameters, by name."""
+
+    kind: Kind
     strength: float
+    parameters: Mapping[str, Any]
 
-    name: ClassVar[str] = "effect"
-    stage: ClassVar[str] = "detector"
-    unit: ClassVar[str] = ""
-    cause: ClassVar[str] = ""
-    nominal: ClassVar[float] = 1.0
-    largest: ClassVar[float] = 1.0
-    power: ClassVar[float] = 1.0
-    varies: ClassVar[bool] = False
-    noise_realisations: ClassVar[int] = 0
+    def __getitem__(self, name: str) -> Any:
+        """The parameter with this name."""
+        return self.parameters[name]
 
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        """This effect with a given strength. The other parameters are drawn at random."""
-        return cls(strength)
-
-    def at(self, strength: float) -> Self:
+    def at(self, strength: float) -> Effect:
         """The same effect with another strength."""
-        return dataclasses.replace(self, strength=strength)
+        return replace(self, strength=strength)
 
     def as_json(self) -> dict[str, Any]:
-        """Name, strength and parameters of the effect, as JSON."""
-        values = {key: value for key, value in dataclasses.asdict(self).items() if key != "strength"}
-        return {"name": self.name, "strength": self.strength, "unit": self.unit, "parameters": values}
+        """Name, strength, unit and parameters of the effect, as JSON."""
+        parameters = dict(self.parameters)
+        return {
+            "name": self.kind.name,
+            "strength": self.strength,
+            "unit": self.kind.unit,
+            "parameters": parameters,
+        }
 
-    def scene(self, scene: Plane, moment: Moment) -> Plane:
-        """Change the fine scene [y, x], DN/s."""
-        return scene
 
-    def covered(
-        self,
-        share: Plane | None,
-        place: Place,
-        first: tuple[int, int],
-        shape: tuple[int, int],
-        moment: Moment,
-    ) -> Plane | None:
-        """Change the fraction of each fine pixel [y, x] of a window that the occulter covers.
-
-        share: this fraction; None: the fraction that a disc at rest covers. place: the position of the disc. first,
-        shape: the first detector pixel (y, x) and the size of the window. The default returns `share`.
-        """
-        return share
-
-    def optics(self, optics: FineOptics, moment: Moment) -> FineOptics:
-        """Change the telescope."""
-        return optics
-
-    def spread(self, seen: Plane, lit: Plane, optics: FineOptics, moment: Moment) -> Plane:
-        """Change the fine light `seen` [y, x], DN/s, if the PSF varies across the field. lit: the fine scene with its occulter."""
-        return seen
-
-    def light(self, seen: Plane, moment: Moment) -> Plane:
-        """Change the fine light in the focal plane [y, x], DN/s."""
-        return seen
-
-    def expected(self, rate: Plane, moment: Moment) -> Plane:
-        """Change the light on detector pixels [y, x], DN/s, before photon noise."""
-        return rate
-
-    def read_out(self, dn: Plane, moment: Moment, earlier: list[Earlier]) -> Plane:
-        """Change the values of one exposure [y, x], in DN with noise. earlier: the images that were read before."""
-        return dn
-
-    def saturation_dn(self, exposures: list[Plane], plan: Plan) -> float | None:
-        """The level in DN at which high-only images clip; None if the effect sets no level."""
-        return None
+def apply_effects(effects: Sequence[Effect], step: str, value: Any, *beside: Any) -> Any:
+    """The value after a step of the simulation: every effect that acts on this step changes it. step: a field of `Kind`."""
+    for effect in effects:
+        change = getattr(effect.kind, step)
+        if change is not None and effect.strength:
+            value = change(effect, value, *beside)
+    return value
 
 
 def acts_on(effect: Effect, *steps: str) -> bool:
-    """Whether an effect changes at least one of these steps (names of methods)."""
-    return any(getattr(type(effect), step) is not getattr(Effect, step) for step in steps)
+    """Whether an effect changes at least one of these steps."""
+    return effect.strength != 0 and any(getattr(effect.kind, step) is not None for step in steps)
 
 
-def unit_coordinates(shape: tuple[int, int]) -> tuple[Plane, Plane]:
+def unit_coordinates(shape: tuple[int, ...]) -> tuple[Plane, Plane]:
     """Coordinates of the pixels: u (1, nx) along x and v (ny, 1) along y, each from -0.5 to 0.5 across the field."""
     ny, nx = shape
     return (np.arange(nx)[None, :] + 0.5) / nx - 0.5, (np.arange(ny)[:, None] + 0.5) / ny - 0.5
 
 
+def direction(angle_deg: float) -> tuple[float, float]:
+    """Cosine and sine of a direction."""
+    return float(np.cos(np.deg2rad(angle_deg))), float(np.sin(np.deg2rad(angle_deg)))
+
+
 def angle(rng: np.random.Generator) -> float:
     """A random direction, degrees."""
     return float(rng.uniform(0, 360))
+
+
+def sign(rng: np.random.Generator) -> int:
+    """1 or -1, drawn at random."""
+    return int(rng.choice([-1, 1]))
+
+
+def seed(rng: np.random.Generator) -> int:
+    """A random seed."""
+    return int(rng.integers(2**31))

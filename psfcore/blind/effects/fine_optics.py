@@ -248,8 +248,3 @@ def turned_offsets(optics: FineOptics, angle_deg: float) -> tuple[Kernel, Kernel
     x, y = optics.offsets_px
     cos, sin = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
     return x * cos + y * sin, y * cos - x * sin
-
-
-def small_kernel(weights: Kernel) -> Kernel:
-    """A kernel [y, x] normalised to sum 1."""
-    return np.asarray(weights / weights.sum())

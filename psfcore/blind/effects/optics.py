@@ -3,78 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, gaussian_filter
 
-from psfcore.blind.effects.effect import Effect, Moment, angle, unit_coordinates
-from psfcore.blind.effects.fine_optics import FINE, FineOptics, scaled_scatter, small_kernel, turned_offsets
+from psfcore.blind.effects.effect import Effect, Kind, Moment, angle, direction, sign, unit_coordinates
+from psfcore.blind.effects.fine_optics import FINE, FineOptics, scaled_scatter, turned_offsets
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.simulate.plan import Plan
 
 Plane = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class AnisotropicScatter(Effect):
+def _anisotropic_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """Scatter that is stretched along a direction. The stretch grows with the distance r as r / (r + b)."""
-
-    angle_deg: float = 0.0
-
-    name: ClassVar[str] = "anisotropic_scatter"
-    stage: ClassVar[str] = "optics"
-    unit: ClassVar[str] = "stretch"
-    cause: ClassVar[str] = "the mirrors were polished along one direction"
-    nominal: ClassVar[float] = 0.1
-    largest: ClassVar[float] = 0.6
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, angle(rng) % 180)
-
-    def optics(self, optics: FineOptics, moment: Moment) -> FineOptics:
-        if self.strength == 0:
-            return optics
-        law = optics.law
-        along, across = turned_offsets(optics, self.angle_deg)
-        r = np.hypot(along, across)
-        factor = 1 + self.strength * r / (r + law.b_px)
-        falloff = (law.b_px + np.hypot(along / factor, across * factor)) ** -law.c
-        isotropic = (law.b_px + r) ** -law.c
-        return _rescaled(optics, falloff, isotropic)
+    law = optics.law
+    along, across = turned_offsets(optics, effect["angle_deg"])
+    r = np.hypot(along, across)
+    factor = 1 + effect.strength * r / (r + law.b_px)
+    falloff = (law.b_px + np.hypot(along / factor, across * factor)) ** -law.c
+    return _rescaled(optics, falloff, (law.b_px + r) ** -law.c)
 
 
-@dataclass(frozen=True)
-class OneSidedScatter(Effect):
-    """Scatter that is stronger towards one side, similar to coma. It reaches a few tens of pixels. Not in the
-    library."""
-
-    angle_deg: float = 0.0
-    reach_px: float = 40.0
-
-    name: ClassVar[str] = "one_sided_scatter"
-    stage: ClassVar[str] = "optics"
-    unit: ClassVar[str] = "share"
-    cause: ClassVar[str] = "a mirror is tilted or contaminated on one side"
-    nominal: ClassVar[float] = 0.2
-    largest: ClassVar[float] = 0.95
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, angle(rng), float(rng.uniform(15, 80)))
-
-    def optics(self, optics: FineOptics, moment: Moment) -> FineOptics:
-        if self.strength == 0:
-            return optics
-        law = optics.law
-        along, across = turned_offsets(optics, self.angle_deg)
-        r = np.hypot(along, across)
-        isotropic = (law.b_px + r) ** -law.c
-        lean = along / np.maximum(r, 0.5 / FINE) * np.exp(-r / self.reach_px)
-        return _rescaled(optics, isotropic * (1 + self.strength * lean), isotropic)
+def _one_sided_scatter(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
+    """Scatter that is stronger towards one side, similar to coma. It reaches a few tens of pixels."""
+    along, across = turned_offsets(optics, effect["angle_deg"])
+    r = np.hypot(along, across)
+    isotropic = (optics.law.b_px + r) ** -optics.law.c
+    lean = along / np.maximum(r, 0.5 / FINE) * np.exp(-r / effect["reach_px"])
+    return _rescaled(optics, isotropic * (1 + effect.strength * lean), isotropic)
 
 
 def _rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
@@ -83,81 +42,33 @@ def _rescaled(optics: FineOptics, falloff: Plane, before: Plane) -> FineOptics:
     return dataclasses.replace(optics, scatter=scaled_scatter(falloff, optics.law, amplitude))
 
 
-@dataclass(frozen=True)
-class WideHalo(Effect):
+def _wide_halo(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """A fraction of the light is in a halo, exponential or Moffat, that is tens to hundreds of pixels wide."""
-
-    scale_px: float = 100.0
-    moffat: bool = False
-
-    name: ClassVar[str] = "wide_halo"
-    stage: ClassVar[str] = "optics"
-    unit: ClassVar[str] = "share of light"
-    cause: ClassVar[str] = (
-        "particles or a second surface scatter to large distances, besides the roughness of the mirrors"
-    )
-    nominal: ClassVar[float] = 0.02
-    largest: ClassVar[float] = 0.3
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, float(rng.uniform(0.15, 0.5) * plan.size_px), bool(rng.random() < 0.5))
-
-    def optics(self, optics: FineOptics, moment: Moment) -> FineOptics:
-        if self.strength == 0:
-            return optics
-        x, y = optics.offsets_px
-        r = np.hypot(x, y)
-        if self.moffat:  # half of the light is within 0.88 scale_px
-            halo = (1 + (r / self.scale_px) ** 2) ** -2.2 * 1.2 / (np.pi * self.scale_px**2)
-        else:
-            halo = np.exp(-r / self.scale_px) / (2 * np.pi * self.scale_px**2)
-        scatter = (1 - self.strength) * optics.scatter + self.strength * halo / FINE**2
-        return dataclasses.replace(optics, scatter=scatter)
+    scale_px = effect["scale_px"]
+    x, y = optics.offsets_px
+    r = np.hypot(x, y)
+    if effect["moffat"]:  # half of the light is within 0.88 scale_px
+        halo = (1 + (r / scale_px) ** 2) ** -2.2 * 1.2 / (np.pi * scale_px**2)
+    else:
+        halo = np.exp(-r / scale_px) / (2 * np.pi * scale_px**2)
+    scatter = (1 - effect.strength) * optics.scatter + effect.strength * halo / FINE**2
+    return dataclasses.replace(optics, scatter=scatter)
 
 
-@dataclass(frozen=True)
-class CoreBlur(Effect):
+def _draw_wide_halo(plan: Plan, rng: np.random.Generator) -> dict[str, Any]:
+    return {"scale_px": float(rng.uniform(0.15, 0.5) * plan.size_px), "moffat": bool(rng.random() < 0.5)}
+
+
+def _core_blur(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """A wider core. A Moffat profile blurs it (defocus, figure errors), or it is spread along a straight line (jitter)."""
-
-    angle_deg: float = 0.0
-    jitter: bool = False
-
-    name: ClassVar[str] = "core_blur"
-    stage: ClassVar[str] = "optics"
-    unit: ClassVar[str] = "px"
-    cause: ClassVar[str] = "the telescope is out of focus, or moves during the exposure"
-    nominal: ClassVar[float] = 1.0
-    largest: ClassVar[float] = 3.0
-    power: ClassVar[float] = 1.5
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, angle(rng) % 180, bool(rng.random() < 0.5))
-
-    def optics(self, optics: FineOptics, moment: Moment) -> FineOptics:
-        if self.strength == 0:
-            return optics
-        blur = _line(self.strength, self.angle_deg) if self.jitter else _moffat(self.strength)
-        return _blurred(optics, blur)
+    width = effect.strength
+    return _blurred(optics, _line(width, effect["angle_deg"]) if effect["jitter"] else _moffat(width))
 
 
-@dataclass(frozen=True)
-class FocusDrift(Effect):
-    """Blur by a uniform disc. Its diameter grows from 0 at the first image to `strength` at the last. Not in the library."""
-
-    name: ClassVar[str] = "focus_drift"
-    stage: ClassVar[str] = "optics"
-    unit: ClassVar[str] = "px at the end"
-    cause: ClassVar[str] = "the telescope's structure warms during the transit"
-    nominal: ClassVar[float] = 2.0
-    largest: ClassVar[float] = 8.0
-    power: ClassVar[float] = 1.5
-    varies: ClassVar[bool] = True
-
-    def optics(self, optics: FineOptics, moment: Moment) -> FineOptics:
-        diameter = self.strength * moment.elapsed
-        return optics if diameter == 0 else _blurred(optics, _pillbox(diameter))
+def _focus_drift(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
+    """Blur by a uniform disc. Its diameter grows from 0 at the first image to the strength at the last."""
+    diameter = effect.strength * moment.elapsed
+    return optics if diameter == 0 else _blurred(optics, _pillbox(diameter))
 
 
 def _blurred(optics: FineOptics, blur: Plane) -> FineOptics:
@@ -174,7 +85,7 @@ def _square(reach_px: float, finer: int) -> tuple[Plane, Plane]:
 
 def _collected(samples: Plane, finer: int) -> Plane:
     n = samples.shape[0] // finer
-    return small_kernel(samples.reshape(n, finer, n, finer).sum(axis=(1, 3)))
+    return _normalised(samples.reshape(n, finer, n, finer).sum(axis=(1, 3)))
 
 
 def _moffat(width_px: float) -> Plane:
@@ -202,141 +113,154 @@ def _line(length_px: float, angle_deg: float) -> Plane:
         for dy, wy in ((0, 1 - (y - row)), (1, y - row)):
             for dx, wx in ((0, 1 - (x - column)), (1, x - column)):
                 plane[row + dy, column + dx] += wy * wx
-    return small_kernel(plane)
+    return _normalised(plane)
 
 
-@dataclass(frozen=True)
-class MeshRotation(Effect):
-    """The mesh is rotated with respect to its assumed angle."""
-
-    sign: int = 1
-
-    name: ClassVar[str] = "mesh_rotation"
-    stage: ClassVar[str] = "optics"
-    unit: ClassVar[str] = "degrees"
-    cause: ClassVar[str] = "the filter was mounted at another angle"
-    nominal: ClassVar[float] = 3.0
-    largest: ClassVar[float] = 20.0
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, int(rng.choice([-1, 1])))
-
-    def optics(self, optics: FineOptics, moment: Moment) -> FineOptics:
-        if self.strength == 0:
-            return optics
-        return dataclasses.replace(optics, diffraction=optics.glass.fine(turn_deg=self.sign * self.strength))
+def _normalised(weights: Plane) -> Plane:
+    """A kernel [y, x] with the sum 1."""
+    return np.asarray(weights / weights.sum())
 
 
-@dataclass(frozen=True)
-class MeshPitch(Effect):
+def _mesh_pitch(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """The distances of the mesh orders are larger, or smaller, than assumed."""
-
-    sign: int = 1
-
-    name: ClassVar[str] = "mesh_pitch"
-    stage: ClassVar[str] = "optics"
-    unit: ClassVar[str] = "share of the spacing"
-    cause: ClassVar[str] = "the pitch of the mesh, or the wavelength, differs from the assumed one"
-    nominal: ClassVar[float] = 0.05
-    largest: ClassVar[float] = 0.3
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, int(rng.choice([-1, 1])))
-
-    def optics(self, optics: FineOptics, moment: Moment) -> FineOptics:
-        if self.strength == 0:
-            return optics
-        kernel = optics.glass.fine(pitch_factor=1 + self.sign * self.strength)
-        return dataclasses.replace(optics, diffraction=kernel)
+    kernel = optics.glass.fine(pitch_factor=1 + effect["sign"] * effect.strength)
+    return dataclasses.replace(optics, diffraction=kernel)
 
 
-@dataclass(frozen=True)
-class FieldDependentScatter(Effect):
+def _mesh_rotation(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
+    """The mesh is rotated with respect to its assumed angle."""
+    kernel = optics.glass.fine(turn_deg=effect["sign"] * effect.strength)
+    return dataclasses.replace(optics, diffraction=kernel)
+
+
+def _field_dependent_scatter(
+    effect: Effect, seen: Plane, lit: Plane, optics: FineOptics, moment: Moment
+) -> Plane:
     """The total scatter depends on the position of the source in the field.
 
-    The relative change of the total scatter is the sum of a linear and a quadratic term. The linear term is `strength`
+    The relative change of the total scatter is the sum of a linear and a quadratic term. The linear term is the strength
     at the edge of the field.
     """
-
-    angle_deg: float = 0.0
-    bowl: float = 0.5
-
-    name: ClassVar[str] = "field_dependent_scatter"
-    stage: ClassVar[str] = "optics"
-    unit: ClassVar[str] = "share of the scatter"
-    cause: ClassVar[str] = "light from another field angle meets a rougher part of the mirrors"
-    nominal: ClassVar[float] = 0.2
-    largest: ClassVar[float] = 0.8
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, angle(rng), float(rng.uniform(-0.6, 0.6)))
-
-    def spread(self, seen: Plane, lit: Plane, optics: FineOptics, moment: Moment) -> Plane:
-        if self.strength == 0:
-            return seen
-        u, v = unit_coordinates((lit.shape[0], lit.shape[1]))
-        tilt = 2 * (u * np.cos(np.deg2rad(self.angle_deg)) + v * np.sin(np.deg2rad(self.angle_deg)))
-        more = self.strength * (tilt + self.bowl * (4 * (u**2 + v**2) - 2 / 3))
-        return np.asarray(seen + optics.more_scatter.apply(more * lit))
+    u, v = unit_coordinates(lit.shape)
+    cos, sin = direction(effect["angle_deg"])
+    more = effect.strength * (2 * (u * cos + v * sin) + effect["bowl"] * (4 * (u**2 + v**2) - 2 / 3))
+    return np.asarray(seen + optics.more_scatter.apply(more * lit))
 
 
-@dataclass(frozen=True)
-class Ghost(Effect):
+def _ghost(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """A faint copy of the image that is displaced, out of focus, slightly rotated and slightly magnified."""
-
-    shift_x: float = 0.1
-    shift_y: float = 0.0
-    turn_deg: float = 0.0
-    magnification: float = 1.0
-    blur_px: float = 4.0
-
-    name: ClassVar[str] = "ghost"
-    stage: ClassVar[str] = "optics"
-    unit: ClassVar[str] = "share of light"
-    cause: ClassVar[str] = "light is reflected between the filter and the detector"
-    nominal: ClassVar[float] = 0.01
-    largest: ClassVar[float] = 0.1
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        way, towards = float(rng.uniform(0.08, 0.3)), float(rng.uniform(0, 2 * np.pi))
-        return cls(
-            strength,
-            way * float(np.cos(towards)),
-            way * float(np.sin(towards)),
-            float(rng.uniform(-3, 3)),
-            float(rng.uniform(0.96, 1.04)),
-            float(rng.uniform(2, 10)),
-        )
-
-    def light(self, seen: Plane, moment: Moment) -> Plane:
-        if self.strength == 0:
-            return seen
-        n = seen.shape[0]
-        cos, sin = np.cos(np.deg2rad(self.turn_deg)), np.sin(np.deg2rad(self.turn_deg))
-        turn = np.array([[cos, -sin], [sin, cos]]) / self.magnification
-        middle = np.array([(n - 1) / 2, (n - 1) / 2])
-        shift = n * np.array([self.shift_y, self.shift_x])
-        copy = affine_transform(
-            gaussian_filter(seen, self.blur_px * FINE, mode="constant"),
-            turn,
-            middle - turn @ (middle + shift),
-            order=1,
-        )
-        return np.asarray(seen + self.strength / self.magnification**2 * copy)
+    n, magnification = seen.shape[0], effect["magnification"]
+    cos, sin = direction(effect["turn_deg"])
+    turn = np.array([[cos, -sin], [sin, cos]]) / magnification
+    middle = np.array([(n - 1) / 2, (n - 1) / 2])
+    shift = n * np.array([effect["shift_y"], effect["shift_x"]])
+    soft = gaussian_filter(seen, effect["blur_px"] * FINE, mode="constant")
+    copy = affine_transform(soft, turn, middle - turn @ (middle + shift), order=1)
+    return np.asarray(seen + effect.strength / magnification**2 * copy)
 
 
-OPTICS_EFFECTS: tuple[type[Effect], ...] = (
-    Ghost,
-    AnisotropicScatter,
-    FieldDependentScatter,
-    WideHalo,
-    CoreBlur,
-    MeshRotation,
-    MeshPitch,
-    OneSidedScatter,
-    FocusDrift,
+def _draw_ghost(plan: Plan, rng: np.random.Generator) -> dict[str, Any]:
+    way, towards = float(rng.uniform(0.08, 0.3)), float(rng.uniform(0, 2 * np.pi))
+    return {
+        "shift_x": way * float(np.cos(towards)),
+        "shift_y": way * float(np.sin(towards)),
+        "turn_deg": float(rng.uniform(-3, 3)),
+        "magnification": float(rng.uniform(0.96, 1.04)),
+        "blur_px": float(rng.uniform(2, 10)),
+    }
+
+
+OPTICS_EFFECTS = (
+    Kind(
+        "ghost",
+        "optics",
+        "share of light",
+        "light is reflected between the filter and the detector",
+        nominal=0.01,
+        largest=0.1,
+        draw=_draw_ghost,
+        light=_ghost,
+    ),
+    Kind(
+        "anisotropic_scatter",
+        "optics",
+        "stretch",
+        "the mirrors were polished along one direction",
+        nominal=0.1,
+        largest=0.6,
+        draw=lambda plan, rng: {"angle_deg": angle(rng) % 180},
+        optics=_anisotropic_scatter,
+    ),
+    Kind(
+        "field_dependent_scatter",
+        "optics",
+        "share of the scatter",
+        "light from another field angle meets a rougher part of the mirrors",
+        nominal=0.2,
+        largest=0.8,
+        draw=lambda plan, rng: {"angle_deg": angle(rng), "bowl": float(rng.uniform(-0.6, 0.6))},
+        spread=_field_dependent_scatter,
+    ),
+    Kind(
+        "wide_halo",
+        "optics",
+        "share of light",
+        "particles or a second surface scatter to large distances, besides the roughness of the mirrors",
+        nominal=0.02,
+        largest=0.3,
+        draw=_draw_wide_halo,
+        optics=_wide_halo,
+    ),
+    Kind(
+        "core_blur",
+        "optics",
+        "px",
+        "the telescope is out of focus, or moves during the exposure",
+        nominal=1.0,
+        largest=3.0,
+        power=1.5,
+        draw=lambda plan, rng: {"angle_deg": angle(rng) % 180, "jitter": bool(rng.random() < 0.5)},
+        optics=_core_blur,
+    ),
+    Kind(
+        "mesh_rotation",
+        "optics",
+        "degrees",
+        "the filter was mounted at another angle",
+        nominal=3.0,
+        largest=20.0,
+        draw=lambda plan, rng: {"sign": sign(rng)},
+        optics=_mesh_rotation,
+    ),
+    Kind(
+        "mesh_pitch",
+        "optics",
+        "share of the spacing",
+        "the pitch of the mesh, or the wavelength, differs from the assumed one",
+        nominal=0.05,
+        largest=0.3,
+        draw=lambda plan, rng: {"sign": sign(rng)},
+        optics=_mesh_pitch,
+    ),
+    Kind(
+        "one_sided_scatter",
+        "optics",
+        "share",
+        "a mirror is tilted or contaminated on one side",
+        nominal=0.2,
+        largest=0.95,
+        draw=lambda plan, rng: {"angle_deg": angle(rng), "reach_px": float(rng.uniform(15, 80))},
+        optics=_one_sided_scatter,
+    ),
+    Kind(
+        "focus_drift",
+        "optics",
+        "px at the end",
+        "the telescope's structure warms during the transit",
+        nominal=2.0,
+        largest=8.0,
+        power=1.5,
+        varies=True,
+        optics=_focus_drift,
+    ),
 )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from psfcore.blind.effects.detector import DETECTOR_EFFECTS
-from psfcore.blind.effects.effect import Effect
+from psfcore.blind.effects.effect import Kind
 from psfcore.blind.effects.optics import OPTICS_EFFECTS
-from psfcore.blind.effects.readout import READOUT_EFFECTS
 from psfcore.blind.effects.scene import SCENE_EFFECTS
 from psfcore.errors import DataError
 
-EFFECTS: dict[str, type[Effect]] = {
-    effect.name: effect for effect in (*SCENE_EFFECTS, *OPTICS_EFFECTS, *DETECTOR_EFFECTS, *READOUT_EFFECTS)
+EFFECTS: dict[str, Kind] = {
+    effect.name: effect for effect in (*SCENE_EFFECTS, *OPTICS_EFFECTS, *DETECTOR_EFFECTS)
 }
 KNOWN = (
     "dark_offset",
@@ -35,7 +34,7 @@ KNOWN = (
 UNKNOWN = tuple(sorted(set(EFFECTS) - set(KNOWN)))
 
 
-def effect_named(name: str) -> type[Effect]:
+def effect_named(name: str) -> Kind:
     """The effect with this name. Raises DataError "unknown-effect"."""
     if name not in EFFECTS:
         raise DataError("unknown-effect", f"expected one of {', '.join(sorted(EFFECTS))}; got {name!r}")

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
-from psfcore.blind.effects.effect import Effect, Moment, angle
+from psfcore.blind.effects.effect import Effect, Kind, Moment, Window, angle, direction, seed
 from psfcore.blind.effects.fine_optics import FINE
 from psfcore.simulate.disc import covered_share
 from psfcore.simulate.plan import HIGH, Plan
@@ -19,114 +18,49 @@ from psfcore.transit.transit import Place
 Plane = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class OcculterMotion(Effect):
-    """The disc moves along a straight line during the exposure. It is simulated in steps of at most a fifth of a pixel."""
-
-    angle_deg: float = 0.0
-
-    name: ClassVar[str] = "occulter_motion"
-    stage: ClassVar[str] = "scene"
-    unit: ClassVar[str] = "px/s"
-    cause: ClassVar[str] = "the occulter moves across the field during the exposure"
-    nominal: ClassVar[float] = 0.4
-    largest: ClassVar[float] = 1.5
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, angle_deg=float(rng.normal(3.0, 8.0)))
-
-    def covered(
-        self,
-        share: Plane | None,
-        place: Place,
-        first: tuple[int, int],
-        shape: tuple[int, int],
-        moment: Moment,
-    ) -> Plane | None:
-        way = self.strength * moment.shot.exposure_s
-        if way == 0:
-            return share
-        steps = max(5, int(np.ceil(5 * way)))
-        along = way * ((np.arange(steps) + 0.5) / steps - 0.5)
-        cos, sin = np.cos(np.deg2rad(self.angle_deg)), np.sin(np.deg2rad(self.angle_deg))
-        moved = (Place(place.x_px + s * cos, place.y_px + s * sin, place.radius_px) for s in along)
-        return np.asarray(sum(covered_share(at, first, shape, FINE) for at in moved) / steps)
+def _occulter_motion(effect: Effect, share: Plane | None, window: Window, moment: Moment) -> Plane:
+    """The disc moves along a straight line during the exposure, in steps of at most a fifth of a pixel."""
+    way = effect.strength * moment.shot.exposure_s
+    steps = max(5, int(np.ceil(5 * way)))
+    along = way * ((np.arange(steps) + 0.5) / steps - 0.5)
+    cos, sin = direction(effect["angle_deg"])
+    x_px, y_px, radius_px = window.place.x_px, window.place.y_px, window.place.radius_px
+    moved = (Place(x_px + s * cos, y_px + s * sin, radius_px) for s in along)
+    return np.asarray(sum(covered_share(at, window.first, window.shape, FINE) for at in moved) / steps)
 
 
-@dataclass(frozen=True)
-class SceneEvolution(Effect):
+def _scene_evolution(effect: Effect, scene: Plane, moment: Moment) -> Plane:
     """Patches of the Sun brighten and fade with the same period, but with different phases."""
-
-    seed: int = 0
-    patch: float = 0.05
-    period: float = 0.3
-
-    name: ClassVar[str] = "scene_evolution"
-    stage: ClassVar[str] = "scene"
-    unit: ClassVar[str] = "share, rms"
-    cause: ClassVar[str] = "the Sun changes between the images of a pointing"
-    nominal: ClassVar[float] = 0.2
-    largest: ClassVar[float] = 0.6
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(
-            strength, int(rng.integers(2**31)), float(rng.uniform(0.02, 0.08)), float(rng.uniform(0.15, 0.6))
-        )
-
-    def scene(self, scene: Plane, moment: Moment) -> Plane:
-        if self.strength == 0:
-            return scene
-        phase = 2 * np.pi * moment.elapsed / self.period
-        first, second = (
-            patches(scene.shape[0], self.seed + 10 * moment.shot.pointing + k, self.patch) for k in (0, 1)
-        )
-        change = self.strength * (first * np.sin(phase) + second * (np.cos(phase) - 1))
-        return np.asarray(scene * np.exp(change - change.var() / 2))
+    phase = 2 * np.pi * moment.elapsed / effect["period"]
+    first, second = (
+        patches(scene.shape[0], effect["seed"] + 10 * moment.shot.pointing + k, effect["patch"])
+        for k in (0, 1)
+    )
+    change = effect.strength * (first * np.sin(phase) + second * (np.cos(phase) - 1))
+    return np.asarray(scene * np.exp(change - change.var() / 2))
 
 
-@dataclass(frozen=True)
-class OutOfFieldLight(Effect):
+def _out_of_field_light(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """In each pointing, a bright band beyond one edge of the field scatters light into the field.
 
-    strength: the brightness of the band in a pointing is `strength` times the entry of `levels`. The band is half as
-    wide as the field, and begins a twelfth of the field beyond the edge. edges: the edge of each pointing; 0 left, 1
-    right, 2 below, 3 above. b_px, c, a: parameters of the power law that scatters the light of the band.
+    The brightness of the band in a pointing is the strength times the entry of `levels`. The band is half as wide as the
+    field, and begins a twelfth of the field beyond the edge. edges: the edge of each pointing; 0 left, 1 right, 2 below, 3
+    above. b_px, c, a: parameters of the power law that scatters the light of the band.
     """
+    pointing = moment.shot.pointing - 1
+    band = _band(seen.shape[0], effect["edges"][pointing], effect["b_px"], effect["c"], effect["a"])
+    return seen + effect.strength * effect["levels"][pointing] * band
 
-    edges: tuple[int, ...] = (0, 1, 1)
-    levels: tuple[float, ...] = (1.0, 1.0, 1.0)
-    b_px: float = 6.0
-    c: float = 2.5
-    a: float = 0.5
 
-    name: ClassVar[str] = "out_of_field_light"
-    stage: ClassVar[str] = "scene"
-    unit: ClassVar[str] = "DN/s"
-    cause: ClassVar[str] = "light from the Sun beyond the edge of the detector is scattered into the field"
-    nominal: ClassVar[float] = 400.0
-    largest: ClassVar[float] = 4000.0
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        edges = tuple(int(edge) for edge in rng.integers(0, 4, len(plan.views)))
-        levels = tuple(float(level) for level in rng.uniform(0.3, 1.0, len(plan.views)))
-        return cls(
-            strength,
-            edges,
-            levels,
-            float(rng.uniform(4, 8)),
-            float(rng.uniform(2.4, 2.6)),
-            float(rng.uniform(0.3, 0.7)),
-        )
-
-    def light(self, seen: Plane, moment: Moment) -> Plane:
-        if self.strength == 0:
-            return seen
-        pointing = moment.shot.pointing
-        edge, level = self.edges[pointing - 1], self.levels[pointing - 1]
-        return seen + self.strength * level * _band(seen.shape[0], edge, self.b_px, self.c, self.a)
+def _draw_out_of_field_light(plan: Plan, rng: np.random.Generator) -> dict[str, Any]:
+    count = len(plan.views)
+    return {
+        "edges": tuple(int(edge) for edge in rng.integers(0, 4, count)),
+        "levels": tuple(float(level) for level in rng.uniform(0.3, 1.0, count)),
+        "b_px": float(rng.uniform(4, 8)),
+        "c": float(rng.uniform(2.4, 2.6)),
+        "a": float(rng.uniform(0.3, 0.7)),
+    }
 
 
 @cache
@@ -150,78 +84,47 @@ def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
     return np.ascontiguousarray(np.maximum(turned, 0.0))
 
 
-@dataclass(frozen=True)
-class LimbGlint(Effect):
-    """Additional light in one pointing: rays that spread from a point beyond the edge of the field. Not in the library."""
-
-    pointing: int = 1
-    angle_deg: float = 0.0
-    rays: int = 3
-    phase_deg: float = 0.0
-
-    name: ClassVar[str] = "limb_glint"
-    stage: ClassVar[str] = "scene"
-    unit: ClassVar[str] = "DN/s"
-    cause: ClassVar[str] = "in one pointing an edge of the baffle reflects sunlight"
-    nominal: ClassVar[float] = 1.0
-    largest: ClassVar[float] = 60.0
-
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        pointing = int(rng.choice([1, len(plan.views)]))
-        return cls(strength, pointing, angle(rng), int(rng.integers(2, 6)), angle(rng))
-
-    def light(self, seen: Plane, moment: Moment) -> Plane:
-        if moment.shot.pointing != self.pointing or self.strength == 0:
-            return seen
-        n = seen.shape[0]
-        x = (np.arange(n)[None, :] + 0.5) / n - 0.5 - 0.8 * np.cos(np.deg2rad(self.angle_deg))
-        y = (np.arange(n)[:, None] + 0.5) / n - 0.5 - 0.8 * np.sin(np.deg2rad(self.angle_deg))
-        fan = np.cos(2 * self.rays * np.arctan2(y, x) + np.deg2rad(self.phase_deg)) ** 2
-        return seen + self.strength * (0.2 + fan) * np.exp(-np.hypot(x, y) / 0.5) / np.exp(-1.6)
+def _limb_glint(effect: Effect, seen: Plane, moment: Moment) -> Plane:
+    """Additional light in one pointing: rays that spread from a point beyond the edge of the field."""
+    if moment.shot.pointing != effect["pointing"]:
+        return seen
+    n = seen.shape[0]
+    cos, sin = direction(effect["angle_deg"])
+    x = (np.arange(n)[None, :] + 0.5) / n - 0.5 - 0.8 * cos
+    y = (np.arange(n)[:, None] + 0.5) / n - 0.5 - 0.8 * sin
+    fan = np.cos(2 * effect["rays"] * np.arctan2(y, x) + np.deg2rad(effect["phase_deg"])) ** 2
+    return seen + effect.strength * (0.2 + fan) * np.exp(-np.hypot(x, y) / 0.5) / np.exp(-1.6)
 
 
-@dataclass(frozen=True)
-class SaturationFill(Effect):
-    """High-only images clip bright pixels. These pixels also flicker, so other images show other values in them.
+def _draw_limb_glint(plan: Plan, rng: np.random.Generator) -> dict[str, Any]:
+    pointing = int(rng.choice([1, len(plan.views)]))
+    return {
+        "pointing": pointing,
+        "angle_deg": angle(rng),
+        "rays": int(rng.integers(2, 6)),
+        "phase_deg": angle(rng),
+    }
 
-    strength: the fraction of the light that is lost by clipping.
-    """
 
-    seed: int = 0
-    flicker: float = 0.3
+def _saturation_fill(effect: Effect, scene: Plane, moment: Moment) -> Plane:
+    """The bright pixels that clip also flicker, so other images show other values in them."""
+    bright = scene > np.quantile(scene[::4, ::4], 0.98)
+    phase = patches(scene.shape[0], effect["seed"] + moment.shot.pointing, 0.1)
+    swing = effect["flicker"] * effect.strength / (effect.strength + 0.005)
+    factor = 1 + swing * np.sin(40 * moment.elapsed + 2 * phase)
+    return np.where(bright, scene * factor, scene)
 
-    name: ClassVar[str] = "saturation_fill"
-    stage: ClassVar[str] = "scene"
-    unit: ClassVar[str] = "share of the light above the level"
-    cause: ClassVar[str] = "clipped pixels are filled from another image, or stay clipped"
-    nominal: ClassVar[float] = 0.03
-    largest: ClassVar[float] = 0.15
 
-    @classmethod
-    def drawn(cls, strength: float, plan: Plan, rng: np.random.Generator) -> Self:
-        return cls(strength, int(rng.integers(2**31)), float(rng.uniform(0.15, 0.5)))
-
-    def scene(self, scene: Plane, moment: Moment) -> Plane:
-        if self.strength == 0:
-            return scene
-        bright = scene > np.quantile(scene[::4, ::4], 0.98)
-        phase = patches(scene.shape[0], self.seed + moment.shot.pointing, 0.1)
-        swing = self.flicker * self.strength / (self.strength + 0.005)
-        factor = 1 + swing * np.sin(40 * moment.elapsed + 2 * phase)
-        return np.where(bright, scene * factor, scene)
-
-    def saturation_dn(self, exposures: list[Plane], plan: Plan) -> float | None:
-        if self.strength == 0:
-            return None
-        high = [dn for dn, shot in zip(exposures, plan.shots, strict=True) if shot.gain_mode == HIGH]
-        values = np.concatenate([np.maximum(dn, 0.0).ravel() for dn in high])
-        low, top = 0.0, float(values.max())
-        for _ in range(40):
-            level = (low + top) / 2
-            lost = float(np.maximum(values - level, 0.0).sum() / values.sum())
-            low, top = (level, top) if lost > self.strength else (low, level)
-        return float(np.rint(top))
+def _saturation_level(effect: Effect, exposures: list[Plane], plan: Plan) -> float:
+    """The level at which high-only images clip. The strength is the fraction of the light that is lost by clipping."""
+    high = [dn for dn, shot in zip(exposures, plan.shots, strict=True) if shot.gain_mode == HIGH]
+    values = np.concatenate([np.maximum(dn, 0.0).ravel() for dn in high])
+    low, top = 0.0, float(values.max())
+    for _ in range(40):
+        level = (low + top) / 2
+        lost = float(np.maximum(values - level, 0.0).sum() / values.sum())
+        low, top = (level, top) if lost > effect.strength else (low, level)
+    return float(np.rint(top))
 
 
 @cache
@@ -234,10 +137,60 @@ def patches(size: int, seed: int, patch: float) -> Plane:
     return np.asarray((plane - plane.mean()) / plane.std())
 
 
-SCENE_EFFECTS: tuple[type[Effect], ...] = (
-    OcculterMotion,
-    SceneEvolution,
-    OutOfFieldLight,
-    SaturationFill,
-    LimbGlint,
+SCENE_EFFECTS = (
+    Kind(
+        "occulter_motion",
+        "scene",
+        "px/s",
+        "the occulter moves across the field during the exposure",
+        nominal=0.4,
+        largest=1.5,
+        draw=lambda plan, rng: {"angle_deg": float(rng.normal(3.0, 8.0))},
+        covered=_occulter_motion,
+    ),
+    Kind(
+        "scene_evolution",
+        "scene",
+        "share, rms",
+        "the Sun changes between the images of a pointing",
+        nominal=0.2,
+        largest=0.6,
+        draw=lambda plan, rng: {
+            "seed": seed(rng),
+            "patch": float(rng.uniform(0.02, 0.08)),
+            "period": float(rng.uniform(0.15, 0.6)),
+        },
+        scene=_scene_evolution,
+    ),
+    Kind(
+        "out_of_field_light",
+        "scene",
+        "DN/s",
+        "light from the Sun beyond the edge of the detector is scattered into the field",
+        nominal=400.0,
+        largest=4000.0,
+        draw=_draw_out_of_field_light,
+        light=_out_of_field_light,
+    ),
+    Kind(
+        "saturation_fill",
+        "scene",
+        "share of the light above the level",
+        "clipped pixels are filled from another image, or stay clipped",
+        nominal=0.03,
+        largest=0.15,
+        draw=lambda plan, rng: {"seed": seed(rng), "flicker": float(rng.uniform(0.15, 0.5))},
+        scene=_saturation_fill,
+        saturation_dn=_saturation_level,
+    ),
+    Kind(
+        "limb_glint",
+        "scene",
+        "DN/s",
+        "in one pointing an edge of the baffle reflects sunlight",
+        nominal=1.0,
+        largest=60.0,
+        draw=_draw_limb_glint,
+        light=_limb_glint,
+    ),
 )

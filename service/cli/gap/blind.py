@@ -94,7 +94,7 @@ def blind(
     repeat the command."""
     from psfcore.blind.case_set import SetPlan, alone_in, make_set
     from psfcore.blind.run_set import run_set
-    from psfcore.blind.score_set import write_score
+    from psfcore.blind.score import write_score
     from psfcore.simulate.from_files import image_rate
 
     def say(line: str) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 
 from psfcore.blind.chain import Chain, EffectFree
-from psfcore.blind.effects.effect import Earlier, Moment
+from psfcore.blind.effects.effect import Earlier, Effect, Moment, apply_effects
 from psfcore.blind.effects.fine_optics import (
     FINE,
     SYNTHETIC,
@@ -19,7 +19,6 @@ from psfcore.blind.effects.fine_optics import (
     fine_optics,
 )
 from psfcore.blind.effects.registry import EFFECTS, KNOWN, UNKNOWN, effect_named
-from psfcore.blind.effects.scene import SaturationFill
 from psfcore.errors import DataError
 from psfcore.simulate.disc import binned
 from psfcore.simulate.plan import COMBINED, HIGH, Plan, default_plan
@@ -29,6 +28,10 @@ from psfcore.simulate.scatter_truth import ScatterTruth, anisotropic_kernel
 LAW = ScatterTruth(5.0, 2.5, 0.4)
 GLASS = Glass(SYNTHETIC, 64)
 SIZE_PX = 96
+
+
+def effect_of(name: str, strength: float, **parameters: Any) -> Effect:
+    return Effect(EFFECTS[name], strength, parameters)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +68,7 @@ def test_an_effect_changes_images_unless_its_strength_is_0(
 ) -> None:
     dn = Chain(effect_free, ()).read_out(clean, 5)
     for name, kind in EFFECTS.items():
-        effect = kind.drawn(kind.nominal, plan, np.random.default_rng(8))
+        effect = kind.drawn(plan, np.random.default_rng(8))
         still, changed = Chain(effect_free, (effect.at(0.0),)), Chain(effect_free, (effect,))
         np.testing.assert_allclose(still.all_expected(), clean, rtol=1e-6, atol=1e-6, err_msg=name)
         np.testing.assert_array_equal(still.read_out(clean, 5), dn, err_msg=name)
@@ -76,12 +79,10 @@ def test_an_effect_changes_images_unless_its_strength_is_0(
 
 def test_equal_seeds_give_equal_effects_and_other_seeds_others(plan: Plan) -> None:
     for effect in EFFECTS.values():
-        first, second, third = (effect.drawn(1.0, plan, np.random.default_rng(seed)) for seed in (1, 1, 2))
+        first, second, third = (effect.drawn(plan, np.random.default_rng(seed)) for seed in (1, 1, 2))
         assert first == second
-        free = [field.name for field in dataclasses.fields(effect) if field.name != "strength"]
-        assert not free or any(
-            effect.drawn(1.0, plan, np.random.default_rng(seed)) != third for seed in range(3, 9)
-        )
+        others = (effect.drawn(plan, np.random.default_rng(seed)) for seed in range(3, 9))
+        assert not first.parameters or any(other != third for other in others)
 
 
 def test_the_binned_scatter_kernel_follows_the_power_law(optics: FineOptics) -> None:
@@ -118,20 +119,20 @@ def test_effects_of_the_optics_and_charge_that_repels_conserve_light(
     plan: Plan, optics: FineOptics, clean: list[np.ndarray]
 ) -> None:
     for name in ("anisotropic_scatter", "one_sided_scatter", "core_blur", "focus_drift"):
-        effect = EFFECTS[name].drawn(EFFECTS[name].nominal, plan, np.random.default_rng(2))
-        changed = effect.optics(optics, Moment(plan, len(plan.shots) - 1))
-        assert changed.scatter.sum() == pytest.approx(optics.scatter.sum(), abs=2e-3), name
-        assert changed.diffraction.sum() == pytest.approx(1.0, abs=3e-3), name
-    spread = EFFECTS["brighter_fatter"](0.05).expected(clean[2], Moment(plan, 2))
+        effect = EFFECTS[name].drawn(plan, np.random.default_rng(2))
+        after = apply_effects([effect], "optics", optics, Moment(plan, len(plan.shots) - 1))
+        assert after.scatter.sum() == pytest.approx(optics.scatter.sum(), abs=2e-3), name
+        assert after.diffraction.sum() == pytest.approx(1.0, abs=3e-3), name
+    spread = apply_effects([effect_of("brighter_fatter", 0.05)], "expected", clean[2], Moment(plan, 2))
     assert spread.sum() == pytest.approx(clean[2].sum(), rel=1e-12)
     assert spread.std() < clean[2].std()
 
 
 def test_scatter_that_depends_on_the_field_moves_light_between_pixels(plan: Plan, optics: FineOptics) -> None:
-    effect = EFFECTS["field_dependent_scatter"](0.5)
+    effect = effect_of("field_dependent_scatter", 0.5, angle_deg=0.0, bowl=0.5)
     lit = np.zeros(optics.field)
     lit[SIZE_PX, 2 * SIZE_PX - 40] = 1.0  # a point away from the centre along +x: more scatter
-    added = effect.spread(np.zeros_like(lit), lit, optics, Moment(plan, 0))
+    added = apply_effects([effect], "spread", np.zeros_like(lit), lit, optics, Moment(plan, 0))
     assert added[SIZE_PX, 2 * SIZE_PX - 40] < 0
     assert added[SIZE_PX + 21, SIZE_PX] > 0  # off the mesh's orders, which follow the core
 
@@ -139,7 +140,7 @@ def test_scatter_that_depends_on_the_field_moves_light_between_pixels(plan: Plan
 def test_a_moving_disc_uncovers_light_only_at_its_ends(
     plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
 ) -> None:
-    effect = EFFECTS["occulter_motion"](1.0)  # along x
+    effect = effect_of("occulter_motion", 1.0, angle_deg=0.0)
     shot = plan.shots[0]
     moved = Chain(effect_free, (effect,)).expected(0) - clean[0]
     row, column, radius = round(shot.y_px), round(shot.x_px), int(plan.radius_px)
@@ -151,25 +152,27 @@ def test_a_moving_disc_uncovers_light_only_at_its_ends(
 def test_effects_of_the_readout_change_dn_as_defined(plan: Plan) -> None:
     """Persistence decays, a gain mismatch changes combined images only, a nonlinearity reduces faint signals only."""
     nothing, earlier = np.zeros((4, 4)), Earlier(np.full((4, 4), 100.0), plan.shots[0].time_s)
-    persistence = EFFECTS["persistence"](0.1)
-    assert np.all(persistence.read_out(nothing, Moment(plan, 0), []) == 0)
+    persistence = effect_of("persistence", 0.1, decay_s=300.0)
+    assert np.all(apply_effects([persistence], "read_out", nothing, Moment(plan, 0), []) == 0)
     wait_s = plan.shots[1].time_s - plan.shots[0].time_s
-    left = persistence.read_out(nothing, Moment(plan, 1), [earlier])
+    left = apply_effects([persistence], "read_out", nothing, Moment(plan, 1), [earlier])
     np.testing.assert_allclose(left, 10.0 * np.exp(-wait_s / 300.0))
-    mismatch, dn = EFFECTS["gain_mismatch"](0.1), np.full((4, 4), 50.0)
+    mismatch, dn = effect_of("gain_mismatch", 0.1, sign=1), np.full((4, 4), 50.0)
     for index, shot in enumerate(plan.shots):
         factor = {COMBINED: 1.1, HIGH: 1.0}[shot.gain_mode]
-        np.testing.assert_allclose(mismatch.read_out(dn, Moment(plan, index), []), factor * dn)
-    faint = dataclasses.replace(EFFECTS["nonlinearity"](0.2), knee_dn=100.0)
+        after = apply_effects([mismatch], "read_out", dn, Moment(plan, index), [])
+        np.testing.assert_allclose(after, factor * dn)
+    faint = effect_of("nonlinearity", 0.2, knee_dn=100.0, trap=False)
     dn = np.array([[5.0, 100.0, 1000.0]])
-    np.testing.assert_allclose(faint.read_out(dn, Moment(plan, 0), []), [[4.0, 100.0, 1000.0]])
+    after = apply_effects([faint], "read_out", dn, Moment(plan, 0), [])
+    np.testing.assert_allclose(after, [[4.0, 100.0, 1000.0]])
 
 
 def test_saturation_loses_the_share_of_light_given_by_its_strength(
-    plan: Plan, clean: list[np.ndarray]
+    plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
 ) -> None:
     exposures = [rate * shot.exposure_s for rate, shot in zip(clean, plan.shots, strict=True)]
-    level = SaturationFill(0.03).saturation_dn(exposures, plan)
+    level = Chain(effect_free, [effect_of("saturation_fill", 0.03)]).saturation_dn(clean)
     assert level is not None
     high = np.concatenate(
         [dn.ravel() for dn, shot in zip(exposures, plan.shots, strict=True) if shot.gain_mode == HIGH]

@@ -45,10 +45,10 @@ def clean(clean_case: Case) -> Made:
 def test_kinds_have_their_shares_and_effects_occur_in_turn() -> None:
     cases = [draw_case(1, n, SIZE_PX, IMAGES) for n in range(72)]
     assert Counter(case.kind for case in cases) == {CLEAN: 24, SINGLE: 27, PAIR: 9, FOREIGN: 12}
-    names = Counter(case.effects[0].name for case in cases if case.kind == SINGLE)
+    names = Counter(case.effects[0].kind.name for case in cases if case.kind == SINGLE)
     assert set(names) == set(KNOWN)
     assert max(names.values()) - min(names.values()) <= 1
-    assert all(len({effect.name for effect in case.effects}) == 2 for case in cases if case.kind == PAIR)
+    assert all(len({effect.kind.name for effect in case.effects}) == 2 for case in cases if case.kind == PAIR)
     # A case is the same for its seed and number.
     assert draw_case(1, 5, SIZE_PX, IMAGES) == cases[5] != draw_case(2, 5, SIZE_PX, IMAGES)
     with pytest.raises(DataError, match="unknown-effect"):
@@ -56,17 +56,17 @@ def test_kinds_have_their_shares_and_effects_occur_in_turn() -> None:
     # Each target is used in turn for every effect.
     only, left_pct = ("ghost", "wide_halo"), (2.0, 4.0, 8.0)
     cases = [draw_case(1, n, SIZE_PX, IMAGES, only=only, left_pct=left_pct) for n in range(7)]
-    targets = [(case.effects[0].name, *case.target_pct) for case in cases]
+    targets = [(case.effects[0].kind.name, *case.target_pct) for case in cases]
     assert targets == [(name, pct) for pct in (*left_pct, 2.0) for name in only][:7]
 
 
 def test_strong_effects_occur_alone_in_pairs_and_beside_a_changing_sun() -> None:
     cases = [draw_case(2, n, SIZE_PX, IMAGES) for n in range(17 * 24)]
     pairs = [case for case in cases if case.kind == PAIR]
-    beside_sun = [case for case in pairs[1::3] if case.effects[1].name == "scene_evolution"]
+    beside_sun = [case for case in pairs[1::3] if case.effects[1].kind.name == "scene_evolution"]
     assert len(beside_sun) == len(pairs[1::3]) == 17
     # Every other known effect stands beside the Sun once.
-    assert {case.effects[0].name for case in beside_sun} == set(KNOWN) - {"scene_evolution"}
+    assert {case.effects[0].kind.name for case in beside_sun} == set(KNOWN) - {"scene_evolution"}
     assert {case.target_pct[1] for case in beside_sun} == {None}
     assert all(0.02 <= case.effects[1].strength <= 0.3 for case in beside_sun)
     targets = np.array([[*case.target_pct, np.nan][:2] for case in pairs], dtype=float)

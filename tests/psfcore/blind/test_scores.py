@@ -11,8 +11,7 @@ from matplotlib.image import imread
 
 from psfcore.blind.bounds import LEVEL
 from psfcore.blind.plot import score_png
-from psfcore.blind.rows import share_of_expected, wilson
-from psfcore.blind.score_table import score, table
+from psfcore.blind.score import score, set_figures, share, table, wilson
 from psfcore.blind.scoring import (
     Judged,
     covers,
@@ -21,7 +20,6 @@ from psfcore.blind.scoring import (
     true_closure,
     verdict_is_right,
 )
-from psfcore.blind.set_rows import set_rows
 
 
 def truth(kind: str, *names: str, left: float = 0.0, **more: Any) -> dict[str, Any]:
@@ -97,7 +95,7 @@ def test_wilson_agrees_with_the_textbook() -> None:
 
 def test_every_figure_of_the_answers_equals_the_one_computed_by_hand() -> None:
     rows = {row.figure: row for row in score(JUDGED).rows}
-    assert set(rows) - {row.figure for row in set_rows(JUDGED)} == set(FIGURES)
+    assert set(rows) - {row.figure for row in set_figures(JUDGED)} == set(FIGURES)
     for figure, (cases, value, met) in FIGURES.items():
         assert (rows[figure].cases, rows[figure].met) == (cases, met), figure
         assert rows[figure].value == (value if value is None else pytest.approx(value)), figure
@@ -219,7 +217,7 @@ COMPARED = (
 
 
 def test_every_figure_of_the_sets_equals_the_one_computed_by_hand() -> None:
-    rows = {row.figure: row for row in set_rows(SETS)}
+    rows = {row.figure: row for row in set_figures(SETS)}
     for figure, (cases, value) in FIGURES_OF_SETS.items():
         assert (rows[figure].cases, rows[figure].value) == (cases, pytest.approx(value)), figure
     assert rows["set covers the truth"].interval95 == pytest.approx(wilson(7, 11))
@@ -227,7 +225,7 @@ def test_every_figure_of_the_sets_equals_the_one_computed_by_hand() -> None:
 
 
 def test_what_is_right_is_compared_with_what_could_be_known() -> None:
-    rows = {row.figure: row for row in set_rows(SETS)}
+    rows = {row.figure: row for row in set_figures(SETS)}
     alone = [one.known.alone for one in SETS if one.known is not None]
     assert alone[:3] == [1 - LEVEL] * 3
     assert alone[3] > 0.999 > 0.5 > alone[5]
@@ -245,7 +243,7 @@ def test_what_is_right_is_compared_with_what_could_be_known() -> None:
     mean = math.fsum(alone[3:]) / 7
     assert rows[COMPARED[1]].interval95 == pytest.approx((low / mean, high / mean))
     # Nothing is compared where nothing could be known.
-    row = share_of_expected("nothing", SETS[:1], is_right_and_alone, lambda one: 0.0)
+    row = share("nothing", SETS[:1], is_right_and_alone, expected=lambda one: 0.0)
     assert (row.cases, row.value, row.interval95) == (1, None, None)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from psfcore.blind.case_set import SetPlan, make_set
-from psfcore.blind.score_table import score
+from psfcore.blind.score import score
 from psfcore.blind.scoring import Judged
 from psfcore.blind.simulator import checked_truth, simulator_of, source_sha256
 from psfcore.errors import DataError
