@@ -56,6 +56,23 @@ class ImageInfo:
 
 
 @dataclass(frozen=True, eq=False)
+class Prior:
+    """The prior of the parameter of each column, a Gaussian (columns,). The coordinates of the PSF have no prior.
+
+    likely: the largest plausible size; infinite for the coordinates of the PSF. positive: whether the parameter cannot be
+    negative. field: whether it is a coefficient of a random field.
+    """
+
+    likely: Vector
+    positive: NDArray[np.bool_]
+    field: NDArray[np.bool_]
+
+    def precision(self, columns: Sequence[int], scale: float | Vector = 1.0) -> Vector:
+        """1 / variance for these columns. scale: the width of the Gaussian, in units of the likely size."""
+        return np.asarray((self.likely[list(columns)] * scale) ** -2.0)
+
+
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """All the data that a diagnosis uses.
 
@@ -79,11 +96,24 @@ class Evidence:
     def columns_of(self, effect: str) -> dict[str, int]:
         """The column of each parameter of an effect, by the parameter's name.
 
-        An effect that is fitted for each pointing may have fewer or more columns than parameters.
+        An effect that is fitted for each pointing may have fewer or more columns than parameters; a column or parameter
+        without a partner is left out.
         """
         (found,) = (one for one in self.effects if one.name == effect)
         names = (parameter.name for parameter in found.parameters)
         return dict(zip(names, self.columns[effect], strict=False))
+
+    @cached_property
+    def prior(self) -> Prior:
+        """The prior of every column."""
+        found = Prior(
+            np.full(self.size, np.inf), np.zeros(self.size, np.bool_), np.zeros(self.size, np.bool_)
+        )
+        for effect in self.effects:
+            for column, parameter in zip(self.columns[effect.name], effect.parameters, strict=False):
+                found.likely[column] = parameter.likely
+                found.positive[column], found.field[column] = parameter.positive, effect.field
+        return found
 
     def numbers_of(self, columns: Sequence[int]) -> int:
         """The number of values that were measured in the unocculted field to compute the changes of these columns."""

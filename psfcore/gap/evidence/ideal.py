@@ -143,20 +143,14 @@ def left_by_hypotheses(model: LinearModel) -> tuple[Left, ...]:
 
 def _left(model: LinearModel, effects: tuple[Effect, ...]) -> Left:
     evidence, base = model.evidence, len(model.evidence.base)
-    # An effect that is fitted for each pointing may have fewer or more changes than parameters.
-    paired = [
-        (column, parameter.positive)
-        for effect in effects
-        for column, parameter in zip(evidence.columns[effect.name], effect.parameters, strict=False)
-    ]
-    columns, positive = [column for column, _ in paired], dict(paired)
+    columns = [column for effect in effects for column in evidence.columns_of(effect.name).values()]
     while True:
         step = model.fit(columns)
         sigma = np.sqrt(np.maximum(np.diag(step.covariance)[base:], 1e-300))
         below = [
             (value, column)
             for value, column in zip(step.values[base:] / sigma, columns, strict=True)
-            if positive[column] and value < 0
+            if evidence.prior.positive[column] and value < 0
         ]
         if not below:
             break

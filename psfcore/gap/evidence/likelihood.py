@@ -40,12 +40,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp
 
+from psfcore.gap.evidence.evidence import Prior
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
 from psfcore.gap.evidence.one_sided import log_odds_above_zero, log_odds_at_zero, log_of_any_number
 from psfcore.gap.evidence.unocculted_blocks import LEAST_IMAGES
@@ -145,7 +145,12 @@ class Likelihood:
         if further is not None:
             self._jacobian = np.concatenate([self._jacobian, further.discs], axis=2)
             errors = np.concatenate([errors, further.unocculted])
-        self._further = 0.0 if further is None else further.width
+        own, more = evidence.prior, 0 if further is None else further.discs.shape[2]
+        self._of_columns = Prior(
+            np.append(own.likely, np.full(more, 0.0 if further is None else further.width)),
+            np.append(own.positive, np.zeros(more, np.bool_)),
+            np.append(own.field, np.zeros(more, np.bool_)),
+        )
         self._white = np.linalg.inv(np.linalg.cholesky(self._covariance))
         base = (self._white @ self._jacobian[:, :, self._base]).reshape(-1, len(self._base))
         self._to_base = np.linalg.pinv(base)
@@ -202,7 +207,7 @@ class Likelihood:
             below = [
                 (value, c)
                 for value, c in zip(acting, columns, strict=True)
-                if value <= 0 and self._positive[c]
+                if value <= 0 and self._of_columns.positive[c]
             ]
             if below:
                 gone = min(below)[1]
@@ -260,31 +265,10 @@ class Likelihood:
         covariance = scaled_inverse(_together(parts, scales)[0] + prior, weakest=WEAKEST)
         return found[first:], np.asarray(covariance[first:, first:])
 
-    @cached_property
-    def _positive(self) -> NDArray[np.bool_]:
-        out = np.zeros(self._jacobian.shape[2], dtype=np.bool_)
-        for effect in self._evidence.effects:
-            for column, parameter in zip(
-                self._evidence.columns[effect.name], effect.parameters, strict=False
-            ):
-                out[column] = parameter.positive
-        return out
-
-    @cached_property
-    def _likely(self) -> Vector:
-        """The likely size of the parameter of each column."""
-        size = np.full(self._jacobian.shape[2], self._further)
-        for effect in self._evidence.effects:
-            for column, parameter in zip(
-                self._evidence.columns[effect.name], effect.parameters, strict=False
-            ):
-                size[column] = parameter.likely
-        return size
-
     def _prior(self, columns: Sequence[int], scale: float) -> Vector:
         """1 / variance of the prior, for the coordinates of the PSF and then for these columns. 0: no prior, as for
         the PSF."""
-        return np.append(np.zeros(len(self._base)), (self._likely[list(columns)] * scale) ** -2.0)
+        return np.append(np.zeros(len(self._base)), self._of_columns.precision(columns, scale))
 
     def _fit(
         self, parts: tuple[_Part, _Part], columns: Sequence[int], taken: Vector
@@ -328,8 +312,8 @@ class Likelihood:
             for part, s in zip(parts, scales, strict=True)
         )
         whole = theta + np.append(np.zeros(base), taken)
-        positive = self._positive[columns]
-        one_sided = [c for c in columns if self._positive[c]]
+        positive = self._of_columns.positive[columns]
+        one_sided = [c for c in columns if self._of_columns.positive[c]]
         measured = np.array([self._evidence.numbers_of([c]) for c in one_sided], dtype=np.float64)
         cost_of_measured = MEASURED * measured / (2 * scales[1] ** (1 + CORRELATED))
         found = []
@@ -351,10 +335,10 @@ class Likelihood:
             curvature = np.diag(every)[free:] - np.einsum("ij,jk,ik->i", across, inverse, across)
             put_back = -float(np.sum(left * taken_at_zero + curvature * taken_at_zero**2 / 2))
             at_zero_odds = log_odds_at_zero(
-                left + curvature * taken_at_zero, curvature, self._likely[at_zero] * scale
+                left + curvature * taken_at_zero, curvature, self._of_columns.likely[at_zero] * scale
             )
             above_zero_odds = log_odds_above_zero(
-                values[positive], errors[positive], self._likely[one_sided] * scale
+                values[positive], errors[positive], self._of_columns.likely[one_sided] * scale
             )
             # The evidence contains the cost of their measured numbers.
             above_zero_odds = above_zero_odds - cost_of_measured

@@ -144,19 +144,9 @@ class LinearModel:
 
     @cached_property
     def _prior(self) -> Vector:
-        """1 / variance of the prior of each column; 0 for the coordinates of the PSF, which have no prior."""
-        out = np.zeros(self.evidence.size)
-        for effect in self.evidence.effects:
-            wide = 1.0 if effect.field else UNLIKELY
-            for column, parameter in zip(self.evidence.columns[effect.name], effect.parameters, strict=False):
-                out[column] = (wide * parameter.likely) ** -2
-        return out
-
-    @cached_property
-    def of_fields(self) -> frozenset[int]:
-        """The columns of all random fields."""
-        fields = (effect.name for effect in self.evidence.effects if effect.field)
-        return frozenset(column for name in fields for column in self.evidence.columns[name])
+        """1 / variance of the prior of each column; 0 for the coordinates of the PSF."""
+        prior = self.evidence.prior
+        return prior.precision(range(self.evidence.size), np.where(prior.field, 1.0, UNLIKELY))
 
     def pull_of_prior(self, step: Step, taken_out: Vector) -> Vector:
         """How much smaller the fitted values become if the prior also applies to the amounts that were subtracted
@@ -169,10 +159,11 @@ class LinearModel:
     def learned(self, columns: Sequence[int]) -> Vector:
         """l of Eq. (3) for the columns of random fields in `columns`. The other columns of `columns` and the PSF are
         refitted."""
-        field = [column for column in columns if column in self.of_fields]
+        prior = self.evidence.prior
+        field = [column for column in columns if prior.field[column]]
         if not field:
             return np.zeros(0)
-        others = [*self.evidence.base, *(column for column in columns if column not in self.of_fields)]
+        others = [*self.evidence.base, *(column for column in columns if not prior.field[column])]
         here, first = [*others, *field], len(others)
         normal = self.equations()[0][np.ix_(here, here)]
         cross = normal[:first, first:]

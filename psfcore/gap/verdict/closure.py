@@ -130,7 +130,8 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
     deviance: dict[tuple[int, ...], float] = {}
     spread: dict[tuple[int, ...], tuple[Vector, Vector]] = {}
     base = len(evidence.base)
-    free = base + len(set(columns) - model.of_fields)  # a prior constrains the parameters of a random field
+    # A prior constrains the parameters of a random field.
+    free = base + sum(not evidence.prior.field[column] for column in columns)
     unocculted_noise = math.sqrt(model.unocculted_scale)
     for fold in scheme:
         fitted = [n for n in fold.fitted if n in by_index]

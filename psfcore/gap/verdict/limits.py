@@ -248,10 +248,7 @@ class _Limits:
         self, likelihood: Likelihood, evidence: Evidence, unknown: Discrepancy, prior: Mapping[Kind, float]
     ) -> None:
         self._likelihood, self._evidence = likelihood, evidence
-        self._columns = {
-            e.name: [c for c, _ in zip(evidence.columns[e.name], e.parameters, strict=False)]
-            for e in evidence.effects
-        }
+        self._columns = {e.name: list(evidence.columns_of(e.name).values()) for e in evidence.effects}
         orders = [columns for one in ALTERNATIVES if (columns := unknown.columns(one, evidence.size))]
         shown = sorted({c for columns in (*self._columns.values(), *orders) for c in columns})
         number = {column: k for k, column in enumerate(shown)}
@@ -275,15 +272,18 @@ class _Limits:
         None: all."""
         columns = self._columns[effect.name]
         part = np.arange(len(columns)) if kept is None else np.array(kept)
-        likely = np.array([effect.parameters[k].likely for k in part])
+        likely = self._likely(effect)[part]
         scales = np.array(SCALES)
         prior = self._prior["single"] / len(self._evidence.effects) / self._prior["none"]
         offset = math.log(prior / effect.trials)
         offset -= MEASURED * self._evidence.numbers_of([columns[k] for k in part]) / 2
-        one_sided = part.size == 1 and effect.parameters[part[0]].positive
+        one_sided = part.size == 1 and bool(self._evidence.prior.positive[columns[part[0]]])
         return _Hypothesis(
             self._of[effect.name][part], scales[:, None] * likely, offset, self._normal, one_sided
         )
+
+    def _likely(self, effect: Effect) -> Vector:
+        return self._evidence.prior.likely[self._columns[effect.name]]
 
     # --- strengths that would be found ------------------------------------------------------------------
 
@@ -305,10 +305,10 @@ class _Limits:
         if seen <= 0:
             return None
         change = self._normal[:, column]
-        positive = [p.positive for p in effect.parameters[: self._of[effect.name].size]]
+        positive = self._evidence.prior.positive[self._columns[effect.name]]
         # A fit leaves out a positive parameter if its fitted value is negative. If the true value is 0, this happens in half of
         # all cases. ln E is therefore the mean of two values: with all parameters, and without those that may be left out.
-        fewer = [m for m in range(len(positive)) if m == k or not positive[m]]
+        fewer = [m for m in range(positive.size) if m == k or not positive[m]]
         own = (self._single[effect.name], self._hypothesis(effect, fewer))
         sided = math.log(2) if positive[k] else 0.0
         # A rival that would have to be negative cannot act.
@@ -329,7 +329,7 @@ class _Limits:
     def _of_field(self, effect: Effect, need: _Need, observed: bool) -> ParameterLimits:
         """The limits of the standard deviation of the coefficients of a random field."""
         columns = self._of[effect.name]
-        likely = np.array([effect.parameters[k].likely for k in range(columns.size)])
+        likely = self._likely(effect)
         change = self._normal[:, columns] * (likely / likely[0])
         hypotheses = (self._single[effect.name], *self._rivals(effect))
         ways = [_odds_of(h, change, self._likelihood.gained) for h in hypotheses]
@@ -410,7 +410,7 @@ class _Limits:
         columns = self._of[acting.name]
         inner = self._normal[np.ix_(rival.columns, rival.columns)] + np.diag(rival.widths[-1] ** -2.0)
         if acting.field:
-            likely = np.array([acting.parameters[k].likely for k in range(columns.size)])
+            likely = self._likely(acting)
             size = at.found_90 * likely / likely[0]
             across = self._normal[np.ix_(rival.columns, columns)] * size
             own = float((np.diag(self._normal)[columns] * size**2).sum())
@@ -419,7 +419,7 @@ class _Limits:
         column = columns[names.index(at.name)]
         change = self._normal[rival.columns, column] * at.found_90
         own = float(self._normal[column, column]) * at.found_90**2
-        positive = np.array([p.positive for p in fitted.parameters[: rival.columns.size]])
+        positive = self._evidence.prior.positive[self._columns[fitted.name]]
         signs = (1.0,) if acting.parameters[names.index(at.name)].positive else (1.0, -1.0)
         explained = max(_explained(inner, sign * change, positive) for sign in signs)
         return math.sqrt(max(own - explained, 0.0))

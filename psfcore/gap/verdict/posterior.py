@@ -175,11 +175,7 @@ def weigh(
     taken: Mapping[str, Sequence[float]] | None = None,
 ) -> Weighed:
     """Weigh the hypothesis that the effects `names` act together. taken: as in `at_refit`."""
-    by_name = {effect.name: effect for effect in evidence.effects}
-    # An effect that is fitted for each pointing may have fewer or more changes than parameters.
-    columns = [
-        [c for c, _ in zip(evidence.columns[name], by_name[name].parameters, strict=False)] for name in names
-    ]
+    columns = [list(evidence.columns_of(name).values()) for name in names]
     before = taken or {}
     subtracted = [
         value
