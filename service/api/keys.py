@@ -11,11 +11,11 @@ import time
 from collections.abc import Iterable
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.http.callers import Caller, KeyFirst, Reading, Submitting
-from service.http.paging import Cursor, Limit, Page, page, position
+from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.state import Shared
 from workers.catalogue.access.keys import LABEL_LENGTH, OWNER, Scope, TooManyKeys
@@ -101,7 +101,7 @@ class MadeKey(KeyView):
 
 @router.get("", summary="List keys")
 def list_keys(
-    request: Request,
+    paging: Paging,
     caller: Reading,
     state: Shared,
     owner: Annotated[
@@ -111,17 +111,13 @@ def list_keys(
             description="owner of the keys; `*`: all owners. To list the keys of another owner, you need the scope admin",
         ),
     ] = None,
-    limit: Limit = 50,
-    cursor: Cursor = None,
 ) -> Page[KeyView]:
     """Your keys, newest first, including expired and revoked keys."""
     _check_used(state)
     owner = owner or caller.owner
     _check_for(caller, owner)
-    rows = state.catalogue.keys.page(
-        None if owner == EVERYBODY else owner, limit=limit + 1, after=position(cursor)
-    )
-    return page(request, rows, limit, KeyView.of)
+    rows = state.catalogue.keys.page(None if owner == EVERYBODY else owner, **paging.query)
+    return paging.page(rows, KeyView.of)
 
 
 @router.post("", status_code=201, summary="Make a key")

@@ -26,10 +26,8 @@ from service.http.callers import Caller, Submitting
 from service.http.problems import RESPONSES, Problem
 from service.http.quotas import Allowed, check_length
 from service.http.state import Shared, State
-from workers.catalogue.tables import ImageRow, TransitRow
 from workers.files.partial_uploads import PartialUpload, PartialUploads
 from workers.files.store import sha256_of
-from workers.intake.uploads import image_row, transit_row
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"], responses=RESPONSES)
 UploadId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
@@ -41,7 +39,7 @@ ALGORITHMS: dict[str, Callable[[], Any]] = {
     "md5": hashlib.md5,
 }
 PART = "application/offset+octet-stream"
-KINDS = ("transit", "image")
+KINDS: dict[str, uploads.Kind[Any]] = {"transit": uploads.TRANSIT, "image": uploads.IMAGE}
 _PART_BODY = {
     "parameters": [
         {"name": name, "in": "header", "required": required, "schema": {"type": "string"}}
@@ -100,24 +98,26 @@ def begin_upload(request: Request, caller: Submitting, state: Shared) -> Respons
     _check_version(request)
     length = _number(request, "upload-length")
     metadata = _metadata(request.headers.get("upload-metadata", ""))
-    kind, sha256 = metadata.get("kind", "transit"), metadata.get("sha256")
-    if kind not in KINDS:
-        raise Problem(422, "bad-upload", f"expected the kind transit or image; got {kind[:40]!r}")
+    name, sha256 = metadata.get("kind", "transit"), metadata.get("sha256")
+    if name not in KINDS:
+        raise Problem(422, "bad-upload", f"expected the kind {' or '.join(KINDS)}; got {name[:40]!r}")
+    kind = KINDS[name]
     if sha256 is not None and not (len(sha256) == 64 and set(sha256) <= set("0123456789abcdef")):
         raise Problem(422, "bad-upload", f"expected a SHA-256 of 64 hexadecimal digits; got {sha256[:80]!r}")
-    uploads.check_size(length, _most_bytes(state, kind))
+    kind.check_size(length, state)
     open_uploads = PartialUploads(state.settings.data_dir)
     if sha256 is not None:
-        if _is_known(state, caller, kind, sha256) and state.store.size(sha256) == length:
-            return _answer(200, {"Content-Location": f"/v1/{kind}s/{sha256}", "Upload-Offset": str(length)})
-        equal = open_uploads.equal(caller.owner, kind, length, sha256)
+        row = state.catalogue.get(kind.table, sha256, caller.owner)
+        if row is not None and state.store.size(sha256) == length:
+            location = f"{kind.address}/{sha256}"
+            return _answer(200, {"Content-Location": location, "Upload-Offset": str(length)})
+        equal = open_uploads.equal(caller.owner, name, length, sha256)
         if equal is not None:
             return _described(200, open_uploads, equal)
     check_length(state, caller, length)
     try:
-        upload = open_uploads.create(
-            caller.owner, kind, length, uploads.label(metadata.get("filename")), sha256
-        )
+        filename = uploads.label(metadata.get("filename"))
+        upload = open_uploads.create(caller.owner, name, length, filename, sha256)
     except DataError as error:
         raise Problem(429, error.code, error.message) from error
     return _described(201, open_uploads, upload)
@@ -178,13 +178,6 @@ def delete_upload(upload_id: UploadId, request: Request, caller: Submitting, sta
     return _answer(204, {})
 
 
-def _is_known(state: State, caller: Caller, kind: str, sha256: str) -> bool:
-    """Whether the owner has uploaded this file before."""
-    if kind == "transit":
-        return state.catalogue.get(TransitRow, sha256, caller.owner) is not None
-    return state.catalogue.get(ImageRow, sha256, caller.owner) is not None
-
-
 async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take: Allowed) -> None:
     """Append the body to the received bytes. Raises ``Problem`` 413 and 460; then the bytes of this request are removed."""
     offset, checksum = file.tell(), _checksum(request.headers.get("upload-checksum"))
@@ -222,7 +215,7 @@ async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take:
 
 def _complete(open_uploads: PartialUploads, upload: PartialUpload, caller: Caller, state: State) -> str:
     """Check a complete file and add it to the catalogue; returns its address. A file that cannot be used is removed."""
-    path, settings = open_uploads.path(upload), state.settings
+    path = open_uploads.path(upload)
     sha256 = sha256_of(path)
     try:
         if upload.sha256 not in (None, sha256):
@@ -231,17 +224,13 @@ def _complete(open_uploads: PartialUploads, upload: PartialUpload, caller: Calle
                 "wrong-checksum",
                 f"expected a file with the SHA-256 {upload.sha256}; got one with {sha256}: upload it again",
             )
-        if upload.kind == "transit":
-            contents = uploads.archive_contents(path, settings.archive_limits)
-            transit = transit_row(caller.owner, sha256, upload.length, upload.filename, contents)
-            Allowed(state, caller).keep(path, sha256, transit)
-        else:
-            summary = uploads.fits_summary(path, state.limits)
-            image = image_row(caller.owner, sha256, upload.length, upload.filename, summary)
-            Allowed(state, caller).keep(path, sha256, image)
+        kind = KINDS[upload.kind]
+        summary = kind.inspect(path, state)
+        row = kind.row(caller.owner, sha256, upload.length, upload.filename, summary)
+        Allowed(state, caller).keep(path, sha256, row)
     finally:
         open_uploads.remove(upload)
-    return f"/v1/{upload.kind}s/{sha256}"
+    return f"{kind.address}/{sha256}"
 
 
 def _found(open_uploads: PartialUploads, upload_id: str, caller: Caller) -> PartialUpload:
@@ -268,10 +257,6 @@ def _described(status: int, open_uploads: PartialUploads, upload: PartialUpload)
 
 def _answer(status: int, headers: dict[str, str]) -> Response:
     return Response(status_code=status, headers={"Tus-Resumable": VERSION, **headers})
-
-
-def _most_bytes(state: State, kind: str) -> int:
-    return state.settings.max_transit_bytes if kind == "transit" else state.settings.max_upload_bytes
 
 
 def _check_version(request: Request) -> None:

@@ -23,20 +23,18 @@ from workers.contract.identities import (
     report_identity,
     request_identity,
 )
-from workers.contract.methods import Parameters
 from workers.contract.queues import Queue
 from workers.contract.requests import (
     CrossValidate,
     Deconvolve,
     GapDiagnose,
+    Parameters,
     PsfBuild,
     PsfFit,
     PsfInterpolate,
     PsfTables,
     Report,
     Rerun,
-)
-from workers.contract.resolved import (
     ResolvedCrossValidate,
     ResolvedDeconvolve,
     ResolvedGapDiagnose,

@@ -24,13 +24,10 @@ from workers.contract.identities import (
     psf_identity,
 )
 from workers.contract.kinds import KINDS, JobRequest, Kind, load
-from workers.contract.methods import Parameters
-from workers.contract.requests import Deconvolve, PsfBuild
-from workers.contract.resolved import ResolvedDeconvolve
+from workers.contract.requests import Deconvolve, Parameters, PsfBuild, ResolvedDeconvolve
 from workers.intake import compatibility
 from workers.intake.deprecated import check_not_deprecated
-from workers.intake.no_psf import no_psf
-from workers.intake.psf_choice import Found, picked_for_image
+from workers.intake.psf_choice import Found, no_psf, picked_for_image
 from workers.lineage import made_by
 from workers.rows import row_of
 

@@ -15,8 +15,8 @@ from pydantic import BaseModel
 from sqlalchemy import Engine, event, update
 from sqlalchemy.exc import OperationalError
 
-from service.api import events, owner_events
-from service.api.owner_events import Watch
+from service.api import events
+from service.api.events import Watch
 from service.views.jobs import JobView
 from tests.service.api.live import Following, Live, running
 from tests.service.conftest import execute, refusal
@@ -66,7 +66,7 @@ class Looks:
     def __init__(
         self, catalogue: Catalogue, *named: str, owner: str = DEFAULT_OWNER, since: float | None = None
     ) -> None:
-        since = catalogue.followed_jobs.now() - owner_events.OVERLAP_S if since is None else since
+        since = catalogue.followed_jobs.now() - events.OVERLAP_S if since is None else since
         rows = catalogue.followed_jobs
         self.watch = Watch("job", rows, JobView.of, owner, frozenset(named), Place(since))
 
@@ -82,7 +82,7 @@ class BulkLooks(Looks):
     """The same for bulk runs."""
 
     def __init__(self, catalogue: Catalogue, *named: str, after_end: int = 2) -> None:
-        since = Place(catalogue.followed_bulks.now() - owner_events.OVERLAP_S)
+        since = Place(catalogue.followed_bulks.now() - events.OVERLAP_S)
         rows = catalogue.followed_bulks
         self.watch = Watch("bulk", rows, Line.of, DEFAULT_OWNER, frozenset(named), since, after_end=after_end)
 
@@ -170,7 +170,7 @@ def test_a_deleted_bulk_run_is_gone_once(catalogue: Catalogue, end: str) -> None
 def test_a_bulk_run_that_ended_some_time_ago_is_followed_until_it_is_deleted(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(owner_events, "OVERLAP_S", 0.0)
+    monkeypatch.setattr(events, "OVERLAP_S", 0.0)
     runs = [bulk_run(catalogue) for _ in range(3)]
     before = bulk_run(catalogue)
     catalogue.bulks.cancel(before)
@@ -214,7 +214,7 @@ def test_other_owners_and_turns_of_bulk_runs_are_not_told(catalogue: Catalogue) 
 def test_ends_since_a_time_come_in_pages_that_lose_none(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (followed, owner_events):
+    for module in (followed, events):
         monkeypatch.setattr(module, "MOST", 3)
     ids = [submitted(catalogue) for _ in range(10)]
     at = time.time() - 3600.0
@@ -231,7 +231,7 @@ def test_ends_since_a_time_come_in_pages_that_lose_none(
 def test_of_very_many_waiting_jobs_the_newest_are_told_and_every_end(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (followed, owner_events):
+    for module in (followed, events):
         monkeypatch.setattr(module, "MOST", 3)
     ids = [submitted(catalogue) for _ in range(5)]
     looks = Looks(catalogue)

@@ -12,8 +12,7 @@ from workers.catalogue.contexts import Pin
 from workers.catalogue.tables import PsfRow
 from workers.contract.identities import interpolated_psf_identity
 from workers.contract.requests import Deconvolve, PsfInterpolate
-from workers.intake.psf_choice import picked_for_image
-from workers.intake.psf_reason import reasoned_psf
+from workers.intake.psf_choice import picked_for_image, reasoned_psf
 from workers.intake.requests import resolved_deconvolution
 
 SERIES = "hri_euv/174/total"
