@@ -51,7 +51,7 @@ from workers import traces
 from workers.catalogue.catalogue import Catalogue
 from workers.contract.requests import FEWEST_DIGITS
 from workers.files.modes import private_folder
-from workers.files.opened import open_store
+from workers.files.store import open_store
 from workers.settings import Settings, software_version
 
 SHORT = re.compile(r"\^\[0-9a-f\]\{(32|64)\}\$")

@@ -43,7 +43,7 @@ from workers.contract.kinds import JobRequest
 from workers.contract.phases import Phase
 from workers.contract.requests import PsfBuild
 from workers.contract.suggestions import explained
-from workers.files.intact import files_of
+from workers.files.collection import files_of
 from workers.files.store import Store, sha256_of
 from workers.intake import estimates
 from workers.intake.deprecated import details_now

@@ -16,8 +16,7 @@ from service.http.state import Shared
 from service.views.products import ProductView
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.requests import Identity
-from workers.files.collection import remove_unnamed
-from workers.files.intact import files_of
+from workers.files.collection import files_of, remove_unnamed
 from workers.intake.deprecated import details_now
 
 router = APIRouter(prefix="/v1/images", tags=["images"], responses=RESPONSES)

@@ -20,8 +20,7 @@ from starlette.exceptions import HTTPException
 from psfcore.errors import DataError
 from workers import checks, logs
 from workers.contract.suggestions import explained
-from workers.files.full_disk import NO_ROOM, STORAGE_FULL, is_disk_full
-from workers.files.store import StoreAway
+from workers.files.store import NO_ROOM, STORAGE_FULL, StoreAway, is_disk_full
 
 log = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"

@@ -10,7 +10,7 @@ from service.http.state import State
 from workers import checks
 from workers.catalogue.catalogue import Row
 from workers.catalogue.owners import MIB, NOT_KEPT, ROWS_NOT_KEPT, OverQuota, Usage
-from workers.files.full_disk import STORAGE_FULL
+from workers.files.store import STORAGE_FULL
 
 
 class Allowed:

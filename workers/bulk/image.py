@@ -26,8 +26,7 @@ from workers.contract.identities import product_identity
 from workers.contract.requests import Deconvolve, ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files import beneath
-from workers.files.full_disk import is_disk_full
-from workers.files.store import sha256_of
+from workers.files.store import is_disk_full, sha256_of
 from workers.intake import estimates
 from workers.intake.deprecated import details_now
 from workers.intake.requests import resolved_deconvolution

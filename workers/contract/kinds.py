@@ -143,7 +143,7 @@ _ROWS = (
     ),
     Kind(
         "psf-fit",
-        task="workers.tasks.psf_fit:psf_fit",
+        task="workers.tasks.transits:psf_fit",
         result=Result.PSF,
         parameters=PsfFit,
         resolved=ResolvedPsfFit,
@@ -164,7 +164,7 @@ _ROWS = (
     ),
     Kind(
         "psf-tables",
-        task="workers.tasks.tables:psf_tables",
+        task="workers.tasks.psf_build:psf_tables",
         result=Result.PSF,
         parameters=PsfTables,
         resolved=PsfTables,
@@ -188,7 +188,7 @@ _ROWS = (
     ),
     Kind(
         "report",
-        task="workers.tasks.report:report",
+        task="workers.tasks.transits:report",
         result=Result.REPORT,
         parameters=Report,
         resolved=ResolvedReport,
