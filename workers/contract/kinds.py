@@ -82,7 +82,7 @@ class Kind:
     | origin | the origin of the PSFs or products that this kind makes; a rerun finds the kind of its job by this origin |
     | needs_room | whether the job starts only if the owner's quota is not full |
     | counted_whole | whether the reported steps count the whole job, so that the time left can be estimated from them |
-    | time_advice, memory_advice | advice for a request that needs more than the operator's limits |
+    | memory_advice, time_advice | advice for a request that needs more than the limits of the operator; time_advice: None if it is the same |
     """
 
     name: str
@@ -97,8 +97,8 @@ class Kind:
     queue: Queue = Queue.INTERACTIVE
     needs_room: bool = True
     counted_whole: bool = False
-    time_advice: str = "use fewer or smaller images"
     memory_advice: str = "use fewer or smaller images"
+    time_advice: str | None = None
 
     @property
     def request(self) -> type[Request]:
@@ -138,12 +138,11 @@ _ROWS = (
         origin="built",
         resolver="workers.intake.requests:resolve_psf_build",
         counted_whole=True,
-        time_advice="use a smaller size, or fewer spectral lines in the bandpass",
         memory_advice="use a smaller size, or fewer spectral lines in the bandpass",
     ),
     Kind(
         "psf-fit",
-        task="workers.tasks.transits:psf_fit",
+        task="workers.tasks.psf_fit:psf_fit",
         result=Result.PSF,
         parameters=PsfFit,
         resolved=ResolvedPsfFit,
@@ -159,18 +158,16 @@ _ROWS = (
         resolved=PsfInterpolate,
         identity=interpolated_psf_identity,
         origin=INTERPOLATED,
-        time_advice="crop the two PSFs",
         memory_advice="crop the two PSFs",
     ),
     Kind(
         "psf-tables",
-        task="workers.tasks.psf_build:psf_tables",
+        task="workers.tasks.tables:psf_tables",
         result=Result.PSF,
         parameters=PsfTables,
         resolved=PsfTables,
         identity=request_identity("psf-tables"),
         needs_room=False,  # the quota does not count tables
-        time_advice="crop the PSF",
         memory_advice="crop the PSF",
     ),
     Kind(
@@ -183,12 +180,11 @@ _ROWS = (
         assistant="workers.tasks.crossval:assist_cross_validation",
         queue=Queue.CROSSVAL,  # these jobs take long, so quick jobs run first
         counted_whole=True,
-        time_advice="use fewer runs, scheme 'shared', or fewer or smaller images",
         memory_advice="use fewer runs, scheme 'shared', or fewer or smaller images",
     ),
     Kind(
         "report",
-        task="workers.tasks.transits:report",
+        task="workers.tasks.report:report",
         result=Result.REPORT,
         parameters=Report,
         resolved=ResolvedReport,

@@ -170,7 +170,7 @@ def checked(
         raise DataError(
             "too-much-time",
             f"expected a job of at most {settings.max_job_s:g} s (HELIOPSF_MAX_JOB_S); this one takes about "
-            f"{expected.seconds:g} s: {KINDS[kind].time_advice}",
+            f"{expected.seconds:g} s: {KINDS[kind].time_advice or KINDS[kind].memory_advice}",
         )
     return asdict(expected)
 
@@ -184,7 +184,7 @@ def estimate(
     if kind == "deconvolve":
         cpu_s, mib = _deconvolution(parameters, catalogue, owner)
     elif kind == "psf-build":
-        cpu_s, mib = _build(parameters, _mask_px(parameters, catalogue, owner))
+        cpu_s, mib = _build(parameters, catalogue, owner)
     else:
         cpu_s, mib = _linear(kind, parameters, catalogue, owner)
     start_s = cpu_s / threads**COSTS.threads_exponent
@@ -226,7 +226,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
         psf_shape = psf_shape if psf is None else tuple(psf.details["shape"])
     elif parameters.get("psf_recipe") is not None:  # the PSF may still have to be built
         recipe = parameters["psf_recipe"]
-        built_s, built_mib = _build(recipe, _mask_px(recipe, catalogue, owner))
+        built_s, built_mib = _build(recipe, catalogue, owner)
         psf_shape = (recipe["size"], recipe["size"])
     method, draws = parameters["method"], parameters["error_draws"]
     whole_px = ny * nx
@@ -252,13 +252,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     )
 
 
-def _mask_px(recipe: Mapping[str, Any], catalogue: Catalogue, owner: str) -> int:
-    """Number of pixels of the mask image of a PSF build; 0 if it has none."""
-    image = catalogue.get(ImageRow, recipe.get("mask_id") or "", owner)
-    return 0 if image is None else math.prod(image.summary["shape"])
-
-
-def _build(parameters: Mapping[str, Any], mask_px: int = 0) -> tuple[float, float]:
+def _build(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> tuple[float, float]:
     cost = COSTS.kinds.psf_build
     size = max(parameters["size"], cost.grid_px)
     grid = size / cost.grid_px
@@ -285,7 +279,9 @@ def _build(parameters: Mapping[str, Any], mask_px: int = 0) -> tuple[float, floa
         cost.cell_bytes * max(work.cells, default=0),
         cost.entry_bytes * work.mount_entries + cost.spectrum_bytes * work.mask_cells * size,
     )
-    arrays += cost.image_bytes * mask_px
+    mask = catalogue.get(ImageRow, parameters.get("mask_id") or "", owner)
+    if mask is not None:
+        arrays += cost.image_bytes * math.prod(mask.summary["shape"])
     return len(instrument.spectral_lines) * line_s, meshes_mib + cost.grid_mib * grid**2 + arrays / MIB
 
 
@@ -302,8 +298,7 @@ def _linear(
         cpu_s += parameters["runs"] * (run_s + run_ns * 1e-9 * pixels)
     built_s, built_mib = 0.0, 0.0
     if parameters.get("diffraction_recipe") is not None:
-        recipe = parameters["diffraction_recipe"]
-        built_s, built_mib = _build(recipe, _mask_px(recipe, catalogue, owner))
+        built_s, built_mib = _build(parameters["diffraction_recipe"], catalogue, owner)
     return built_s + cpu_s, max(built_mib, cost.base_mib + cost.pixel_bytes * pixels / MIB)
 
 

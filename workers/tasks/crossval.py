@@ -31,7 +31,7 @@ from workers.catalogue.tables import ReportRow
 from workers.contract.identities import psf_fit_identity
 from workers.contract.requests import ResolvedCrossValidate
 from workers.tasks.context import Context
-from workers.tasks.data.reports import keep_report, provenance_of
+from workers.tasks.data.reports import keep_report, provenance_of, write_json
 from workers.tasks.data.solutions import solved
 from workers.tasks.transits import load_transit
 
@@ -147,17 +147,18 @@ def _save(
         "inputs_sha256": transit.sha256,
         "provenance": provenance_of(context, request),
     }
-    keep_report(
-        context,
-        identity,
-        "cross-validation",
-        said,
-        draw=lambda path: cross_validation_png(
-            found, fits, [frame.pointing for frame in transit.frames], path
-        ),
-        transit_id=request.transit_id,
-        details={"sentence": said["sentence"], "held_out": found.held_out, "folds": len(fits)},
-    )
+    with context.store.temporary() as text, context.store.temporary() as picture:
+        write_json(text, said)
+        cross_validation_png(found, fits, [frame.pointing for frame in transit.frames], picture)
+        keep_report(
+            context,
+            identity,
+            "cross-validation",
+            transit_id=request.transit_id,
+            text=text,
+            picture=picture,
+            details={"sentence": said["sentence"], "held_out": found.held_out, "folds": len(fits)},
+        )
 
 
 def sentence(found: Bands, folds: int) -> str:

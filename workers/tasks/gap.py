@@ -11,7 +11,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from psfcore.drawing.plots import psf_png
 from psfcore.errors import DataError
+from psfcore.fits.psfs import write_psf
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
 from psfcore.gap.effect_sources import library_sha256
@@ -25,8 +27,8 @@ from workers.catalogue.tables import ReportRow
 from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
 from workers.contract.requests import ResolvedGapDiagnose
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import given_psf, keep_psf
-from workers.tasks.data.reports import keep_report, provenance_of
+from workers.tasks.data.psfs import given_psf, psf_row
+from workers.tasks.data.reports import keep_report, provenance_of, write_json
 from workers.tasks.data.solutions import solver
 from workers.tasks.transits import load_transit
 
@@ -127,12 +129,25 @@ def _save_psf(context: Context, report_id: str, found: Diagnosis, provenance: di
         version=f"0.1.0+{identity[:8]}",
         provenance={"psf_id": identity, "parents": parents, **provenance},
     )
-    details = {
-        "transit_id": parents["transit"],
-        "parents": parents,
-        "diffraction_psf_id": provenance["diffraction_psf_id"],
-    }
-    context.add(keep_psf(context, psf, identity, origin="fitted", details=details))
+    with context.store.temporary() as file, context.store.temporary() as picture:
+        write_psf(file, psf)
+        psf_png(psf, picture)
+        row = psf_row(
+            psf,
+            identity,
+            context.owner,
+            origin="fitted",
+            file_sha256=context.store.keep(file),
+            store=context.store,
+            preview_sha256=context.store.keep(picture),
+            details={
+                "transit_id": parents["transit"],
+                "parents": parents,
+                "diffraction_psf_id": provenance["diffraction_psf_id"],
+            },
+            threads=context.settings.threads,
+        )
+    context.add(row)
     return identity
 
 
@@ -146,18 +161,26 @@ def _save(
 ) -> None:
     """Write JSON, HTML page and picture into the store, and add the row to the catalogue."""
     said = gap_report(found) | {"provenance": provenance | {"corrected_psf_id": corrected}}
-    keep_report(
-        context,
-        identity,
-        KIND,
-        said,
-        draw=lambda path: path.write_bytes(gap_png(found, said)),
-        page=gap_page(found, said).html(),
-        transit_id=request.transit_id,
-        details={
-            **{name: said[name] for name in ("sentence", "verdict", "answer", "gap", "cautions")},
-            "strongest_axis": said["where"][0]["axis"],
-            "psf_id": request.psf_id,
-            "corrected_psf_id": corrected,
-        },
-    )
+    with (
+        context.store.temporary() as text,
+        context.store.temporary() as page,
+        context.store.temporary() as picture,
+    ):
+        write_json(text, said)
+        page.write_text(gap_page(found, said).html(), "utf-8")
+        picture.write_bytes(gap_png(found, said))
+        keep_report(
+            context,
+            identity,
+            KIND,
+            transit_id=request.transit_id,
+            text=text,
+            page=page,
+            picture=picture,
+            details={
+                **{name: said[name] for name in ("sentence", "verdict", "answer", "gap", "cautions")},
+                "strongest_axis": said["where"][0]["axis"],
+                "psf_id": request.psf_id,
+                "corrected_psf_id": corrected,
+            },
+        )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from psfcore.fits.psfs import read_psf
+from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import Psf, cumulative_curve
 from psfcore.scatter.interpolation import Epoch, curve_sigma, interpolated_psf, parameters_of
 from psfcore.scatter.total_psf import CURVE_RADII_PX
@@ -18,7 +18,7 @@ from workers.contract.identities import interpolated_psf_identity
 from workers.contract.requests import PsfInterpolate
 from workers.intake.compatibility import of_upload
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import keep_psf, named_psf
+from workers.tasks.data.psfs import named_psf, psf_row
 from workers.tasks.data.reports import provenance_of
 from workers.versions.interpolation import name_of
 from workers.versions.series import INTERPOLATED, series_of
@@ -59,14 +59,7 @@ def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
         threads=context.settings.threads,
     )
     context.report(STAGE, 1, 2)
-    between = psf.provenance["interpolated_between"]
-    details = {
-        "parents": {name: end["psf_id"] for name, end in zip(("before", "after"), between, strict=True)},
-        "weights": {end["psf_id"]: end["weight"] for end in between},
-        "job_id": context.job_id,
-        "fit": _fit_of(psf, context.settings.threads),
-    }
-    row = keep_psf(context, psf, identity, origin=INTERPOLATED, details=details)
+    row = _saved(context, identity, psf)
     # The files of the ends do not name the variant of the channel; their rows do.
     row.channel = named_psf(context, request.before_psf_id).channel or row.channel
     row.series = series_of(row.instrument, row.channel, row.kind)
@@ -83,6 +76,32 @@ def _epoch(context: Context, psf_id: str, time: str) -> Epoch:
         psf, name=row.name, version=row.version, instrument=instrument, wavelength_angstrom=angstrom
     )
     return Epoch(psf, datetime.fromisoformat(time), {"psf_id": row.id, "file_sha256": row.file_sha256})
+
+
+def _saved(context: Context, identity: str, psf: Psf) -> PsfRow:
+    """The row of the PSF; its file, picture and tables are in the store."""
+    from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
+
+    ends = psf.provenance["interpolated_between"]
+    with context.store.temporary() as file, context.store.temporary() as picture:
+        write_psf(file, psf)
+        psf_png(psf, picture)
+        return psf_row(
+            psf,
+            identity,
+            context.owner,
+            origin=INTERPOLATED,
+            file_sha256=context.store.keep(file),
+            store=context.store,
+            preview_sha256=context.store.keep(picture),
+            details={
+                "parents": {name: end["psf_id"] for name, end in zip(("before", "after"), ends, strict=True)},
+                "weights": {end["psf_id"]: end["weight"] for end in ends},
+                "job_id": context.job_id,
+                "fit": _fit_of(psf, context.settings.threads),
+            },
+            threads=context.settings.threads,
+        )
 
 
 def _fit_of(psf: Psf, threads: int) -> dict[str, Any]:

@@ -1,5 +1,4 @@
-"""The tasks ``psf-build``, which builds a PSF version from an instrument file, and ``psf-tables``, which makes the tables
-and the picture of a PSF that has none yet, for example an uploaded PSF."""
+"""The task ``psf-build``: builds a PSF version from an instrument file."""
 
 from __future__ import annotations
 
@@ -12,43 +11,21 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.images import read_plane
-from psfcore.fits.psfs import read_psf
+from psfcore.fits.psfs import write_psf
 from psfcore.instruments.model import Instrument, parse_instrument
+from psfcore.psf import Psf
 from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.identities import interpolated_psf_identity, recipe_of
-from workers.contract.requests import PsfBuild, PsfInterpolate, PsfTables, ResolvedDeconvolve
+from workers.contract.requests import PsfBuild, PsfInterpolate, ResolvedDeconvolve
 from workers.settings import library_versions
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import is_total_alone, keep_psf, keep_tables, named_psf
+from workers.tasks.data.psfs import is_total_alone, named_psf, psf_row
 from workers.versions.series import TOTAL
 
 
 def psf_build(context: Context, parameters: Mapping[str, Any]) -> str:
     """Build a PSF from an instrument file and add it to the catalogue; returns the PSF's id."""
     return built_psf(context, PsfBuild.model_validate(parameters)).id
-
-
-def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:
-    """Make the tables of a PSF of the catalogue, and its picture if it is missing; returns the PSF's id."""
-    request = PsfTables.model_validate(parameters)
-    row = named_psf(context, request.psf_id)
-    context.report("reading", 0, 3)
-    psf = read_psf(context.store.verified(row.file_sha256), context.limits)
-    context.report("making tables", 1, 3)
-    tables_sha256 = keep_tables(psf, context.store, context.settings.threads)
-    context.report("drawing", 2, 3)
-    with context.store.temporary() as picture:
-        preview_sha256 = row.preview_sha256
-        if preview_sha256 is None or context.store.size(preview_sha256) is None:
-            from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
-
-            psf_png(psf, picture)
-            preview_sha256 = context.store.keep(picture)
-    context.report("drawing", 3, 3)
-    context.catalogue.psfs.describe(
-        row.id, context.owner, tables_sha256=tables_sha256, preview_sha256=preview_sha256
-    )
-    return row.id
 
 
 def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
@@ -123,17 +100,31 @@ def built_psf(context: Context, build: PsfBuild, *, whole: bool = True) -> PsfRo
         threads=context.settings.threads,
         progress=lambda step, steps: context.report("building the PSF", step, steps),
     )
-    row = keep_psf(
-        context,
-        psf,
-        identity,
-        origin="built",
-        kind=build.component or TOTAL,
-        details={"job_id": context.job_id, "libraries": library_versions()},
-        whole=whole,
-        instrument_file=recipe.text.encode(),
-    )
+    with context.store.temporary() as path:
+        write_psf(path, psf, instrument_file=recipe.text.encode())
+        row = psf_row(
+            psf,
+            identity,
+            context.owner,
+            origin="built",
+            file_sha256=context.store.keep(path),
+            store=context.store,
+            preview_sha256=_picture(context, psf) if whole else None,
+            kind=build.component or TOTAL,
+            details={"job_id": context.job_id, "libraries": library_versions()},
+            threads=context.settings.threads,
+            whole=whole,
+        )
     return context.add(row) if there is None else context.catalogue.refile(row)
+
+
+def _picture(context: Context, psf: Psf) -> str:
+    """Draw a PSF into the store; returns the SHA-256 of the picture."""
+    from psfcore.drawing import plots  # matplotlib is loaded only if a picture is drawn
+
+    with context.store.temporary() as picture:
+        plots.psf_png(psf, picture)
+        return context.store.keep(picture)
 
 
 def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> NDArray[np.float64] | None:

@@ -27,7 +27,7 @@ from workers.lineage import Made, lineage
 from workers.rows import row_of
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import named_psf
-from workers.tasks.data.reports import keep_report
+from workers.tasks.data.reports import keep_report, write_json
 
 KIND = "rerun"
 SCHEMA = 1
@@ -137,12 +137,14 @@ def _save(context: Context, identity: str, request: ResolvedRerun, first: Thing,
         "again": _made(context, again) | {"id": again.id},
         "parameters": request.parameters,
     }
-    named = ("of", "sentence", "same", "same_file", "largest_relative_difference")
-    details = {name: said[name] for name in named} | {"output_sha256": again.file_sha256}
-    context.report(
-        "comparing", 1, 1
-    )  # raises an exception if the job was cancelled, so that no report is kept
-    keep_report(context, identity, KIND, said, details=details, about_id=request.id)
+    with context.store.temporary() as text:
+        write_json(text, said)
+        named = ("of", "sentence", "same", "same_file", "largest_relative_difference")
+        details = {name: said[name] for name in named} | {"output_sha256": again.file_sha256}
+        context.report(
+            "comparing", 1, 1
+        )  # raises an exception if the job was cancelled, so that no report is kept
+        keep_report(context, identity, KIND, text=text, details=details, about_id=request.id)
 
 
 def _made(context: Context, row: Thing) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from workers.catalogue.tables import DEFAULT_OWNER
 from workers.files.store import Store
 from workers.settings import Settings
 from workers.tasks.context import Context
-from workers.tasks.data.reports import keep_report
+from workers.tasks.data.reports import keep_report, write_json
 
 GAP_ID = "9a" * 32
 
@@ -31,7 +31,10 @@ def keep_gap_report(settings: Settings, owner: str = DEFAULT_OWNER) -> dict[str,
         html = gap_page(found, said).html()
     catalogue, store = Catalogue(settings.catalogue_url), Store(settings.data_dir)
     context = cast(Context, SimpleNamespace(owner=owner, store=store, add=catalogue.add))
-    keep_report(context, GAP_ID, "gap", said, page=html, details={"sentence": said["sentence"]})
+    with store.temporary() as text, store.temporary() as page:
+        write_json(text, said)
+        page.write_text(html, "utf-8")
+        keep_report(context, GAP_ID, "gap", text=text, page=page, details={"sentence": said["sentence"]})
     catalogue.close()
     return said
 

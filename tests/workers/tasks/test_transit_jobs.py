@@ -24,7 +24,7 @@ from tests.conftest import write_image
 from tests.fitted_transit import copied_data, counted_inversions, fitted_transit
 from tests.html_page import check_stands_alone, read_page
 from tests.transit_files import TRUTH, diffraction
-from workers.tasks import transits as report_task
+from workers.tasks import report as report_task
 
 LIMITS = FitsLimits(max_pixels=2**24)
 FILES = {f"{k:03d}.fits" for k in range(9)}

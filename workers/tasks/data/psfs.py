@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from psfcore.fits.psfs import read_psf, write_psf
+from psfcore.fits.psfs import read_psf
 from psfcore.psf import Psf, cumulative_curve
 from workers.catalogue.tables import PsfRow
 from workers.files.store import Store
@@ -101,44 +100,3 @@ def keep_tables(psf: Psf, store: Store, threads: int) -> str:
     with store.temporary() as path:
         path.write_text(json.dumps(tables_of(psf, threads=threads), separators=(",", ":"), allow_nan=False))
         return store.keep(path)
-
-
-def keep_psf(
-    context: Context,
-    psf: Psf,
-    identity: str,
-    *,
-    origin: str,
-    details: Mapping[str, Any],
-    draw: Callable[[Path], object] | None = None,
-    kind: str = TOTAL,
-    whole: bool = True,
-    instrument_file: bytes | None = None,
-) -> PsfRow:
-    """Write the file of a new PSF, its tables and its picture into the store; returns its row, which is not added yet.
-
-    draw: draws the picture; default: ``psf_png``. details, kind, whole: as for ``psf_row``; without components there is
-    no picture either. instrument_file: as for ``write_psf``.
-    """
-    store = context.store
-    with store.temporary() as file, store.temporary() as picture:
-        write_psf(file, psf, instrument_file=instrument_file)
-        if whole and draw is None:
-            from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
-
-            psf_png(psf, picture)
-        elif whole and draw is not None:
-            draw(picture)
-        return psf_row(
-            psf,
-            identity,
-            context.owner,
-            origin=origin,
-            file_sha256=store.keep(file),
-            store=store,
-            preview_sha256=store.keep(picture) if whole else None,
-            kind=kind,
-            details=details,
-            threads=context.settings.threads,
-            whole=whole,
-        )
