@@ -106,8 +106,6 @@ class DefaultAsked(BaseModel):
 class Move(PastChange):
     """A past change of the default context."""
 
-    model_config = ConfigDict(from_attributes=True)
-
     context: str | None = Field(validation_alias="context_id")
 
 

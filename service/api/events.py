@@ -78,9 +78,8 @@ DESCRIBED_OF_OWNER: dict[int | str, dict[str, Any]] = {
     },
 }
 
-Said = tuple[
-    str, bool
-]  # the next text of a stream, empty if nothing has changed; and whether the stream ends after it
+# The next text of a stream, empty if nothing has changed; and whether the stream ends after it.
+Said = tuple[str, bool]
 
 
 @dataclass(frozen=True)
@@ -191,9 +190,8 @@ def _stream(request: Request, state: Shared, caller: Caller, say: Callable[[], S
                 text, last = "", False
             if text or time.monotonic() - said_at > ALIVE_EVERY_S:
                 said_at = time.monotonic()
-                yield (
-                    text or ": still here\n\n"
-                )  # the comment keeps the connection open while nothing changes
+                # The comment keeps the connection open while nothing changes.
+                yield text or ": still here\n\n"
             if last:
                 return
             await asyncio.sleep(LOOK_EVERY_S)

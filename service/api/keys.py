@@ -65,11 +65,6 @@ class NewKey(BaseModel):
             raise ValueError("expected expires_at or lasts_days; got both: leave one out")
         return self
 
-    def end(self, now: float) -> float | None:
-        """The time at which the key expires, seconds since 1970; None if the request does not limit the life of the
-        key."""
-        return self.expires_at if self.lasts_days is None else now + self.lasts_days * DAY_S
-
 
 class KeyView(BaseModel):
     """A key, without its secret."""
@@ -228,7 +223,7 @@ def _end(state: Shared, caller: Caller, body: NewKey) -> float | None:
     """The end of a new key. Raises ``Problem`` 422 if this end is in the past, and 403 if it is later than the end of
     the caller's key."""
     now = time.time()
-    asked = body.end(now)
+    asked = body.expires_at if body.lasts_days is None else now + body.lasts_days * DAY_S
     if asked is not None and asked <= now:
         raise Problem(
             422, "end-in-the-past", f"expected an end in the future; got {asked:.0f}: choose a later one"

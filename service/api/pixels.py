@@ -44,24 +44,16 @@ class Part:
     width, height: None means up to the last column or row.
     """
 
-    x: int
-    y: int
-    width: int | None
-    height: int | None
-    step: int
-
-
-def _part(
-    x: Annotated[int, Query(ge=0, le=LARGEST, description="first column of the window, counted from 0")] = 0,
+    x: Annotated[int, Query(ge=0, le=LARGEST, description="first column of the window, counted from 0")] = 0
     y: Annotated[
         int, Query(ge=0, le=LARGEST, description="first row of the window, counted from 0 as in FITS")
-    ] = 0,
+    ] = 0
     width: Annotated[
         int | None, Query(ge=1, le=LARGEST, description="number of columns; default: up to the last column")
-    ] = None,
+    ] = None
     height: Annotated[
         int | None, Query(ge=1, le=LARGEST, description="number of rows; default: up to the last row")
-    ] = None,
+    ] = None
     step: Annotated[
         int,
         Query(
@@ -70,12 +62,10 @@ def _part(
             description="n: each number of the answer stands for a block of n x n pixels. The number is the mean of the finite "
             "pixels; for `quality`, the bitwise OR. Blocks at the last rows and columns of the window may be smaller",
         ),
-    ] = 1,
-) -> Part:
-    return Part(x, y, width, height, step)
+    ] = 1
 
 
-Window = Annotated[Part, Depends(_part)]
+Window = Annotated[Part, Depends()]
 SHAPE = {"type": "string", "pattern": r"^\d+,\d+$"}
 DESCRIBED: dict[int | str, dict[str, Any]] = {
     200: {

@@ -87,8 +87,6 @@ class StatusChange(BaseModel):
 class Change(PastChange):
     """A past change of status."""
 
-    model_config = ConfigDict(from_attributes=True)
-
     status_before: PsfStatus
     status: PsfStatus
     version_before: str
@@ -143,16 +141,12 @@ def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, 
 
 def _asked(body: StatusChange) -> StatusAsked:
     ranged = {"valid_from", "valid_to"} & body.model_fields_set
+    values = body.model_dump(exclude={"valid_from", "valid_to", "successor", "supersedes"})
     return StatusAsked(
-        status=body.status,
-        reason=body.reason,
-        version=body.version,
         validity=Validity.of(body.valid_from, body.valid_to) if ranged else None,
         successor_id=body.successor,
         supersedes=tuple(body.supersedes),
-        instrument=body.instrument,
-        channel=body.channel,
-        kind=body.kind,
+        **values,
     )
 
 
@@ -186,8 +180,6 @@ class SeriesChange(BaseModel):
 
 class SeriesMove(PastChange):
     """A past change of a series."""
-
-    model_config = ConfigDict(from_attributes=True)
 
     interpolated: bool
 

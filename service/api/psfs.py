@@ -198,11 +198,11 @@ async def upload_psf(
     file is not stored. If a job of this service made the same file, and the request gives no name, version, instrument,
     channel or kind, the answer is the existing PSF.
     """
-    named = {"name": name, "version": version, "instrument": instrument, "channel": channel, "kind": kind}
+    columns = {"name": name, "version": version, "instrument": instrument, "channel": channel, "kind": kind}
     # Otherwise a PSF that was built here, downloaded and sent again would have a second id.
-    known = None if any(named.values()) else partial(_made_here, state, caller)
+    equal = None if any(columns.values()) else partial(_made_here, state, caller)
     return PsfView.of(
-        await uploads.add_upload(request, response, caller, state, uploads.PSF, known=known, named=named)
+        await uploads.add_upload(request, response, caller, state, uploads.PSF, equal=equal, columns=columns)
     )
 
 

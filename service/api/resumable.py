@@ -40,30 +40,30 @@ ALGORITHMS: dict[str, Callable[[], Any]] = {
 }
 PART = "application/offset+octet-stream"
 KINDS: dict[str, uploads.Kind[Any]] = {"transit": uploads.TRANSIT, "image": uploads.IMAGE}
+
+
+def _header(name: str, description: str | None = None, *, required: bool = True) -> dict[str, Any]:
+    """The OpenAPI description of a header."""
+    described = {} if description is None else {"description": description}
+    return {"name": name, "in": "header", "required": required, "schema": {"type": "string"}, **described}
+
+
 _PART_BODY = {
     "parameters": [
-        {"name": name, "in": "header", "required": required, "schema": {"type": "string"}}
-        for name, required in (("Tus-Resumable", True), ("Upload-Offset", True), ("Upload-Checksum", False))
+        _header("Tus-Resumable"),
+        _header("Upload-Offset"),
+        _header("Upload-Checksum", required=False),
     ],
     "requestBody": {"required": True, "content": {PART: {"schema": {"type": "string", "format": "binary"}}}},
 }
+_METADATA = (
+    "kind (transit, which is the default, or image), filename and sha256, each with its value in base64"
+)
 _CREATION = {
     "parameters": [
-        {
-            "name": name,
-            "in": "header",
-            "required": name != "Upload-Metadata",
-            "schema": {"type": "string"},
-            "description": text,
-        }
-        for name, text in (
-            ("Tus-Resumable", VERSION),
-            ("Upload-Length", "size of the file, bytes"),
-            (
-                "Upload-Metadata",
-                "kind (transit, which is the default, or image), filename and sha256, each with its value in base64",
-            ),
-        )
+        _header("Tus-Resumable", VERSION),
+        _header("Upload-Length", "size of the file, bytes"),
+        _header("Upload-Metadata", _METADATA, required=False),
     ]
 }
 
@@ -97,7 +97,12 @@ def begin_upload(request: Request, caller: Submitting, state: Shared) -> Respons
     """
     _check_version(request)
     length = _number(request, "upload-length")
-    metadata = _metadata(request.headers.get("upload-metadata", ""))
+    metadata: dict[str, str] = {}  # pairs of a key and its value in base64
+    for pair in filter(
+        None, (part.strip() for part in request.headers.get("upload-metadata", "").split(","))
+    ):
+        key, _, value = pair.partition(" ")
+        metadata[key] = _decoded(value.strip()).decode("utf-8", "replace")
     name, sha256 = metadata.get("kind", "transit"), metadata.get("sha256")
     if name not in KINDS:
         raise Problem(422, "bad-upload", f"expected the kind {' or '.join(KINDS)}; got {name[:40]!r}")
@@ -126,9 +131,8 @@ def begin_upload(request: Request, caller: Submitting, state: Shared) -> Respons
 @router.head("/{upload_id}", status_code=200, summary="How much has arrived", response_class=Response)
 def upload_offset(upload_id: UploadId, request: Request, caller: Submitting, state: Shared) -> Response:
     """`Upload-Offset`: number of bytes that the service has. Continue from there."""
-    _check_version(request)
-    open_uploads = PartialUploads(state.settings.data_dir)
-    answer = _described(200, open_uploads, _found(open_uploads, upload_id, caller))
+    open_uploads, upload = _open_upload(upload_id, request, caller, state)
+    answer = _described(200, open_uploads, upload)
     answer.headers["Cache-Control"] = "no-store"
     return answer
 
@@ -147,11 +151,9 @@ async def send_part(upload_id: UploadId, request: Request, caller: Submitting, s
     cannot be checked. The answer is 409 if the offset is another one, 460 if the checksum does not fit, and 423 if another
     request sends bytes now.
     """
-    _check_version(request)
     if request.headers.get("content-type", "") != PART:
         raise Problem(415, "bad-upload", f"expected Content-Type: {PART}; got another one")
-    open_uploads = PartialUploads(state.settings.data_dir)
-    upload = await run_in_threadpool(_found, open_uploads, upload_id, caller)
+    open_uploads, upload = await run_in_threadpool(_open_upload, upload_id, request, caller, state)
     with ExitStack() as held:
         try:
             file = held.enter_context(open_uploads.opened(upload))
@@ -172,17 +174,21 @@ async def send_part(upload_id: UploadId, request: Request, caller: Submitting, s
 @router.delete("/{upload_id}", status_code=204, summary="Delete an open upload", response_class=Response)
 def delete_upload(upload_id: UploadId, request: Request, caller: Submitting, state: Shared) -> Response:
     """Delete the bytes that have arrived. The upload cannot be continued."""
-    _check_version(request)
-    open_uploads = PartialUploads(state.settings.data_dir)
-    open_uploads.remove(_found(open_uploads, upload_id, caller))
+    open_uploads, upload = _open_upload(upload_id, request, caller, state)
+    open_uploads.remove(upload)
     return _answer(204, {})
 
 
 async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take: Allowed) -> None:
     """Append the body to the received bytes. Raises ``Problem`` 413 and 460; then the bytes of this request are removed."""
-    offset, checksum = file.tell(), _checksum(request.headers.get("upload-checksum"))
-    digest = None if checksum is None else checksum[0]()
-    whole = False
+    offset, declared, whole = file.tell(), request.headers.get("upload-checksum"), False
+    algorithm, _, value = (declared or "").partition(" ")
+    if declared is not None and algorithm not in ALGORITHMS:
+        raise Problem(
+            400, "bad-upload", f"expected a checksum by {', '.join(ALGORITHMS)}; got {algorithm[:20]!r}"
+        )
+    checksum = None if declared is None else _decoded(value)
+    digest = None if declared is None else ALGORITHMS[algorithm]()
     try:
         async for chunk in request.stream():
             if file.tell() + len(chunk) > upload.length:
@@ -192,7 +198,7 @@ async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take:
                 file.write(chunk)
                 if digest is not None:
                     digest.update(chunk)
-        if checksum is not None and digest is not None and digest.digest() != checksum[1]:
+        if digest is not None and digest.digest() != checksum:
             raise Problem(
                 460,
                 "wrong-checksum",
@@ -233,7 +239,12 @@ def _complete(open_uploads: PartialUploads, upload: PartialUpload, caller: Calle
     return f"{kind.address}/{sha256}"
 
 
-def _found(open_uploads: PartialUploads, upload_id: str, caller: Caller) -> PartialUpload:
+def _open_upload(
+    upload_id: str, request: Request, caller: Caller, state: State
+) -> tuple[PartialUploads, PartialUpload]:
+    """All open uploads, and the upload of a request. Raises ``Problem`` 412 for another version of tus, and 404."""
+    _check_version(request)
+    open_uploads = PartialUploads(state.settings.data_dir)
     upload = open_uploads.find(upload_id, caller.owner)
     if upload is None:
         raise Problem(
@@ -242,7 +253,7 @@ def _found(open_uploads: PartialUploads, upload_id: str, caller: Caller) -> Part
             f"expected the id of an open upload; got {upload_id}, which was completed, deleted or has expired: begin the upload "
             "again",
         )
-    return upload
+    return open_uploads, upload
 
 
 def _described(status: int, open_uploads: PartialUploads, upload: PartialUpload) -> Response:
@@ -276,24 +287,6 @@ def _number(request: Request, name: str) -> int:
             400, "bad-upload", f"expected a number of bytes in the header {name.title()}; got {text[:40]!r}"
         )
     return int(text)
-
-
-def _metadata(text: str) -> dict[str, str]:
-    """The metadata of a creation: pairs of a key and its value in base64."""
-    found: dict[str, str] = {}
-    for pair in filter(None, (part.strip() for part in text.split(","))):
-        key, _, value = pair.partition(" ")
-        found[key] = _decoded(value.strip()).decode("utf-8", "replace")
-    return found
-
-
-def _checksum(text: str | None) -> tuple[Callable[[], Any], bytes] | None:
-    if text is None:
-        return None
-    name, _, value = text.partition(" ")
-    if name not in ALGORITHMS:
-        raise Problem(400, "bad-upload", f"expected a checksum by {', '.join(ALGORITHMS)}; got {name[:20]!r}")
-    return ALGORITHMS[name], _decoded(value)
 
 
 def _decoded(text: str) -> bytes:

@@ -106,7 +106,7 @@ class Listing:
         return page(self.request, rows, self.limit, view)
 
 
-def _listing(request: Request, limit: Limit = 50, cursor: Cursor = None) -> Listing:
+async def _listing(request: Request, limit: Limit = 50, cursor: Cursor = None) -> Listing:
     return Listing(request, limit, cursor)
 
 

@@ -186,11 +186,11 @@ def install(app: FastAPI, as_page: AsPage) -> None:
     @app.exception_handler(SQLAlchemyError)
     @app.exception_handler(OSError)
     def _away(request: Request, error: SQLAlchemyError | OSError) -> Response:
-        found = _of_system(error)
-        if found is None:
+        reply = _of_system(error)
+        if reply is None:
             raise error  # it is answered as an internal error
         log.error("%s: %s", "database" if isinstance(error, SQLAlchemyError) else "storage", error)
-        return answer(request, found, as_page)
+        return answer(request, reply, as_page)
 
     @app.exception_handler(Exception)
     def _ours(request: Request, _error: Exception) -> Response:

@@ -151,13 +151,13 @@ async def add_upload(
     state: State,
     kind: Kind[Row],
     *,
-    known: Callable[[str], Row | None] | None = None,
-    named: Mapping[str, str | None] | None = None,
+    equal: Callable[[str], Row | None] | None = None,
+    columns: Mapping[str, str | None] | None = None,
 ) -> Row:
     """Receive the file of a request, check it and add it to the catalogue; returns its row.
 
-    Sets the status and the header Location of the response. known: finds a row that stands for the file with this
-    SHA-256; the file is then not added. named: further arguments of ``kind.row``. Raises ``Problem`` 413 if the file
+    Sets the status and the header Location of the response. equal: finds a row that stands for the file with this
+    SHA-256; the file is then not added. columns: further arguments of ``kind.row``. Raises ``Problem`` 413 if the file
     exceeds the size limit or the quota, 415 if it is of another kind, 400 for a broken form or an incomplete upload, and 422
     if the content shows that the file cannot be used.
     """
@@ -165,9 +165,9 @@ async def add_upload(
     with state.store.temporary() as path:
         sha256, size, filename = await _receive(request, path, state, kind, allowed)
         summary = await anyio.to_thread.run_sync(kind.inspect, path, state, limiter=state.inspecting)
-        there = None if known is None else await run_in_threadpool(known, sha256)
+        there = None if equal is None else await run_in_threadpool(equal, sha256)
         if there is None:
-            upload = kind.row(caller.owner, sha256, size, filename, summary, **(named or {}))
+            upload = kind.row(caller.owner, sha256, size, filename, summary, **(columns or {}))
             row, new = await run_in_threadpool(allowed.keep, path, sha256, upload)
         else:
             row, new = there, False

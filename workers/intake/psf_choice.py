@@ -135,9 +135,12 @@ def look_for_image(
             "no-instrument",
             "expected DETECTOR or INSTRUME in the image's header; got neither: name the PSF in the request",
         )
-    at = _observed_at(header)
+    try:
+        at = seconds(header["date_obs"] or "")
+    except DataError:  # the keyword contains a text that is not a time; a missing time is reported below
+        at = None
     found = look(catalogue, PsfFilter(instrument, channel, kind, valid_at=at), owner, context)
-    if at is None and any(not _always(psf) for psf in found.psfs):
+    if at is None and any((psf.valid_from, psf.valid_to) != (-math.inf, math.inf) for psf in found.psfs):
         raise DataError(
             "no-date",
             f"expected DATE-BEG or DATE-OBS in the image's header, in the form 2024-03-01T12:00:00, because PSFs of "
@@ -192,17 +195,6 @@ def _seen_as(
     pinned = catalogue.contexts.asked_for(context, owner)
     known = catalogue.series.variants(instrument, channel, kind, owner, None if pinned is None else pinned.id)
     return instrument, variant_for(header["cards"], known) or channel
-
-
-def _observed_at(header: Mapping[str, Any]) -> float | None:
-    try:
-        return seconds(header["date_obs"] or "")
-    except DataError:  # the keyword contains a text that is not a time; the caller reports a missing time
-        return None
-
-
-def _always(psf: PsfRow) -> bool:
-    return psf.valid_from == -math.inf and psf.valid_to == math.inf
 
 
 def _joined(given: Mapping[str, str]) -> str:
