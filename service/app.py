@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
 import anyio
 from fastapi import FastAPI
@@ -12,29 +14,22 @@ from psfcore.fits.viewing.planes import Planes
 from service.api import (
     bulk,
     bulk_results,
-    estimates,
+    contexts,
     events,
     images,
     jobs,
     keys,
     lineage,
-    owner_events,
-    products,
-    reports,
+    pixels,
+    psf_curves,
+    psf_status,
+    psfs,
     resumable,
     transits,
 )
-from service.api.files import headers, pixels
-from service.api.psfs import affected, contexts, series
-from service.api.psfs import choice as psf_choice
-from service.api.psfs import curves as psf_queries
-from service.api.psfs import status as psf_status
-from service.api.psfs import versions as psfs
-from service.http import description, guard, observation, problems
-from service.http.access import Access
-from service.http.bodies import BodyLimits
+from service.http import guard, observation, problems
 from service.http.rates import AtOnce, Rates
-from service.http.state import State
+from service.http.state import Access, State
 from service.operation import docs, health, metrics
 from service.pages import archive_runs as archive_run_pages
 from service.pages import assets, login, visitors
@@ -54,10 +49,13 @@ from service.uws import routes as uws
 from service.vo import cutouts, interfaces, links, lists
 from workers import traces
 from workers.catalogue.catalogue import Catalogue
+from workers.contract.requests import FEWEST_DIGITS
 from workers.files.modes import private_folder
-from workers.files.opened import open_store
+from workers.files.store import open_store
 from workers.settings import Settings, software_version
 
+SHORT = re.compile(r"\^\[0-9a-f\]\{(32|64)\}\$")
+PROBLEM = f"#/components/schemas/{problems.ProblemDocument.__name__}"
 CUTOUTS_AT_ONCE = 2
 DECODED_AT_ONCE = 2
 INSPECTED_AT_ONCE = 2
@@ -115,29 +113,33 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
     )
     problems.install(app, problem_page)
     visitors.install(app)
-    description.install(app)
-    guard.install(app, access, BodyLimits.of(settings), problem_page)
+    _correct_description(app)
+    guard.install(app, access, settings, problem_page)
     app.state.requests = observation.install(app)
-    # psf_choice comes before psfs, so that "best" is not taken for an id.
-    versions = (psf_choice, psf_status, series, contexts, affected, lineage)
-    for part in (
-        *versions,
-        images,
-        transits,
-        jobs,
-        estimates,
-        psfs,
-        psf_queries,
-        products,
-        pixels,
-        headers,
-        reports,
-        resumable,
-        bulk,
-        bulk_results,
-        events,
-        owner_events,
-        keys,
+    routers = (
+        psfs.choosing,  # before psfs.router, so that "best" is not taken for an id
+        psf_status.router,
+        psf_status.series,
+        contexts.router,
+        psf_status.affected,
+        lineage.router,
+        images.router,
+        transits.router,
+        jobs.router,
+        jobs.estimating,
+        psfs.router,
+        psf_curves.router,
+        images.products,
+        pixels.router,
+        pixels.headers,
+        transits.reports,
+        resumable.router,
+        bulk.router,
+        bulk_results.router,
+        events.router,
+        keys.router,
+    )
+    pages = (
         uws,
         interfaces,
         lists,
@@ -160,6 +162,42 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         report_page,
         login,
         key_pages,
-    ):
-        app.include_router(part.router)
+    )
+    for router in (*routers, *(part.router for part in pages)):
+        app.include_router(router)
     return app
+
+
+def _correct_description(app: FastAPI) -> None:
+    """Correct the OpenAPI description, because the framework describes some answers wrongly: errors are problem
+    documents on every route, and ids in addresses may be shortened."""
+    generate = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            _correct(generate())
+        assert app.openapi_schema is not None
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _correct(description: dict[str, Any]) -> None:
+    for operations in description["paths"].values():
+        for operation in operations.values():
+            for parameter in operation.get("parameters", ()):
+                _shorten(parameter)
+            for response in operation["responses"].values():
+                content = response.get("content", {})
+                if content.get("application/json", {}).get("schema", {}).get("$ref") == PROBLEM:
+                    content[problems.MEDIA_TYPE] = content.pop("application/json")
+
+
+def _shorten(parameter: dict[str, Any]) -> None:
+    """Describe an id in a path: the first digits of the id are accepted too, see ``service.http.callers``."""
+    whole = SHORT.fullmatch(parameter["schema"].get("pattern", ""))
+    if parameter["in"] == "path" and whole is not None:
+        parameter["schema"]["pattern"] = f"^[0-9a-f]{{{FEWEST_DIGITS},{whole[1]}}}$"
+        parameter["description"] = (
+            f"an id, or its first {FEWEST_DIGITS} or more digits if no other id begins with them"
+        )

@@ -43,11 +43,11 @@ from workers.contract.kinds import JobRequest
 from workers.contract.phases import Phase
 from workers.contract.requests import PsfBuild
 from workers.contract.suggestions import explained
-from workers.files.intact import files_of
+from workers.files.collection import files_of
 from workers.files.store import Store, sha256_of
 from workers.intake import estimates
-from workers.intake.cost_model import COSTS
 from workers.intake.deprecated import details_now
+from workers.intake.estimates import COSTS
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 from workers.machine import free_bytes

@@ -21,7 +21,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.app import create_app
-from service.http.access import check_can_serve
+from service.http.state import check_can_serve
 from workers import logs
 from workers.catalogue.catalogue import Catalogue
 from workers.files.modes import private_folder

@@ -168,7 +168,7 @@ FAULTS = (
           ("tests/workers/files/test_store.py",), ("tests/service/operation/test_disk.py",)),
     Fault("intake-end-of-validity-included", "workers/catalogue/psfs.py",
           "PsfRow.valid_to > wanted.valid_at", "PsfRow.valid_to >= wanted.valid_at",
-          ("tests/workers/catalogue/test_psfs.py", "tests/workers/intake"), ("tests/service/api/psfs",)),
+          ("tests/workers/catalogue/test_psfs.py", "tests/workers/intake"), ("tests/service/api/test_psfs.py",)),
     Fault("bulk-image-of-a-living-worker-taken", "workers/catalogue/bulks.py",
           "BulkItemRow.state == ItemState.TAKEN, ~held.exists()", "BulkItemRow.state == ItemState.TAKEN",
           ("tests/workers/catalogue/test_bulks.py",), ("tests/workers/bulk",)),

@@ -15,8 +15,7 @@ import pytest
 import s3fs
 from moto.server import ThreadedMotoServer
 
-from workers.files.opened import open_store
-from workers.files.store import Store
+from workers.files.store import Store, open_store
 from workers.settings import Settings
 
 

@@ -37,9 +37,7 @@ def database(catalogue: Catalogue) -> None:
     try:
         catalogue.ping()
     except SQLAlchemyError as error:
-        raise (
-            _damage(error) if damaged(error) else Unusable(f"the database does not answer ({_kind(error)})")
-        ) from error
+        raise (_damage(error) if damaged(error) else _silent(error)) from error
     started = time.monotonic()
     if started < _pages_good_until.get(catalogue, 0.0):
         return
@@ -53,6 +51,10 @@ def database(catalogue: Catalogue) -> None:
 
 def _damage(error: SQLAlchemyError) -> Unusable:
     return Unusable(f"the database is damaged ({_kind(error)}); restore a copy of it")
+
+
+def _silent(error: SQLAlchemyError) -> Unusable:
+    return Unusable(f"the database does not answer ({_kind(error)})")
 
 
 def storage(folder: Path, min_free_mib: int) -> None:
@@ -93,12 +95,8 @@ def broker(settings: Settings) -> None:
         queue.check(settings)
     except queue.AWAY as error:
         raise Unusable(f"the broker does not answer ({_kind(error)})") from error
-    except (
-        ValueError,
-        KeyError,
-        ImportError,
-        AttributeError,
-    ) as error:  # the text is not a URL, or the library for its scheme is not installed
+    # The text is not a URL, or the library for its scheme is not installed.
+    except (ValueError, KeyError, ImportError, AttributeError) as error:
         raise Unusable(f"the broker's URL cannot be used ({_kind(error)})") from error
 
 
@@ -107,7 +105,7 @@ def embedded_worker(catalogue: Catalogue, settings: Settings) -> None:
     try:
         workers = catalogue.census.workers(settings.lease_s)
     except SQLAlchemyError as error:
-        raise Unusable(f"the database does not answer ({_kind(error)})") from error
+        raise _silent(error) from error
     if not workers:
         raise Unusable(f"no worker has announced itself for {settings.lease_s:g} s")
 
@@ -147,11 +145,9 @@ def damaged(error: SQLAlchemyError) -> bool:
 
 def database_said(error: SQLAlchemyError) -> str:
     """A summary of a database error. The original text may contain the URL, so it is not shown."""
-    words = str(getattr(error, "orig", None) or error).lower()
-    known = [reason for pattern, reason in _REASONS.items() if re.search(pattern, words)]
-    return (
-        known[0] if known else f"it does not answer ({type(getattr(error, 'orig', None) or error).__name__})"
-    )
+    original = getattr(error, "orig", None) or error
+    known = (reason for pattern, reason in _REASONS.items() if re.search(pattern, str(original).lower()))
+    return next(known, f"it does not answer ({type(original).__name__})")
 
 
 def _kind(error: BaseException) -> str:

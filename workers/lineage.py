@@ -14,7 +14,7 @@ from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, TransitRow
 from workers.contract.kinds import kind_of_origin
-from workers.contract.resolved import ResolvedRerun
+from workers.contract.requests import ResolvedRerun
 from workers.versions.series import INTERPOLATED
 
 MOST_DEEP = 16

@@ -5,7 +5,7 @@ from __future__ import annotations
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, TransitRow
-from workers.contract.short_ids import FEWEST_DIGITS
+from workers.contract.requests import FEWEST_DIGITS
 
 # The word of an error code, the name of the thing in messages, and what its user can do.
 NAMES = {

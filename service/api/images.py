@@ -1,25 +1,26 @@
-"""Uploaded images: ``/v1/images``."""
+"""Uploaded images, ``/v1/images``, and the products of their deconvolutions, ``/v1/products``."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, Field
 
 from service.http import downloads as files
 from service.http import uploads
 from service.http.callers import Reading, Submitting
-from service.http.paging import Cursor, Limit, Page, page, position
+from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES
-from service.http.quotas import Allowed
 from service.http.state import Shared
-from workers.catalogue.tables import ImageRow
+from service.views.products import ProductView
+from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.requests import Identity
-from workers.intake.uploads import image_row
+from workers.files.collection import files_of, remove_unnamed
+from workers.intake.deprecated import details_now
 
 router = APIRouter(prefix="/v1/images", tags=["images"], responses=RESPONSES)
+products = APIRouter(prefix="/v1/products", tags=["products"], responses=RESPONSES)
 
 
 class ImageView(BaseModel):
@@ -48,23 +49,13 @@ class ImageView(BaseModel):
 )
 async def upload_image(request: Request, response: Response, caller: Submitting, state: Shared) -> ImageView:
     """Upload one FITS file. The header is checked at upload. The pixels are read by the jobs that use the image."""
-    take = Allowed(state, caller)
-    limit = state.settings.max_upload_bytes
-    async with uploads.receive(request, state.store, state.limits, limit, take) as upload:
-        row = image_row(caller.owner, upload.sha256, upload.bytes, upload.filename, upload.summary)
-        row, new = await run_in_threadpool(take.keep, upload.path, upload.sha256, row)
-    response.status_code = 201 if new else 200
-    response.headers["Location"] = f"/v1/images/{row.id}"
-    return ImageView.of(row)
+    return ImageView.of(await uploads.add_upload(request, response, caller, state, uploads.IMAGE))
 
 
 @router.get("", summary="List uploaded images")
-def list_images(
-    request: Request, caller: Reading, state: Shared, limit: Limit = 50, cursor: Cursor = None
-) -> Page[ImageView]:
+def list_images(paging: Paging, caller: Reading, state: Shared) -> Page[ImageView]:
     """Uploaded images, newest first."""
-    rows = state.catalogue.page(ImageRow, owner=caller.owner, limit=limit + 1, after=position(cursor))
-    return page(request, rows, limit, ImageView.of)
+    return paging.page(state.catalogue.page(ImageRow, owner=caller.owner, **paging.query), ImageView.of)
 
 
 @router.get("/{image_id}", summary="One uploaded image")
@@ -81,3 +72,79 @@ def get_image_file(image_id: Identity, request: Request, caller: Reading, state:
     name = row.filename or f"image-{image_id[:12]}.fits{'.gz' if gzipped else ''}"
     media_type = files.GZIP_TYPE if gzipped else files.FITS_TYPE
     return files.send(request, state.store, image_id, media_type, name, size=row.bytes)
+
+
+@products.get("", summary="List products")
+def list_products(
+    paging: Paging,
+    caller: Reading,
+    state: Shared,
+    image_id: Identity | None = None,
+    psf_id: Identity | None = None,
+) -> Page[ProductView]:
+    """Products, newest first. `image_id` and `psf_id` select the products of one image or of one PSF."""
+    rows = state.catalogue.page(
+        ProductRow, owner=caller.owner, image_id=image_id, psf_id=psf_id, **paging.query
+    )
+    return paging.page(rows, ProductView.of)
+
+
+@products.get("/{product_id}", summary="One product")
+def get_product(product_id: Identity, caller: Reading, state: Shared) -> ProductView:
+    """A product's metadata, with links to its files. If its PSF was deprecated since, `details.warnings` says so."""
+    row = state.row(ProductRow, product_id, caller.owner)
+    return ProductView.of(row, details_now(state.catalogue, row))
+
+
+@products.get("/{product_id}/file", summary="The product as FITS", response_class=Response)
+def get_product_file(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """Download the product; its hash is the ETag."""
+    row = state.row(ProductRow, product_id, caller.owner)
+    name = row.details["filename"]
+    return files.send(request, state.store, row.file_sha256, files.FITS_TYPE, name, size=row.bytes)
+
+
+@products.get(
+    "/{product_id}/preview",
+    summary="Picture: the image before and after, and the change",
+    response_class=Response,
+)
+def get_product_preview(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """The picture as PNG."""
+    row = state.row(ProductRow, product_id, caller.owner)
+    return files.send(request, state.store, row.preview_sha256, "image/png", None)
+
+
+@products.get("/{product_id}/thumbnail", summary="Small picture of the product", response_class=Response)
+def get_product_thumbnail(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """A PNG of the deconvolved image, row 0 at the bottom, whose longer side has at most 192 px."""
+    digest = state.row(ProductRow, product_id, caller.owner).details.get("thumbnail_sha256")
+    missing = (
+        "no-thumbnail",
+        "expected a product with a thumbnail; this one was made before products had one: use its preview, or delete the "
+        "product and submit the job again",
+    )
+    return files.send(request, state.store, digest, "image/png", None, missing=missing)
+
+
+@products.get("/{product_id}/changes", summary="Picture of all changes", response_class=Response)
+def get_product_changes(product_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """A PNG that shows the image before and after, the change, difference, ratio and histogram, if the job had `changes_picture` true."""
+    digest = state.row(ProductRow, product_id, caller.owner).details.get("changes_picture_sha256")
+    missing = (
+        "no-changes-picture",
+        "expected a product whose job had changes_picture true; this job had it false: submit the job again with "
+        "changes_picture true",
+    )
+    return files.send(request, state.store, digest, "image/png", None, missing=missing)
+
+
+@products.delete("/{product_id}", status_code=204, summary="Delete a product", response_class=Response)
+def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> Response:
+    """Remove the product from the catalogue and from your quota. The same request makes it again."""
+    row = state.row(ProductRow, product_id, caller.owner)
+    state.catalogue.delete_product(product_id, caller.owner)
+    # The files are deleted at once. Otherwise an owner who deletes products and submits jobs in turn could exceed the
+    # quota.
+    remove_unnamed(state.catalogue, state.store, [digest for digest, _ in files_of(row)])
+    return Response(status_code=204)

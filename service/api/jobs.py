@@ -1,31 +1,33 @@
-"""Submit, list, show and cancel jobs: ``/v1/jobs``."""
+"""Submit, list, show and cancel jobs, ``/v1/jobs``, and estimate them before they are submitted, ``/v1/estimates``."""
 
 from __future__ import annotations
 
 import logging
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Path, Response
 from pydantic import BaseModel, Field
 
-from psfcore.errors import DataError
 from service.http.callers import Caller, KeyFirst, Reading, Submitting
-from service.http.paging import Cursor, Limit, Page, page, position
-from service.http.problems import RESPONSES, Problem, problem
+from service.http.paging import Page, Paging
+from service.http.problems import RESPONSES, Problem, as_problems, problem
 from service.http.quotas import check_room
 from service.http.state import Shared
-from service.views.jobs import JobView
+from service.views.jobs import Estimate, JobView
 from workers.catalogue.tables import JobRow
-from workers.contract.kinds import KINDS, JobRequest
+from workers.contract.kinds import KINDS, JobRequest, queue_of
 from workers.contract.phases import Phase
 from workers.contract.queues import Queue
+from workers.contract.requests import Deconvolve, ResolvedDeconvolve
 from workers.intake import estimates
-from workers.intake.again import reopened, without_results
+from workers.intake.again import reopened, there, without_results
+from workers.intake.psf_choice import ChosenPsf, reasoned_psf
 from workers.intake.requests import resolve
 from workers.rows import no_such
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES, route_class=KeyFirst)
+estimating = APIRouter(prefix="/v1/estimates", tags=["jobs"], responses=RESPONSES, route_class=KeyFirst)
 JobId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
 
 
@@ -34,6 +36,25 @@ class Identified(BaseModel):
 
     result_id: str = Field(description="id that the result has, or would have")
     parameters: dict[str, Any] = Field(description="the parameters, with every default and the PSF filled in")
+
+
+class EstimateView(BaseModel):
+    """The estimate for a request. The request is not submitted."""
+
+    parameters: dict[str, Any] = Field(description="the parameters, with every default and the PSF filled in")
+    result_id: str = Field(
+        description="id that the result has, or would have; for a kind whose jobs always make a new result (`rerun`), this id is "
+        "different each time"
+    )
+    existing: str | None = Field(
+        description="address of the result, if it is in the catalogue already; otherwise null"
+    )
+    estimate: Estimate
+    queue: Queue = Field(description="the queue in which the job would wait")
+    waiting_before: int = Field(
+        description="number of waiting jobs that are expected to start before the job; 1000: 1000 or more"
+    )
+    psf: ChosenPsf | None = Field(description="the PSF of a `deconvolve` job; null for other kinds")
 
 
 @router.post(
@@ -75,14 +96,15 @@ def prepared(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str,
     Raises ``Problem`` if the request cannot be accepted.
     """
     check_room(state, caller.owner, more_rows=1)
-    try:
-        parameters, identity = resolve(
-            body, state.catalogue, caller.owner, added_effects=state.settings.added_effects
-        )
+    parameters, identity = _resolved(body, caller, state)
+    with as_problems():
         estimate = estimates.checked(body.kind, parameters, state.catalogue, caller.owner, state.settings)
-    except DataError as error:
-        raise problem(error) from error
     return parameters, identity, estimate
+
+
+def _resolved(body: JobRequest, caller: Caller, state: Shared) -> tuple[dict[str, Any], str]:
+    with as_problems():
+        return resolve(body, state.catalogue, caller.owner, added_effects=state.settings.added_effects)
 
 
 @router.post("/identity", summary="The id that the result of a job has or would have")
@@ -91,30 +113,40 @@ def get_identity(body: JobRequest, caller: Submitting, state: Shared) -> Identif
 
     For a kind whose jobs always make a new result (`rerun`), the id is different each time.
     """
-    try:
-        parameters, identity = resolve(
-            body, state.catalogue, caller.owner, added_effects=state.settings.added_effects
-        )
-    except DataError as error:
-        raise problem(error) from error
+    parameters, identity = _resolved(body, caller, state)
     return Identified(result_id=identity, parameters=parameters)
 
 
-@router.get("", summary="List jobs")
-def list_jobs(
-    request: Request,
-    caller: Reading,
-    state: Shared,
-    phase: Phase | None = None,
-    limit: Limit = 50,
-    cursor: Cursor = None,
-) -> Page[JobView]:
-    """Your jobs, newest first. `waiting_before` is not counted here: it is null."""
-    rows = state.catalogue.page(
-        JobRow, owner=caller.owner, limit=limit + 1, after=position(cursor), phase=phase
+@estimating.post("", summary="Estimate a job without submitting it")
+def estimate_job(body: JobRequest, caller: Submitting, state: Shared) -> EstimateView:
+    """Estimate a job without starting it. The request and its errors are the same as for `POST /v1/jobs`. The answer
+    contains the expected time and memory, the place in the queue and, for a deconvolution, the PSF and the reason for
+    its choice."""
+    parameters, result_id, estimate = prepared(body, caller, state)
+    queue = queue_of(body.kind) if body.queue is None else Queue(body.queue)
+    result = KINDS[body.kind].result
+    psf = None
+    if body.kind == "deconvolve":
+        wanted, resolved = cast(Deconvolve, body.parameters), ResolvedDeconvolve.model_validate(parameters)
+        psf = reasoned_psf(wanted, resolved, state.catalogue, caller.owner)
+    known = there(result, result_id, caller.owner, state.catalogue, state.store)
+    return EstimateView(
+        parameters=parameters,
+        result_id=result_id,
+        existing=f"{result}/{result_id}" if known else None,
+        estimate=Estimate.model_validate(estimate),
+        queue=queue,
+        waiting_before=state.catalogue.places.before_new(caller.owner, queue),
+        psf=psf,
     )
+
+
+@router.get("", summary="List jobs")
+def list_jobs(paging: Paging, caller: Reading, state: Shared, phase: Phase | None = None) -> Page[JobView]:
+    """Your jobs, newest first. `waiting_before` is not counted here: it is null."""
+    rows = state.catalogue.page(JobRow, owner=caller.owner, phase=phase, **paging.query)
     gone = without_results(rows, state.catalogue)
-    return page(request, rows, limit, lambda row: JobView.of(row, result_deleted=row.id in gone))
+    return paging.page(rows, lambda row: JobView.of(row, result_deleted=row.id in gone))
 
 
 @router.get("/{job_id}", summary="Show a job: phase, progress, result or error")

@@ -11,11 +11,11 @@ import time
 from collections.abc import Iterable
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.http.callers import Caller, KeyFirst, Reading, Submitting
-from service.http.paging import Cursor, Limit, Page, page, position
+from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.state import Shared
 from workers.catalogue.access.keys import LABEL_LENGTH, OWNER, Scope, TooManyKeys
@@ -65,11 +65,6 @@ class NewKey(BaseModel):
             raise ValueError("expected expires_at or lasts_days; got both: leave one out")
         return self
 
-    def end(self, now: float) -> float | None:
-        """The time at which the key expires, seconds since 1970; None if the request does not limit the life of the
-        key."""
-        return self.expires_at if self.lasts_days is None else now + self.lasts_days * DAY_S
-
 
 class KeyView(BaseModel):
     """A key, without its secret."""
@@ -101,7 +96,7 @@ class MadeKey(KeyView):
 
 @router.get("", summary="List keys")
 def list_keys(
-    request: Request,
+    paging: Paging,
     caller: Reading,
     state: Shared,
     owner: Annotated[
@@ -111,17 +106,13 @@ def list_keys(
             description="owner of the keys; `*`: all owners. To list the keys of another owner, you need the scope admin",
         ),
     ] = None,
-    limit: Limit = 50,
-    cursor: Cursor = None,
 ) -> Page[KeyView]:
     """Your keys, newest first, including expired and revoked keys."""
     _check_used(state)
     owner = owner or caller.owner
     _check_for(caller, owner)
-    rows = state.catalogue.keys.page(
-        None if owner == EVERYBODY else owner, limit=limit + 1, after=position(cursor)
-    )
-    return page(request, rows, limit, KeyView.of)
+    rows = state.catalogue.keys.page(None if owner == EVERYBODY else owner, **paging.query)
+    return paging.page(rows, KeyView.of)
 
 
 @router.post("", status_code=201, summary="Make a key")
@@ -232,7 +223,7 @@ def _end(state: Shared, caller: Caller, body: NewKey) -> float | None:
     """The end of a new key. Raises ``Problem`` 422 if this end is in the past, and 403 if it is later than the end of
     the caller's key."""
     now = time.time()
-    asked = body.end(now)
+    asked = body.expires_at if body.lasts_days is None else now + body.lasts_days * DAY_S
     if asked is not None and asked <= now:
         raise Problem(
             422, "end-in-the-past", f"expected an end in the future; got {asked:.0f}: choose a later one"

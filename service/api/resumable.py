@@ -26,10 +26,8 @@ from service.http.callers import Caller, Submitting
 from service.http.problems import RESPONSES, Problem
 from service.http.quotas import Allowed, check_length
 from service.http.state import Shared, State
-from workers.catalogue.tables import ImageRow, TransitRow
 from workers.files.partial_uploads import PartialUpload, PartialUploads
 from workers.files.store import sha256_of
-from workers.intake.uploads import image_row, transit_row
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"], responses=RESPONSES)
 UploadId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
@@ -41,31 +39,31 @@ ALGORITHMS: dict[str, Callable[[], Any]] = {
     "md5": hashlib.md5,
 }
 PART = "application/offset+octet-stream"
-KINDS = ("transit", "image")
+KINDS: dict[str, uploads.Kind[Any]] = {"transit": uploads.TRANSIT, "image": uploads.IMAGE}
+
+
+def _header(name: str, description: str | None = None, *, required: bool = True) -> dict[str, Any]:
+    """The OpenAPI description of a header."""
+    described = {} if description is None else {"description": description}
+    return {"name": name, "in": "header", "required": required, "schema": {"type": "string"}, **described}
+
+
 _PART_BODY = {
     "parameters": [
-        {"name": name, "in": "header", "required": required, "schema": {"type": "string"}}
-        for name, required in (("Tus-Resumable", True), ("Upload-Offset", True), ("Upload-Checksum", False))
+        _header("Tus-Resumable"),
+        _header("Upload-Offset"),
+        _header("Upload-Checksum", required=False),
     ],
     "requestBody": {"required": True, "content": {PART: {"schema": {"type": "string", "format": "binary"}}}},
 }
+_METADATA = (
+    "kind (transit, which is the default, or image), filename and sha256, each with its value in base64"
+)
 _CREATION = {
     "parameters": [
-        {
-            "name": name,
-            "in": "header",
-            "required": name != "Upload-Metadata",
-            "schema": {"type": "string"},
-            "description": text,
-        }
-        for name, text in (
-            ("Tus-Resumable", VERSION),
-            ("Upload-Length", "size of the file, bytes"),
-            (
-                "Upload-Metadata",
-                "kind (transit, which is the default, or image), filename and sha256, each with its value in base64",
-            ),
-        )
+        _header("Tus-Resumable", VERSION),
+        _header("Upload-Length", "size of the file, bytes"),
+        _header("Upload-Metadata", _METADATA, required=False),
     ]
 }
 
@@ -99,25 +97,32 @@ def begin_upload(request: Request, caller: Submitting, state: Shared) -> Respons
     """
     _check_version(request)
     length = _number(request, "upload-length")
-    metadata = _metadata(request.headers.get("upload-metadata", ""))
-    kind, sha256 = metadata.get("kind", "transit"), metadata.get("sha256")
-    if kind not in KINDS:
-        raise Problem(422, "bad-upload", f"expected the kind transit or image; got {kind[:40]!r}")
+    metadata: dict[str, str] = {}  # pairs of a key and its value in base64
+    for pair in filter(
+        None, (part.strip() for part in request.headers.get("upload-metadata", "").split(","))
+    ):
+        key, _, value = pair.partition(" ")
+        metadata[key] = _decoded(value.strip()).decode("utf-8", "replace")
+    name, sha256 = metadata.get("kind", "transit"), metadata.get("sha256")
+    if name not in KINDS:
+        raise Problem(422, "bad-upload", f"expected the kind {' or '.join(KINDS)}; got {name[:40]!r}")
+    kind = KINDS[name]
     if sha256 is not None and not (len(sha256) == 64 and set(sha256) <= set("0123456789abcdef")):
         raise Problem(422, "bad-upload", f"expected a SHA-256 of 64 hexadecimal digits; got {sha256[:80]!r}")
-    uploads.check_size(length, _most_bytes(state, kind))
+    kind.check_size(length, state)
     open_uploads = PartialUploads(state.settings.data_dir)
     if sha256 is not None:
-        if _is_known(state, caller, kind, sha256) and state.store.size(sha256) == length:
-            return _answer(200, {"Content-Location": f"/v1/{kind}s/{sha256}", "Upload-Offset": str(length)})
-        equal = open_uploads.equal(caller.owner, kind, length, sha256)
+        row = state.catalogue.get(kind.table, sha256, caller.owner)
+        if row is not None and state.store.size(sha256) == length:
+            location = f"{kind.address}/{sha256}"
+            return _answer(200, {"Content-Location": location, "Upload-Offset": str(length)})
+        equal = open_uploads.equal(caller.owner, name, length, sha256)
         if equal is not None:
             return _described(200, open_uploads, equal)
     check_length(state, caller, length)
     try:
-        upload = open_uploads.create(
-            caller.owner, kind, length, uploads.label(metadata.get("filename")), sha256
-        )
+        filename = uploads.label(metadata.get("filename"))
+        upload = open_uploads.create(caller.owner, name, length, filename, sha256)
     except DataError as error:
         raise Problem(429, error.code, error.message) from error
     return _described(201, open_uploads, upload)
@@ -126,9 +131,8 @@ def begin_upload(request: Request, caller: Submitting, state: Shared) -> Respons
 @router.head("/{upload_id}", status_code=200, summary="How much has arrived", response_class=Response)
 def upload_offset(upload_id: UploadId, request: Request, caller: Submitting, state: Shared) -> Response:
     """`Upload-Offset`: number of bytes that the service has. Continue from there."""
-    _check_version(request)
-    open_uploads = PartialUploads(state.settings.data_dir)
-    answer = _described(200, open_uploads, _found(open_uploads, upload_id, caller))
+    open_uploads, upload = _open_upload(upload_id, request, caller, state)
+    answer = _described(200, open_uploads, upload)
     answer.headers["Cache-Control"] = "no-store"
     return answer
 
@@ -147,11 +151,9 @@ async def send_part(upload_id: UploadId, request: Request, caller: Submitting, s
     cannot be checked. The answer is 409 if the offset is another one, 460 if the checksum does not fit, and 423 if another
     request sends bytes now.
     """
-    _check_version(request)
     if request.headers.get("content-type", "") != PART:
         raise Problem(415, "bad-upload", f"expected Content-Type: {PART}; got another one")
-    open_uploads = PartialUploads(state.settings.data_dir)
-    upload = await run_in_threadpool(_found, open_uploads, upload_id, caller)
+    open_uploads, upload = await run_in_threadpool(_open_upload, upload_id, request, caller, state)
     with ExitStack() as held:
         try:
             file = held.enter_context(open_uploads.opened(upload))
@@ -172,24 +174,21 @@ async def send_part(upload_id: UploadId, request: Request, caller: Submitting, s
 @router.delete("/{upload_id}", status_code=204, summary="Delete an open upload", response_class=Response)
 def delete_upload(upload_id: UploadId, request: Request, caller: Submitting, state: Shared) -> Response:
     """Delete the bytes that have arrived. The upload cannot be continued."""
-    _check_version(request)
-    open_uploads = PartialUploads(state.settings.data_dir)
-    open_uploads.remove(_found(open_uploads, upload_id, caller))
+    open_uploads, upload = _open_upload(upload_id, request, caller, state)
+    open_uploads.remove(upload)
     return _answer(204, {})
-
-
-def _is_known(state: State, caller: Caller, kind: str, sha256: str) -> bool:
-    """Whether the owner has uploaded this file before."""
-    if kind == "transit":
-        return state.catalogue.get(TransitRow, sha256, caller.owner) is not None
-    return state.catalogue.get(ImageRow, sha256, caller.owner) is not None
 
 
 async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take: Allowed) -> None:
     """Append the body to the received bytes. Raises ``Problem`` 413 and 460; then the bytes of this request are removed."""
-    offset, checksum = file.tell(), _checksum(request.headers.get("upload-checksum"))
-    digest = None if checksum is None else checksum[0]()
-    whole = False
+    offset, declared, whole = file.tell(), request.headers.get("upload-checksum"), False
+    algorithm, _, value = (declared or "").partition(" ")
+    if declared is not None and algorithm not in ALGORITHMS:
+        raise Problem(
+            400, "bad-upload", f"expected a checksum by {', '.join(ALGORITHMS)}; got {algorithm[:20]!r}"
+        )
+    checksum = None if declared is None else _decoded(value)
+    digest = None if declared is None else ALGORITHMS[algorithm]()
     try:
         async for chunk in request.stream():
             if file.tell() + len(chunk) > upload.length:
@@ -199,7 +198,7 @@ async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take:
                 file.write(chunk)
                 if digest is not None:
                     digest.update(chunk)
-        if checksum is not None and digest is not None and digest.digest() != checksum[1]:
+        if digest is not None and digest.digest() != checksum:
             raise Problem(
                 460,
                 "wrong-checksum",
@@ -222,7 +221,7 @@ async def _append(request: Request, file: BinaryIO, upload: PartialUpload, take:
 
 def _complete(open_uploads: PartialUploads, upload: PartialUpload, caller: Caller, state: State) -> str:
     """Check a complete file and add it to the catalogue; returns its address. A file that cannot be used is removed."""
-    path, settings = open_uploads.path(upload), state.settings
+    path = open_uploads.path(upload)
     sha256 = sha256_of(path)
     try:
         if upload.sha256 not in (None, sha256):
@@ -231,20 +230,21 @@ def _complete(open_uploads: PartialUploads, upload: PartialUpload, caller: Calle
                 "wrong-checksum",
                 f"expected a file with the SHA-256 {upload.sha256}; got one with {sha256}: upload it again",
             )
-        if upload.kind == "transit":
-            contents = uploads.archive_contents(path, settings.archive_limits)
-            transit = transit_row(caller.owner, sha256, upload.length, upload.filename, contents)
-            Allowed(state, caller).keep(path, sha256, transit)
-        else:
-            summary = uploads.fits_summary(path, state.limits)
-            image = image_row(caller.owner, sha256, upload.length, upload.filename, summary)
-            Allowed(state, caller).keep(path, sha256, image)
+        kind = KINDS[upload.kind]
+        summary = kind.inspect(path, state)
+        row = kind.row(caller.owner, sha256, upload.length, upload.filename, summary)
+        Allowed(state, caller).keep(path, sha256, row)
     finally:
         open_uploads.remove(upload)
-    return f"/v1/{upload.kind}s/{sha256}"
+    return f"{kind.address}/{sha256}"
 
 
-def _found(open_uploads: PartialUploads, upload_id: str, caller: Caller) -> PartialUpload:
+def _open_upload(
+    upload_id: str, request: Request, caller: Caller, state: State
+) -> tuple[PartialUploads, PartialUpload]:
+    """All open uploads, and the upload of a request. Raises ``Problem`` 412 for another version of tus, and 404."""
+    _check_version(request)
+    open_uploads = PartialUploads(state.settings.data_dir)
     upload = open_uploads.find(upload_id, caller.owner)
     if upload is None:
         raise Problem(
@@ -253,7 +253,7 @@ def _found(open_uploads: PartialUploads, upload_id: str, caller: Caller) -> Part
             f"expected the id of an open upload; got {upload_id}, which was completed, deleted or has expired: begin the upload "
             "again",
         )
-    return upload
+    return open_uploads, upload
 
 
 def _described(status: int, open_uploads: PartialUploads, upload: PartialUpload) -> Response:
@@ -268,10 +268,6 @@ def _described(status: int, open_uploads: PartialUploads, upload: PartialUpload)
 
 def _answer(status: int, headers: dict[str, str]) -> Response:
     return Response(status_code=status, headers={"Tus-Resumable": VERSION, **headers})
-
-
-def _most_bytes(state: State, kind: str) -> int:
-    return state.settings.max_transit_bytes if kind == "transit" else state.settings.max_upload_bytes
 
 
 def _check_version(request: Request) -> None:
@@ -291,24 +287,6 @@ def _number(request: Request, name: str) -> int:
             400, "bad-upload", f"expected a number of bytes in the header {name.title()}; got {text[:40]!r}"
         )
     return int(text)
-
-
-def _metadata(text: str) -> dict[str, str]:
-    """The metadata of a creation: pairs of a key and its value in base64."""
-    found: dict[str, str] = {}
-    for pair in filter(None, (part.strip() for part in text.split(","))):
-        key, _, value = pair.partition(" ")
-        found[key] = _decoded(value.strip()).decode("utf-8", "replace")
-    return found
-
-
-def _checksum(text: str | None) -> tuple[Callable[[], Any], bytes] | None:
-    if text is None:
-        return None
-    name, _, value = text.partition(" ")
-    if name not in ALGORITHMS:
-        raise Problem(400, "bad-upload", f"expected a checksum by {', '.join(ALGORITHMS)}; got {name[:20]!r}")
-    return ALGORITHMS[name], _decoded(value)
 
 
 def _decoded(text: str) -> bytes:

@@ -16,8 +16,7 @@ from service.cli.fields import options_of
 from service.cli.progress import say
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
-from workers.contract.requests import Deconvolve
-from workers.contract.short_ids import FEWEST_DIGITS
+from workers.contract.requests import FEWEST_DIGITS, Deconvolve
 
 if TYPE_CHECKING:
     from service.client.http import Client

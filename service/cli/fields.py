@@ -1,7 +1,7 @@
 """Options of commands, made from the fields of the requests: name, type, limits, default and help text.
 
 A command names the fields that it offers and passes their values on as they are. A new field therefore needs no further
-declaration: `workers.contract.requests` and `workers.contract.methods` describe it.
+declaration: `workers.contract.requests` describes it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from pydantic.fields import FieldInfo
 
 from psfcore.errors import DataError
 from psfcore.noise_figures import NoiseFigures
-from workers.contract.methods import METHODS, RichardsonLucy
-from workers.contract.option import Option
+from workers.contract.requests import METHODS, Option, RichardsonLucy
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 _NULL = re.compile(r"; null: (.*?)(?=\. |$)")

@@ -32,7 +32,7 @@ def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
     """
     from sqlalchemy.exc import SQLAlchemyError
 
-    from service.http.access import Access, NoKeyYet
+    from service.http.state import Access, NoKeyYet
     from service.server import serve as run
     from workers import checks
     from workers.catalogue.schema import SchemaError

@@ -20,6 +20,7 @@ import asyncio
 import base64
 import binascii
 import hmac
+import re
 from collections.abc import Callable, Coroutine, Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, get_type_hints
@@ -33,19 +34,43 @@ from fastapi.routing import APIRoute
 from fastapi.security import SecurityScopes
 from fastapi.security.base import SecurityBase
 
-from service.http import short_ids
-from service.http.bodies import BULK, JsonRequest
-from service.http.guard import SAFE_METHODS
-from service.http.problems import Problem
+from service.http.guard import BULK, SAFE_METHODS, JsonRequest
+from service.http.problems import Problem, problem
 from service.http.rates import Bucket
 from service.http.state import Shared, State, state_of
 from workers.catalogue.access.keys import OWNER, OWNER_RULE, KeyRefused, Scope
 from workers.catalogue.access.sessions import SessionRow
-from workers.catalogue.tables import DEFAULT_OWNER, KeyRow
+from workers.catalogue.bulk_tables import BulkRow
+from workers.catalogue.catalogue import ListedRow
+from workers.catalogue.database import several_ids_fit
+from workers.catalogue.tables import (
+    DEFAULT_OWNER,
+    ImageRow,
+    JobRow,
+    KeyRow,
+    ProductRow,
+    PsfRow,
+    ReportRow,
+    TransitRow,
+)
+from workers.contract.requests import SHORT_ID
+from workers.rows import no_such
 
 ACT_FOR = "X-Owner"  # names the owner that an administrator acts for
 FORM_TOKEN = "X-Form-Token"
 SESSION_COOKIE = "heliopsf_session"
+# The parts of addresses that are ids: the table, the name of the thing, and the digits of a whole id.
+IDS: dict[str, tuple[type[ListedRow], str, int]] = {
+    "image_id": (ImageRow, "image", 64),
+    "transit_id": (TransitRow, "transit", 64),
+    "psf_id": (PsfRow, "psf", 64),
+    "other_id": (PsfRow, "psf", 64),
+    "product_id": (ProductRow, "product", 64),
+    "report_id": (ReportRow, "report", 64),
+    "job_id": (JobRow, "job", 32),
+    "bulk_id": (BulkRow, "bulk", 32),
+}
+_SHORT = re.compile(SHORT_ID)
 BEARER, BASIC = 'Bearer realm="heliopsf"', 'Basic realm="heliopsf", charset="UTF-8"'
 
 
@@ -108,8 +133,29 @@ def admit(request: Request, state: State, scopes: Iterable[str], form_token: str
         bucket = Bucket.READS if reading else Bucket.SUBMISSIONS
         request.state.allowance = state.rates.take(bucket, caller.name)
     # Parameters of the path are read after this dependency, so every route gets whole ids.
-    short_ids.complete(request, state, caller.owner)
+    _complete_ids(request, state, caller.owner)
     return caller
+
+
+def _complete_ids(request: Request, state: State, owner: str) -> None:
+    """Replace each shortened id in the path of the request by the whole id: its first digits stand for an id.
+
+    Raises ``Problem`` 404 if the owner has nothing whose id begins with these digits, and 409 with the candidates if the
+    owner has several.
+    """
+    path = request.scope["path_params"]
+    for part, text in path.items():
+        if part not in IDS or not _SHORT.fullmatch(text):
+            continue
+        table, thing, digits = IDS[part]
+        if len(text) >= digits:
+            continue
+        fitting = state.catalogue.ids_from(table, text, owner)
+        if not fitting:
+            raise problem(no_such(thing, text, shortened=True))
+        if len(fitting) > 1:
+            raise problem(several_ids_fit(text, fitting), candidates=fitting)
+        path[part] = fitting[0]
 
 
 def address_of(request: Request) -> str:

@@ -1,8 +1,9 @@
-"""Sends stored files, with their SHA-256 as ETag."""
+"""Sends stored files and contents made from them. An ETag says whether the client has a content already."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import logging
 from pathlib import Path
 
@@ -14,30 +15,44 @@ from workers.files.store import BadFile, Store, lost
 
 log = logging.getLogger(__name__)
 
-FITS_TYPE = "application/fits"
-GZIP_TYPE = "application/gzip"
+FITS_TYPE, GZIP_TYPE, JSON_TYPE = "application/fits", "application/gzip", "application/json"
 KEPT = "private, max-age=31536000, immutable"  # the content at an address never changes
 
 
 def send(
     request: Request,
     store: Store,
-    digest: str,
+    digest: str | None,
     media_type: str,
     filename: str | None,
     *,
     size: int | None = None,
+    missing: tuple[str, str] | None = None,
 ) -> Response:
-    """The file, or 304 if the client already has it. size: as for ``found``. Raises ``Problem`` 410.
+    """The file with this SHA-256 as ETag, or 304 if the client already has it. size: as for ``found``.
 
-    Clients can check the received file against the SHA-256 in the header Repr-Digest (RFC 9530).
+    Clients can check the received file against the SHA-256 in the header Repr-Digest (RFC 9530). Raises ``Problem`` 410
+    if the file is lost, and 404 with the code and the message of ``missing`` if digest is None.
     """
+    if digest is None:
+        assert missing is not None
+        raise Problem(404, *missing)
     content = base64.b64encode(bytes.fromhex(digest)).decode()
     headers = {"ETag": f'"{digest}"', "Cache-Control": KEPT, "Repr-Digest": f"sha-256=:{content}:"}
     if known(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     path = found(store, digest, size)
     return FileResponse(path, media_type=media_type, filename=filename, headers=headers)
+
+
+def headers_of(content: str) -> dict[str, str]:
+    """The headers of an answer that is made from stored files. content: a text that determines the answer."""
+    return {"ETag": f'"{hashlib.sha256(content.encode()).hexdigest()}"', "Cache-Control": KEPT}
+
+
+def unchanged(request: Request, headers: dict[str, str]) -> Response | None:
+    """The answer 304 if the client already has the content with these headers; otherwise None."""
+    return Response(status_code=304, headers=headers) if known(request, headers["ETag"]) else None
 
 
 def found(store: Store, digest: str, size: int | None = None) -> Path:
@@ -53,12 +68,12 @@ def found(store: Store, digest: str, size: int | None = None) -> Path:
                 return path
         return store.verified(digest)
     except FileNotFoundError as error:
-        raise _told(lost(digest)) from error
+        raise _logged(lost(digest)) from error
     except BadFile as error:
-        raise _told(error) from error
+        raise _logged(error) from error
 
 
-def _told(error: BadFile) -> Problem:
+def _logged(error: BadFile) -> Problem:
     log.error("%s", error.message)
     return problem(error)
 

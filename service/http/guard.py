@@ -1,31 +1,47 @@
-"""Checks every request before its route (host, origin, length), and sets the security headers of every answer."""
+"""Checks every request before its route (host, origin, size of the body), and sets the security headers of every answer.
+
+A body costs memory and time before its content is known. Therefore its size is bounded while it arrives, and the values
+in JSON are counted before Python makes objects of these values. The proxy in front of the server bounds the time.
+"""
 
 from __future__ import annotations
 
+import json
+import re
+from typing import Any
 from urllib.parse import urlsplit
 
-from fastapi import FastAPI, Request, Response
+from fastapi import FastAPI, Request
+from fastapi.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.http import problems
-from service.http.access import Access
-from service.http.bodies import BodyLimits
+from service.http.forms import FORM
+from service.http.problems import SECURITY_HEADERS, AsPage, Problem, answer
+from service.http.state import Access
+from workers.settings import Settings
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 # Style sheets, scripts and pictures of pages. These files contain no data of owners, and the page of a
 # refusal needs them.
 FOR_EVERYBODY = "/static/"
+BULK = frozenset({"/v1/bulk", "/v1/bulk/estimate"})  # the only addresses at which large JSON is expected
+# Addresses that limit the size of a body themselves, because the body may contain files; /uws/jobs only of a form.
+UPLOADS = re.compile(r"(/v1)?/(images|psfs|transits)|/v1/uploads/.*", re.DOTALL)
+UWS_FORMS = re.compile(r"/uws/jobs(/[^/]+/parameters)?")
+# The largest request, a bulk run of 100,000 uploaded images, has one list and one value for each image. Python makes a
+# list or an object for each bracket, and pydantic may report an error for each member of an object.
+MOST_OF = {b"[": 25_000, b"{": 25_000, b":": 25_000, b",": 200_000}
 
 
-def install(app: FastAPI, access: Access, bodies: BodyLimits, as_page: problems.AsPage) -> None:
+def install(app: FastAPI, access: Access, settings: Settings, as_page: AsPage) -> None:
     """Guard every request of the application. as_page: makes the page of a refusal, for browsers."""
-    app.add_middleware(_Guard, access=access, bodies=bodies, as_page=as_page)
+    app.add_middleware(_Guard, access=access, settings=settings, as_page=as_page)
 
 
 class _Guard:
-    def __init__(self, app: ASGIApp, access: Access, bodies: BodyLimits, as_page: problems.AsPage) -> None:
-        self._app, self._access, self._bodies, self._as_page = app, access, bodies, as_page
+    def __init__(self, app: ASGIApp, access: Access, settings: Settings, as_page: AsPage) -> None:
+        self._app, self._access, self._settings, self._as_page = app, access, settings, as_page
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -42,13 +58,13 @@ class _Guard:
             if scope["method"] not in SAFE_METHODS or not scope["path"].startswith(FOR_EVERYBODY):
                 self._check_host(headers)
             _check_origin(scope["method"], headers)
-        except problems.Problem as problem:
-            await self._refusal(Request(scope), problem)(scope, receive, kept)
+        except Problem as problem:
+            await answer(Request(scope), problem, self._as_page)(scope, receive, kept)
             return
         # Nobody reads the body of a request that changes nothing. A stream of events receives only to notice
         # that its client has disconnected, so no limit may end the stream.
         if scope["method"] not in SAFE_METHODS:
-            receive = self._bodies.received(scope["path"], headers, receive)
+            receive = self._limited(scope["path"], headers, receive)
         try:
             await self._app(scope, receive, kept)
         finally:
@@ -56,10 +72,38 @@ class _Guard:
             if at_end is not None:
                 at_end()
 
-    def _refusal(self, request: Request, problem: problems.Problem) -> Response:
-        if problems.wants_page(request):
-            return self._as_page(request, problem.status, problem.code, problem.detail, {})
-        return problems.document(problem.status, problem.code, problem.detail)
+    def _limited(self, path: str, headers: Headers, receive: Receive) -> Receive:
+        """The body of a request, within the limits of the settings. Uploads have limits of their own.
+
+        The reader of the body gets ``Problem`` 413 at once if the declared length is too large, and as soon as too many
+        bytes have arrived.
+        """
+        if _may_have_files(path, headers.get("content-type", "")):
+            return receive
+        most, setting = self._settings.max_body_kib * 2**10, "HELIOPSF_MAX_BODY_KIB"
+        if path in BULK:
+            most, setting = self._settings.max_bulk_body_mib * 2**20, "HELIOPSF_MAX_BULK_BODY_MIB"
+        declared = headers.get("content-length", "")
+        got, more = 0, True
+
+        async def limited() -> Message:
+            nonlocal got, more
+            if not more:  # the body is complete; the next message is the end of the connection
+                return await receive()
+            if not (declared.isdecimal() and int(declared) > most):
+                message = await receive()
+                got += len(message.get("body", b""))
+                more = message.get("more_body", False)
+                if got <= most:
+                    return message
+            raise Problem(
+                413,
+                "too-large",
+                f"expected a request of at most {most} bytes; got more: send less in one request, or ask the operator to raise "
+                f"{setting}",
+            )
+
+        return limited
 
     def _check_host(self, headers: Headers) -> None:
         """Refuse a request whose Host header does not contain a host name of this service. This prevents DNS rebinding.
@@ -72,12 +116,18 @@ class _Guard:
             return
         sent = headers.get("host", "")
         if _host_name(sent) not in hosts:
-            raise problems.Problem(
+            raise Problem(
                 421,
                 "host-not-served",
                 f"expected a host name of this service; got {sent[:80]!r}: use another address, or add the name to "
                 "HELIOPSF_ALLOWED_HOSTS",
             )
+
+
+def _may_have_files(path: str, content_type: str) -> bool:
+    """Whether the route itself limits the size of a body of this type."""
+    form = content_type.lower().startswith(FORM)
+    return UPLOADS.fullmatch(path) is not None or (form and UWS_FORMS.fullmatch(path) is not None)
 
 
 def _check_origin(method: str, headers: Headers) -> None:
@@ -90,7 +140,7 @@ def _check_origin(method: str, headers: Headers) -> None:
     else:  # an older browser, or a program
         foreign = origin is not None and urlsplit(origin).netloc.lower() != headers.get("host", "").lower()
     if foreign:
-        raise problems.Problem(
+        raise Problem(
             403,
             "cross-site",
             "expected a request from a program or from a page of this service; got a request from a page of another site: "
@@ -108,7 +158,7 @@ def _host_name(sent: str) -> str:
 
 def _keep(headers: MutableHeaders, scope: Scope) -> None:
     """Add the headers that every answer has. Headers that the route has set are not replaced."""
-    for name, value in problems.SECURITY_HEADERS.items():
+    for name, value in SECURITY_HEADERS.items():
         headers.setdefault(name, value)
     if "etag" in headers:
         headers.add_vary_header("Authorization")
@@ -119,3 +169,19 @@ def _keep(headers: MutableHeaders, scope: Scope) -> None:
     if allowance is not None:
         for name, value in allowance.headers.items():
             headers.setdefault(name, value)
+
+
+class JsonRequest(Request):
+    """A request with JSON. Its values are counted before it is parsed; a thread parses it, so that other requests do not wait."""
+
+    async def json(self) -> Any:
+        """The content of the body. Raises ``Problem`` 413 for too many values, and ValueError if it is not JSON."""
+        content = await self.body()
+        for sign, most in MOST_OF.items():
+            if content.count(sign) > most:
+                raise Problem(
+                    413,
+                    "too-many-values",
+                    f"expected JSON with at most {most} characters '{sign.decode()}'; got {content.count(sign)}: send less in one request",
+                )
+        return await run_in_threadpool(json.loads, content)

@@ -48,7 +48,6 @@ class RequestMetrics:
 
     def count(self, route: str, method: str, status: int, seconds: float, received: int) -> None:
         """Count an answered request."""
-        method = method if method in METHODS else "other"
         self._answered.labels(route, method, str(status)).inc()
         self._seconds.labels(route, method).observe(seconds)
         if received:
@@ -98,37 +97,23 @@ class _Observed:
         finally:
             seconds = time.perf_counter() - started
             route = getattr(scope.get("route"), "path", NOWHERE)
-            self._metrics.count(route, scope["method"], status, seconds, received)
-            _trace(scope, route, status, request_id)
-            routine = route in ROUTINE and status < 500
-            log.log(
-                logging.DEBUG if routine else logging.INFO,
-                "%s %s %d",
-                scope["method"] if scope["method"] in METHODS else "other",
-                scope["path"],  # the path without the query
-                status,
-                extra={
-                    "fields": {
-                        "route": route,
-                        "status": status,
-                        "seconds": round(seconds, 4),
-                        **_caller(scope),
-                    }
-                },
-            )
-
-
-def _trace(scope: Scope, route: str, status: int, request_id: str) -> None:
-    """Describe the request in its span, in the words of the semantic conventions of OpenTelemetry."""
-    method = scope["method"] if scope["method"] in METHODS else "other"
-    attributes: dict[str, traces.Attribute] = {
-        "http.request.method": method,
-        "http.route": route,
-        "http.response.status_code": status,
-        "heliopsf.request": request_id,
-        **{f"heliopsf.{name}": value for name, value in _caller(scope).items()},
-    }
-    traces.note(attributes, name=f"{method} {route}", failed=f"status {status}" if status >= 500 else None)
+            method = scope["method"] if scope["method"] in METHODS else "other"
+            caller = _caller(scope)
+            self._metrics.count(route, method, status, seconds, received)
+            # The request in its span, in the words of the semantic conventions of OpenTelemetry.
+            attributes: dict[str, traces.Attribute] = {
+                "http.request.method": method,
+                "http.route": route,
+                "http.response.status_code": status,
+                "heliopsf.request": request_id,
+                **{f"heliopsf.{name}": value for name, value in caller.items()},
+            }
+            failed = f"status {status}" if status >= 500 else None
+            traces.note(attributes, name=f"{method} {route}", failed=failed)
+            level = logging.DEBUG if route in ROUTINE and status < 500 else logging.INFO
+            fields = {"route": route, "status": status, "seconds": round(seconds, 4), **caller}
+            # The path does not contain the query.
+            log.log(level, "%s %s %d", method, scope["path"], status, extra={"fields": fields})
 
 
 def _caller(scope: Scope) -> dict[str, str]:

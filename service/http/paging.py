@@ -6,9 +6,10 @@ import base64
 import binascii
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Generic, Protocol, TypeVar
 
-from fastapi import Query, Request
+from fastapi import Depends, Query, Request
 from pydantic import BaseModel, Field
 
 from service.http.problems import Problem
@@ -85,3 +86,28 @@ def page(request: Request, rows: Sequence[Row], limit: int, view: Callable[[Row]
     after = rows[limit - 1] if len(rows) > limit else None
     next_page = None if after is None else following(request, repr(after.created_at), after.id)
     return Page(items=[view(row) for row in rows[:limit]], next=next_page)
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The page of a list that a request asks for."""
+
+    request: Request
+    limit: int
+    cursor: str | None = None
+
+    @property
+    def query(self) -> dict[str, Any]:
+        """Arguments of the query for the rows. Raises ``Problem`` 422 if this service did not issue the cursor."""
+        return {"limit": self.limit + 1, "after": position(self.cursor)}
+
+    def page(self, rows: Sequence[Row], view: Callable[[Row], Item]) -> Page[Item]:
+        """The page of the rows that ``query`` gave."""
+        return page(self.request, rows, self.limit, view)
+
+
+async def _listing(request: Request, limit: Limit = 50, cursor: Cursor = None) -> Listing:
+    return Listing(request, limit, cursor)
+
+
+Paging = Annotated[Listing, Depends(_listing)]

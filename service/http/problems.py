@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any, cast
 
@@ -19,8 +20,7 @@ from starlette.exceptions import HTTPException
 from psfcore.errors import DataError
 from workers import checks, logs
 from workers.contract.suggestions import explained
-from workers.files.full_disk import NO_ROOM, STORAGE_FULL, is_disk_full
-from workers.files.store import StoreAway
+from workers.files.store import NO_ROOM, STORAGE_FULL, StoreAway, is_disk_full
 
 log = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
@@ -116,137 +116,110 @@ def problem(error: DataError, **more: Any) -> Problem:
     return Problem(STATUS_OF.get(error.code, 422), error.code, error.message, **{**error.fields, **more})
 
 
-def document(
-    status: int, code: str, detail: str, *, headers: Mapping[str, str] | None = None, **more: Any
-) -> JSONResponse:
-    """The response for a problem."""
-    body = {
-        "type": f"urn:heliopsf:{code}",
-        "title": _OF_TUS.get(status) or HTTPStatus(status).phrase,
-        "status": status,
-        "detail": detail,
-        **more,
-    }
-    return JSONResponse(body, status_code=status, media_type=MEDIA_TYPE, headers=headers)
+@contextmanager
+def as_problems() -> Iterator[None]:
+    """Raise the errors of a request or its data that occur in the ``with`` block as problems."""
+    try:
+        yield
+    except DataError as error:
+        raise problem(error) from error
 
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
     "4XX": {"model": ProblemDocument, "description": "The request was refused; `detail` says why."},
 }
-
-
 AsPage = Callable[[Request, int, str, str, Mapping[str, Any]], Response]
 
 
-def install(app: FastAPI, as_page: AsPage) -> None:
-    """Make the application answer every error with a problem document, or with a page if a browser asked for a page.
+def answer(request: Request, error: Problem, as_page: AsPage) -> Response:
+    """The answer to a request that failed: a problem document, or a page if a browser asked for a page.
 
     as_page: a function (request, status, code, detail, fields) that makes the page.
     """
+    if wants_page(request):
+        page = as_page(request, error.status, error.code, error.detail, error.more)
+        for name, value in (error.headers or {}).items():
+            page.headers.setdefault(name, value)  # a page has its own security policy
+        return page
+    body = {
+        "type": f"urn:heliopsf:{error.code}",
+        "title": _OF_TUS.get(error.status) or HTTPStatus(error.status).phrase,
+        "status": error.status,
+        "detail": error.detail,
+        **error.more,
+    }
+    return JSONResponse(body, error.status, media_type=MEDIA_TYPE, headers=error.headers)
 
-    def answer(
-        request: Request,
-        status: int,
-        code: str,
-        detail: str,
-        *,
-        headers: Mapping[str, str] | None = None,
-        **more: Any,
-    ) -> Response:
-        if not wants_page(request):
-            return document(status, code, detail, headers=headers, **more)
-        made = as_page(request, status, code, detail, more)
-        for name, value in (headers or {}).items():
-            made.headers.setdefault(name, value)  # a page has its own security policy
-        return made
+
+def install(app: FastAPI, as_page: AsPage) -> None:
+    """Make the application answer every error as ``answer`` does."""
 
     @app.exception_handler(Problem)
-    def _problem(request: Request, found: Problem) -> Response:
-        return answer(request, found.status, found.code, found.detail, headers=found.headers, **found.more)
+    def _problem(request: Request, error: Problem) -> Response:
+        return answer(request, error, as_page)
 
     @app.exception_handler(RequestValidationError)
     def _invalid(request: Request, error: RequestValidationError) -> Response:
         body = getattr(request.scope.get("route"), "body_field", None)
         model = None if body is None else body.field_info.annotation
         errors = []
-        for found in error.errors()[:MOST_ERRORS]:
+        for one in error.errors()[:MOST_ERRORS]:
             # The location of a field of the body starts with "body", which is not part of the model.
-            inside = cast(ErrorDetails, found | {"loc": found["loc"][1:]})
-            [(_, message)] = explained([inside], model if found["loc"][:1] == ("body",) else None)
-            errors.append({"at": "/".join(map(str, found["loc"])), "message": message})
+            inside = cast(ErrorDetails, one | {"loc": one["loc"][1:]})
+            [(_, message)] = explained([inside], model if one["loc"][:1] == ("body",) else None)
+            errors.append({"at": "/".join(map(str, one["loc"])), "message": message})
         detail = "; ".join(f"{e['at']}: {e['message']}" for e in errors)
         if len(error.errors()) > MOST_ERRORS:
             detail += f"; and {len(error.errors()) - MOST_ERRORS} more errors"
-        return answer(request, 422, "invalid-request", detail, errors=errors)
+        return answer(request, Problem(422, "invalid-request", detail, errors=errors), as_page)
 
     @app.exception_handler(HTTPException)
     def _http(request: Request, error: HTTPException) -> Response:
-        detail = str(error.detail)
-        if error.status_code == 404:
-            detail = f"expected an address of this service; nothing is at {request.url.path}: /docs lists all addresses"
-        elif error.status_code == 405:
-            detail = (
-                f"expected a method that {request.url.path} accepts; got {request.method}: /docs lists them"
-            )
-        return answer(request, error.status_code, f"http-{error.status_code}", detail, headers=error.headers)
+        status, path = error.status_code, request.url.path
+        details = {
+            404: f"expected an address of this service; nothing is at {path}: /docs lists all addresses",
+            405: f"expected a method that {path} accepts; got {request.method}: /docs lists them",
+        }
+        detail = details.get(status, str(error.detail))
+        return answer(request, Problem(status, f"http-{status}", detail, headers=error.headers), as_page)
 
-    @app.exception_handler(OperationalError)
-    @app.exception_handler(InterfaceError)
-    @app.exception_handler(PoolTimeoutError)
-    def _database(request: Request, error: SQLAlchemyError) -> Response:
-        log.error("database: %s", error)
-        if is_disk_full(error):
-            return answer(request, 507, STORAGE_FULL, NO_ROOM)
-        return answer(
-            request,
-            503,
-            "database-away",
-            "the database of the service does not answer; try again in a moment",
-            headers={"Retry-After": "5"},
-        )
-
-    @app.exception_handler(DatabaseError)
-    def _damaged(request: Request, error: DatabaseError) -> Response:
-        if not checks.damaged(error):
-            raise error
-        log.error("database: %s", error)
-        return answer(
-            request,
-            503,
-            "database-damaged",
-            "the database of the service is damaged; tell the operator, who must restore a copy",
-        )
-
+    @app.exception_handler(SQLAlchemyError)
     @app.exception_handler(OSError)
-    def _system(request: Request, error: OSError) -> Response:
-        if not is_disk_full(error):
+    def _away(request: Request, error: SQLAlchemyError | OSError) -> Response:
+        reply = _of_system(error)
+        if reply is None:
             raise error  # it is answered as an internal error
-        log.error("storage: %s", error)
-        return answer(request, 507, STORAGE_FULL, NO_ROOM)
-
-    @app.exception_handler(StoreAway)
-    def _store(request: Request, error: StoreAway) -> Response:
-        log.error("storage: %s", error)
-        return answer(
-            request,
-            503,
-            "storage-away",
-            "the file storage of the service does not answer; try again in a moment",
-            headers={"Retry-After": "5"},
-        )
+        log.error("%s: %s", "database" if isinstance(error, SQLAlchemyError) else "storage", error)
+        return answer(request, reply, as_page)
 
     @app.exception_handler(Exception)
     def _ours(request: Request, _error: Exception) -> Response:
         # After this answer Starlette logs the traceback and passes the error on to the server. No middleware sets the
         # headers of this answer, so they are set here.
         headers = {**SECURITY_HEADERS, "X-Request-ID": logs.about().get("request", "")}
-        return answer(
-            request,
-            500,
-            "internal-error",
-            "the service failed and logged the error; send the X-Request-ID of this answer to the operator",
-            headers=headers,
+        detail = (
+            "the service failed and logged the error; send the X-Request-ID of this answer to the operator"
         )
+        return answer(request, Problem(500, "internal-error", detail, headers=headers), as_page)
+
+
+def _of_system(error: SQLAlchemyError | OSError) -> Problem | None:
+    """The problem for an error of the database, the disk or the file storage; None for a fault of the service."""
+    soon = {"Retry-After": "5"}
+    if isinstance(error, StoreAway):
+        detail = "the file storage of the service does not answer; try again in a moment"
+        return Problem(503, "storage-away", detail, headers=soon)
+    if isinstance(error, OperationalError | InterfaceError | PoolTimeoutError | OSError) and is_disk_full(
+        error
+    ):
+        return Problem(507, STORAGE_FULL, NO_ROOM)
+    if isinstance(error, OperationalError | InterfaceError | PoolTimeoutError):
+        detail = "the database of the service does not answer; try again in a moment"
+        return Problem(503, "database-away", detail, headers=soon)
+    if isinstance(error, DatabaseError) and checks.damaged(error):
+        detail = "the database of the service is damaged; tell the operator, who must restore a copy"
+        return Problem(503, "database-damaged", detail)
+    return None
 
 
 def wants_page(request: Request) -> bool:

@@ -10,7 +10,7 @@ from service.http.state import State
 from workers import checks
 from workers.catalogue.catalogue import Row
 from workers.catalogue.owners import MIB, NOT_KEPT, ROWS_NOT_KEPT, OverQuota, Usage
-from workers.files.full_disk import STORAGE_FULL
+from workers.files.store import STORAGE_FULL
 
 
 class Allowed:
@@ -18,7 +18,7 @@ class Allowed:
 
     def __init__(self, state: State, caller: Caller) -> None:
         self._state, self._caller = state, caller
-        self._asked = 0
+        self._bytes = 0
         self._usage: Usage | None = None
 
     def __call__(self, count: int) -> None:
@@ -26,12 +26,10 @@ class Allowed:
 
         The other files of the owner are added up once, at the first bytes; ``keep`` adds them up again.
         """
-        if not self._asked:
+        if not self._bytes:
             self._usage = _limited(self._state, self._caller.owner)
-        self._asked += count
-        check_disk(self._state, self._asked)
-        if self._usage is not None and not self._usage.allows(self._asked):
-            raise _file_too_large(self._usage, self._asked)
+        self._bytes += count
+        _check_file(self._state, self._usage, self._bytes)
         self._state.rates.take_bytes(self._caller.name, count)
 
     def keep(self, file: Path, digest: str, row: Row) -> tuple[Row, bool]:
@@ -49,8 +47,11 @@ class Allowed:
 
 def check_length(state: State, caller: Caller, count: int) -> None:
     """Raise ``Problem`` 413 if a file of this many bytes exceeds the owner's quota, and 507 if the disk has no room for it."""
+    _check_file(state, _limited(state, caller.owner), count)
+
+
+def _check_file(state: State, usage: Usage | None, count: int) -> None:
     check_disk(state, count)
-    usage = _limited(state, caller.owner)
     if usage is not None and not usage.allows(count):
         raise _file_too_large(usage, count)
 
@@ -100,10 +101,5 @@ def _file_too_large(usage: Usage, count: int) -> Problem:
 
 
 def _exceeded(status: int, usage: Usage, message: str) -> Problem:
-    return Problem(
-        status,
-        "quota-exceeded",
-        message,
-        used_bytes=usage.used_bytes,
-        limit_bytes=usage.limit_bytes,
-    )
+    used, limit = usage.used_bytes, usage.limit_bytes
+    return Problem(status, "quota-exceeded", message, used_bytes=used, limit_bytes=limit)

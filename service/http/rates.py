@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 from limits import RateLimitItem, RateLimitItemPerMinute
 from limits.errors import StorageError
@@ -37,6 +38,9 @@ class Bucket(StrEnum):
     READS = "reads"
     SUBMISSIONS = "submissions"
     UPLOADS = "upload-mib"
+
+
+UNITS = {Bucket.READS: "requests", Bucket.SUBMISSIONS: "submissions", Bucket.UPLOADS: "MiB of uploads"}
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,13 @@ class Rates:
             return None
         allowance = Allowance(bucket, item.amount, left, max(1, math.ceil(reset_at - time.time())))
         if not granted:
-            raise _too_many(allowance)
+            raise Problem(
+                429,
+                "too-many-requests",
+                f"expected at most {allowance.limit} {UNITS[bucket]} per minute; got more: try again in "
+                f"{allowance.reset_s} s",
+                headers={"Retry-After": str(allowance.reset_s), **allowance.headers},
+            )
         return allowance
 
     def take_bytes(self, who: str, count: int) -> Allowance | None:
@@ -105,12 +115,11 @@ class Rates:
 
     def _limit_by(self) -> SlidingWindowCounterRateLimiter:
         if self._limiter is None:
-            if self._url is None:
-                self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
-            else:
+            storage: Any = MemoryStorage()
+            if self._url is not None:
                 patience = {"socket_connect_timeout": _PATIENCE_S, "socket_timeout": _PATIENCE_S}
                 storage = storage_from_string(self._url, wrap_exceptions=True, **patience)
-                self._limiter = SlidingWindowCounterRateLimiter(storage)
+            self._limiter = SlidingWindowCounterRateLimiter(storage)
         return self._limiter
 
 
@@ -148,14 +157,3 @@ class AtOnce:
             self._open[who] -= 1
             if not self._open[who]:
                 del self._open[who]
-
-
-def _too_many(allowance: Allowance) -> Problem:
-    unit = {Bucket.READS: "requests", Bucket.SUBMISSIONS: "submissions", Bucket.UPLOADS: "MiB of uploads"}
-    return Problem(
-        429,
-        "too-many-requests",
-        f"expected at most {allowance.limit} {unit[allowance.bucket]} per minute; got more: try again in "
-        f"{allowance.reset_s} s",
-        headers={"Retry-After": str(allowance.reset_s), **allowance.headers},
-    )

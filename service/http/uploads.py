@@ -1,44 +1,34 @@
-"""Receives an upload: streams it to the store, and at the same time hashes, counts and checks its bytes. The whole
+"""Receives an upload: streams it to a temporary file, and at the same time hashes, counts and checks its bytes. The whole
 upload is never in memory."""
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic
 
 import anyio.to_thread
-from fastapi import Request
+from fastapi import Request, Response
 from fastapi.concurrency import run_in_threadpool
 
-from psfcore.errors import DataError, HeaderError
-from psfcore.fits.header import FitsLimits, HeaderSummary, read_summary
+from psfcore.fits.header import HeaderSummary, read_summary
 from psfcore.fits.weights import check_is_psf
-from psfcore.transit.archive import (
-    START_BYTES,
-    ArchiveContents,
-    ArchiveLimits,
-    archive_kind,
-    could_be_archive,
-    list_archive,
-)
+from psfcore.transit.archive import START_BYTES, ArchiveContents, archive_kind, could_be_archive, list_archive
+from service.http.callers import Caller
 from service.http.forms import FORM, FormPart, chunks_of, media_type_of, pieces_of
-from service.http.problems import Problem, problem
-from service.http.state import state_of
-from workers.files.store import Store
+from service.http.problems import Problem, as_problems
+from service.http.quotas import Allowed
+from service.http.state import State
+from workers.catalogue.catalogue import Row
+from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
+from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 
 FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")  # FITS, or FITS in gzip
 FORM_BYTES = 2**16  # largest size of a form without its file
-LARGE = frozenset(
-    {f"{root}/{kind}" for root in ("", "/v1") for kind in ("images", "psfs", "transits")}
-)  # upload addresses; they have their own limits
-PARTS = "/v1/uploads/"  # addresses that receive parts of a resumable upload
 UNDECLARED_BYTES = 2**20  # bytes that are counted in one step if the request does not declare its length
-Take = Callable[[int], object]
 
 
 def _body(what: str, media_type: str) -> dict[str, Any]:
@@ -73,204 +63,147 @@ def _body(what: str, media_type: str) -> dict[str, Any]:
 OPENAPI_BODY = _body("FITS file", "application/fits")
 OPENAPI_TRANSIT_BODY = _body("archive of the transit (.zip, .tar or .tar.gz)", "application/octet-stream")
 
-Found = TypeVar("Found")
-FoundOut = TypeVar("FoundOut", covariant=True)
-
 
 @dataclass(frozen=True)
-class Upload(Generic[Found]):
-    """A completely received file and a summary of its content. The file is not yet in the store."""
+class Kind(Generic[Row]):
+    """A kind of file that can be uploaded.
 
-    path: Path
-    sha256: str
-    bytes: int
-    filename: str | None
-    summary: Found
+    may_start: whether a file of this kind can start with these bytes; True as second argument: there are no further bytes.
+    content: reads the summary of a file, and raises DataError if the file cannot be used. row: makes the row of a file from
+    its owner, SHA-256, size, name and summary.
+    """
 
-
-class _Format(Protocol[FoundOut]):
-    """A kind of file that can be uploaded."""
-
+    address: str
     what: str
+    code: str  # of the error for another kind of file
+    table: type[Row]
     start_bytes: int
+    may_start: Callable[[bytes, bool], bool]
+    content: Callable[[Path, State], Any]
+    row: Callable[..., Row]
+    limit: str = "max_upload_bytes"  # the setting
 
-    def recognise(self, start: bytes, *, whole: bool) -> None:
-        """Raise ``Problem`` if a file of this kind cannot start with these bytes. whole: there are no further bytes."""
+    def most_bytes(self, state: State) -> int:
+        """Largest file of this kind, bytes."""
+        limit: int = getattr(state.settings, self.limit)
+        return limit
 
-    def inspect(self, path: Path) -> FoundOut:
-        """Read the summary of the file. Raises ``Problem`` if the file cannot be used."""
+    def check_start(self, start: bytes, *, whole: bool) -> None:
+        """Raise ``Problem`` 415 if a file of this kind cannot start with these bytes."""
+        if not self.may_start(start, whole):
+            message = f"expected {self.what}; got a file that starts with {start[:9]!r}: check the file"
+            raise Problem(415, self.code, message)
+
+    def check_size(self, size_bytes: int, state: State) -> None:
+        """Raise ``Problem`` 413 if a file is too large, and 400 if it is empty."""
+        if size_bytes > self.most_bytes(state):
+            raise _too_large(self.most_bytes(state))
+        if size_bytes == 0:
+            raise Problem(400, "empty-upload", f"expected {self.what}; got 0 bytes: check the file")
+
+    def inspect(self, path: Path, state: State) -> Any:
+        """The summary of a received file. Raises ``Problem`` 413, 415 or 422 if the file cannot be used."""
+        with path.open("rb") as file:
+            self.check_start(file.read(self.start_bytes), whole=True)
+        with as_problems():
+            return self.content(path, state)
 
 
-@asynccontextmanager
-async def receive(
-    request: Request, store: Store, limits: FitsLimits, max_bytes: int, take: Take
-) -> AsyncIterator[Upload[HeaderSummary]]:
-    """Stream the request's FITS file to a temporary path and inspect its header.
+def _could_be_fits(start: bytes, _whole: bool) -> bool:
+    return any(start.startswith(known[: len(start)]) for known in FITS_STARTS)
 
-    take: counts bytes against the caller's allowance. Raises ``Problem`` 413 if the file exceeds the size limit, 415 if it
-    is not FITS, 400 for a broken form or an incomplete upload, and 422 if the header shows that the file cannot be used.
+
+def _image_content(path: Path, state: State) -> HeaderSummary:
+    return read_summary(path, state.limits)
+
+
+def _psf_content(path: Path, state: State) -> HeaderSummary:
+    summary = read_summary(path, state.limits)
+    check_is_psf(path, summary, state.limits)
+    return summary
+
+
+def _transit_content(path: Path, state: State) -> ArchiveContents:
+    return list_archive(path, state.settings.archive_limits)
+
+
+_FITS = ("a FITS file, which starts with 'SIMPLE  ='", "not-fits")
+_FITS_START = (max(map(len, FITS_STARTS)), _could_be_fits)
+IMAGE = Kind("/v1/images", *_FITS, ImageRow, *_FITS_START, _image_content, image_row)
+PSF = Kind("/v1/psfs", *_FITS, PsfRow, *_FITS_START, _psf_content, uploaded_psf_row)
+TRANSIT = Kind(
+    "/v1/transits",
+    "a .zip, .tar or .tar.gz",
+    "not-an-archive",
+    TransitRow,
+    START_BYTES,
+    lambda start, whole: could_be_archive(start) and (not whole or bool(archive_kind(start))),
+    _transit_content,
+    transit_row,
+    limit="max_transit_bytes",
+)
+
+
+async def add_upload(
+    request: Request,
+    response: Response,
+    caller: Caller,
+    state: State,
+    kind: Kind[Row],
+    *,
+    equal: Callable[[str], Row | None] | None = None,
+    columns: Mapping[str, str | None] | None = None,
+) -> Row:
+    """Receive the file of a request, check it and add it to the catalogue; returns its row.
+
+    Sets the status and the header Location of the response. equal: finds a row that stands for the file with this
+    SHA-256; the file is then not added. columns: further arguments of ``kind.row``. Raises ``Problem`` 413 if the file
+    exceeds the size limit or the quota, 415 if it is of another kind, 400 for a broken form or an incomplete upload, and 422
+    if the content shows that the file cannot be used.
     """
-    async with _receive(request, store, _Fits(limits), max_bytes, take) as upload:
-        yield upload
+    allowed = Allowed(state, caller)
+    with state.store.temporary() as path:
+        sha256, size, filename = await _receive(request, path, state, kind, allowed)
+        summary = await anyio.to_thread.run_sync(kind.inspect, path, state, limiter=state.inspecting)
+        there = None if equal is None else await run_in_threadpool(equal, sha256)
+        if there is None:
+            upload = kind.row(caller.owner, sha256, size, filename, summary, **(columns or {}))
+            row, new = await run_in_threadpool(allowed.keep, path, sha256, upload)
+        else:
+            row, new = there, False
+    response.status_code = 201 if new else 200
+    response.headers["Location"] = f"{kind.address}/{row.id}"
+    return row
 
 
-@asynccontextmanager
-async def receive_psf(
-    request: Request, store: Store, limits: FitsLimits, max_bytes: int, take: Take
-) -> AsyncIterator[Upload[HeaderSummary]]:
-    """Stream the request's FITS file to a temporary path and check that it can be a PSF.
-
-    Raises the same ``Problem`` as ``receive``, and 422 if the file cannot be a PSF.
-    """
-    async with _receive(request, store, _PsfFile(limits), max_bytes, take) as upload:
-        yield upload
-
-
-@asynccontextmanager
-async def receive_transit(
-    request: Request, store: Store, limits: ArchiveLimits, max_bytes: int, take: Take
-) -> AsyncIterator[Upload[ArchiveContents]]:
-    """Stream a transit's archive to a temporary path and check its table of contents and its transit.json.
-
-    Raises the same ``Problem`` as ``receive``. In addition: 413 if the unpacked files would exceed the limits, 415 if the file
-    is not an archive, and 422 if the transit cannot be used.
-    """
-    async with _receive(request, store, _Archive(limits), max_bytes, take) as upload:
-        yield upload
-
-
-@asynccontextmanager
 async def _receive(
-    request: Request, store: Store, expected: _Format[Found], max_bytes: int, take: Take
-) -> AsyncIterator[Upload[Found]]:
-    declared = _refuse_by_length(request, max_bytes)
-    taken = declared
-    if declared:  # if the length is declared, the upload can be refused before it is sent
-        await run_in_threadpool(take, declared)
-    with store.temporary() as path:
-        digest, size, start, filename = hashlib.sha256(), 0, b"", None
-        with path.open("wb") as file:
-            async for name, chunk in _file_of(request, max_bytes):
-                filename = name
-                if len(start) < expected.start_bytes:
-                    start += chunk[: expected.start_bytes - len(start)]
-                    expected.recognise(start, whole=False)
-                size += len(chunk)
-                if size > max_bytes:
-                    raise _too_large(max_bytes)
-                if size > taken:
-                    await run_in_threadpool(take, UNDECLARED_BYTES)
-                    taken += UNDECLARED_BYTES
-                digest.update(chunk)
-                file.write(chunk)
-        if size == 0:
-            raise Problem(400, "empty-upload", f"expected {expected.what}; got 0 bytes: check the file")
-        expected.recognise(start, whole=True)
-        limiter = state_of(request).inspecting
-        found = await anyio.to_thread.run_sync(expected.inspect, path, limiter=limiter)
-        yield Upload(path, digest.hexdigest(), size, filename, found)
-
-
-class _Fits:
-    what = "a FITS file"
-    start_bytes = max(map(len, FITS_STARTS))
-
-    def __init__(self, limits: FitsLimits) -> None:
-        self._limits = limits
-
-    def recognise(self, start: bytes, *, whole: bool) -> None:
-        """Refuse a file that is not FITS at its first bytes, before the rest is received."""
-        if not any(start.startswith(known[: len(start)]) for known in FITS_STARTS):
-            raise Problem(
-                415,
-                "not-fits",
-                f"expected a FITS file (it starts with 'SIMPLE  ='); got {start[:9]!r}: check the file",
-            )
-
-    def inspect(self, path: Path) -> HeaderSummary:
-        try:
-            return read_summary(path, self._limits)
-        except HeaderError as error:
-            raise problem(error) from error
-
-
-class _PsfFile(_Fits):
-    def inspect(self, path: Path) -> HeaderSummary:
-        summary = super().inspect(path)
-        try:
-            check_is_psf(path, summary, self._limits)
-        except DataError as error:
-            raise problem(error) from error
-        return summary
-
-
-class _Archive:
-    what = "a .zip, .tar or .tar.gz"
-    start_bytes = START_BYTES
-
-    def __init__(self, limits: ArchiveLimits) -> None:
-        self._limits = limits
-
-    def recognise(self, start: bytes, *, whole: bool) -> None:
-        """Refuse a file that is not an archive at its first bytes, before the rest is received."""
-        if not (could_be_archive(start) and (not whole or archive_kind(start))):
-            raise Problem(
-                415, "not-an-archive", f"expected {self.what}; got bytes {start[:9]!r}: check the file"
-            )
-
-    def inspect(self, path: Path) -> ArchiveContents:
-        try:
-            return list_archive(path, self._limits)
-        except DataError as error:
-            raise problem(error) from error
-
-
-def _refuse_by_length(request: Request, max_bytes: int) -> int:
-    """The length that the request declares; 0 if it declares none. Raises ``Problem`` 413 if it is too large."""
+    request: Request, path: Path, state: State, kind: Kind[Any], take: Allowed
+) -> tuple[str, int, str | None]:
+    """Write the file of a request to a path; returns its SHA-256, size and name."""
+    most_bytes = kind.most_bytes(state)
     text = request.headers.get("content-length", "")
-    declared = int(text) if text.isdecimal() else 0
-    if declared > max_bytes + FORM_BYTES:
-        raise _too_large(max_bytes)
-    return declared
-
-
-def check_size(size_bytes: int, max_bytes: int) -> None:
-    """Raise ``Problem`` 413 if a received file is too large, and 400 if it is empty."""
-    if size_bytes > max_bytes:
-        raise _too_large(max_bytes)
-    if size_bytes == 0:
-        raise Problem(400, "empty-upload", "expected a file; got 0 bytes: check the file")
-
-
-def fits_summary(path: Path, limits: FitsLimits) -> HeaderSummary:
-    """The summary of a received FITS file. Raises ``Problem`` 415 or 422 if it cannot be used."""
-    return _inspected(path, _Fits(limits))
-
-
-def psf_summary(path: Path, limits: FitsLimits) -> HeaderSummary:
-    """As ``fits_summary``, for a PSF. Raises ``Problem`` 422 if the file cannot be a PSF."""
-    return _inspected(path, _PsfFile(limits))
-
-
-def archive_contents(path: Path, limits: ArchiveLimits) -> ArchiveContents:
-    """The contents of a received archive of a transit. Raises ``Problem`` 413, 415 or 422 if it cannot be used."""
-    return _inspected(path, _Archive(limits))
-
-
-def _inspected(path: Path, expected: _Format[Found]) -> Found:
-    with path.open("rb") as file:
-        expected.recognise(file.read(expected.start_bytes), whole=True)
-    return expected.inspect(path)
-
-
-def has_own_limit(address: str, content_type: str) -> bool:
-    """Whether the route itself limits the size of a body of this type, because the body may contain files."""
-    form = content_type.lower().startswith(FORM)
-    return (
-        address in LARGE
-        or address.startswith(PARTS)
-        or (form and re.fullmatch(r"/uws/jobs(/[^/]+/parameters)?", address) is not None)
-    )
+    counted = int(text) if text.isdecimal() else 0
+    if counted > most_bytes + FORM_BYTES:
+        raise _too_large(most_bytes)
+    if counted:  # if the length is declared, the upload can be refused before it is sent
+        await run_in_threadpool(take, counted)
+    digest, size, start, filename = hashlib.sha256(), 0, b"", None
+    with path.open("wb") as file:
+        async for name, chunk in _file_of(request, most_bytes):
+            filename = name
+            if len(start) < kind.start_bytes:
+                start += chunk[: kind.start_bytes - len(start)]
+                kind.check_start(start, whole=False)
+            size += len(chunk)
+            if size > most_bytes:
+                raise _too_large(most_bytes)
+            if size > counted:
+                await run_in_threadpool(take, UNDECLARED_BYTES)
+                counted += UNDECLARED_BYTES
+            digest.update(chunk)
+            file.write(chunk)
+    kind.check_size(size, state)
+    return digest.hexdigest(), size, filename
 
 
 def _too_large(max_bytes: int) -> Problem:

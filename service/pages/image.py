@@ -9,8 +9,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, RedirectResponse
 
-from service.api.estimates import ChosenPsf, EstimateView, estimate_job
-from service.api.jobs import submit_job
+from service.api.jobs import EstimateView, estimate_job, submit_job
 from service.http.callers import Caller
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -25,6 +24,7 @@ from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.phases import Phase
 from workers.contract.requests import Identity
+from workers.intake.psf_choice import ChosenPsf
 
 MOST_PSFS = MOST_PRODUCTS = 50
 # Statuses of problems that other options of the form can solve.

@@ -13,6 +13,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
 
 from psfcore.fits.header import read_summary
+from psfcore.instruments.files import instrument_names
 from service.api.images import ImageView, upload_image
 from service.http.callers import Caller
 from service.http.quotas import Allowed
@@ -23,7 +24,6 @@ from service.pages.visitors import PageReading, PageSubmitting
 from service.views.jobs import JobView
 from service.views.products import ProductView
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow
-from workers.intake.no_psf import buildable
 from workers.intake.uploads import image_row
 
 SAMPLE = "sample.fits"
@@ -39,7 +39,7 @@ def home(request: Request, caller: PageReading, state: Shared) -> Response:
     return page(
         request,
         "home.html",
-        known=" and ".join(buildable()),
+        known=" and ".join(instrument_names()),
         most_bytes=state.settings.max_upload_bytes,
         products=[product_card(state, row) for row in catalogue.page(ProductRow, owner=owner, limit=LATEST)],
         images=[image_line(row) for row in images],

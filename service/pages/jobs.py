@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from service.api.jobs import JobId, cancel_job, get_job, list_jobs
 from service.http.callers import Caller
-from service.http.paging import Cursor
+from service.http.paging import Cursor, Listing
 from service.http.state import Shared, State
 from service.pages.parts import options
 from service.pages.parts.sentences import of_error
@@ -43,7 +43,7 @@ def job_list(
 ) -> Response:
     """The jobs, newest first."""
     wanted = Phase(phase) if phase in set(Phase) else None
-    found = list_jobs(request, caller, state, wanted, PER_PAGE, cursor)
+    found = list_jobs(Listing(request, PER_PAGE, cursor), caller, state, wanted)
     return page(
         request,
         "jobs.html",

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from service.api.keys import KeyId, MadeKey, NewKey, list_keys, make_key, revoke_key
 from service.http.callers import Caller
-from service.http.paging import Cursor
+from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.rendering import page
@@ -80,7 +80,7 @@ def _page(
     cursor: str | None = None,
     made: MadeKey | None = None,
 ) -> Response:
-    found = list_keys(request, caller, state, owner or None, PER_PAGE, cursor)
+    found = list_keys(Listing(request, PER_PAGE, cursor), caller, state, owner or None)
     admin = Scope.ADMIN in caller.scopes
     return page(
         request,

@@ -9,9 +9,9 @@ from fastapi.responses import RedirectResponse
 from starlette.background import BackgroundTasks
 
 from service.api.bulk import LOOK_FROM
-from service.api.files.pixels import prepare_image
+from service.api.images import delete_product
 from service.api.lineage import get_product_lineage, rerun_product
-from service.api.products import delete_product
+from service.api.pixels import prepare_image
 from service.http import downloads
 from service.http.problems import Problem
 from service.http.state import Shared, State

@@ -9,7 +9,7 @@ from fastapi.responses import JSONResponse, RedirectResponse
 
 from psfcore.transit.manifest import MANIFEST_NAME, TransitManifest
 from service.api.transits import get_transit, list_transits, upload_transit
-from service.http.paging import Cursor
+from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared
 from service.pages.jobs import TITLES
@@ -43,7 +43,7 @@ router = APIRouter(prefix="/transits", include_in_schema=False)
 @router.get("")
 def transit_list(request: Request, caller: PageReading, state: Shared, cursor: Cursor = None) -> Response:
     """The uploaded transits, newest first, and the form that uploads one."""
-    found = list_transits(request, caller, state, PER_PAGE, cursor)
+    found = list_transits(Listing(request, PER_PAGE, cursor), caller, state)
     settings = state.settings
     return page(
         request,

@@ -15,7 +15,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, BinaryIO
+from typing import Annotated, Any, BinaryIO
 
 from fastapi import Depends, Request
 
@@ -27,10 +27,15 @@ from service.http.state import Shared, State
 from service.uws.parameters import MAX_FORM_BYTES, bad, multipart_pairs, read_form, single
 from workers.contract.kinds import KINDS
 from workers.files.store import Store
-from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 
 # The names in UPLOAD, and for each name the parameter that gets the id of the file.
 NAMES = {"image": "image_id", "mask": "mask_id", "transit": "transit_id", "psf": "psf_id"}
+KINDS_OF: dict[str, uploads.Kind[Any]] = {
+    "image": uploads.IMAGE,
+    "mask": uploads.IMAGE,
+    "transit": uploads.TRANSIT,
+    "psf": uploads.PSF,
+}
 INLINE = "param:"
 MOST_FILES = len(NAMES)
 COUNTED_BYTES = 2**20  # bytes that are counted against the caller's allowance in one step
@@ -140,16 +145,10 @@ def _addition(
     state: State, owner: str, name: str, part: Part, allowed: Allowed
 ) -> Callable[[], tuple[object, bool]]:
     """A function that stores a file and adds its row to the catalogue. Raises ``Problem`` 413, 415 or 422 if the file cannot be used."""
-    settings, file = state.settings, (owner, part.sha256, part.bytes, part.filename)
-    keep = partial(allowed.keep, part.path, part.sha256)
-    if name == "transit":
-        uploads.check_size(part.bytes, settings.max_transit_bytes)
-        contents = uploads.archive_contents(part.path, settings.archive_limits)
-        return partial(keep, transit_row(*file, contents))
-    uploads.check_size(part.bytes, settings.max_upload_bytes)
-    if name == "psf":
-        return partial(keep, uploaded_psf_row(*file, uploads.psf_summary(part.path, state.limits)))
-    return partial(keep, image_row(*file, uploads.fits_summary(part.path, state.limits)))
+    kind = KINDS_OF[name]
+    kind.check_size(part.bytes, state)
+    row = kind.row(owner, part.sha256, part.bytes, part.filename, kind.inspect(part.path, state))
+    return partial(allowed.keep, part.path, part.sha256, row)
 
 
 class _Files:

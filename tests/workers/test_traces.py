@@ -98,7 +98,7 @@ def test_without_the_packages_the_setting_is_an_error_that_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "opentelemetry", None)
-    monkeypatch.delitem(sys.modules, "workers.traces.exporter", raising=False)
+    monkeypatch.delitem(sys.modules, "workers.trace_exporter", raising=False)
     with pytest.raises(MissingExtra, match=r"heliopsf\[traces\]"):
         traces.configure(settings_of(tmp_path, "http://127.0.0.1:9/v1/traces"), "server")
 

@@ -27,8 +27,7 @@ from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.bulk import BulkRequest, Output
 from workers.contract.identities import product_identity
 from workers.contract.phases import Fault, JobError
-from workers.contract.requests import Deconvolve
-from workers.contract.resolved import ResolvedDeconvolve
+from workers.contract.requests import Deconvolve, ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files import beneath
 from workers.intake import estimates

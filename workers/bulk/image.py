@@ -23,12 +23,10 @@ from workers.catalogue.bulks import Taken
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.bulk import BulkWork
 from workers.contract.identities import product_identity
-from workers.contract.requests import Deconvolve
-from workers.contract.resolved import ResolvedDeconvolve
+from workers.contract.requests import Deconvolve, ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files import beneath
-from workers.files.full_disk import is_disk_full
-from workers.files.store import sha256_of
+from workers.files.store import is_disk_full, sha256_of
 from workers.intake import estimates
 from workers.intake.deprecated import details_now
 from workers.intake.requests import resolved_deconvolution

@@ -17,7 +17,7 @@ from workers.contract.bulk import BulkPhase
 from workers.contract.identities import canonical_hash
 from workers.contract.phases import Fault, JobError, Phase
 from workers.contract.queues import Queue
-from workers.files.full_disk import STORAGE_FULL
+from workers.files.store import STORAGE_FULL
 from workers.settings import Settings
 
 KIND = "bulk"

@@ -18,7 +18,7 @@ from workers.catalogue.database import Database, begins_with, several_ids_fit
 from workers.catalogue.interpolated.series import may_interpolate
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow, PsfRow
 from workers.contract.identities import canonical_hash
-from workers.contract.short_ids import SHORT_ID
+from workers.contract.requests import SHORT_ID
 from workers.versions.status import PsfStatus
 from workers.versions.validity import Validity, iso
 

@@ -9,9 +9,9 @@ from psfcore.built.recipe import Recipe
 from psfcore.built.recipe import canonical_hash as canonical_hash
 from psfcore.gap.effect_sources import library_sha256
 from psfcore.instruments.files import instrument_path
-from workers.contract.methods import Parameters
-from workers.contract.requests import PsfBuild
-from workers.contract.resolved import (
+from workers.contract.requests import (
+    Parameters,
+    PsfBuild,
     ResolvedCrossValidate,
     ResolvedDeconvolve,
     ResolvedGapDiagnose,

@@ -23,20 +23,18 @@ from workers.contract.identities import (
     report_identity,
     request_identity,
 )
-from workers.contract.methods import Parameters
 from workers.contract.queues import Queue
 from workers.contract.requests import (
     CrossValidate,
     Deconvolve,
     GapDiagnose,
+    Parameters,
     PsfBuild,
     PsfFit,
     PsfInterpolate,
     PsfTables,
     Report,
     Rerun,
-)
-from workers.contract.resolved import (
     ResolvedCrossValidate,
     ResolvedDeconvolve,
     ResolvedGapDiagnose,
@@ -84,7 +82,7 @@ class Kind:
     | origin | the origin of the PSFs or products that this kind makes; a rerun finds the kind of its job by this origin |
     | needs_room | whether the job starts only if the owner's quota is not full |
     | counted_whole | whether the reported steps count the whole job, so that the time left can be estimated from them |
-    | time_advice, memory_advice | advice for a request that needs more than the operator's limits |
+    | memory_advice, time_advice | advice for a request that needs more than the limits of the operator; time_advice: None if it is the same |
     """
 
     name: str
@@ -99,8 +97,8 @@ class Kind:
     queue: Queue = Queue.INTERACTIVE
     needs_room: bool = True
     counted_whole: bool = False
-    time_advice: str = "use fewer or smaller images"
     memory_advice: str = "use fewer or smaller images"
+    time_advice: str | None = None
 
     @property
     def request(self) -> type[Request]:
@@ -140,7 +138,6 @@ _ROWS = (
         origin="built",
         resolver="workers.intake.requests:resolve_psf_build",
         counted_whole=True,
-        time_advice="use a smaller size, or fewer spectral lines in the bandpass",
         memory_advice="use a smaller size, or fewer spectral lines in the bandpass",
     ),
     Kind(
@@ -161,7 +158,6 @@ _ROWS = (
         resolved=PsfInterpolate,
         identity=interpolated_psf_identity,
         origin=INTERPOLATED,
-        time_advice="crop the two PSFs",
         memory_advice="crop the two PSFs",
     ),
     Kind(
@@ -172,7 +168,6 @@ _ROWS = (
         resolved=PsfTables,
         identity=request_identity("psf-tables"),
         needs_room=False,  # the quota does not count tables
-        time_advice="crop the PSF",
         memory_advice="crop the PSF",
     ),
     Kind(
@@ -185,7 +180,6 @@ _ROWS = (
         assistant="workers.tasks.crossval:assist_cross_validation",
         queue=Queue.CROSSVAL,  # these jobs take long, so quick jobs run first
         counted_whole=True,
-        time_advice="use fewer runs, scheme 'shared', or fewer or smaller images",
         memory_advice="use fewer runs, scheme 'shared', or fewer or smaller images",
     ),
     Kind(

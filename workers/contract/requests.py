@@ -1,27 +1,45 @@
-"""Parameters of every job kind as a client sends them.
+"""Parameters of every job kind: as a client sends them, and (``Resolved...``) as the worker gets them.
 
-The web process and the workers both import this module, so it must not load numerical libraries. The parameters of the
-deconvolution methods are in ``workers.contract.methods``. ``workers.contract.kinds`` makes the requests from these models.
+The web process and the workers both import this module, so it must not load numerical libraries.
+``workers.contract.kinds`` makes the requests from these models. To add a method of deconvolution, write a class here, a
+file in ``psfcore/deconvolve/methods`` and a test.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from psfcore.built.recipe import BUILD_VERSION
 from psfcore.deconvolve.box import BOX, LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise_figures import NoiseFigures
-from workers.contract.methods import Method, Parameters, RichardsonLucy
-from workers.contract.option import Option
 from workers.versions.validity import TIME, iso, seconds
+
+
+@dataclass(frozen=True)
+class Option:
+    """How a command names a field of a request, as metadata of its annotation; `service.cli.fields` makes the option.
+
+    name: such as "--saturation"; None: the name of the field. metavar: the placeholder of the value. check: raises DataError
+    for a text that is no value.
+    """
+
+    name: str | None = None
+    metavar: str | None = None
+    check: Callable[[str], object] | None = None
+
 
 ContextName = Annotated[
     str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="id or name of a context")
 ]
+# The first digits of an id stand for the id, if no other id begins with them.
+FEWEST_DIGITS = 8
+SHORT_ID = rf"[0-9a-f]{{{FEWEST_DIGITS},63}}"  # pattern of a text that can be a shortened id
 Identity = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256, 64 hexadecimal digits")]
 TransitId = Annotated[Identity, Field(description="id returned by the upload of the transit")]
 TransitNoise = Annotated[
@@ -52,6 +70,100 @@ ShapeName = Literal[
     "knee",
     "two-power-laws",
     "core",
+]
+
+
+class Parameters(BaseModel):
+    """Base class of the parameters of a job, or of a part of a job. Unknown names are refused; values cannot be changed afterwards.
+
+    algorithm_version: raise it when the same parameters give another result; it is part of the identity of the result.
+    """
+
+    algorithm_version: ClassVar[int]
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class _Method(Parameters):
+    """Parameters that every method of deconvolution has. Each method adds its own."""
+
+    stop: Literal["fixed", "discrepancy"] = Field(
+        "fixed",
+        description="`fixed`: do all `steps`; `discrepancy`: stop once the residual is like the noise",
+    )
+    edges: Literal["zero", "symmetric", "extended"] | None = Field(
+        None, description="assumed scene beyond the field of view; null: depends on the method"
+    )
+    margin_px: int | None = Field(
+        None,
+        ge=0,
+        le=4096,
+        description="width of the margin around the field of view in which the scene is also estimated; null: derived from the PSF",
+    )
+
+
+class RichardsonLucy(_Method):
+    """Richardson-Lucy. The paper recommends 20 steps and edges `zero`."""
+
+    algorithm_version: ClassVar[int] = 2
+    name: Literal["richardson-lucy"] = "richardson-lucy"
+    steps: int = Field(20, ge=1, le=200, description="number of iterations; the paper uses 20")
+
+
+class RichardsonLucyAccelerated(_Method):
+    """Richardson-Lucy with the extrapolation of Biggs and Andrews, which reaches the same result in fewer steps."""
+
+    algorithm_version: ClassVar[int] = 1
+    name: Literal["richardson-lucy-accelerated"]
+    steps: int = Field(10, ge=1, le=200)
+    order: Literal[1, 2] = Field(1, description="order of the extrapolation")
+
+
+class RichardsonLucyExtended(_Method):
+    """Richardson-Lucy that also estimates the scene beyond the edges (Bertero and Boccacci)."""
+
+    algorithm_version: ClassVar[int] = 1
+    name: Literal["richardson-lucy-extended"]
+    steps: int = Field(20, ge=1, le=200)
+
+
+class RichardsonLucyTotalVariation(_Method):
+    """Richardson-Lucy with total-variation regularisation: less noise; meant for pictures rather than photometry."""
+
+    algorithm_version: ClassVar[int] = 1
+    name: Literal["richardson-lucy-total-variation"]
+    steps: int = Field(20, ge=1, le=200)
+    smoothing: float = Field(
+        0.01, ge=0, le=0.02, description="weight of the regularisation, in counts; 0 gives Richardson-Lucy"
+    )
+
+
+class BasicIterative(_Method):
+    """Basic iterative deconvolution, which the paper recommends for a bright source near an edge."""
+
+    algorithm_version: ClassVar[int] = 1
+    name: Literal["basic-iterative"]
+    steps: int = Field(20, ge=1, le=200)
+
+
+class Linear(_Method):
+    """Linear reconstruction: no positivity constraint, no bias of faint pixels, converged after about five steps."""
+
+    algorithm_version: ClassVar[int] = 1
+    name: Literal["linear"]
+    steps: int = Field(5, ge=1, le=200)
+
+
+Method = Annotated[
+    RichardsonLucy
+    | RichardsonLucyAccelerated
+    | RichardsonLucyExtended
+    | RichardsonLucyTotalVariation
+    | BasicIterative
+    | Linear,
+    Field(discriminator="name"),
+]
+METHODS: list[str] = [
+    get_args(one.model_fields["name"].annotation)[0] for one in get_args(get_args(Method)[0])
 ]
 
 
@@ -312,3 +424,53 @@ class Rerun(Parameters):
 
     of: Literal["product", "psf"] = Field(description="type of the result to make again")
     id: Identity = Field(description="id of the product or PSF; an uploaded PSF cannot be made again")
+
+
+class ResolvedDeconvolve(Deconvolve):
+    """A deconvolution with the id of its PSF. If the PSF may still have to be built or interpolated, the parameters
+    also say how."""
+
+    psf_id: Identity
+    context: None = Field(None, exclude=True)  # the PSF is chosen; context_id says from which context
+    psf_recipe: PsfBuild | None = None
+    psf_interpolation: PsfInterpolate | None = None
+    picked_for: str | None = None  # the instrument of the image, if the service chose the PSF
+    context_id: str | None = None  # the context from which the service chose the PSF
+
+
+class ResolvedPsfFit(PsfFit):
+    """A fit with the recipe of the diffraction PSF, if the transit does not contain it."""
+
+    diffraction_recipe: PsfBuild | None = None
+
+
+class ResolvedCrossValidate(CrossValidate):
+    """A cross-validation with the recipe of the diffraction PSF, if the transit does not contain it."""
+
+    diffraction_recipe: PsfBuild | None = None
+
+
+class ResolvedReport(Report):
+    """A report with the recipe of the diffraction PSF, if a fit needs one."""
+
+    diffraction_recipe: PsfBuild | None = None
+
+
+class ResolvedGapDiagnose(GapDiagnose):
+    """A diagnosis with the recipe of the diffraction PSF and the effects that the operator adds to the library."""
+
+    diffraction_recipe: PsfBuild | None = None
+    added_effects: tuple[str, ...] = ()
+    # Hashes of the source texts of the added effects, because a changed text may change the diagnosis.
+    added_effects_sha256: tuple[str, ...] = ()
+
+
+class ResolvedRerun(Rerun):
+    """A rerun with the kind and the parameters of the job that made the product or PSF."""
+
+    kind: str
+    parameters: dict[str, Any]
+
+
+# Jobs on an uploaded transit.
+ResolvedOnTransit = ResolvedPsfFit | ResolvedCrossValidate | ResolvedReport | ResolvedGapDiagnose

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import operator
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -26,6 +27,7 @@ _MAGIC = re.compile(r"[*?\[]")
 _FITS_ENDING = re.compile(r"\.(fits|fit|fts)(\.gz)?$", re.IGNORECASE)
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._-]+")
 _CHUNK = 2**20
+_SIGNS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "!=": operator.ne}
 Place = tuple[str, ...]
 
 
@@ -157,9 +159,8 @@ def _walk(
         folder, names, indices = left.pop()
         if _is_after((*names, ""), after):
             yield Looked(folder, (*names, ""))
-        indices |= {
-            index + 1 for index in indices if parts[index] == ANY_FOLDERS
-        }  # ** also matches no folder
+        # ** also matches no folder.
+        indices |= {index + 1 for index in indices if parts[index] == ANY_FOLDERS}
         below: list[tuple[Path, Place, frozenset[int]]] = []
         for entry in _entries(folder):
             path, place = Path(entry.path), (*names, entry.name)
@@ -263,14 +264,4 @@ def _compared(value: Any, sign: str, other: Any) -> bool:
     """
     if isinstance(value, bool) or isinstance(value, str) != isinstance(other, str):
         return sign == "!="
-    match sign:
-        case "<":
-            return bool(value < other)
-        case "<=":
-            return bool(value <= other)
-        case ">":
-            return bool(value > other)
-        case ">=":
-            return bool(value >= other)
-        case _:
-            return bool(value != other)
+    return bool(_SIGNS[sign](value, other))

@@ -1,8 +1,8 @@
-"""Remove files that no row of the catalogue refers to. A job leaves such files if it is killed before it adds its row.
+"""The files to which the rows of the catalogue refer: check that the store has them, and remove all other files.
 
-Recent files are not removed, because an upload first stores its file and then adds the row that refers to it. An upload
-may also store a file again while the collection removes it, and add the row a little later. Therefore the rows are read
-a second time before a file is deleted for good.
+A job leaves a file without a row if it is killed before it adds its row. Recent files are not removed, because an upload
+first stores its file and then adds the row that refers to it. An upload may also store a file again while the collection
+removes it, and add the row a little later. Therefore the rows are read a second time before a file is deleted for good.
 
 Kept solutions of transits can be made again, so old ones are removed too, with their rows. The same age limit applies.
 """
@@ -10,15 +10,99 @@ Kept solutions of transits can be made again, so old ones are removed too, with 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
-from workers.files.store import Blob, Store
+from workers.catalogue.named_files import Kept
+from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
+from workers.files.store import Blob, FileState, Store
 
 # An upload adds its row directly after it has stored its file; a job adds its row within seconds.
 SECOND_LOOK_AFTER_S = 10.0
+# Entries of a row's details that name further files.
+NAMED_IN_DETAILS = (
+    "changes_picture_sha256",
+    "output_sha256",
+    "page_sha256",
+    "report_sha256",
+    "tables_sha256",
+    "thumbnail_sha256",
+)
+NAMES: dict[type[Any], str] = {
+    ImageRow: "image",
+    TransitRow: "transit",
+    PsfRow: "psf",
+    ProductRow: "product",
+    ReportRow: "report",
+    SolutionRow: "solution",
+}
+
+
+def files_of(row: ProductRow | PsfRow | ReportRow) -> Iterator[tuple[str, int | None]]:
+    """SHA-256 and size (bytes; None: not recorded) of each file of a result; its main file comes first."""
+    yield row.file_sha256, row.bytes
+    if row.preview_sha256 is not None:
+        yield row.preview_sha256, None
+    for name in NAMED_IN_DETAILS:
+        if row.details.get(name) is not None:
+            yield row.details[name], None
+
+
+def intact(store: Store, row: ProductRow | PsfRow | ReportRow) -> bool:
+    """Whether the store has all files of a result, each with its recorded size. The content of the files is not read.
+
+    Raises ``StoreAway``.
+    """
+    for digest, expected in files_of(row):
+        size = store.size(digest)
+        if size is None or expected not in (None, size):
+            return False
+    return True
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A row of the catalogue with a lost or damaged file. files: SHA-256 and state of each lost or damaged file."""
+
+    row: Kept
+    files: tuple[tuple[str, FileState], ...]
+
+    @property
+    def what(self) -> str:
+        """The kind of the row whose file is lost or damaged, for example "product"."""
+        return NAMES[type(self.row)]
+
+
+def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iterator[Fault]:
+    """Find the rows whose files are lost or damaged.
+
+    content: read each file and compare its SHA-256. Otherwise only compare the size of each file with its recorded
+    size, if any. If several rows refer to a file, the file is read once. Raises ``StoreAway``.
+    """
+    states: dict[str, FileState] = {}
+    for table in NAMES:
+        for row in catalogue.named_files.kept(table):
+            bad = []
+            for digest, size in _files(row):
+                if digest not in states:
+                    states[digest] = store.state(digest, size, content=content)
+                if states[digest] != "good":
+                    bad.append((digest, states[digest]))
+            if bad:
+                yield Fault(row, tuple(bad))
+
+
+def _files(row: Kept) -> Iterator[tuple[str, int | None]]:
+    match row:
+        case ImageRow() | TransitRow():
+            yield row.id, row.bytes
+        case SolutionRow():
+            yield row.file_sha256, row.bytes
+        case _:
+            yield from files_of(row)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ File names are hashes; they never come from a client.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import math
 import os
@@ -18,14 +19,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from psfcore.errors import DataError
+from sqlalchemy.exc import SQLAlchemyError
+
+from psfcore.errors import DataError, module_of_extra
 from psfcore.transit.archive import ArchiveLimits, unpack
+from workers.settings import Settings
 
 ADVICE = (
     "if it was uploaded, upload it again; if a job made it, submit the same request again, and the job makes it again; if "
     "this does not help, tell the operator, who finds such files with `heliopsf store check`"
 )
 DAMAGED = f"its content has changed on the disk: {ADVICE}"
+STORAGE_FULL = "storage-full"  # the code of such an error
+NO_ROOM = "expected free space on the disk of the service; the disk is full: ask the operator to make room, then try again"
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 class StoreAway(ConnectionError):
@@ -237,6 +244,15 @@ class Store:
         return set()
 
 
+def open_store(settings: Settings) -> Store:
+    """The store that the settings name: a local folder, or S3. Raises ``MissingExtra`` if the packages for S3 are missing."""
+    if settings.store_url is None:
+        return Store(settings.data_dir)
+    remote = module_of_extra("s3", "workers.files.s3_store").RemoteStore
+    store: Store = remote(settings.store_url, settings.data_dir, settings.store_cache_mib * 2**20)
+    return store
+
+
 def lost(digest: str) -> BadFile:
     """The error for a file that is not in the store, although the catalogue refers to it."""
     return BadFile("file-lost", f"expected the file {digest} in the store; it is not there: {ADVICE}")
@@ -255,3 +271,23 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def is_disk_full(error: BaseException) -> bool:
+    """Whether an exception says that a disk is full, or that a quota of the file system is used up.
+
+    While a library handles the OSError of the system, it may raise another OSError; the error of the system is then the
+    context of the new error. Databases have codes of their own: SQLITE_FULL of SQLite, 53100 of PostgreSQL.
+    """
+    if isinstance(error, SQLAlchemyError):
+        original = getattr(error, "orig", None)
+        return (
+            getattr(original, "sqlite_errorname", None) == "SQLITE_FULL"
+            or getattr(original, "sqlstate", None) == "53100"
+        )
+    cause: BaseException | None = error
+    while isinstance(cause, OSError):
+        if cause.errno in _FULL:
+            return True
+        cause = cause.__cause__ or cause.__context__
+    return False

@@ -24,8 +24,7 @@ from workers.contract.kinds import KINDS, Result
 from workers.contract.phases import Phase
 from workers.contract.queues import Queue
 from workers.contract.requests import PsfTables
-from workers.files.examination import Fault
-from workers.files.intact import intact
+from workers.files.collection import Fault, intact
 from workers.files.store import Store
 from workers.lineage import made_by
 

@@ -19,7 +19,7 @@ from psfcore.fits.header import origin_of, plate_scale_arcsec, wavelength_angstr
 from psfcore.instruments.model import load_instrument
 from psfcore.noise_figures import NoiseFigures
 from workers.catalogue.tables import PsfRow
-from workers.contract.resolved import ResolvedDeconvolve
+from workers.contract.requests import ResolvedDeconvolve
 from workers.versions.variants import without_variant
 
 

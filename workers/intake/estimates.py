@@ -1,8 +1,11 @@
 """Estimates the time and memory of a job from the sizes of its inputs, before the job is accepted.
 
-The initial values are in ``workers.intake.cost_model``. The time is then multiplied by a factor that was measured on
+The initial values are in ``estimates.json``; ``python -m benchmarks.estimates --write`` measured these values. The time is then multiplied by a factor that was measured on
 completed jobs of the same kind in this catalogue. A wrong estimate does little harm, because a job that takes too
 long is stopped, and no memory is reserved.
+
+In ``estimates.json``, times in seconds are processor time on one core of a machine of 2026. Times per pixel are in ns,
+memory per pixel in bytes.
 
 | symbol | name | unit |
 |---|---|---|
@@ -15,10 +18,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from importlib.resources import files
 from statistics import median
 from typing import Any
 from weakref import WeakKeyDictionary
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from psfcore.deconvolve.box import EXPECTED_RIM_PX, Box
 from psfcore.deconvolve.memory import MIB, Asked, deconvolution_bytes, of_method
@@ -30,7 +36,6 @@ from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
 from workers.contract.identities import instrument_text
 from workers.contract.kinds import KINDS
 from workers.contract.requests import PsfBuild
-from workers.intake.cost_model import COSTS
 from workers.settings import Settings
 
 ASSESSED_BYTES = (
@@ -39,16 +44,102 @@ ASSESSED_BYTES = (
 READ_BYTES = 25.0  # for each pixel of the image beyond the region that is deconvolved
 BYTES_A_PIXEL = 4.0  # assumed for the files of a transit, because only their length is known here
 
-FEWEST_JOBS, MOST_JOBS = (
-    3,
-    30,
-)  # number of completed jobs of a kind from which the factor is computed, as a median
+# Number of completed jobs of a kind from which the factor is computed, as a median.
+FEWEST_JOBS, MOST_JOBS = 3, 30
 BOUNDS = 0.2, 5.0
 # If the measured time of a job is below this fraction of its estimate, the job found its result in the catalogue and
 # computed nothing. Such jobs are left out.
 FOUND = 0.05
 KEEP_FACTOR_S = 60.0
 _factors: WeakKeyDictionary[Catalogue, dict[str, tuple[float, float]]] = WeakKeyDictionary()
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Linear(_Frozen):
+    """Time and memory as a constant plus a part that is proportional to the number of pixels that the job reads.
+
+    as_published, shapes: if the request sets the parameter of this name, the time is multiplied by this factor.
+    """
+
+    base_s: float
+    pixel_ns: float
+    base_mib: float
+    pixel_bytes: float
+    as_published: float = 1.0
+    shapes: float = 1.0
+    run: dict[str, tuple[float, float]] = {}  # time of one run, by scheme: s, and ns per pixel
+
+
+class Deconvolution(_Frozen):
+    """Time of a deconvolution. The plane is the image with its margins. `psfcore.deconvolve.memory` has the memory.
+
+    step_ns: for each method, the time of one step for one pixel of the plane, ns.
+    """
+
+    base_s: float
+    image_ns: float
+    step_ns: dict[str, float]
+    psf_draws: int  # deconvolutions with other PSFs, for the errors of a fitted PSF: two per parameter
+
+
+class Build(_Frozen):
+    """The time that a PSF build takes for each spectral line of the bandpass, and the memory that it needs.
+
+    A mask is sampled at S^2 points per pixel. ``psfcore.instruments.workload`` counts the points, cells, windows and
+    entries. Suffix _ns: the time for one point, cell, window or entry; suffix _bytes: the memory for one.
+    """
+
+    disc_s: float
+    mesh_s: float
+    mask_s: float
+    fewest_samples: int  # smallest S
+    samples_exponent: float
+    grid_px: int
+    grid_exponent: float
+    grid_mib: float
+    meshes_mib: float
+    airy_ns: float
+    airy_bytes: float
+    cell_ns: float
+    cell_bytes: float
+    window_ns: float  # for each window and pixel of an edge of the grid
+    outlines: int  # outlines of a mount that ``mask_s`` includes
+    entry_ns: float  # for each further entry of the list of edges, times S
+    entry_bytes: float
+    spectrum_bytes: float  # for each row of the mask and pixel of an edge of the grid
+    image_bytes: float  # for each pixel of a mask image
+
+
+class Costs(_Frozen):
+    """The content of ``estimates.json``.
+
+    threads_exponent: p. With n threads, the time is the time of one thread multiplied by n ** -p.
+    """
+
+    class Kinds(BaseModel):
+        """The models by kind of job. Every kind except ``deconvolve`` and ``psf-build`` is Linear; a kind without an entry uses "other"."""
+
+        model_config = ConfigDict(frozen=True, extra="allow")
+        __pydantic_extra__: dict[str, Linear]
+
+        deconvolve: Deconvolution
+        psf_build: Build = Field(alias="psf-build")
+        other: Linear
+
+    worker_mib: float  # memory of a worker with its libraries, before its first job
+    threads_exponent: float
+    kinds: Kinds
+
+    def linear(self, kind: str) -> Linear:
+        """The linear model of a kind; the model "other" if the kind has no entry."""
+        return (self.kinds.__pydantic_extra__ or {}).get(kind, self.kinds.other)
+
+
+COSTS_FILE = files(__package__).joinpath("estimates.json")
+COSTS = Costs.model_validate_json(COSTS_FILE.read_text("utf-8"))
 
 
 @dataclass(frozen=True)
@@ -59,10 +150,6 @@ class Estimate:
     seconds: float
     start_s: float
 
-    def as_json(self) -> dict[str, Any]:
-        """The estimate as JSON, as it is stored with the job."""
-        return {"memory_mib": self.memory_mib, "seconds": self.seconds, "start_s": self.start_s}
-
 
 def checked(
     kind: str, parameters: Mapping[str, Any], catalogue: Catalogue, owner: str, settings: Settings
@@ -71,21 +158,21 @@ def checked(
 
     Raises DataError "too-much-memory" or "too-much-time" if it exceeds the operator's limits.
     """
-    found = estimate(kind, parameters, catalogue, owner, settings.threads)
-    if found.memory_mib > settings.max_job_memory_mib:
+    expected = estimate(kind, parameters, catalogue, owner, settings.threads)
+    if expected.memory_mib > settings.max_job_memory_mib:
         raise DataError(
             "too-much-memory",
             f"expected a job of at most {settings.max_job_memory_mib} MiB (HELIOPSF_MAX_JOB_MEMORY_MIB; its default follows "
-            f"from the memory and the worker processes of the service's machine); this one needs about {found.memory_mib} "
+            f"from the memory and the worker processes of the service's machine); this one needs about {expected.memory_mib} "
             f"MiB: {KINDS[kind].memory_advice}",
         )
-    if found.seconds > settings.max_job_s:
+    if expected.seconds > settings.max_job_s:
         raise DataError(
             "too-much-time",
             f"expected a job of at most {settings.max_job_s:g} s (HELIOPSF_MAX_JOB_S); this one takes about "
-            f"{found.seconds:g} s: {KINDS[kind].time_advice}",
+            f"{expected.seconds:g} s: {KINDS[kind].time_advice or KINDS[kind].memory_advice}",
         )
-    return found.as_json()
+    return asdict(expected)
 
 
 def estimate(
@@ -97,7 +184,7 @@ def estimate(
     if kind == "deconvolve":
         cpu_s, mib = _deconvolution(parameters, catalogue, owner)
     elif kind == "psf-build":
-        cpu_s, mib = _build(parameters, _mask_px(parameters, catalogue, owner))
+        cpu_s, mib = _build(parameters, catalogue, owner)
     else:
         cpu_s, mib = _linear(kind, parameters, catalogue, owner)
     start_s = cpu_s / threads**COSTS.threads_exponent
@@ -139,7 +226,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
         psf_shape = psf_shape if psf is None else tuple(psf.details["shape"])
     elif parameters.get("psf_recipe") is not None:  # the PSF may still have to be built
         recipe = parameters["psf_recipe"]
-        built_s, built_mib = _build(recipe, _mask_px(recipe, catalogue, owner))
+        built_s, built_mib = _build(recipe, catalogue, owner)
         psf_shape = (recipe["size"], recipe["size"])
     method, draws = parameters["method"], parameters["error_draws"]
     whole_px = ny * nx
@@ -165,13 +252,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     )
 
 
-def _mask_px(recipe: Mapping[str, Any], catalogue: Catalogue, owner: str) -> int:
-    """Number of pixels of the mask image of a PSF build; 0 if it has none."""
-    image = catalogue.get(ImageRow, recipe.get("mask_id") or "", owner)
-    return 0 if image is None else math.prod(image.summary["shape"])
-
-
-def _build(parameters: Mapping[str, Any], mask_px: int = 0) -> tuple[float, float]:
+def _build(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> tuple[float, float]:
     cost = COSTS.kinds.psf_build
     size = max(parameters["size"], cost.grid_px)
     grid = size / cost.grid_px
@@ -198,7 +279,9 @@ def _build(parameters: Mapping[str, Any], mask_px: int = 0) -> tuple[float, floa
         cost.cell_bytes * max(work.cells, default=0),
         cost.entry_bytes * work.mount_entries + cost.spectrum_bytes * work.mask_cells * size,
     )
-    arrays += cost.image_bytes * mask_px
+    mask = catalogue.get(ImageRow, parameters.get("mask_id") or "", owner)
+    if mask is not None:
+        arrays += cost.image_bytes * math.prod(mask.summary["shape"])
     return len(instrument.spectral_lines) * line_s, meshes_mib + cost.grid_mib * grid**2 + arrays / MIB
 
 
@@ -215,8 +298,7 @@ def _linear(
         cpu_s += parameters["runs"] * (run_s + run_ns * 1e-9 * pixels)
     built_s, built_mib = 0.0, 0.0
     if parameters.get("diffraction_recipe") is not None:
-        recipe = parameters["diffraction_recipe"]
-        built_s, built_mib = _build(recipe, _mask_px(recipe, catalogue, owner))
+        built_s, built_mib = _build(parameters["diffraction_recipe"], catalogue, owner)
     return built_s + cpu_s, max(built_mib, cost.base_mib + cost.pixel_bytes * pixels / MIB)
 
 

@@ -1,5 +1,5 @@
-"""Finds the one PSF that meets filters or fits the header of an image. If no PSF or several PSFs fit, the error says
-why.
+"""Finds the one PSF that meets filters or fits the header of an image, and says why it was chosen. If no PSF or several
+PSFs fit, the error says why.
 
 If the PSFs of a series may be interpolated, and the time of an image is between the ranges of two PSFs, the search also
 finds these two PSFs.
@@ -8,24 +8,30 @@ finds these two PSFs.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from pydantic import BaseModel, Field
+
 from psfcore.errors import DataError
+from psfcore.instruments.model import load_instrument
+from psfcore.instruments.unknown import agreement_with_image, same_as_image, unknown_instrument
+from psfcore.instruments.unknown import channel_of as channel_of_image
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import NOW
 from workers.catalogue.interpolated.series import Ends
 from workers.catalogue.psfs import PsfFilter
-from workers.catalogue.tables import PsfContextRow, PsfRow
-from workers.contract.requests import PsfInterpolate
-from workers.versions.interpolation import rounded
-from workers.versions.series import TOTAL, channel_of, instrument_of, series_of
+from workers.catalogue.tables import ImageRow, PsfContextRow, PsfRow
+from workers.contract.requests import Deconvolve, PsfInterpolate, ResolvedDeconvolve
+from workers.versions.interpolation import name_of, rounded
+from workers.versions.series import TOTAL, UPLOADED, channel_of, instrument_of, series_of
 from workers.versions.status import PsfStatus
 from workers.versions.validity import iso, seconds
-from workers.versions.variants import variant_for
+from workers.versions.variants import variant_for, without_variant
 
 MOST_NAMED = 20
+MOST_SEARCHED = 500
 
 
 @dataclass(frozen=True)
@@ -129,9 +135,12 @@ def look_for_image(
             "no-instrument",
             "expected DETECTOR or INSTRUME in the image's header; got neither: name the PSF in the request",
         )
-    at = _observed_at(header)
+    try:
+        at = seconds(header["date_obs"] or "")
+    except DataError:  # the keyword contains a text that is not a time; a missing time is reported below
+        at = None
     found = look(catalogue, PsfFilter(instrument, channel, kind, valid_at=at), owner, context)
-    if at is None and any(not _always(psf) for psf in found.psfs):
+    if at is None and any((psf.valid_from, psf.valid_to) != (-math.inf, math.inf) for psf in found.psfs):
         raise DataError(
             "no-date",
             f"expected DATE-BEG or DATE-OBS in the image's header, in the form 2024-03-01T12:00:00, because PSFs of "
@@ -188,16 +197,117 @@ def _seen_as(
     return instrument, variant_for(header["cards"], known) or channel
 
 
-def _observed_at(header: Mapping[str, Any]) -> float | None:
-    try:
-        return seconds(header["date_obs"] or "")
-    except DataError:  # the keyword contains a text that is not a time; the caller reports a missing time
-        return None
-
-
-def _always(psf: PsfRow) -> bool:
-    return psf.valid_from == -math.inf and psf.valid_to == math.inf
-
-
 def _joined(given: Mapping[str, str]) -> str:
     return ", ".join(f"{name} {value}" for name, value in given.items())
+
+
+class ChosenPsf(BaseModel):
+    """The PSF that a deconvolution would use."""
+
+    id: str
+    name: str
+    version: str = Field(
+        description="version of the PSF; if the PSF is not built yet: version of its instrument file"
+    )
+    status: str | None = Field(description="draft, certified or deprecated; null: the PSF is not built yet")
+    why: str = Field(description="a sentence that says why this PSF was chosen")
+
+
+def reasoned_psf(
+    wanted: Deconvolve, resolved: ResolvedDeconvolve, catalogue: Catalogue, owner: str
+) -> ChosenPsf:
+    """The PSF that was chosen for a request, with a sentence that says why.
+
+    wanted: the parameters of the request. resolved: the same parameters after ``workers.intake.requests.resolve``.
+    """
+    row = catalogue.get(PsfRow, resolved.psf_id, owner)
+    if row is not None:
+        why = _why(wanted, resolved, row, catalogue, owner)
+        return ChosenPsf(id=row.id, name=row.name, version=row.version, status=row.status, why=why)
+    if resolved.psf_interpolation is not None:
+        before = catalogue.get(PsfRow, resolved.psf_interpolation.before_psf_id, owner)
+        assert before is not None  # resolve() has found it
+        name, version = name_of(before.instrument, resolved.psf_id)
+        why = _why_interpolated(resolved.psf_interpolation, catalogue, owner) + "; the job makes it first."
+        return ChosenPsf(id=resolved.psf_id, name=name, version=version, status=None, why=why)
+    # resolve() has found the image and the PSF, or the recipe of the PSF
+    assert resolved.psf_recipe is not None and resolved.psf_recipe.instrument is not None
+    instrument = load_instrument(resolved.psf_recipe.instrument)
+    name, version = instrument.name, instrument.version
+    why = _why_built(wanted, catalogue, owner) + "; the job builds it first."
+    return ChosenPsf(id=resolved.psf_id, name=name, version=version, status=None, why=why)
+
+
+def _why(
+    wanted: Deconvolve, resolved: ResolvedDeconvolve, row: PsfRow, catalogue: Catalogue, owner: str
+) -> str:
+    if wanted.psf_id is not None:
+        return "The request names this PSF."
+    if resolved.psf_interpolation is not None:
+        return _why_interpolated(resolved.psf_interpolation, catalogue, owner) + "."
+    if resolved.psf_recipe is not None:
+        return _why_built(wanted, catalogue, owner) + "."
+    seen = f"the images of {row.series} at the time of this image"
+    context = catalogue.contexts.asked_for(wanted.context, owner)
+    if context is None or resolved.context_id is None:
+        return f"This PSF is certified for {seen}."
+    which = "The default context" if wanted.context is None else "Context"
+    return f"{which} {context.name} pins this PSF for {seen}."
+
+
+def _why_interpolated(asked: PsfInterpolate, catalogue: Catalogue, owner: str) -> str:
+    said = []
+    for psf_id, until in ((asked.before_psf_id, "until"), (asked.after_psf_id, "from")):
+        row = catalogue.get(PsfRow, psf_id, owner)
+        named = psf_id[:12] if row is None else f"{psf_id[:12]} ({row.name} {row.version})"
+        said.append(
+            f"PSF {named}, which holds {until} {asked.before_time if until == 'until' else asked.after_time}"
+        )
+    return f"This PSF is interpolated to {asked.time}, between {said[0]}, and {said[1]}"
+
+
+def _why_built(wanted: Deconvolve, catalogue: Catalogue, owner: str) -> str:
+    image = catalogue.get(ImageRow, wanted.image_id, owner)
+    series = None if image is None else series_of(*seen_through(image.summary), TOTAL)
+    return f"No PSF of {series or 'this instrument'} is certified, so the PSF is built from the instrument file that heliopsf ships"
+
+
+def no_psf(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> DataError:
+    """The error "no-psf-for-instrument" for an image with this header summary.
+
+    The error has these fields: `image` is the name of the telescope. `instruments` are the instruments whose PSF can
+    be built, sorted by how well they agree with the image. `psfs` are PSFs of the catalogue that could fit. `ways`
+    are the possible next steps. In both lists, `same` names the properties that agree with the image; `told` also
+    says which properties differ.
+    """
+    return unknown_instrument(header, list(_candidates(catalogue, header, owner)))
+
+
+def _candidates(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> Iterator[dict[str, Any]]:
+    """At most MOST_NAMED PSFs of the same telescope or plate scale, newest first.
+
+    PSFs of other channels are left out.
+    """
+    image_channel = channel_of_image(None, header["wavelnth"])
+    found = 0
+    for row in catalogue.psfs.page(PsfFilter(), owner, limit=MOST_SEARCHED):
+        scale = row.details.get("plate_scale_arcsec")
+        channel = None if row.channel is None else without_variant(row.channel)
+        same = same_as_image(row.instrument, channel, scale, header)
+        other_channel = image_channel is not None and channel is not None and channel != image_channel
+        usable = row.kind in (TOTAL, UPLOADED) and row.status != PsfStatus.DEPRECATED
+        if not usable or other_channel or not {"telescope", "plate_scale"} & set(same):
+            continue
+        yield {
+            "id": row.id,
+            "name": row.name,
+            "version": row.version,
+            "status": row.status,
+            "instrument": row.instrument,
+            "channel": row.channel,
+            "same": same,
+            "told": agreement_with_image(same, channel, scale, header),
+        }
+        found += 1
+        if found == MOST_NAMED:
+            return

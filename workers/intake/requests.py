@@ -24,13 +24,10 @@ from workers.contract.identities import (
     psf_identity,
 )
 from workers.contract.kinds import KINDS, JobRequest, Kind, load
-from workers.contract.methods import Parameters
-from workers.contract.requests import Deconvolve, PsfBuild
-from workers.contract.resolved import ResolvedDeconvolve
+from workers.contract.requests import Deconvolve, Parameters, PsfBuild, ResolvedDeconvolve
 from workers.intake import compatibility
 from workers.intake.deprecated import check_not_deprecated
-from workers.intake.no_psf import no_psf
-from workers.intake.psf_choice import Found, picked_for_image
+from workers.intake.psf_choice import Found, no_psf, picked_for_image
 from workers.lineage import made_by
 from workers.rows import row_of
 
@@ -147,11 +144,8 @@ def resolved_deconvolution(
     resolved = ResolvedDeconvolve(
         **_psf_for(catalogue, header, wanted, owner), **wanted.model_dump(exclude={"psf_id", "context"})
     )
-    psf_id = resolved.psf_id
-    if (
-        resolved.psf_interpolation is not None
-    ):  # both ends have the instrument, channel and pixels of the new PSF
-        psf_id = resolved.psf_interpolation.before_psf_id
+    between = resolved.psf_interpolation  # both ends have the instrument, channel and pixels of the new PSF
+    psf_id = resolved.psf_id if between is None else between.before_psf_id
     compatibility.check(resolved, catalogue.get(PsfRow, psf_id, owner), header)
     return resolved
 
@@ -229,9 +223,8 @@ def _certified(catalogue: Catalogue, owner: str, found: Found) -> dict[str, Any]
     if interpolation is None:
         return {"psf_id": found.one().id}
     identity = interpolated_psf_identity(interpolation)
-    if (
-        found.context is None
-    ):  # a context still uses the PSFs that it pins, even if they were deprecated later
+    # A context still uses the PSFs that it pins, even if they were deprecated later.
+    if found.context is None:
         check_not_deprecated(
             catalogue,
             identity,

@@ -14,10 +14,8 @@ from workers.versions.series import UPLOADED, channel_of, instrument_of, series_
 from workers.versions.status import PsfStatus
 
 TEXT_LENGTH = 200
-NAME_LENGTH, VERSION_LENGTH = (
-    80,
-    40,
-)  # as in the query of an upload: the columns are indexed, and indexes have a limit
+# As in the query of an upload: the columns are indexed, and indexes have a limit.
+NAME_LENGTH, VERSION_LENGTH = 80, 40
 
 
 def image_row(

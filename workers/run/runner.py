@@ -23,8 +23,7 @@ from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.kinds import KINDS
 from workers.contract.phases import Fault, JobError, Phase
 from workers.contract.queues import Queue
-from workers.files.full_disk import NO_ROOM, STORAGE_FULL, is_disk_full
-from workers.files.store import Store
+from workers.files.store import NO_ROOM, STORAGE_FULL, Store, is_disk_full
 from workers.run.attempt import Assistance, Attempt, Cancelled, Progress, TookTooLong
 from workers.run.child import MARGIN, Child, allowed_mib, is_out_of_memory
 from workers.run.stopping import Stopping

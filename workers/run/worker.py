@@ -156,7 +156,7 @@ def _runner() -> Runner:
     # Set this before numba is imported, because numba's OpenMP layer ends forked child processes.
     os.environ["NUMBA_THREADING_LAYER"] = "workqueue"
     os.environ["NUMBA_NUM_THREADS"] = str(settings.threads)
-    from workers.files.opened import open_store
+    from workers.files.store import open_store
     from workers.run.child import Child
     from workers.run.registry import load_tasks
     from workers.run.runner import Runner

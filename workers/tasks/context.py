@@ -12,7 +12,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
 from workers.contract.phases import JobError
-from workers.files.intact import intact
+from workers.files.collection import intact
 from workers.files.store import Store
 from workers.settings import Settings
 from workers.tasks.stage_timer import StageTimer

@@ -29,7 +29,7 @@ from psfcore.transit.transit import Transit
 from workers.catalogue.parts import Part
 from workers.catalogue.tables import ReportRow
 from workers.contract.identities import psf_fit_identity
-from workers.contract.resolved import ResolvedCrossValidate
+from workers.contract.requests import ResolvedCrossValidate
 from workers.tasks.context import Context
 from workers.tasks.data.reports import keep_report, provenance_of, write_json
 from workers.tasks.data.solutions import solved

@@ -22,7 +22,7 @@ from psfcore.psf import Psf
 from psfcore.psf_sampling import psf_for_image
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.identities import product_identity
-from workers.contract.resolved import ResolvedDeconvolve
+from workers.contract.requests import ResolvedDeconvolve
 from workers.intake.compatibility import noise_of, of_upload
 from workers.intake.deprecated import CODE, deprecated_warning
 from workers.rows import row_of

@@ -25,7 +25,7 @@ from psfcore.psf import Psf
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from workers.catalogue.tables import ReportRow
 from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
-from workers.contract.resolved import ResolvedGapDiagnose
+from workers.contract.requests import ResolvedGapDiagnose
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import given_psf, psf_row
 from workers.tasks.data.reports import keep_report, provenance_of, write_json

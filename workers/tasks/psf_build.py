@@ -16,8 +16,7 @@ from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.psf import Psf
 from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.identities import interpolated_psf_identity, recipe_of
-from workers.contract.requests import PsfBuild, PsfInterpolate
-from workers.contract.resolved import ResolvedDeconvolve
+from workers.contract.requests import PsfBuild, PsfInterpolate, ResolvedDeconvolve
 from workers.settings import library_versions
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import is_total_alone, named_psf, psf_row

@@ -12,7 +12,7 @@ from psfcore.scatter.report import fit_json
 from psfcore.transit.prepare import Prepared
 from workers.catalogue.tables import PsfRow
 from workers.contract.identities import diffraction_identity, psf_fit_identity
-from workers.contract.resolved import ResolvedPsfFit
+from workers.contract.requests import ResolvedPsfFit
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import psf_row
 from workers.tasks.data.reports import provenance_of, write_json

@@ -14,7 +14,7 @@ from psfcore.report.report import PsfReport, make_report, report_json
 from psfcore.transit.transit import Kernel
 from workers.catalogue.tables import ReportRow
 from workers.contract.identities import report_identity
-from workers.contract.resolved import ResolvedReport
+from workers.contract.requests import ResolvedReport
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import given_psf
 from workers.tasks.data.reports import keep_report, provenance_of, write_json

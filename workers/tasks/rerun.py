@@ -22,7 +22,7 @@ from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
 from workers.contract.identities import rerun_identity
 from workers.contract.kinds import KINDS
-from workers.contract.resolved import ResolvedRerun
+from workers.contract.requests import ResolvedRerun
 from workers.lineage import Made, lineage
 from workers.rows import row_of
 from workers.tasks.context import Context

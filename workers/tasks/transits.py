@@ -8,7 +8,7 @@ from psfcore.transit.folder import read_prepared
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
 from workers.catalogue.tables import TransitRow
-from workers.contract.resolved import ResolvedOnTransit
+from workers.contract.requests import ResolvedOnTransit
 from workers.rows import row_of
 from workers.tasks.context import Context
 from workers.tasks.psf_build import built_psf

@@ -29,7 +29,7 @@ from service.cli.operator.database import sentence
 from service.cli.options import DATA, read_settings
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
-from workers.files.opened import open_store
+from workers.files.store import open_store
 from workers.machine import cores
 from workers.settings import Settings, software_version
 

@@ -11,9 +11,8 @@ from service.cli.operator.key import Duration
 from service.cli.options import DATA, read_settings, user_errors
 from workers.catalogue.access.keys import OWNER, OWNER_RULE
 from workers.catalogue.owners import MIB, Usage
-from workers.files.collection import collect
-from workers.files.examination import examine
-from workers.files.opened import open_store
+from workers.files.collection import collect, examine
+from workers.files.store import open_store
 from workers.intake.again import repair
 
 DAY_S = 86_400

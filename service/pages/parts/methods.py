@@ -7,7 +7,7 @@ from typing import Any, get_args
 from annotated_types import Ge, Le
 
 from service.pages.parts.forms import Sent, text
-from workers.contract.methods import Method, RichardsonLucy
+from workers.contract.requests import Method, RichardsonLucy
 
 USUAL = RichardsonLucy()
 

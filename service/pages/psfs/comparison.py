@@ -12,8 +12,8 @@ from fastapi.responses import RedirectResponse
 from psfcore.errors import DataError
 from psfcore.tables import lookup
 from psfcore.tables.lookup import TOTAL
-from service.api.psfs.curves import tables_of
-from service.api.psfs.versions import get_psf
+from service.api.psf_curves import tables_of
+from service.api.psfs import get_psf
 from service.http.problems import Problem
 from service.http.state import Shared
 from service.pages.parts.plots import Plot, Series, around, light_beyond_plot, shown_radii

@@ -10,9 +10,8 @@ from fastapi.responses import RedirectResponse
 from pydantic import ValidationError, validate_call
 
 from psfcore.instruments.files import instrument_names
-from service.api.psfs.filters import psf_filter
-from service.api.psfs.versions import list_psfs, upload_psf
-from service.http.paging import Cursor
+from service.api.psfs import list_psfs, psf_filter, upload_psf
+from service.http.paging import Cursor, Listing
 from service.http.state import Shared
 from service.pages.parts.forms import fields, filled, start_job, wrong_fields
 from service.pages.rendering import page
@@ -32,7 +31,7 @@ _filter: Callable[..., PsfFilter] = validate_call(psf_filter)
 def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Cursor = None) -> Response:
     """PSFs, newest first, with the filters of the API."""
     asked = _asked(request)
-    found = list_psfs(request, caller, state, _wanted(asked), asked.get("context"), PER_PAGE, cursor)
+    found = list_psfs(Listing(request, PER_PAGE, cursor), caller, state, _wanted(asked), asked.get("context"))
     return page(
         request,
         "psfs.html",

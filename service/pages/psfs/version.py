@@ -13,14 +13,21 @@ from starlette.datastructures import FormData
 
 from psfcore.tables import lookup
 from service.api.lineage import get_psf_lineage, rerun_psf
-from service.api.psfs.affected import list_affected_by_psf
-from service.api.psfs.curves import get_cutout, tables_of
-from service.api.psfs.series import SeriesChange, SeriesView, change_series, get_series
-from service.api.psfs.status import StatusChange, change_psf_status, get_psf_status
-from service.api.psfs.versions import delete_psf, get_psf
+from service.api.psf_curves import get_cutout, tables_of
+from service.api.psf_status import (
+    SeriesChange,
+    SeriesView,
+    StatusChange,
+    change_psf_status,
+    change_series,
+    get_psf_status,
+    get_series,
+    list_affected_by_psf,
+)
+from service.api.psfs import delete_psf, get_psf
 from service.http import downloads
 from service.http.callers import Caller
-from service.http.paging import Cursor
+from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.parts.forms import checked, filled, start_job, text
@@ -80,7 +87,7 @@ def products(
     psf_id: Identity, request: Request, caller: PageReading, state: Shared, cursor: Cursor = None
 ) -> Response:
     """The products that were made with the PSF."""
-    found = list_affected_by_psf(psf_id, request, caller, state, PER_PAGE, cursor)
+    found = list_affected_by_psf(psf_id, Listing(request, PER_PAGE, cursor), caller, state)
     view = get_psf(psf_id, caller, state)
     return page(request, "psf_products.html", psf=view, products=found.items, next=found.next)
 

@@ -1,26 +1,37 @@
-"""Progress as server-sent events from a running server."""
+"""Progress as server-sent events: of one job or bulk run from a running server; and all jobs and bulk runs of an owner in one
+stream, what each look tells, and the stream over HTTP."""
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterator
+from itertools import groupby
 from typing import Any
 
 import httpx
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import update
+from pydantic import BaseModel
+from sqlalchemy import Engine, event, update
+from sqlalchemy.exc import OperationalError
 
 from service.api import events
+from service.api.events import Watch
 from service.app import create_app
 from service.client.http import ServiceError
+from service.views.jobs import JobView
 from tests.service.api.live import Following, Live, running
 from tests.service.conftest import execute, refusal
 from tests.service.keyed import bearer, keyed
 from tests.whole.stack import wait_for
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import new_id
+from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.followed import rows as followed
+from workers.catalogue.followed.rows import Place
+from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow, KeyRow
 from workers.contract.bulk import BulkPhase
 from workers.settings import Settings
@@ -111,11 +122,7 @@ def test_a_job_that_is_destroyed_and_a_server_that_stops_end_their_streams(live:
 
 
 def test_a_bulk_is_followed(live: Live) -> None:
-    row = BulkRow(
-        id=new_id(), owner=DEFAULT_OWNER, name="", phase=BulkPhase.RUNNING, request={}, request_key="k",
-        psf_id="p" * 64, created_at=time.time(), running_since=time.time(), listed=True,
-    )  # fmt: skip
-    bulk_id = live.catalogue.bulks.create(row, ["a" * 64, "b" * 64])[0].id
+    bulk_id = bulk_run(live.catalogue)
     following = Following(f"{live.url}/v1/bulk/{bulk_id}/events")
     following.await_lines("data:", 1)
     assert '"total":2' in following.said("data:")[0]
@@ -163,3 +170,333 @@ def test_a_stream_ends_with_its_key(settings: Settings, monkeypatch: pytest.Monk
             assert said.text.count("event: progress") == 1 and "event: end" not in said.text
             refused = service.api.get(f"/v1/jobs/{job.id}/events", headers=bearer(key))
             refusal(refused, 401, f"key-{how}")
+
+
+# All jobs and bulk runs of an owner ------------------------------------------------------------------
+
+
+@pytest.fixture
+def catalogue(settings: Settings) -> Iterator[Catalogue]:
+    settings.data_dir.mkdir(exist_ok=True)
+    catalogue = Catalogue(settings.catalogue_url)
+    catalogue.upgrade()
+    yield catalogue
+    catalogue.close()
+
+
+class Line(BaseModel):
+    id: str
+    phase: str
+
+    @classmethod
+    def of(cls, row: BulkRow) -> Line:
+        return cls(id=row.id, phase=row.phase)
+
+
+class Looks:
+    """The news of one look after the other, as (name of the event, data)."""
+
+    watch: Watch[Any]
+
+    def __init__(
+        self, catalogue: Catalogue, *named: str, owner: str = DEFAULT_OWNER, since: float | None = None
+    ) -> None:
+        since = catalogue.followed_jobs.now() - events.OVERLAP_S if since is None else since
+        rows = catalogue.followed_jobs
+        self.watch = Watch("job", rows, JobView.of, owner, frozenset(named), Place(since))
+
+    def told(self) -> list[tuple[str, dict[str, Any]]]:
+        news, self.watch = self.watch.look()
+        return [_parsed(one.text) for one in news]
+
+    def phases(self) -> list[tuple[str, str]]:
+        return [(data["id"], data.get("phase", name)) for name, data in self.told()]
+
+
+class BulkLooks(Looks):
+    """The same for bulk runs."""
+
+    def __init__(self, catalogue: Catalogue, *named: str, after_end: int = 2) -> None:
+        since = Place(catalogue.followed_bulks.now() - events.OVERLAP_S)
+        rows = catalogue.followed_bulks
+        self.watch = Watch("bulk", rows, Line.of, DEFAULT_OWNER, frozenset(named), since, after_end=after_end)
+
+
+def _parsed(text: str) -> tuple[str, dict[str, Any]]:
+    lines = dict(line.split(": ", 1) for line in text.splitlines() if line)
+    return lines["event"], json.loads(lines["data"])
+
+
+def submitted(catalogue: Catalogue, owner: str = DEFAULT_OWNER, kind: str = "psf-build") -> str:
+    return catalogue.jobs.submit(kind, {"bulk_id": "b"}, new_id(), owner)[0].id
+
+
+def claimed(catalogue: Catalogue, job_id: str) -> Lease:
+    lease = catalogue.jobs.claim(job_id, "w")
+    assert lease is not None
+    return lease
+
+
+def ended_long_ago(catalogue: Catalogue, job_id: str, ago_s: float = 3600.0) -> float:
+    """Complete a job and let its end lie in the past; returns that time."""
+    at = time.time() - ago_s
+    catalogue.jobs.complete(claimed(catalogue, job_id), "r" * 64)
+    execute(catalogue, update(JobRow).where(JobRow.id == job_id).values(ended_at=at))
+    return at
+
+
+def bulk_run(catalogue: Catalogue, owner: str = DEFAULT_OWNER) -> str:
+    row = BulkRow(
+        id=new_id(), owner=owner, name="", phase=BulkPhase.RUNNING, request={}, request_key=new_id(),
+        psf_id="p" * 64, created_at=time.time(), running_since=time.time(), listed=True,
+    )  # fmt: skip
+    return catalogue.bulks.create(row, ["a" * 64, "b" * 64])[0].id
+
+
+def test_a_job_is_told_when_it_is_new_changes_and_ends(catalogue: Catalogue) -> None:
+    looks = Looks(catalogue)
+    assert looks.told() == []
+    job_id = submitted(catalogue)
+    assert looks.phases() == [(job_id, "QUEUED")] and looks.told() == []
+    lease = claimed(catalogue, job_id)
+    assert looks.phases() == [(job_id, "EXECUTING")]
+    catalogue.jobs.progress(lease, "building", 1, 2)
+    ((name, data),) = looks.told()
+    row = catalogue.jobs.get(job_id)
+    assert row is not None and name == "job" and data["progress"]["stage"] == "building"
+    catalogue.jobs.heartbeat(lease)
+    assert looks.told() == [], "a heartbeat is no news"
+    catalogue.jobs.complete(lease, "r" * 64)
+    assert looks.phases() == [(job_id, "COMPLETED")] and looks.told() == [] == looks.told()
+
+
+def test_ends_that_no_look_saw_coming_are_told_once(catalogue: Catalogue) -> None:
+    looks = Looks(catalogue)
+    looks.told()
+    quick = submitted(catalogue)
+    catalogue.jobs.complete(claimed(catalogue, quick), "r" * 64)
+    assert looks.phases() == [(quick, "COMPLETED")] and looks.told() == [], "between two looks"
+    assert catalogue.again.reopen(quick)
+    assert looks.phases() == [(quick, "QUEUED")], "it runs again"
+    catalogue.jobs.complete(claimed(catalogue, quick), "r" * 64)
+    assert looks.phases() == [(quick, "COMPLETED")]
+    late = submitted(catalogue)
+    assert looks.phases() == [(late, "QUEUED")]
+    ended_long_ago(catalogue, late)
+    assert looks.phases() == [(late, "COMPLETED")] and looks.told() == [], "clocks do not matter"
+    deleted = submitted(catalogue)
+    looks.told()
+    catalogue.uws.destroy(deleted)
+    assert looks.told() == [("gone", {"kind": "job", "id": deleted})] and looks.told() == []
+
+
+@pytest.mark.parametrize("end", ["pause", "cancel"])
+def test_a_deleted_bulk_run_is_gone_once(catalogue: Catalogue, end: str) -> None:
+    run, kept = bulk_run(catalogue), bulk_run(catalogue)
+    looks = BulkLooks(catalogue)
+    looks.told()
+    for one in (run, kept):
+        assert getattr(catalogue.bulks, end)(one)
+    assert {phase for _, phase in looks.phases()} == {"PAUSED" if end == "pause" else "CANCELLED"}
+    assert catalogue.bulks.delete(run)
+    assert looks.told() == [("gone", {"kind": "bulk", "id": run})] and looks.told() == []
+
+
+def test_a_bulk_run_that_ended_some_time_ago_is_followed_until_it_is_deleted(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "OVERLAP_S", 0.0)
+    runs = [bulk_run(catalogue) for _ in range(3)]
+    before = bulk_run(catalogue)
+    catalogue.bulks.cancel(before)
+    time.sleep(0.01)
+    looks = BulkLooks(catalogue)
+    looks.told()
+    for run in runs:
+        catalogue.bulks.cancel(run)
+        time.sleep(0.01)
+        assert looks.phases() == [(run, "CANCELLED")]
+    assert looks.told() == []
+    assert set(looks.watch.known) == set(runs[1:]), "the two that ended last"
+    for run in (before, *runs):
+        assert catalogue.bulks.delete(run)
+    assert sorted(looks.phases()) == sorted((run, "gone") for run in runs[1:])
+    assert looks.told() == []
+    assert BulkLooks(catalogue, before).phases() == [(before, "gone")], "as a name that nothing has"
+
+
+def test_a_named_job_is_told_in_any_phase_and_when_it_is_deleted(catalogue: Catalogue) -> None:
+    draft = catalogue.uws.draft("psf-build", {}, owner=DEFAULT_OWNER).id
+    old, unknown = submitted(catalogue), "0" * 32
+    ended_long_ago(catalogue, old)
+    assert Looks(catalogue).told() == [], "without its name, an old end is no news"
+    looks = Looks(catalogue, draft, old, unknown)
+    assert sorted(looks.phases()) == sorted([(draft, "PENDING"), (old, "COMPLETED"), (unknown, "gone")])
+    assert looks.told() == []
+    catalogue.uws.destroy(old)
+    assert looks.phases() == [(old, "gone")] and looks.told() == []
+
+
+def test_other_owners_and_turns_of_bulk_runs_are_not_told(catalogue: Catalogue) -> None:
+    theirs, turn = submitted(catalogue, "bob"), submitted(catalogue, kind="bulk")
+    looks = Looks(catalogue, theirs)
+    assert looks.phases() == [(theirs, "gone")], "as if there were no such job"
+    for job_id in (theirs, turn):
+        catalogue.jobs.complete(claimed(catalogue, job_id), "r" * 64)
+    assert looks.told() == []
+
+
+def test_ends_since_a_time_come_in_pages_that_lose_none(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (followed, events):
+        monkeypatch.setattr(module, "MOST", 3)
+    ids = [submitted(catalogue) for _ in range(10)]
+    at = time.time() - 3600.0
+    for number, job_id in enumerate(ids):  # several ended at the same moment
+        ended_long_ago(catalogue, job_id)
+        ended = update(JobRow).where(JobRow.id == job_id).values(ended_at=at + number // 4)
+        execute(catalogue, ended)
+    looks = Looks(catalogue, since=at - 1)
+    pages = [looks.phases() for _ in range(6)]
+    assert [len(page) for page in pages] == [3, 3, 3, 1, 0, 0]
+    assert sorted(job_id for page in pages for job_id, _ in page) == sorted(ids)
+
+
+def test_of_very_many_waiting_jobs_the_newest_are_told_and_every_end(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (followed, events):
+        monkeypatch.setattr(module, "MOST", 3)
+    ids = [submitted(catalogue) for _ in range(5)]
+    looks = Looks(catalogue)
+    assert sorted(job_id for job_id, _ in looks.phases()) == sorted(ids[2:])
+    newer = [submitted(catalogue) for _ in range(2)]
+    assert sorted(job_id for job_id, _ in looks.phases()) == sorted(newer)
+    assert set(looks.watch.known) == {ids[4], *newer}, "what is not looked at is forgotten"
+    lease = claimed(catalogue, ids[0])
+    assert looks.phases() == [(ids[0], "EXECUTING")]
+    catalogue.jobs.complete(lease, "r" * 64)
+    catalogue.jobs.complete(claimed(catalogue, ids[1]), "r" * 64)
+    assert sorted(looks.phases()) == sorted([(ids[0], "COMPLETED"), (ids[1], "COMPLETED")])
+
+
+def test_many_jobs_need_as_few_queries_as_one(catalogue: Catalogue) -> None:
+    statements: list[str] = []
+
+    def count(_connection: Any, _cursor: Any, statement: str, *_: Any) -> None:
+        if statement.startswith("SELECT"):
+            statements.append(statement)
+
+    event.listen(Engine, "before_cursor_execute", count)
+    looks = Looks(catalogue)
+    counts = []
+    for many in (1, 50):
+        ids = [submitted(catalogue) for _ in range(many)]
+        statements.clear()
+        assert sorted(job_id for job_id, _ in looks.phases()) == sorted(ids)
+        counts.append(len(statements))
+    assert counts == [5, 5]  # clock, ended, two phases, and the rows that have changed
+    statements.clear()
+    assert looks.told() == [] and len(statements) == 4
+    event.remove(Engine, "before_cursor_execute", count)
+
+
+def test_a_look_that_fails_loses_nothing(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = Looks(catalogue)
+    job_id = submitted(catalogue)
+
+    def away(*_: Any) -> None:
+        raise OperationalError("SELECT", {}, Exception("the database is away"))
+
+    with monkeypatch.context() as broken:
+        broken.setattr(catalogue.followed_jobs, "rows", away)
+        with pytest.raises(OperationalError):
+            looks.told()
+    assert looks.phases() == [(job_id, "QUEUED")]
+
+
+def test_a_stream_follows_jobs_and_bulk_runs(live: Live) -> None:
+    first_id, lease = live.job()
+    following = Following(f"{live.url}/v1/events")
+    following.await_lines("data:", 1)  # the job that is at work
+    assert following.type.startswith("text/event-stream") and live.streams() == 1
+    bulk_id = bulk_run(live.catalogue)
+    following.await_lines("data:", 2)
+    live.client.pause_bulk(bulk_id)
+    following.await_lines("data:", 3)  # its pause
+    live.client.cancel_bulk(bulk_id)
+    live.catalogue.jobs.complete(lease, "r" * 64)
+    following.await_lines("data:", 5)  # both ends
+    live.client.delete_bulk(bulk_id)
+    wait_for(lambda: following.said("event:")[-1] == "gone", "the deletion", timeout_s=10)
+    *told, gone = [json.loads(data) for data in following.said("data:")]
+    assert gone == {"kind": "bulk", "id": bulk_id}
+    # A look at the run between two of the changes that cancelling makes to its rows tells the phase CANCELLED twice.
+    phases = [phase for phase, _ in groupby(one["phase"] for one in told if one["id"] == bulk_id)]
+    assert phases == ["RUNNING", "PAUSED", "CANCELLED"]
+    assert [one["phase"] for one in told if one["id"] == first_id] == ["EXECUTING", "COMPLETED"]
+    assert following.said("event:")[:3] == ["job", "bulk", "bulk"]
+    # An event does not look whether the result still exists; this job never had one.
+    ended = [one for one in told if one["id"] == first_id][-1]
+    assert {**ended, "result_deleted": True} == live.client.job(first_id)
+    live.app.state.stopping = True
+    following.join(5)
+    assert not following.is_alive(), "a server that stops ends its streams"
+
+
+def test_many_jobs_come_in_one_stream_and_streams_are_counted_together(live: Live) -> None:
+    ids = [submitted(live.catalogue) for _ in range(50)]
+    both = [Following(f"{live.url}/v1/events") for _ in range(2)]
+    for one in both:
+        one.await_lines("data:", 50)
+        assert {json.loads(data)["id"] for data in one.said("data:")} == set(ids)
+    for address in ("/v1/events", f"/v1/jobs/{ids[0]}/events"):
+        with httpx.stream("GET", f"{live.url}{address}") as answer:
+            assert answer.status_code == 429  # the body of an accepted stream would never end
+            answer.read()
+            refusal(answer, 429, "too-many-streams")
+
+
+def once(api: TestClient, **request: Any) -> tuple[list[tuple[str, dict[str, Any]]], str]:
+    """What a short stream says at its first look, and the last id."""
+    said = api.get("/v1/events", **request)
+    assert said.status_code == 200, said.text
+    blocks = [block for block in said.text.split("\n\n") if "event: " in block]
+    return [_parsed(block) for block in blocks], said.text.split("id: ")[-1].splitlines()[0]
+
+
+def test_a_reconnected_client_gets_the_ends_that_it_missed(settings: Settings) -> None:
+    with keyed(settings, stream_s=0.05) as service:
+        ann, catalogue = service.client("ann"), service.catalogue
+        assert once(ann)[0] == [], "nothing is there, but the stream has an id"
+        missed, before = submitted(catalogue, "ann"), submitted(catalogue, "ann")
+        at = ended_long_ago(catalogue, missed, 1800.0)
+        ended_long_ago(catalogue, before, 3600.0)
+        theirs = submitted(catalogue, "bob")
+        ended_long_ago(catalogue, theirs, 1700.0)
+        assert once(ann)[0] == []
+        told, last_id = once(ann, headers={"Last-Event-ID": f"{at - 60:.3f}"})
+        assert [(name, data["id"]) for name, data in told] == [("job", missed)]
+        assert at < float(last_id) < time.time() - 5, "the next reconnection asks from before this look"
+        assert once(ann, headers={"Last-Event-ID": last_id})[0] == []
+
+
+def test_named_ones_are_sent_first(settings: Settings) -> None:
+    with keyed(settings, stream_s=0.05) as service:
+        catalogue, ann = service.catalogue, service.client("ann")
+        for _ in range(3):
+            submitted(catalogue, "ann")
+        old, run = submitted(catalogue, "ann"), bulk_run(catalogue, "ann")
+        ended_long_ago(catalogue, old)
+        catalogue.bulks.cancel(run)
+        others, theirs = bulk_run(catalogue, "ann"), bulk_run(catalogue, "bob")
+        query = [("job", old), ("bulk", run), ("bulk", theirs)]
+        told, _ = once(ann, params=query)
+        assert [data["id"] for _, data in told[:3]] == [old, run, theirs]
+        assert [name for name, _ in told] == ["job", "bulk", "gone", "job", "job", "job", "bulk"]
+        assert told[-1][1]["id"] == others
+        refused = ann.get("/v1/events", params=[("job", new_id()) for _ in range(51)])
+        assert refused.status_code == 422
+        assert ann.get("/v1/events", params={"job": "x"}).status_code == 422
+        assert ann.get("/v1/events", headers={"Last-Event-ID": "yesterday"}).status_code == 422

@@ -13,7 +13,6 @@ import numpy as np
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
-from psfcore.instruments.files import instrument_names
 from tests.conftest import SMALL_INSTRUMENT, write_image
 from tests.service.conftest import job_after, refusal, result_of, upload
 from workers.settings import Settings
@@ -109,21 +108,6 @@ def test_an_image_of_a_known_instrument_needs_no_psf_id(api: TestClient, tmp_pat
         "psf_recipe"
     ]
     assert recipe["instrument"] is None and recipe["instrument_file"].startswith("turn_deg = 20.00\n")
-
-
-def test_an_image_without_a_known_psf_gets_a_problem_with_the_ways_on(
-    api: TestClient, image_file: Path
-) -> None:
-    parameters = {"image_id": upload(api, image_file)}
-    answer = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
-    problem = answer.json()
-    detail = refusal(answer, 409, "no-psf-for-instrument")
-    assert "TEST" in detail and "psf_id" in detail
-    assert {one["name"] for one in problem["instruments"]} == set(instrument_names())
-    assert problem["psfs"] == [] and [way["way"] for way in problem["ways"]] == ["name", "upload", "fit"]
-    parameters["psf_id"] = "a" * 64
-    answer = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": parameters})
-    refusal(answer, 404, "no-such-psf")
 
 
 def test_a_job_is_cancelled_before_its_start_and_a_failed_one_says_why(

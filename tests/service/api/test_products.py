@@ -25,7 +25,7 @@ from tests.service.conftest import refusal, result_of, upload, work_through_bulk
 from tests.service.vo.made import add_product
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
-from workers.files.intact import intact
+from workers.files.collection import intact
 from workers.files.store import Store
 from workers.settings import Settings
 

@@ -19,7 +19,7 @@ from sqlalchemy import inspect
 from service.app import create_app
 from service.cli.main import main
 from service.client.http import Client, ServiceError
-from service.http.access import check_can_serve
+from service.http.state import check_can_serve
 from tests.service.conftest import upload
 from tests.service.keyed import Keyed, bearer
 from workers.catalogue.access.keys import KeyRefused, Keys, Scope

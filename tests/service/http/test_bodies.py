@@ -153,7 +153,7 @@ def test_json_is_parsed_off_the_event_loop(shared_service: Keyed, monkeypatch: p
             threads.append(threading.current_thread().name)
         return loads(content, **options)
 
-    monkeypatch.setattr("service.http.bodies.json.loads", parse)
+    monkeypatch.setattr("service.http.guard.json.loads", parse)
     answer = shared_service.client("ann").post("/v1/jobs", content=body, headers=JSON)
     monkeypatch.undo()
     assert answer.status_code == 422

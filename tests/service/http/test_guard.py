@@ -9,7 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from service.http.access import Access
+from service.http.state import Access
 from service.pages import assets
 from tests.service.conftest import refusal, upload
 from tests.service.keyed import Keyed, bearer, keyed

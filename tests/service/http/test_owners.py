@@ -141,7 +141,7 @@ def test_another_s_things_are_answered_as_if_there_were_none_and_do_not_change(
 
 def test_lists_show_one_s_own_alone(shared_service: Keyed, anns: dict[str, str]) -> None:
     bob, ann = shared_service.client("eve"), shared_service.client("ann")
-    # One PSF; a stream, which test_owner_events.py tests; and keys, of which everybody who asks has one.
+    # One PSF; a stream, which test_events.py tests; and keys, of which everybody who asks has one.
     no_lists = ("/v1/psfs/best", "/v1/events", "/v1/keys")
     lists = [
         p

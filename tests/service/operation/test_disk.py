@@ -24,7 +24,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow
 from workers.files import beneath
 from workers.files import store as stores
-from workers.files.full_disk import is_disk_full
+from workers.files.store import is_disk_full
 from workers.settings import Settings
 
 

@@ -12,11 +12,11 @@ from fastapi.testclient import TestClient
 from httpx import Response
 from sqlalchemy.exc import OperationalError
 
+from psfcore.instruments.files import instrument_names
 from service.app import create_app
 from service.pages.rendering import POLICY, counted, date, duration, number, percent, size
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload
-from workers.intake.no_psf import buildable
 from workers.settings import Settings
 
 PERSON = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
@@ -184,7 +184,7 @@ def test_the_page_of_the_api_names_its_icon(api: TestClient) -> None:
 
 def test_the_first_page_says_what_the_service_can_build(api: TestClient) -> None:
     told = "The service knows the optics of aia_171 and hri_euv, and builds the PSF for your image."
-    assert told.replace("aia_171 and hri_euv", " and ".join(buildable())) in api.get("/").text
+    assert told.replace("aia_171 and hri_euv", " and ".join(instrument_names())) in api.get("/").text
 
 
 # Words ----------------------------------------------------------------------------------------------

@@ -25,8 +25,7 @@ from workers.bulk import task
 from workers.bulk.turns import keep_turns
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.catalogue import Catalogue
-from workers.files.opened import open_store
-from workers.files.store import Store
+from workers.files.store import Store, open_store
 from workers.run.runner import Runner
 from workers.settings import Settings
 

@@ -20,22 +20,22 @@ from workers.contract.identities import (
     report_identity,
     request_identity,
 )
-from workers.contract.methods import Linear, Parameters, RichardsonLucy
 from workers.contract.requests import (
     CrossValidate,
     GapDiagnose,
+    Linear,
+    Parameters,
     PsfBuild,
     PsfFit,
     PsfInterpolate,
     PsfTables,
     Report,
-)
-from workers.contract.resolved import (
     ResolvedCrossValidate,
     ResolvedDeconvolve,
     ResolvedGapDiagnose,
     ResolvedPsfFit,
     ResolvedReport,
+    RichardsonLucy,
 )
 
 A, B, T = "a" * 64, "b" * 64, "c" * 64

@@ -16,8 +16,7 @@ from pydantic import ValidationError
 
 from tests.s3 import client_of, elsewhere, key_of, opened_store, s3_bucket
 from workers.files import s3_store as remote_store
-from workers.files.opened import open_store
-from workers.files.store import BadFile, Store, StoreAway
+from workers.files.store import BadFile, Store, StoreAway, open_store
 from workers.settings import Settings
 
 CONTENT = b"light" * 1000

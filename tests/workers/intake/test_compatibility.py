@@ -14,9 +14,7 @@ from psfcore.fits.header import FitsLimits, read_summary
 from psfcore.noise_figures import NoiseFigures
 from tests.conftest import write_image, write_psf
 from workers.catalogue.tables import ImageRow, PsfRow
-from workers.contract.methods import RichardsonLucy
-from workers.contract.requests import PsfBuild
-from workers.contract.resolved import ResolvedDeconvolve
+from workers.contract.requests import PsfBuild, ResolvedDeconvolve, RichardsonLucy
 from workers.intake.compatibility import check, noise_of
 from workers.intake.uploads import image_row, uploaded_psf_row
 

@@ -24,12 +24,10 @@ from tests.workers.databases import add, change
 from tests.workers.psf_examples import psf as psf_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, JobRow, TransitRow
-from workers.contract.methods import Method, RichardsonLucy
 from workers.contract.phases import Phase
-from workers.contract.requests import PsfBuild
+from workers.contract.requests import Method, PsfBuild, RichardsonLucy
 from workers.intake import estimates
-from workers.intake.cost_model import COSTS
-from workers.intake.estimates import BOUNDS, FEWEST_JOBS, KEEP_FACTOR_S, checked, estimate
+from workers.intake.estimates import BOUNDS, COSTS, FEWEST_JOBS, KEEP_FACTOR_S, checked, estimate
 from workers.settings import Settings
 from workers.tasks.context import Context
 
@@ -57,8 +55,6 @@ def needs(
     catalogue: Catalogue, kind: str, parameters: dict[str, Any], threads: int = 1
 ) -> tuple[float, float]:
     found = estimate(kind, parameters, catalogue, OWNER, threads)
-    assert found.as_json()["memory_mib"] == found.memory_mib
-    assert found.as_json()["seconds"] == found.seconds
     return found.seconds, found.memory_mib
 
 

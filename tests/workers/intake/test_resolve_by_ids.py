@@ -8,7 +8,7 @@ from psfcore.errors import DataError
 from tests.workers.psf_examples import OWNER, psf
 from workers.catalogue.catalogue import Catalogue
 from workers.contract.kinds import Kind, Result
-from workers.contract.methods import Parameters
+from workers.contract.requests import Parameters
 from workers.intake.requests import Asked, resolve_by_ids
 
 UNKNOWN = "f" * 64

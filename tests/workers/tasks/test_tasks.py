@@ -19,8 +19,8 @@ from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
-from workers.contract.methods import METHODS
 from workers.contract.phases import Phase
+from workers.contract.requests import METHODS
 from workers.files.store import Store
 from workers.run import attempt
 from workers.run.runner import Runner

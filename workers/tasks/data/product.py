@@ -24,7 +24,7 @@ from psfcore.fits.product.cards import described
 from psfcore.image import Image, MaskBit
 from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.identities import product_identity
-from workers.contract.resolved import ResolvedDeconvolve
+from workers.contract.requests import ResolvedDeconvolve
 from workers.files.archive import safe_name
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from workers.catalogue.tables import ReportRow
-from workers.contract.methods import Parameters
+from workers.contract.requests import Parameters
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
 

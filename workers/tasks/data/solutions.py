@@ -29,7 +29,7 @@ from psfcore.transit.transit import Transit
 from workers.catalogue.owners import OverQuota
 from workers.catalogue.tables import SolutionRow
 from workers.contract.identities import canonical_hash, diffraction_identity
-from workers.contract.resolved import ResolvedOnTransit
+from workers.contract.requests import ResolvedOnTransit
 from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
 

@@ -16,8 +16,7 @@ from psfcore.transit.transit import Transit
 from tests.psfcore import small_transits
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, SolutionRow
-from workers.contract.requests import PsfBuild
-from workers.contract.resolved import ResolvedCrossValidate, ResolvedPsfFit, ResolvedReport
+from workers.contract.requests import PsfBuild, ResolvedCrossValidate, ResolvedPsfFit, ResolvedReport
 from workers.files.store import Store, StoreAway
 from workers.settings import Settings
 from workers.tasks.context import Context

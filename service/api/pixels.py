@@ -1,13 +1,12 @@
-"""Pixels of images and products, ``.../pixels``: raw numbers, so that a viewer can show exact values.
+"""The contents of the files of images and products: pixels, ``.../pixels``, and headers, ``.../header``.
 
-The first request for a plane decodes it; later requests read the decoded plane (``psfcore.fits.viewing``). The first
+Pixels are raw numbers, so that a viewer can show exact values. The first request for a plane decodes it; later requests read the decoded plane (``psfcore.fits.viewing``). The first
 request for pixels loads the numerical libraries.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, BinaryIO, Literal
@@ -15,13 +14,15 @@ from typing import Annotated, Any, BinaryIO, Literal
 import anyio.to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import StreamingResponse
+from fastapi.responses import JSONResponse, StreamingResponse
+from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
+from psfcore.fits.viewing.all_cards import all_cards
 from psfcore.fits.viewing.planes import Decoded, Plane
 from service.http import downloads as files
 from service.http.callers import Reading
-from service.http.problems import RESPONSES, Problem, problem
+from service.http.problems import RESPONSES, Problem, as_problems
 from service.http.quotas import check_disk
 from service.http.state import Shared, State
 from workers.catalogue.tables import ImageRow, ProductRow
@@ -33,6 +34,7 @@ MEDIA_TYPE = "application/octet-stream"
 IMAGE, QUALITY = "image", "quality"
 LARGEST = 2**31 - 1
 router = APIRouter(tags=["pixels"], responses=RESPONSES)
+headers = APIRouter(tags=["headers"], responses=RESPONSES)
 
 
 @dataclass(frozen=True)
@@ -42,24 +44,16 @@ class Part:
     width, height: None means up to the last column or row.
     """
 
-    x: int
-    y: int
-    width: int | None
-    height: int | None
-    step: int
-
-
-def _part(
-    x: Annotated[int, Query(ge=0, le=LARGEST, description="first column of the window, counted from 0")] = 0,
+    x: Annotated[int, Query(ge=0, le=LARGEST, description="first column of the window, counted from 0")] = 0
     y: Annotated[
         int, Query(ge=0, le=LARGEST, description="first row of the window, counted from 0 as in FITS")
-    ] = 0,
+    ] = 0
     width: Annotated[
         int | None, Query(ge=1, le=LARGEST, description="number of columns; default: up to the last column")
-    ] = None,
+    ] = None
     height: Annotated[
         int | None, Query(ge=1, le=LARGEST, description="number of rows; default: up to the last row")
-    ] = None,
+    ] = None
     step: Annotated[
         int,
         Query(
@@ -68,12 +62,10 @@ def _part(
             description="n: each number of the answer stands for a block of n x n pixels. The number is the mean of the finite "
             "pixels; for `quality`, the bitwise OR. Blocks at the last rows and columns of the window may be smaller",
         ),
-    ] = 1,
-) -> Part:
-    return Part(x, y, width, height, step)
+    ] = 1
 
 
-Asked = Annotated[Part, Depends(_part)]
+Window = Annotated[Part, Depends()]
 SHAPE = {"type": "string", "pattern": r"^\d+,\d+$"}
 DESCRIBED: dict[int | str, dict[str, Any]] = {
     200: {
@@ -102,12 +94,12 @@ async def get_image_pixels(
     request: Request,
     caller: Reading,
     state: Shared,
-    asked: Asked,
+    part: Window,
     plane: Annotated[Literal["image"], Query(description="an uploaded image has one plane")] = "image",
 ) -> Response:
     """The pixel values of the file, in DN or DN/s as they are stored (BSCALE and BZERO applied). Saturated pixels are not marked."""
     await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
-    return await _pixels(request, state, image_id, plane, asked)
+    return await _pixels(request, state, image_id, plane, part)
 
 
 @router.get(
@@ -121,7 +113,7 @@ async def get_product_pixels(
     request: Request,
     caller: Reading,
     state: Shared,
-    asked: Asked,
+    part: Window,
     plane: Annotated[
         Literal["image", "error", "quality"],
         Query(
@@ -132,28 +124,25 @@ async def get_product_pixels(
     """The pixel values of a plane of the product. Values of `quality` are whole numbers, as in the file. 404: the product does not
     have this plane."""
     row = await run_in_threadpool(state.row, ProductRow, product_id, caller.owner)
-    return await _pixels(request, state, row.file_sha256, plane, asked)
+    return await _pixels(request, state, row.file_sha256, plane, part)
 
 
-async def _pixels(request: Request, state: Shared, digest: str, name: str, asked: Part) -> Response:
+async def _pixels(request: Request, state: Shared, digest: str, name: str, part: Part) -> Response:
     """A part of a plane of a stored file, or 304 if the client already has it."""
-    tag = hashlib.sha256(f"{ANSWERS_VERSION} {digest} pixels {name} {asked}".encode()).hexdigest()
-    headers = {"ETag": f'"{tag}"', "Cache-Control": files.KEPT}
-    if files.known(request, headers["ETag"]):
-        return Response(status_code=304, headers=headers)
+    sent = files.headers_of(f"{ANSWERS_VERSION} {digest} pixels {name} {part}")
+    if (same := files.unchanged(request, sent)) is not None:
+        return same
     plane = state.planes.kept((digest, name))
-    try:
+    with as_problems():
         if plane is None:
             plane = await anyio.to_thread.run_sync(_decoded, state, digest, name, limiter=state.decoding)
-        shape, length, pieces = await run_in_threadpool(_cut, plane, asked, name == QUALITY)
-    except DataError as error:
-        raise problem(error) from error
-    headers["X-Plane-Shape"] = "{},{}".format(*plane.shape)
-    headers["X-Pixels-Shape"] = "{},{}".format(*shape)
-    headers["Content-Length"] = str(length)
+        shape, length, pieces = await run_in_threadpool(_cut, plane, part, name == QUALITY)
+    sent["X-Plane-Shape"] = "{},{}".format(*plane.shape)
+    sent["X-Pixels-Shape"] = "{},{}".format(*shape)
+    sent["Content-Length"] = str(length)
     if plane.unit is not None:
-        headers["X-Pixels-Unit"] = plane.unit
-    return StreamingResponse(pieces, media_type=MEDIA_TYPE, headers=headers)
+        sent["X-Pixels-Unit"] = plane.unit
+    return StreamingResponse(pieces, media_type=MEDIA_TYPE, headers=sent)
 
 
 async def prepare_image(state: State, digest: str) -> None:
@@ -177,11 +166,54 @@ def _decoded(state: State, digest: str, name: str) -> Plane:
     return state.planes.decoded((digest, name), decode)
 
 
-def _cut(plane: Plane, asked: Part, bits: bool) -> tuple[tuple[int, int], int, Iterator[bytes]]:
+def _cut(plane: Plane, part: Part, bits: bool) -> tuple[tuple[int, int], int, Iterator[bytes]]:
     """Shape, number of bytes and bytes of the answer. Raises DataError "window-outside"."""
     from psfcore.fits.viewing.windows import pixels, window_of
 
-    window = window_of(
-        plane.shape, x=asked.x, y=asked.y, width=asked.width, height=asked.height, step=asked.step
-    )
+    window = window_of(plane.shape, x=part.x, y=part.y, width=part.width, height=part.height, step=part.step)
     return window.shape, window.length, pixels(plane, window, bits=bits)
+
+
+class HduHeader(BaseModel):
+    """The header of one HDU of a FITS file."""
+
+    index: int = Field(description="number of the HDU, counted from 0")
+    name: str = Field(description="EXTNAME; empty: the HDU has no name")
+    cards: list[tuple[str, str | int | float | bool | None, str]] = Field(
+        description="keyword, value and comment of each card, in the order of the file; value null: the card has no value"
+    )
+
+
+@headers.get(
+    "/v1/images/{image_id}/header", summary="All headers of an uploaded image", response_model=list[HduHeader]
+)
+async def get_image_header(image_id: Identity, request: Request, caller: Reading, state: Shared) -> Response:
+    """Every card of every HDU, with COMMENT and HISTORY. A tile-compressed image has the header of the table that holds it."""
+    row = await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
+    return await _headers(request, state, image_id, row.bytes)
+
+
+@headers.get(
+    "/v1/products/{product_id}/header", summary="All headers of a product", response_model=list[HduHeader]
+)
+async def get_product_header(
+    product_id: Identity, request: Request, caller: Reading, state: Shared
+) -> Response:
+    """Every card of the image and of its planes, with COMMENT and HISTORY."""
+    row = await run_in_threadpool(state.row, ProductRow, product_id, caller.owner)
+    return await _headers(request, state, row.file_sha256, row.bytes)
+
+
+async def _headers(request: Request, state: Shared, digest: str, size: int) -> Response:
+    sent = files.headers_of(f"{ANSWERS_VERSION} {digest} header")
+    if (same := files.unchanged(request, sent)) is not None:
+        return same
+
+    def read() -> Response:
+        listed = all_cards(files.found(state.store, digest, size), state.limits)
+        content = [{"index": one.index, "name": one.name, "cards": one.cards} for one in listed]
+        return JSONResponse(content, headers=sent)
+
+    with as_problems():
+        # Reading thousands of cards takes a second. The limiter bounds how many requests read cards or pixels at once.
+        return await anyio.to_thread.run_sync(read, limiter=state.decoding)

@@ -5,7 +5,6 @@ A job makes the tables when it builds or fits a PSF. An uploaded PSF has no tabl
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
@@ -16,12 +15,11 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import BaseModel, Field
 
-from psfcore.errors import DataError
 from psfcore.fits.cutout import Cutout, cutout
 from psfcore.tables import lookup as psf_lookup
 from service.http import downloads as files
 from service.http.callers import Caller, Reading
-from service.http.problems import RESPONSES, Problem, problem
+from service.http.problems import RESPONSES, Problem, as_problems
 from service.http.state import Shared, State
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import Identity
@@ -119,8 +117,8 @@ def get_curve(
     ] = None,
 ) -> Response:
     """1 - encircled energy at radii, with errors for a fitted PSF."""
-    wanted = None if radii is None else _numbers(radii)
-    return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.curve(tables, wanted))
+    radii_px = None if radii is None else _numbers(radii)
+    return _answer(request, caller, state, [psf_id], lambda tables: psf_lookup.curve(tables, radii_px))
 
 
 @router.get("/{psf_id}/profile", summary="Mean weight by radius", response_model=ProfileAnswer)
@@ -165,20 +163,18 @@ async def get_cutout(
 ) -> Response:
     """The central part of the PSF, not renormalised. Its centre is at [size // 2, size // 2]."""
     row = await run_in_threadpool(state.row, PsfRow, psf_id, caller.owner)
-    headers = _headers(f"{row.file_sha256} cutout {size}")
-    if files.known(request, headers["ETag"]):
-        return Response(status_code=304, headers=headers)
+    headers = files.headers_of(f"{ANSWERS_VERSION} {row.file_sha256} cutout {size}")
+    if (same := files.unchanged(request, headers)) is not None:
+        return same
 
     def cut() -> Cutout:
         return cutout(files.found(state.store, row.file_sha256, row.bytes), size, state.limits)
 
-    try:
-        made = await anyio.to_thread.run_sync(cut, limiter=state.cutouts)
-    except DataError as error:
-        raise problem(error) from error
+    with as_problems():
+        part = await anyio.to_thread.run_sync(cut, limiter=state.cutouts)
     headers["Content-Disposition"] = f'attachment; filename="psf-{psf_id[:12]}-{size}px.fits"'
-    headers["Content-Length"] = str(made.length)
-    return StreamingResponse(made.pieces(), media_type=files.FITS_TYPE, headers=headers)
+    headers["Content-Length"] = str(part.length)
+    return StreamingResponse(part.pieces(), media_type=files.FITS_TYPE, headers=headers)
 
 
 def tables_of(state: State, caller: Caller, psf_id: str) -> Mapping[str, Any]:
@@ -193,19 +189,14 @@ def _answer(
     """The answer from the tables of these PSFs, or 304 if the client already has this answer."""
     rows = [state.row(PsfRow, psf_id, caller.owner) for psf_id in psf_ids]
     digests = [_tables_of(row) for row in rows]
-    headers = _headers(f"{' '.join(digests)} {request.url.path} {request.url.query}")
-    if files.known(request, headers["ETag"]):
-        return Response(status_code=304, headers=headers)
+    headers = files.headers_of(
+        f"{ANSWERS_VERSION} {' '.join(digests)} {request.url.path} {request.url.query}"
+    )
+    if (same := files.unchanged(request, headers)) is not None:
+        return same
     tables = [_read(state, row, digest) for row, digest in zip(rows, digests, strict=True)]
-    try:
+    with as_problems():
         return JSONResponse(ask(*tables), headers=headers)
-    except DataError as error:
-        raise problem(error) from error
-
-
-def _headers(what: str) -> dict[str, str]:
-    digest = hashlib.sha256(f"{ANSWERS_VERSION} {what}".encode()).hexdigest()
-    return {"ETag": f'"{digest}"', "Cache-Control": files.KEPT}
 
 
 def _read(state: Shared, row: PsfRow, digest: str) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""Series of PSFs over HTTP: images between two PSFs use a PSF between them; filter and plate scale choose a variant."""
+"""Series of PSFs over HTTP: images between two PSFs use a PSF between them."""
 
 from __future__ import annotations
 
@@ -199,45 +199,3 @@ def test_invalid_changes_of_a_series_are_refused(api: TestClient, ends: tuple[st
     ):
         refusal(api.put(address, json=body), status, code)
     assert api.get(SERIES).json() == {"series": "hri_euv/174/total", "interpolated": False, "history": []}
-
-
-def certified(api: TestClient, path: Path, total: float, version: str, **range_and_channel: Any) -> str:
-    """Upload a fitted PSF and certify it; returns its id."""
-    write_fitted(path, EARLY | {"total": total})
-    psf_id: str = api.post("/v1/psfs", params={"kind": "total"}, content=path.read_bytes()).json()["id"]
-    body = {"status": "certified", "version": version, **range_and_channel}
-    answer = api.post(f"/v1/psfs/{psf_id}/status", json=body)
-    assert answer.status_code == 200, answer.text
-    return psf_id
-
-
-def psf_of(api: TestClient, path: Path, **cards: Any) -> dict[str, Any]:
-    """The parameters of the deconvolution of an image with these cards."""
-    write_image(path, **SEEN, **{"DATE-BEG": "2022-08-30"}, **cards)
-    wanted = {"image_id": upload(api, path), "method": {"name": "linear", "steps": 1}}
-    answer = api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": wanted})
-    assert answer.status_code == 202, answer.text
-    parameters: dict[str, Any] = answer.json()["parameters"]
-    return parameters
-
-
-def test_filter_and_plate_scale_choose_the_psf(
-    api: TestClient, run_jobs: Callable[[], None], tmp_path: Path
-) -> None:
-    plain = certified(api, tmp_path / "1.fits", 0.40, "1.0.0")
-    filtered = certified(api, tmp_path / "2.fits", 0.41, "1.0.0", channel="174-open_2")
-    scaled = certified(api, tmp_path / "3.fits", 0.42, "1.0.0", channel="174-0.492arcsec")
-    binned = {"CDELT1": 0.984, "CDELT2": 0.984}
-    assert psf_of(api, tmp_path / "d.fits", **binned)["psf_id"] == plain, "rebinned for a binned image"
-    run_jobs()
-    assert [job["phase"] for job in api.get("/v1/jobs").json()["items"]] == ["COMPLETED"]
-    assert psf_of(api, tmp_path / "a.fits", FILTER="Open 1")["psf_id"] == plain
-    assert psf_of(api, tmp_path / "b.fits", FILTER="Open 2")["psf_id"] == filtered
-    scale = {"CDELT1": 0.492, "CDELT2": 0.492}
-    assert psf_of(api, tmp_path / "c.fits", **scale)["psf_id"] == scaled
-    found = api.get("/v1/images/" + upload(api, tmp_path / "b.fits") + "/psf").json()
-    assert (found["psf"]["id"], found["channel"]) == (filtered, "174-open_2")
-    write_image(tmp_path / "e.fits", **SEEN, **{"DATE-BEG": "2022-08-30"}, FILTER="Open 2", **scale)
-    body = {"kind": "deconvolve", "parameters": {"image_id": upload(api, tmp_path / "e.fits")}}
-    refused = api.post("/v1/jobs", json=body)
-    assert refused.status_code == 409 and "174-0.492arcsec, 174-open_2" in refused.json()["detail"]

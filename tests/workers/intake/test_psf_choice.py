@@ -1,19 +1,26 @@
-"""Between which PSFs the PSF of an image is interpolated: certified ones, or those that a context pins."""
+"""The PSF of an image: the variant of its channel, the two PSFs between which its PSF is interpolated, and the error, for people
+and for programs, if its PSF is not known."""
 
 from __future__ import annotations
 
+import pickle
+from pathlib import Path
 from typing import Any
 
 import pytest
+from astropy.io import fits
 
+from psfcore.errors import DataError
+from psfcore.instruments.files import instrument_names
+from service.local import LocalService
+from tests.conftest import write_image, write_psf
 from tests.workers.psf_examples import OWNER, certify, deprecate, header_of, identity, psf, refused, years
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
 from workers.catalogue.tables import PsfRow
 from workers.contract.identities import interpolated_psf_identity
 from workers.contract.requests import Deconvolve, PsfInterpolate
-from workers.intake.psf_choice import picked_for_image
-from workers.intake.psf_reason import reasoned_psf
+from workers.intake.psf_choice import look_for_image, picked_for_image, reasoned_psf
 from workers.intake.requests import resolved_deconvolution
 
 SERIES = "hri_euv/174/total"
@@ -202,3 +209,161 @@ def test_requests_with_wrong_times_are_refused() -> None:
     for changes, words in WRONG:
         with pytest.raises(ValueError, match=words):
             PsfInterpolate.model_validate(known | changes)
+
+
+@pytest.fixture
+def variants(catalogue: Catalogue) -> Catalogue:
+    """At the same time: a PSF for the channel, and one for each of two variants."""
+    for name, channel in (("plain", None), ("open_2", "174-open_2"), ("binned", "174-0.984arcsec")):
+        catalogue.add(psf(name))
+        certify(catalogue, name, "1.0.0", years(2020, 2022), channel=channel)
+    return catalogue
+
+
+def image(
+    filter_name: str | None, scale: float = 0.492, date: str = "2021-06-01", **more: Any
+) -> dict[str, Any]:
+    cards = {"FILTER": filter_name, "CDELT1": scale, "CDELT2": scale, "DETECTOR": "HRI_EUV"}
+    known = {key: value for key, value in cards.items() if value is not None}
+    return header_of(date, **({"cards": known} | more))
+
+
+def chosen(catalogue: Catalogue, header: dict[str, Any], context: str | None = None) -> str:
+    found = picked_for_image(catalogue, header, OWNER, context)
+    assert found is not None
+    assert look_for_image(catalogue, header, OWNER, context).one().id == found.one().id
+    return found.one().name
+
+
+def test_the_header_chooses_the_variant(variants: Catalogue) -> None:
+    assert chosen(variants, image(None)) == "plain"
+    assert chosen(variants, image("closed")) == "plain"
+    assert chosen(variants, image("Open 2")) == "open_2"
+    assert chosen(variants, image(None, 0.984)) == "binned"
+    with pytest.raises(DataError) as caught:
+        chosen(variants, image("Open 2", 0.984))
+    assert caught.value.code == "several-variants-fit"
+    assert picked_for_image(variants, image("Open 2"), "somebody", None) is None
+    assert chosen(variants, image("Open 2", wavelnth=174.5)) == "open_2"
+
+
+def test_a_variant_has_its_own_versions_ranges_and_interpolation(variants: Catalogue) -> None:
+    row = variants.psfs.released("hri_euv/174-open_2/total", OWNER)
+    assert list(row) == ["1.0.0"]
+    late = image("Open 2", date="2023-06-01")
+    with pytest.raises(DataError, match="channel 174-open_2") as caught:
+        chosen(variants, late)
+    assert caught.value.code == "no-psf-fits", "the PSF of the channel alone is not used in its place"
+    variants.add(psf("later"))
+    certify(variants, "later", "2.0.0", years(2024, None), channel="174-open_2")
+    variants.series.set_interpolated("hri_euv/174-open_2/total", OWNER, True, "x")
+    found = picked_for_image(variants, late, OWNER, None)
+    assert found is not None and found.interpolation is not None
+    assert found.interpolation.before_psf_id == identity("open_2")
+    plain = picked_for_image(variants, image(None, date="2023-06-01"), OWNER, None)
+    assert plain is not None and plain.interpolation is None
+
+
+def test_a_context_chooses_among_its_own_variants(variants: Catalogue) -> None:
+    variants.contexts.create("plain", OWNER, "x", pins=[Pin(identity("plain"))])
+    variants.contexts.create("all", OWNER, "x")
+    assert chosen(variants, image("Open 2"), "plain") == "plain"
+    assert chosen(variants, image("Open 2"), "all") == "open_2"
+    assert chosen(variants, image("Open 2"), "now") == "open_2"
+
+
+def test_only_a_draft_becomes_a_variant_of_its_channel(variants: Catalogue) -> None:
+    variants.add(psf("other"))
+    for channel in ("304", "304-open_2", "1740"):
+        with pytest.raises(DataError) as caught:
+            certify(variants, "other", "9.0.0", channel=channel)
+        assert caught.value.code == "line-known"
+    with pytest.raises(DataError) as caught:
+        certify(variants, "plain", "1.0.0", years(2020, 2021), channel="174-open_1")
+    assert caught.value.code == "line-known", "a variants PSF keeps its series"
+
+
+# TELESCOP differs from that of the archive, so the image is not recognised as one of aia_171.
+AIA = {"TELESCOP": "SDO", "INSTRUME": "AIA_3", "WAVELNTH": 171, "CDELT1": 0.6, "CDELT2": 0.6}
+
+
+def upload(local: LocalService, path: Path, size: int, **cards: object) -> str:
+    """A PSF of its own size, so that each has an id of its own."""
+    write_psf(path, size=size)
+    fits.writeto(path, fits.getdata(path), fits.Header(cards), overwrite=True)
+    return str(local.upload_psf(path, name=path.stem)["id"])
+
+
+def refused_image(local: LocalService, tmp_path: Path, **cards: object) -> DataError:
+    tmp_path.mkdir(exist_ok=True)
+    write_image(tmp_path / "i.fits", **cards)
+    with pytest.raises(DataError) as caught:
+        local.deconvolve(tmp_path / "i.fits")
+    assert caught.value.code == "no-psf-for-instrument"
+    return caught.value
+
+
+def test_the_error_names_instruments_psfs_and_ways(local: LocalService, tmp_path: Path) -> None:
+    of_telescope = upload(local, tmp_path / "aia.fits", 32, INSTRUME="AIA_3", WAVELNTH=171)
+    of_scale = upload(local, tmp_path / "scale.fits", 34, CDELT1=0.602)
+    upload(local, tmp_path / "channel.fits", 36, INSTRUME="AIA_2", WAVELNTH=193, CDELT1=0.6)
+    upload(local, tmp_path / "far.fits", 38, INSTRUME="XRT", CDELT1=1.03)
+    error = refused_image(local, tmp_path, **AIA)
+    assert [psf["id"] for psf in error.fields["psfs"]] == [of_scale, of_telescope], "newest first"
+    assert [psf["same"] for psf in error.fields["psfs"]] == [["plate_scale"], ["telescope", "channel"]]
+    instruments = {one["name"]: one for one in error.fields["instruments"]}
+    assert set(instruments) == set(instrument_names())
+    assert instruments["aia_171"]["same"] == ["telescope", "channel", "plate_scale"]
+    assert instruments["hri_euv"]["same"] == []
+    assert [way["way"] for way in error.fields["ways"]] == ["name", "upload", "fit"]
+    for named in (of_telescope, "aia_171", "SDO AIA_3", "171 angstrom"):
+        assert named in error.message
+    assert "hri_euv" not in error.message
+
+
+def test_what_does_not_agree_is_told_too(local: LocalService, tmp_path: Path) -> None:
+    upload(local, tmp_path / "aia.fits", 32, INSTRUME="AIA_3", CDELT1=0.6)
+    error = refused_image(local, tmp_path, **{**AIA, "WAVELNTH": 1600, "CDELT1": 2.4, "CDELT2": 2.4})
+    instruments = {one["name"]: one["told"] for one in error.fields["instruments"]}
+    other_scale = "another pixel scale (0.599489, not 2.4 arcsec)"
+    assert instruments["aia_171"] == (
+        f"same telescope, but another channel (171, not 1600 Å) and {other_scale}"
+    )
+    assert [psf["told"] for psf in error.fields["psfs"]] == [
+        "same telescope, but another pixel scale (0.6, not 2.4 arcsec)"
+    ]
+    error = refused_image(local, tmp_path / "again", **{**AIA, "WAVELNTH": 1600})
+    instruments = {one["name"]: one["told"] for one in error.fields["instruments"]}
+    assert instruments["aia_171"] == "same telescope and pixel scale, but another channel (171, not 1600 Å)"
+    assert error.fields["image"] == "SDO AIA_3"
+
+
+def test_an_image_without_any_name_gets_the_ways_too(local: LocalService, tmp_path: Path) -> None:
+    error = refused_image(local, tmp_path, TELESCOP="")
+    assert error.fields["psfs"] == [] and len(error.fields["ways"]) == 3
+    assert "an unnamed instrument" in error.message
+
+
+def test_instruments_that_agree_most_come_first_also_in_another_process(
+    local: LocalService, tmp_path: Path
+) -> None:
+    error = refused_image(local, tmp_path, **AIA)
+    names = [one["name"] for one in error.fields["instruments"]]
+    assert names[:4] == ["aia_171", "aia_94", "aia_131", "aia_193"]
+    again = pickle.loads(pickle.dumps(error))
+    assert (again.code, again.message, again.fields) == (error.code, error.message, error.fields)
+
+
+PUBLISHED: tuple[tuple[dict[str, object], str, str], ...] = (
+    ({"TELESCOP": "HINODE", "INSTRUME": "XRT"}, "upload", "SolarSoft"),
+    ({"TELESCOP": "TRACE", "INSTRUME": "TRACE", "WAVE_LEN": "171"}, "fit", "Venus of 2004"),
+    ({"OBSRVTRY": "STEREO_B", "INSTRUME": "SECCHI", "DETECTOR": "EUVI", "WAVELNTH": 171}, "fit", "2007"),
+    ({"TELESCOP": "PROBA2", "INSTRUME": "SWAP", "WAVELNTH": 174}, "fit", "covers a part of the Sun"),
+)
+
+
+def test_the_ways_name_what_is_published_for_the_telescope(local: LocalService, tmp_path: Path) -> None:
+    for number, (cards, way, published) in enumerate(PUBLISHED):
+        error = refused_image(local, tmp_path / str(number), **cards)
+        texts = {one["way"]: one["text"] for one in error.fields["ways"]}
+        assert [name for name, text in texts.items() if published in text] == [way]

@@ -4,30 +4,23 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Path, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from psfcore.errors import DataError
-from service.api.psfs.filters import TEXT
+from service.api.psf_status import Reason, ShownTime, Time
 from service.http.callers import Certifying, KeyFirst, Reading
-from service.http.paging import Cursor, Limit, Page, page, position
-from service.http.problems import RESPONSES, problem
+from service.http.paging import Page, Paging
+from service.http.problems import RESPONSES, as_problems
 from service.http.quotas import check_rows
 from service.http.state import Shared
 from service.views.changes import PastChange
 from workers.catalogue.contexts import NAME, Pin
-from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow
+from workers.catalogue.tables import PsfContextRow
 from workers.contract.requests import ContextName, Identity
-from workers.versions.validity import TIME, Validity, iso
+from workers.versions.validity import Validity
 
 router = APIRouter(prefix="/v1/contexts", tags=["contexts"], responses=RESPONSES, route_class=KeyFirst)
 
-Time = Annotated[
-    str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; a time without a zone is UTC")
-]
-Reason = Annotated[
-    str, Field(max_length=400, pattern=TEXT, description="the reason, stored for later readers")
-]
 IdOrName = Annotated[
     str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="id or name of the context")
 ]
@@ -58,26 +51,16 @@ class ContextAsked(BaseModel):
 class PinView(BaseModel):
     """The PSF that is used for a series in a range of observation times."""
 
+    model_config = ConfigDict(from_attributes=True)
+
     series: str = Field(description="instrument/channel/kind")
-    valid_from: str | None = Field(description="null: no lower limit")
-    valid_to: str | None = Field(description="null: no upper limit")
+    valid_from: ShownTime = Field(description="null: no lower limit")
+    valid_to: ShownTime = Field(description="null: no upper limit")
     psf_id: str
     version: str = Field(description="version of the PSF when it was pinned")
     interpolated: bool = Field(
         description="whether the PSFs of this series may be interpolated in this context, as for the series when the context was created"
     )
-
-    @classmethod
-    def of(cls, row: PsfPinRow) -> PinView:
-        """The description of a pin, from its row in the catalogue."""
-        return cls(
-            series=row.series,
-            valid_from=iso(row.valid_from),
-            valid_to=iso(row.valid_to),
-            psf_id=row.psf_id,
-            version=row.version,
-            interpolated=row.interpolated,
-        )
 
 
 class ContextView(BaseModel):
@@ -123,12 +106,7 @@ class DefaultAsked(BaseModel):
 class Move(PastChange):
     """A past change of the default context."""
 
-    context: str | None
-
-    @classmethod
-    def of(cls, row: DefaultContextRow) -> Move:
-        """The description of a change of the default context, from its row in the catalogue."""
-        return cls(context=row.context_id, at=row.at, by=row.by, reason=row.reason)
+    context: str | None = Field(validation_alias="context_id")
 
 
 class DefaultView(BaseModel):
@@ -150,23 +128,19 @@ def create_context(body: ContextAsked, response: Response, caller: Certifying, s
     """Pin PSFs under a name: the given PSFs, or all PSFs that are certified now."""
     contexts = state.catalogue.contexts
     check_rows(state, caller.owner, 1 + len(body.pins or ()))
-    try:
-        pins = None if body.pins is None else [_pin(asked) for asked in body.pins]
+    with as_problems():
+        pins = None if body.pins is None else [_pin(pin) for pin in body.pins]
         row, new = contexts.create(body.name, caller.owner, caller.name, reason=body.reason, pins=pins)
-    except DataError as error:
-        raise problem(error) from error
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/contexts/{row.id}"
     return _whole(state, row)
 
 
 @router.get("", summary="List contexts")
-def list_contexts(
-    request: Request, caller: Reading, state: Shared, limit: Limit = 50, cursor: Cursor = None
-) -> Page[ContextView]:
+def list_contexts(paging: Paging, caller: Reading, state: Shared) -> Page[ContextView]:
     """Contexts, newest first."""
-    rows = state.catalogue.page(PsfContextRow, owner=caller.owner, limit=limit + 1, after=position(cursor))
-    return page(request, rows, limit, ContextView.of)
+    rows = state.catalogue.page(PsfContextRow, owner=caller.owner, **paging.query)
+    return paging.page(rows, ContextView.of)
 
 
 @router.get("/default", summary="The default context")
@@ -176,7 +150,7 @@ def get_default_context(caller: Reading, state: Shared) -> DefaultView:
     row = contexts.default(caller.owner)
     return DefaultView(
         context=None if row is None else ContextView.of(row),
-        history=[Move.of(move) for move in contexts.default_changes(caller.owner)],
+        history=[Move.model_validate(move) for move in contexts.default_changes(caller.owner)],
     )
 
 
@@ -184,27 +158,25 @@ def get_default_context(caller: Reading, state: Shared) -> DefaultView:
 def move_default_context(body: DefaultAsked, caller: Certifying, state: Shared) -> DefaultView:
     """Set the default context. If `context` is null, there is no default. The history of changes is kept."""
     check_rows(state, caller.owner)
-    try:
+    with as_problems():
         state.catalogue.contexts.set_default(body.context, caller.owner, caller.name, body.reason)
-    except DataError as error:
-        raise problem(error) from error
     return get_default_context(caller, state)
 
 
 @router.get("/{context}", summary="One context with its pins")
 def get_context(context: IdOrName, caller: Reading, state: Shared) -> WholeContext:
     """A context and the PSFs that it pins."""
-    try:
+    with as_problems():
         return _whole(state, state.catalogue.contexts.named(context, caller.owner))
-    except DataError as error:
-        raise problem(error) from error
 
 
-def _pin(asked: PinAsked) -> Pin:
-    told = {"valid_from", "valid_to"} & asked.model_fields_set
-    return Pin(asked.psf_id, Validity.of(asked.valid_from, asked.valid_to) if told else None)
+def _pin(pin: PinAsked) -> Pin:
+    ranged = {"valid_from", "valid_to"} & pin.model_fields_set
+    return Pin(pin.psf_id, Validity.of(pin.valid_from, pin.valid_to) if ranged else None)
 
 
 def _whole(state: Shared, row: PsfContextRow) -> WholeContext:
     pins = state.catalogue.contexts.pins(row.id, row.owner)
-    return WholeContext(**ContextView.of(row).model_dump(), pins=[PinView.of(pin) for pin in pins])
+    return WholeContext(
+        **ContextView.of(row).model_dump(), pins=[PinView.model_validate(pin) for pin in pins]
+    )

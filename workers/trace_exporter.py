@@ -14,8 +14,8 @@ from opentelemetry.trace import NonRecordingSpan, SpanContext, SpanKind, Status,
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 from workers.settings import software_version
-from workers.traces import Attribute
 
+W3C = ("traceparent", "tracestate")  # headers of a request
 SEND_EVERY_MS = 1000  # a worker process that is ended loses the spans of at most this time
 
 
@@ -35,7 +35,7 @@ class Sender:
     @contextmanager
     def request(self, headers: Mapping[str, str]) -> Iterator[None]:
         """The span of a request. If the headers have a ``traceparent``, it is a child of that span."""
-        parent = self._propagator.extract({name: headers[name] for name in _W3C if name in headers})
+        parent = self._propagator.extract({name: headers[name] for name in W3C if name in headers})
         with self._tracer.start_as_current_span("request", context=parent, kind=SpanKind.SERVER):
             yield
 
@@ -51,7 +51,9 @@ class Sender:
         ):
             yield
 
-    def note(self, attributes: Mapping[str, Attribute], *, name: str | None, failed: str | None) -> None:
+    def note(
+        self, attributes: Mapping[str, str | int | float | bool], *, name: str | None, failed: str | None
+    ) -> None:
         """Add attributes to the current span."""
         span = trace.get_current_span()
         span.set_attributes(dict(attributes))
@@ -63,6 +65,3 @@ class Sender:
     def shutdown(self) -> None:
         """Send the spans that wait."""
         self._provider.shutdown()
-
-
-_W3C = ("traceparent", "tracestate")

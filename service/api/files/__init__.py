@@ -1,1 +1,0 @@
-"""The contents of the files of images and products: pixels and headers."""

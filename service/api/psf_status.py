@@ -1,0 +1,311 @@
+"""The status and validity of PSFs, ``/v1/psfs/{id}/status``; whether the PSFs of a series may be interpolated in time,
+``/v1/series``; and the products that were made with deprecated PSFs, ``/v1/affected`` and ``/v1/psfs/{id}/affected``."""
+
+from __future__ import annotations
+
+import logging
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from service.api.psfs import TEXT
+from service.http import paging as pages
+from service.http.callers import Caller, Certifying, KeyFirst, Reading
+from service.http.paging import Page, Paging
+from service.http.problems import RESPONSES, as_problems
+from service.http.quotas import check_rows
+from service.http.state import Shared, State
+from service.views.changes import PastChange
+from service.views.psfs import was_certified
+from workers.catalogue.affected import Affected, Place
+from workers.catalogue.psfs import StatusAsked
+from workers.catalogue.tables import PsfRow
+from workers.contract.requests import Identity
+from workers.versions.series import WORD
+from workers.versions.status import MAY_BECOME, PsfStatus, next_version
+from workers.versions.validity import TIME, Validity, iso
+
+log = logging.getLogger(__name__)
+router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES, route_class=KeyFirst)
+series = APIRouter(prefix="/v1/series", tags=["PSFs"], responses=RESPONSES, route_class=KeyFirst)
+affected = APIRouter(tags=["PSFs"], responses=RESPONSES)
+
+Time = Annotated[
+    str, Field(pattern=TIME, description="such as 2024-03-01T12:00:00Z; a time without a zone is UTC")
+]
+# A time of the catalogue, seconds since 1970, as ISO 8601; null for none and for an open end.
+ShownTime = Annotated[str | None, BeforeValidator(lambda at: iso(at) if isinstance(at, float) else at)]
+Reason = Annotated[
+    str, Field(max_length=400, pattern=TEXT, description="the reason, stored for later readers")
+]
+Word = Annotated[str, Field(pattern=WORD)]
+Instrument = Annotated[str, Path(pattern=WORD, description="such as `hri_euv`")]
+Channel = Annotated[
+    str,
+    Path(
+        pattern=r"^(-|[a-z0-9][a-z0-9_.-]{0,39})$", description="such as `174`; `-`: the channel is unknown"
+    ),
+]
+Kind = Annotated[str, Path(pattern=WORD, description="such as `total`")]
+
+
+class StatusChange(BaseModel):
+    """A change of a PSF's status: certify a draft, change the range of a certified PSF, or deprecate a certified
+    PSF."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    status: PsfStatus
+    reason: Reason = ""
+    version: str | None = Field(
+        None,
+        max_length=40,
+        description="for a draft: a version of three numbers such as 1.2.0, which the series does not have yet",
+    )
+    valid_from: Time | None = Field(
+        None, description="start of the range of observation times; null: no lower limit"
+    )
+    valid_to: Time | None = Field(None, description="end of the range, excluded; null: no upper limit")
+    supersedes: list[Identity] = Field(
+        [],
+        max_length=100,
+        description="ids of certified PSFs of the series that are deprecated in the same step",
+    )
+    successor: Identity | None = Field(
+        None, description="for a deprecated PSF: id of the certified PSF to use instead"
+    )
+    instrument: Word | None = Field(None, description="for a draft whose file names no instrument")
+    channel: Word | None = Field(
+        None,
+        description="for a draft whose file names no wavelength; or a variant of its channel for one filter (card FILTER) or plate "
+        "scale, such as `174-open_2` or `174-0.984arcsec`",
+    )
+    kind: Word | None = Field(None, description="for an uploaded draft, such as `total`")
+
+
+class Change(PastChange):
+    """A past change of status."""
+
+    status_before: PsfStatus
+    status: PsfStatus
+    version_before: str
+    version: str
+    valid_from: ShownTime
+    valid_to: ShownTime
+    successor: str | None = Field(validation_alias="successor_id")
+
+
+class StatusView(BaseModel):
+    """A PSF's status, its allowed changes, and its history."""
+
+    id: str
+    status: PsfStatus
+    version: str
+    series: str | None = Field(
+        description="instrument, channel and kind, as instrument/channel/kind; null: the instrument is unknown"
+    )
+    was_certified: bool = Field(
+        description="whether the PSF is or was certified; if not, it has no range of observation times"
+    )
+    valid_from: ShownTime = Field(description="null: no lower limit, or never certified")
+    valid_to: ShownTime = Field(description="null: no upper limit, or never certified")
+    successor: str | None
+    may_become: list[PsfStatus]
+    next_version: str | None = Field(description="a free version of the series; null: the PSF has no series")
+    history: list[Change] = Field(description="oldest first; never deleted")
+
+
+@router.get("/{psf_id}/status", summary="A PSF's status and its history")
+def get_psf_status(psf_id: Identity, caller: Reading, state: Shared) -> StatusView:
+    """The status of a PSF, the changes that are allowed now, and the past changes: who made each change, when and why."""
+    return _view(state, caller, state.row(PsfRow, psf_id, caller.owner))
+
+
+@router.post("/{psf_id}/status", summary="Certify or deprecate a PSF")
+def change_psf_status(psf_id: Identity, body: StatusChange, caller: Certifying, state: Shared) -> StatusView:
+    """Certify a draft, change the range of a certified PSF, deprecate a certified PSF, or name the successor of a
+    deprecated PSF.
+
+    The time ranges of the certified PSFs of a series must not overlap. If the range in the request overlaps the range
+    of another certified PSF, the answer is 409; the message names this PSF.
+    """
+    # A deprecation is never refused for the quota, because a wrong PSF must not stay certified.
+    if body.status == PsfStatus.CERTIFIED:
+        check_rows(state, caller.owner)
+    with as_problems():
+        row = state.catalogue.psfs.change(psf_id, caller.owner, _asked(body), caller.name)
+    log.info("PSF %s: %s, version %s, by %s", row.id, row.status, row.version, caller.name)
+    return _view(state, caller, row)
+
+
+def _asked(body: StatusChange) -> StatusAsked:
+    ranged = {"valid_from", "valid_to"} & body.model_fields_set
+    values = body.model_dump(exclude={"valid_from", "valid_to", "successor", "supersedes"})
+    return StatusAsked(
+        validity=Validity.of(body.valid_from, body.valid_to) if ranged else None,
+        successor_id=body.successor,
+        supersedes=tuple(body.supersedes),
+        **values,
+    )
+
+
+def _view(state: State, caller: Caller, row: PsfRow) -> StatusView:
+    psfs = state.catalogue.psfs
+    values: dict[str, Any] = {"valid_from": row.valid_from, "valid_to": row.valid_to}
+    return StatusView(
+        id=row.id,
+        status=PsfStatus(row.status),
+        version=row.version,
+        series=row.series,
+        was_certified=was_certified(row),
+        **values,
+        successor=row.successor_id,
+        may_become=sorted(MAY_BECOME[PsfStatus(row.status)]),
+        next_version=None if row.series is None else next_version(psfs.released(row.series, caller.owner)),
+        history=[Change.model_validate(change) for change in psfs.changes(row.id, caller.owner)],
+    )
+
+
+class SeriesChange(BaseModel):
+    """Whether the PSFs of a series may be interpolated."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    interpolated: bool = Field(
+        description="true: the PSF for an image between the ranges of two certified PSFs is interpolated between them"
+    )
+    reason: Reason = ""
+
+
+class SeriesMove(PastChange):
+    """A past change of a series."""
+
+    interpolated: bool
+
+
+class SeriesSummary(BaseModel):
+    """A series of which a PSF was certified."""
+
+    series: str = Field(description="instrument/channel/kind")
+    interpolated: bool = Field(description="whether the PSFs of the series may be interpolated")
+
+
+class SeriesView(SeriesSummary):
+    """A series with the history of its changes."""
+
+    history: list[SeriesMove] = Field(description="the last 200 changes, latest first; all are stored")
+
+
+@series.get("", summary="List series")
+def list_series(caller: Reading, state: Shared) -> Page[SeriesSummary]:
+    """The series of which a PSF was certified, sorted by name, on one page."""
+    known = state.catalogue.series.all(caller.owner)
+    items = [SeriesSummary(series=name, interpolated=interpolated) for name, interpolated in known.items()]
+    return Page(items=items, next=None)
+
+
+@series.get("/{instrument}/{channel}/{kind}", summary="One series")
+def get_series(
+    instrument: Instrument, channel: Channel, kind: Kind, caller: Reading, state: Shared
+) -> SeriesView:
+    """Whether the PSFs of a series may be interpolated, and who changed this, when and why."""
+    return _series(state, caller, f"{instrument}/{channel}/{kind}")
+
+
+@series.put("/{instrument}/{channel}/{kind}", summary="Allow or forbid interpolation")
+def change_series(
+    instrument: Instrument,
+    channel: Channel,
+    kind: Kind,
+    body: SeriesChange,
+    caller: Certifying,
+    state: Shared,
+) -> SeriesView:
+    """Say whether the PSFs of a series may be interpolated in time.
+
+    If they may, a deconvolution that names no PSF interpolates for images whose time is between the ranges of two certified
+    PSFs. Both PSFs must have been fitted with the same shape and the same diffraction PSF. Existing contexts do not change.
+    """
+    name = f"{instrument}/{channel}/{kind}"
+    check_rows(state, caller.owner)
+    with as_problems():
+        state.catalogue.series.set_interpolated(
+            name, caller.owner, body.interpolated, caller.name, body.reason
+        )
+    log.info("series %s: interpolated %s, by %s", name, body.interpolated, caller.name)
+    return _series(state, caller, name)
+
+
+def _series(state: State, caller: Caller, name: str) -> SeriesView:
+    """The description of a series. Raises ``Problem`` "no-such-series"."""
+    with as_problems():
+        moves = state.catalogue.series.changes(name, caller.owner)
+    return SeriesView(
+        series=name,
+        interpolated=bool(moves) and moves[0].interpolated,
+        history=[SeriesMove.model_validate(move) for move in moves],
+    )
+
+
+class AffectedView(BaseModel):
+    """A product, the PSF that made it, and the replacement of this PSF, if there is one."""
+
+    product_id: str
+    image_id: str
+    created_at: float
+    psf_id: str
+    psf_version: str = Field(description="version of the PSF when the product was made")
+    psf_status: str
+    successor: str | None
+    redo_with: str | None = Field(
+        description="id of the replacement PSF, which is the certified PSF at the end of the chain of successors; null: there is no replacement"
+    )
+
+    @classmethod
+    def of(cls, one: Affected) -> AffectedView:
+        """The description of an affected product and its PSF, from their rows in the catalogue."""
+        return cls(
+            product_id=one.product.id,
+            image_id=one.product.image_id,
+            created_at=one.product.created_at,
+            psf_id=one.psf.id,
+            psf_version=one.product.psf_version,
+            psf_status=one.psf.status,
+            successor=one.psf.successor_id,
+            redo_with=None if one.redo_with is None else one.redo_with.id,
+        )
+
+
+@affected.get("/v1/affected", summary="Products made with deprecated PSFs")
+def list_affected(
+    paging: Paging,
+    caller: Reading,
+    state: Shared,
+    superseded: Annotated[bool, Query(description="only products whose PSF has a successor")] = False,
+) -> Page[AffectedView]:
+    """Products whose PSF is deprecated, sorted by PSF; the products of each PSF are listed newest first."""
+    at = pages.place(paging.cursor, 3)
+    after = None if at is None else Place(at[0], pages.number(at[1]), at[2])
+    rows = state.catalogue.affected.page(
+        caller.owner, superseded=superseded, limit=paging.limit + 1, after=after
+    )
+    return _page(paging, rows, whole=True)
+
+
+@affected.get("/v1/psfs/{psf_id}/affected", summary="Products made with a PSF")
+def list_affected_by_psf(
+    psf_id: Identity, paging: Paging, caller: Reading, state: Shared
+) -> Page[AffectedView]:
+    """Products made with this PSF, which may have any status. The newest product is listed first."""
+    psf = state.row(PsfRow, psf_id, caller.owner)
+    return _page(paging, state.catalogue.affected.of_psf(psf, **paging.query), whole=False)
+
+
+def _page(paging: Paging, rows: list[Affected], *, whole: bool) -> Page[AffectedView]:
+    following = None
+    if len(rows) > paging.limit:
+        last = rows[paging.limit - 1]
+        place = (repr(last.product.created_at), last.product.id)
+        following = pages.following(paging.request, *((last.psf.id, *place) if whole else place))
+    return Page(items=[AffectedView.of(one) for one in rows[: paging.limit]], next=following)
