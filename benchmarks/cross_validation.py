@@ -26,8 +26,7 @@ import numpy as np
 from benchmarks.timing import THREADS, reference
 from psfcore.fits.header import FitsLimits
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.validation.bands import bands
-from psfcore.scatter.validation.cross_validation import FoldFit, bootstrap_samples, shared_fits
+from psfcore.scatter.validation.cross_validation import FoldFit, bands, bootstrap_samples, shared_fits
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.simulate.transit_files import write

@@ -27,7 +27,8 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.fits.header import FitsLimits
 from psfcore.psf import cumulative_curve
 from psfcore.scatter.fit import fit_transit
-from psfcore.scatter.inversion import LEAST_LEVEL, Solution, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import LEAST_LEVEL, Solution
 from psfcore.scatter.report import fit_sentence
 from psfcore.scatter.total_psf import TotalPsf
 from psfcore.simulate.plan import default_plan

@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.timing import THREADS, reference, seconds
-from psfcore.scatter.as_published.ring_sums import segment_sums
-from psfcore.scatter.as_published.segments import Segments, shells_as_published
-from tests.psfcore.scatter.as_published.ring_sum_references import segment_sums_fft, segment_sums_plain
+from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
+from tests.psfcore.scatter.ring_sum_references import segment_sums_fft, segment_sums_plain
 
 IMAGES, TARGETS_AN_IMAGE, SIZE_PX = 126, 410, 2048
-EDGES_PX = tuple(shells_as_published())
+EDGES_PX = shells_as_published()
 
 
 def transit_targets() -> list[NDArray[np.int64]]:

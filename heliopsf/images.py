@@ -36,7 +36,7 @@ from psfcore.noise import Noise
 from psfcore.psf import REACH_GRID_PX
 from psfcore.psf import Psf as CorePsf
 from psfcore.psf_sampling import psf_for_image, with_scale
-from psfcore.scatter.samples import possible_psfs
+from psfcore.scatter.total_psf import possible_psfs
 from workers.machine import cores, free_bytes
 
 if TYPE_CHECKING:

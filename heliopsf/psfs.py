@@ -15,13 +15,13 @@ from psfcore.errors import module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.header import FitsLimits
 from psfcore.fits.mask_file import read_mask_image
+from psfcore.fits.times import utc_time
 from psfcore.instruments.files import instrument_path, turned_text
 from psfcore.instruments.model import load_instrument, read_instrument_text
 from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
 from psfcore.psf_sampling import rebinned
 from psfcore.scatter.interpolation import Epoch, interpolated_psf
-from psfcore.scatter.utc_time import utc_time
 from workers.machine import cores
 
 if TYPE_CHECKING:

@@ -25,8 +25,7 @@ from psfcore.fits.header import FitsLimits, read_summary
 from psfcore.fits.psfs import stated_id
 from psfcore.fits.weights import check_is_psf
 from psfcore.tables import lookup
-from psfcore.transit.archive import ArchiveLimits, list_archive
-from psfcore.transit.in_place import FolderTransit, transit_in
+from psfcore.transit.archive import ArchiveLimits, FolderTransit, list_archive, transit_in
 from service.client.errors import ServiceError
 from service.client.operations import Operations
 from service.client.outputs import written

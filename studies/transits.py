@@ -30,13 +30,14 @@ from numpy.typing import NDArray
 
 from psfcore.build import build_psf
 from psfcore.evaluation.shapes import compare_shapes_by_errors
+from psfcore.evaluation.summary_lines import shape_lines
 from psfcore.instruments.model import load_instrument
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
-from psfcore.scatter.as_published.published import AS_PUBLISHED, invert_as_published
-from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.published import AS_PUBLISHED, invert_as_published
+from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import SHAPES, stretch_of
-from psfcore.scatter.validation.bands import bands
-from psfcore.scatter.validation.cross_validation import bootstrap_samples, shared_fits
+from psfcore.scatter.validation.cross_validation import bands, bootstrap_samples, shared_fits
 from psfcore.simulate.bound import photon_bound
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
@@ -142,7 +143,7 @@ def shapes_summary(rows: list[dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         lines.append(f"seed {row['seed']}")
-        lines += row["shapes"].lines()
+        lines += shape_lines(row["shapes"].to_json())
         for name, excess in (("near the centre", row["near"]), ("most apart", row["largest"])):
             lines.append(
                 f"free fit less power law, {name}: {excess.points:+.2f} +- {excess.sigma:.2f} points of all light "

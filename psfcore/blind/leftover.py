@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.noise import Noise
-from psfcore.scatter.inversion import DARK_MARGIN_PX, invert
+from psfcore.scatter.inversion import invert
 from psfcore.scatter.optics import Blur, Lanes, Optics, Pixels, pick, put
+from psfcore.scatter.reconstruction import DARK_MARGIN_PX
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.scatter.total_psf import TotalPsf
 from psfcore.simulate.scatter_truth import ScatterTruth

@@ -17,7 +17,7 @@ PE is the percentage error of a pixel. Differences from the paper:
   denominator and would bias the residual high.
 
 Errors contain the photon and read noise of the image, propagated through Eq. (1). They do not contain the error of the
-PSF. Errors of means are exact (`noise_transfer`). Errors of single pixels come from noise realisations. The variance of
+PSF. Errors of means are exact (`noise_covariance`). Errors of single pixels come from noise realisations. The variance of
 the noise in a realisation follows from the observed intensity, but in the pixels of D from the simulated intensity.
 
 | symbol | name | unit |
@@ -31,17 +31,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.evaluation.frame import FrameEvaluation, Slice, at_centre
-from psfcore.evaluation.superposed import Superposed, Superposition
-from psfcore.noise import Noise
-from psfcore.scatter.inversion import LEAST_DARK_PIXELS, Progress, dark_pixels
-from psfcore.scatter.noise_transfer import noise_covariance
-from psfcore.scatter.optics import Optics, Pixels, pick, put
+from psfcore.evaluation.frame import (
+    FrameEvaluation,
+    Slice,
+    Superposed,
+    at_centre,
+    half_width_px,
+    superposed,
+    superposed_maps,
+)
+from psfcore.scatter.optics import Optics, Pixels, noise_covariance, pick, put
+from psfcore.scatter.reconstruction import LEAST_DARK_PIXELS, Progress, dark_pixels
 from psfcore.transit.occulter import DOUBT_SIGMAS, FoundPlace, find_occulter
 from psfcore.transit.transit import Frame, Kernel, Transit
 
@@ -56,7 +62,7 @@ SLICE_HALF_PX = 20
 SLICES_A_POINTING = 3
 NOISE_REALISATIONS = 4
 INVERSION_STEPS = 6
-_SCENES_KEPT = 24
+SCENES_KEPT = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +98,14 @@ def evaluate(
     Raises DataError "no-occulter" if no image can be evaluated.
     """
     kernels = [psf_for_frame(n) for n in range(len(transit.frames))]
-    superposition = Superposition(max(frame.place.radius_px for frame in transit.frames), noise_realisations)
     sliced = _sliced(transit.frames)
     done: dict[int, FrameEvaluation] = {}
+    noise_pct: dict[int, list[Vector]] = {}
     left_out: dict[str, str] = {}
-    for indices in _sharing(kernels):
+    sharing: dict[int, list[int]] = {}  # the images that share a kernel
+    for n, kernel in enumerate(kernels):
+        sharing.setdefault(id(kernel), []).append(n)
+    for indices in sharing.values():
         simulator = _FrameSimulator(transit, kernels[indices[0]], threads)
         for n in indices:
             progress("evaluating", len(done) + len(left_out), len(kernels))
@@ -109,25 +118,25 @@ def evaluate(
             simulated = simulator.simulated(n, dark)
             done[n] = _compared(simulator, n, found, dark, simulated, sliced=n in sliced)
             rng = np.random.default_rng([seed, n])
-            noise = [simulator.noise_alone(n, dark, simulated, rng) for _ in range(noise_realisations)]
             share = 100 / done[n].observed_dn_s
-            superposition.add(found.place, dark, done[n].pe_pct, [share * r for r in noise])
+            noise_pct[n] = [
+                share * simulator.noise_alone(n, dark, simulated, rng) for _ in range(noise_realisations)
+            ]
     if not done:
         reasons = "; ".join(f"{file}: {why}" for file, why in list(left_out.items())[:3])
         raise DataError(
             "no-occulter",
             f"expected at least one image with a usable occulter; got none ({reasons}): check the positions in transit.json",
         )
-    frames = tuple(done[n] for n in sorted(done))
-    return Evaluation(transit, frames, left_out, superposition.superposed())
-
-
-def _sharing(kernels: Sequence[Kernel]) -> list[list[int]]:
-    """Groups of indices of the images that share a kernel, ordered by the first image of each group."""
-    groups: dict[int, list[int]] = {}
-    for n, kernel in enumerate(kernels):
-        groups.setdefault(id(kernel), []).append(n)
-    return list(groups.values())
+    order = sorted(done)
+    frames = tuple(done[n] for n in order)
+    half_px = half_width_px(max(frame.place.radius_px for frame in transit.frames))
+    pe_maps = superposed_maps(frames, [frame.pe_pct for frame in frames], half_px)
+    noise_maps = [
+        superposed_maps(frames, [noise_pct[n][k] for n in order], half_px) for k in range(noise_realisations)
+    ]
+    maps = superposed(pe_maps, np.array(noise_maps).reshape(-1, *pe_maps.shape))
+    return Evaluation(transit, frames, left_out, maps)
 
 
 def _sliced(frames: Sequence[Frame]) -> set[int]:
@@ -146,18 +155,23 @@ class _FrameSimulator:
     def __init__(self, transit: Transit, kernel: Kernel, threads: int) -> None:
         self.transit, self.kernel = transit, kernel
         self.optics = Optics(kernel, transit.shape, threads=threads)
-        self._scenes = _Scenes(transit, self.optics)
+        self.scene_of = lru_cache(maxsize=SCENES_KEPT)(self._scene)
+
+    def _scene(self, n: int) -> NDArray[np.float32]:
+        """x of Eq. (1), [y, x]."""
+        observed = self.optics.lanes(self.transit.frames[n].pixels)
+        return self.optics.field(self.optics.invert(observed, steps=INVERSION_STEPS))
 
     def find(self, n: int) -> tuple[FoundPlace, Pixels]:
         """The position of the occulter of frame n, and its fully dark pixels."""
         frames = self.transit.frames
         places = [frame.place for frame in frames]
-        found = find_occulter(n, frames, self._scenes, places, self.kernel, self.transit.noise)
+        found = find_occulter(n, frames, self.scene_of, places, self.kernel, self.transit.noise)
         return found, dark_pixels(frames[n], found)
 
     def simulated(self, n: int, dark: Pixels) -> NDArray[np.float32]:
         """s of Eq. (1), [y, x]."""
-        scene = self._scenes[n].copy()
+        scene = self.scene_of(n).copy()
         scene[dark] = 0.0
         return self.optics.field(self.optics.convolve(self.optics.lanes(scene)))
 
@@ -173,27 +187,6 @@ class _FrameSimulator:
         scene = optics.invert_once(optics.lanes(noise))
         put(scene, dark, 0.0)
         return pick(optics.convolve(scene), dark) - noise[dark]
-
-
-class _Scenes(Sequence[NDArray[np.float32]]):
-    """Reconstructed scenes [y, x]. A scene is computed when it is needed; the most recently used scenes are cached."""
-
-    def __init__(self, transit: Transit, optics: Optics) -> None:
-        self._transit, self._optics = transit, optics
-        self._kept: dict[int, NDArray[np.float32]] = {}
-
-    def __len__(self) -> int:
-        return len(self._transit.frames)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        scene = self._kept.pop(index, None)
-        if scene is None:
-            observed = self._optics.lanes(self._transit.frames[index].pixels)
-            scene = self._optics.field(self._optics.invert(observed, steps=INVERSION_STEPS))
-            if len(self._kept) >= _SCENES_KEPT:
-                self._kept.pop(next(iter(self._kept)))
-        self._kept[index] = scene  # at the end of the dict, so that this scene is removed last
-        return scene
 
 
 def _reason(frame: Frame, found: FoundPlace, dark: Pixels) -> str | None:
@@ -218,8 +211,11 @@ def _compared(
     *,
     sliced: bool,
 ) -> FrameEvaluation:
-    frame = simulator.transit.frames[n]
-    noise, centre_noise = _standard_errors(simulator.optics, frame, dark, found, simulator.transit.noise)
+    frame, noise = simulator.transit.frames[n], simulator.transit.noise
+    # The standard errors of two means of s - y: over all dark pixels, and over the dark pixels at the centre.
+    at = at_centre(dark, found)
+    templates = [np.full(at.size, 1 / at.size), at / max(int(np.count_nonzero(at)), 1)]
+    disc, centre = np.sqrt(np.diag(noise_covariance(simulator.optics, frame, dark, templates, noise)))
     along_x, along_y = _slices(frame, found, dark, simulated) if sliced else (None, None)
     return FrameEvaluation(
         index=n,
@@ -230,24 +226,11 @@ def _compared(
         dark=dark,
         observed=frame.pixels[dark].astype(np.float64),
         simulated=simulated[dark].astype(np.float64),
-        noise_dn_s=noise,
-        centre_noise_dn_s=centre_noise,
+        noise_dn_s=float(disc),
+        centre_noise_dn_s=float(centre) if at.any() else float("nan"),
         along_x=along_x,
         along_y=along_y,
     )
-
-
-def _standard_errors(
-    optics: Optics, frame: Frame, dark: Pixels, found: FoundPlace, noise: Noise
-) -> tuple[float, float]:
-    """Standard errors of two means of s - y: over all dark pixels, and over the dark pixels at the centre.
-
-    The second is nan if there are no dark pixels at the centre.
-    """
-    at = at_centre(dark, found)
-    templates = [np.full(at.size, 1 / at.size), at / max(int(np.count_nonzero(at)), 1)]
-    disc, centre = np.sqrt(np.diag(noise_covariance(optics, frame, dark, templates, noise)))
-    return float(disc), float(centre) if at.any() else float("nan")
 
 
 def _slices(

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from psfcore.drawing.plots import CHANGE, INK, write_png
 from psfcore.evaluation.evaluation import Evaluation
-from psfcore.evaluation.frame import FrameEvaluation, Slice
+from psfcore.evaluation.frame import FrameEvaluation, Slice, Superposed
 from psfcore.evaluation.report import summaries
-from psfcore.evaluation.superposed import Superposed
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 
 Vector = NDArray[np.float64]

@@ -19,15 +19,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.evaluation.evaluation import Evaluation
-from psfcore.evaluation.frame import FrameEvaluation, Slice
-from psfcore.evaluation.superposed import Superposed
+from psfcore.evaluation.frame import FrameEvaluation, Slice, Superposed
+from psfcore.json_values import json_attributes, json_values
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 
 Vector = NDArray[np.float64]
@@ -152,12 +152,12 @@ def _rms(values: Vector) -> float:
 
 def report(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> dict[str, Any]:
     """The evaluation as JSON: summaries, trends, every image, maps, slices and the dark offsets of `study`."""
-    *pointings, whole = (_plain(asdict(summary)) for summary in summaries(evaluation))
+    *pointings, whole = summaries(evaluation)
     out: dict[str, Any] = {
         "schema": SCHEMA,
-        "all": whole,
-        "pointings": pointings,
-        "trends": [_plain(asdict(trend)) for trend in trends(evaluation)],
+        "all": json_values(whole),
+        "pointings": json_values(pointings),
+        "trends": json_values(trends(evaluation)),
         "superposed": _superposed_json(evaluation.superposed),
         "frames": [_frame_json(frame) for frame in evaluation.frames],
         "left_out": evaluation.left_out,
@@ -180,26 +180,20 @@ def report(evaluation: Evaluation, study: DarkOffsetStudy | None = None) -> dict
 
 def _frame_json(frame: FrameEvaluation) -> dict[str, Any]:
     centre_observed, centre_simulated = frame.centre_dn_s
-    return _plain(
-        {
-            "file": frame.file,
-            "fov": frame.pointing,
-            "time_s": frame.time_s,
-            "x": frame.found.place.x_px,
-            "y": frame.found.place.y_px,
-            "dark_pixels": int(frame.dark[0].size),
-            "observed_dn_s": frame.observed_dn_s,
-            "simulated_dn_s": frame.simulated_dn_s,
-            "error_dn_s": frame.error_dn_s,
-            "noise_dn_s": frame.noise_dn_s,
-            "residual_pct": frame.residual_pct,
-            "noise_pct": frame.noise_pct,
-            "centre_observed_dn_s": centre_observed,
-            "centre_simulated_dn_s": centre_simulated,
-            "centre_residual_pct": frame.centre_pct,
-            "centre_noise_pct": frame.centre_noise_pct,
-        }
-    )
+    return {
+        "file": frame.file,
+        "fov": frame.pointing,
+        "time_s": frame.time_s,
+        "x": frame.found.place.x_px,
+        "y": frame.found.place.y_px,
+        "dark_pixels": int(frame.dark[0].size),
+        **json_attributes(frame, "observed_dn_s", "simulated_dn_s", "error_dn_s", "noise_dn_s"),
+        **json_attributes(frame, "residual_pct", "noise_pct"),
+        "centre_observed_dn_s": json_values(centre_observed),
+        "centre_simulated_dn_s": json_values(centre_simulated),
+        "centre_residual_pct": json_values(frame.centre_pct),
+        "centre_noise_pct": json_values(frame.centre_noise_pct),
+    }
 
 
 def _superposed_json(maps: Superposed) -> dict[str, Any]:
@@ -207,17 +201,9 @@ def _superposed_json(maps: Superposed) -> dict[str, Any]:
         "images": maps.images,
         "registered": "to the nearest pixel",
         "centre_index": maps.half_px,
-        "mpe_rms_pct": maps.mpe_rms_pct,
-        "mpe_noise_rms_pct": maps.mpe_noise_rms_pct,
-        "mpe_largest_pct": maps.mpe_largest_pct,
-        "mape_mean_pct": maps.mape_mean_pct,
-        "mape_noise_mean_pct": maps.mape_noise_mean_pct,
-        "mape_largest_pct": maps.mape_largest_pct,
-        "count": maps.count.tolist(),
-        "mpe_pct": _rows(maps.mpe_pct),
-        "mape_pct": _rows(maps.mape_pct),
-        "noise_mpe_pct": _rows(maps.noise_mpe_pct),
-        "noise_mape_pct": _rows(maps.noise_mape_pct),
+        **json_attributes(maps, "mpe_rms_pct", "mpe_noise_rms_pct", "mpe_largest_pct"),
+        **json_attributes(maps, "mape_mean_pct", "mape_noise_mean_pct", "mape_largest_pct"),
+        **json_attributes(maps, "count", "mpe_pct", "mape_pct", "noise_mpe_pct", "noise_mape_pct"),
     }
 
 
@@ -231,32 +217,16 @@ def _slice_json(along: Slice) -> dict[str, Any]:
 
 
 def _study_json(study: DarkOffsetStudy) -> dict[str, Any]:
+    largest = ("weight_change_pct", "curve_change_points", "total_curve_change_points")
     return {
-        "radii_px": study.radii_px.tolist(),
-        "curve_radii_px": study.curve_radii_px.tolist(),
-        "nominal": study.nominal,
-        "largest_weight_change_pct": study.largest_weight_change_pct,
-        "largest_curve_change_points": study.largest_curve_change_points,
-        "largest_total_curve_change_points": study.largest_total_curve_change_points,
+        **json_attributes(study, "radii_px", "curve_radii_px", "nominal"),
+        **json_attributes(study, *(f"largest_{name}" for name in largest)),
         "offsets": [
             {
-                "offset_dn": o.offset_dn,
-                "parameters": o.values,
-                "images": o.images,
-                "converged": o.converged,
-                "weight_change_pct": o.weight_change_pct.tolist(),
-                "curve_change_points": o.curve_change_points.tolist(),
-                "total_curve_change_points": o.total_curve_change_points.tolist(),
+                "offset_dn": offset.offset_dn,
+                "parameters": offset.values,
+                **json_attributes(offset, "images", "converged", *largest),
             }
-            for o in study.offsets
+            for offset in study.offsets
         ],
     }
-
-
-def _rows(values: Vector) -> list[list[float | None]]:
-    return [[None if math.isnan(v) else v for v in row] for row in values.tolist()]
-
-
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    """Replace nan and infinity by None, because JSON cannot express them."""
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}

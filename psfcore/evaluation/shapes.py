@@ -29,14 +29,13 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import evaluate
-from psfcore.evaluation.frame import FrameEvaluation
-from psfcore.evaluation.superposed import LEAST_SHARE
-from psfcore.scatter.inversion import Progress, Solution, invert
-from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
+from psfcore.evaluation.frame import LEAST_SHARE, FrameEvaluation, half_width_px, superposed_maps
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import Inversion, Progress, Solution, labelled
+from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW, Vector
 from psfcore.scatter.validation.cross_validation import FoldSample, shared_step
 from psfcore.scatter.validation.free_shells import free_kernel, free_shares, law_light
-from psfcore.transit.blocks import folds
-from psfcore.transit.transit import Kernel
+from psfcore.transit.transit import Kernel, folds
 
 Floats = NDArray[np.float64]
 
@@ -88,21 +87,6 @@ class ShapesByErrors:
             "shapes": [shape.to_json() for shape in self.shapes],
         }
 
-    def lines(self) -> list[str]:
-        """A short table in plain text."""
-        head = f"{'errors on held-out images (%)':<30}{'residual rms':>16}{'MPE rms':>16}{'MAPE mean':>16}"
-        out = [head]
-        for shape in self.shapes:
-            out.append(f"  {shape.name:<28}" + "".join(_cell(shape.figures[k]) for k in FIGURES[1:]))
-        out.append(f"difference from {self.shapes[0].name}")
-        for shape in self.shapes[1:]:
-            out.append(f"  {shape.name:<28}" + "".join(_cell(shape.minus_first[k], "+") for k in FIGURES[1:]))
-        return out
-
-
-def _cell(figure: tuple[float, float], sign: str = "") -> str:
-    return f"{f'{figure[0]:{sign}.2f} ± {figure[1]:.2f}':>16}"
-
 
 def _named(figures: dict[str, tuple[float, float]]) -> dict[str, dict[str, float]]:
     return {name: {"value": value, "sigma": sigma} for name, (value, sigma) in figures.items()}
@@ -121,30 +105,39 @@ def compare_shapes_by_errors(
             "unknown-shape",
             f"expected a fit of the shape {SOFTENED_POWER_LAW.name}; got {solution.inversion.shape.name}: fit that shape first",
         )
-    samples = _fold_samples(len(solution.transit.frames))
     named: dict[str, tuple[Solution | None, KernelOf]] = {
         SOFTENED_POWER_LAW.name: (solution, held_out_kernels(solution))
     }
     for name in STRETCHED:
-        stretched = _fit_of(solution, name, progress)
+        # The fit of another shape to all images starts from the fit of the power law.
+        start, told = SHAPES[name].coordinates(solution.inversion.values), labelled(progress, name)
+        stretched = invert(
+            solution.transit, SHAPES[name], start=start, threads=solution.threads, progress=told
+        )
         named[name] = stretched, held_out_kernels(stretched)
-    named[FREE_SHELLS] = None, _free_fold_kernels(solution, samples, progress)
-    evaluations = {
-        name: _evaluated(solution, kernel_of, name, progress) for name, (_, kernel_of) in named.items()
-    }
+    named[FREE_SHELLS] = None, _free_fold_kernels(solution, progress)
+    evaluations: dict[str, dict[int, FrameEvaluation]] = {}  # the keys are the images' indices
+    for name, (_, kernel_of) in named.items():
+        told, threads = labelled(progress, name), solution.threads
+        done = evaluate(solution.transit, kernel_of, noise_realisations=0, threads=threads, progress=told)
+        evaluations[name] = {frame.index: frame for frame in done.frames}
     images = sorted(set.intersection(*(set(evaluation) for evaluation in evaluations.values())))
-    counts = _bootstrap_counts(len(images), seed)
+    # The number of times that each image counts; in the first row, each image counts once.
+    draws = np.random.default_rng(seed).multinomial(
+        len(images), np.full(len(images), 1 / len(images)), BOOTSTRAP_SAMPLES
+    )
+    counts = np.concatenate((np.ones((1, len(images))), draws))
     found = {
         name: _figures([evaluation[n] for n in images], counts) for name, evaluation in evaluations.items()
     }
     first = found[SOFTENED_POWER_LAW.name]
     return ShapesByErrors(
         images=len(images),
-        folds=len(samples),
+        folds=len(folds(len(solution.transit.frames))),
         shapes=tuple(
             ShapeErrors(
                 name=name,
-                parameters={} if fitted is None else _parameters(fitted),
+                parameters={} if fitted is None else _parameters(fitted.inversion),
                 figures=_with_errors(found[name]),
                 minus_first=_with_errors(found[name] - first),
             )
@@ -153,20 +146,9 @@ def compare_shapes_by_errors(
     )
 
 
-def _fit_of(solution: Solution, name: str, progress: Progress) -> Solution:
-    """Fit another shape to all images, starting from the fit of the power law."""
-    shape = SHAPES[name]
-
-    def said(stage: str, step: int, steps: int) -> None:
-        progress(f"{name}: {stage}", step, steps)
-
-    start = shape.coordinates(solution.inversion.values)
-    return invert(solution.transit, shape, start=start, threads=solution.threads, progress=said)
-
-
-def _parameters(solution: Solution) -> dict[str, tuple[float, float]]:
-    values, sigma = solution.inversion.values, solution.inversion.value_sigma
-    return {name: (values[name], sigma[name]) for name in values}
+def _parameters(inversion: Inversion) -> dict[str, tuple[float, float]]:
+    sigma = inversion.value_sigma
+    return {name: (value, sigma[name]) for name, value in inversion.values.items()}
 
 
 def _fold_samples(images: int) -> tuple[FoldSample, ...]:
@@ -188,57 +170,33 @@ def held_out_kernels(solution: Solution) -> KernelOf:
     Each fold takes one step from the fit to all images (`psfcore.scatter.validation.cross_validation.shared_step`). Raises
     DataError "too-few-images" for fewer than six images.
     """
-    samples, at = _fold_samples(len(solution.transit.frames)), solution.inversion.coordinates
-    kernels = [solution.total.kernel(at + shared_step(solution, sample)) for sample in samples]
-    return _by_image(samples, kernels)
+    return _of_folds(solution, lambda _, at: solution.total.kernel(at))
 
 
-def _free_fold_kernels(solution: Solution, samples: tuple[FoldSample, ...], progress: Progress) -> KernelOf:
+def _free_fold_kernels(solution: Solution, progress: Progress) -> KernelOf:
     """For each image, the total PSF [y, x] with free shells, of the fold that holds the image out."""
-    shape, diffraction = solution.inversion.shape, solution.transit.diffraction
+    shape, diffraction, size = solution.inversion.shape, solution.transit.diffraction, solution.total.size
     shares = free_shares(solution, solution.inversion.coordinates, progress=progress)
-    kernels = []
-    for sample in samples:
-        at = solution.inversion.coordinates + shared_step(solution, sample)
+
+    def kernel(sample: FoldSample, at: Vector) -> Kernel:
         free = shares.fit(sample.counts, law_light(shape, at))
-        kernels.append(
-            free_kernel(free, shape, at, diffraction, solution.total.size, threads=solution.threads)
-        )
-    return _by_image(samples, kernels)
+        return free_kernel(free, shape, at, diffraction, size, threads=solution.threads)
+
+    return _of_folds(solution, kernel)
 
 
-def _by_image(samples: tuple[FoldSample, ...], kernels: list[Kernel]) -> KernelOf:
+def _of_folds(solution: Solution, kernel_of: Callable[[FoldSample, Vector], Kernel]) -> KernelOf:
+    """For each image, the kernel of its fold, which `kernel_of` makes from the fold and its coordinates."""
+    samples, at = _fold_samples(len(solution.transit.frames)), solution.inversion.coordinates
+    kernels = [kernel_of(sample, at + shared_step(solution, sample)) for sample in samples]
     fold_of = {n: sample.fold for sample in samples for n in sample.held_out}
     return lambda n: kernels[fold_of[n]]
 
 
-def _evaluated(
-    solution: Solution, kernel_of: KernelOf, name: str, progress: Progress
-) -> dict[int, FrameEvaluation]:
-    """The evaluation of every usable image with the PSF of its fold; the keys are the images' indices."""
-
-    def said(stage: str, step: int, steps: int) -> None:
-        progress(f"{name}: {stage}", step, steps)
-
-    evaluation = evaluate(
-        solution.transit, kernel_of, noise_realisations=0, threads=solution.threads, progress=said
-    )
-    return {frame.index: frame for frame in evaluation.frames}
-
-
-def _bootstrap_counts(images: int, seed: int) -> Floats:
-    """The number of times that each image counts, (1 + BOOTSTRAP_SAMPLES, images).
-
-    In the first row, each image counts once.
-    """
-    rng = np.random.default_rng(seed)
-    counts = rng.multinomial(images, np.full(images, 1 / images), BOOTSTRAP_SAMPLES)
-    return np.concatenate((np.ones((1, images)), counts))
-
-
 def _figures(frames: list[FrameEvaluation], counts: Floats) -> Floats:
     """FIGURES for all images (first column) and for each bootstrap sample, (FIGURES, 1 + BOOTSTRAP_SAMPLES)."""
-    maps = _maps(frames)
+    half_px = half_width_px(max(frame.found.place.radius_px for frame in frames))
+    maps = superposed_maps(frames, [frame.pe_pct for frame in frames], half_px).reshape(len(frames), -1)
     dark = np.isfinite(maps)
     shown = dark.sum(axis=0) >= LEAST_SHARE * len(frames)
     pe, dark = np.nan_to_num(maps[:, shown]), dark[:, shown]
@@ -255,16 +213,6 @@ def _figures(frames: list[FrameEvaluation], counts: Floats) -> Floats:
             mape.mean(axis=1),
         ]
     )
-
-
-def _maps(frames: list[FrameEvaluation]) -> Floats:
-    """PE of each image at each whole-pixel offset from the centre of the occulter; nan for pixels that are not dark."""
-    half = int(np.ceil(max(frame.found.place.radius_px for frame in frames))) + 1
-    maps = np.full((len(frames), 2 * half + 1, 2 * half + 1), np.nan)
-    for of, frame in zip(maps, frames, strict=True):
-        place = frame.found.place
-        of[frame.dark[0] - round(place.y_px) + half, frame.dark[1] - round(place.x_px) + half] = frame.pe_pct
-    return maps.reshape(len(frames), -1)
 
 
 def _with_errors(figures: Floats) -> dict[str, tuple[float, float]]:

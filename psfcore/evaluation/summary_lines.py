@@ -30,7 +30,7 @@ def summary_lines(evaluation: Json, shapes: Json | None = None) -> list[str]:
     if evaluation["left_out"]:
         lines.append(f"left out: {len(evaluation['left_out'])} images")
         lines += [f"  {file}: {reason}" for file, reason in evaluation["left_out"].items()]
-    return lines if shapes is None else [*lines, *_shapes(shapes["shapes"])]
+    return lines if shapes is None else [*lines, *shape_lines(shapes)]
 
 
 def _pointing(of: Json) -> str:
@@ -58,12 +58,13 @@ def _dark_offsets(study: Json) -> str:
     )
 
 
-def _shapes(shapes: list[Json]) -> list[str]:
-    head = f"{'errors of shapes, held out (%)':<32}"
-    first, *others = shapes
+def shape_lines(shapes: Json) -> list[str]:
+    """The table of a comparison of shapes."""
+    first, *others = shapes["shapes"]
     return [
-        head + "".join(f"{title:>16}" for title in SHAPE_FIGURES.values()),
-        *(f"  {shape['name']:<30}{_figures(shape)}" for shape in shapes),
+        f"{'errors of shapes, held out (%)':<32}"
+        + "".join(f"{title:>16}" for title in SHAPE_FIGURES.values()),
+        *(f"  {shape['name']:<30}{_figures(shape)}" for shape in (first, *others)),
         f"differences from {first['name']}",
         *(f"  {shape['name']:<30}{_figures(shape['minus_softened_power_law'], '+')}" for shape in others),
     ]

@@ -40,8 +40,9 @@ from scipy import ndimage
 from scipy.optimize import nnls
 
 from psfcore.errors import DataError
+from psfcore.json_values import json_attributes
 from psfcore.psf import Psf
-from psfcore.scatter.samples import DIFFRACTION, SCATTER
+from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
 
 BOX_PX = 7
 MATCHED_PX = (60.0, 70.0)
@@ -101,16 +102,13 @@ class FlareFit:
     matched_noise_pct: float | None
 
     def as_json(self) -> dict[str, Any]:
-        """All fields except `simulated` as JSON values; `flare_light` is the sum of the box."""
+        """All fields as JSON values; `flare_light` is the sum of the box."""
         return {
-            "rms_pct": self.rms_pct,
-            "chi2_per_distance": self.chi2_per_distance,
-            "reduced_chi2": self.reduced_chi2,
-            "used_pixels": self.used_pixels,
+            **json_attributes(self, "rms_pct", "chi2_per_distance", "reduced_chi2", "used_pixels"),
             "simulated_over_observed_where_matched": self.matched,
             "matched_noise_pct": self.matched_noise_pct,
             "flare_light": float(self.box.sum()),
-            "box": self.box.tolist(),
+            **json_attributes(self, "box", "simulated"),
         }
 
 
@@ -143,19 +141,11 @@ class FlareComparison:
 
     def as_json(self) -> dict[str, Any]:
         """The comparison as JSON, with the profile."""
-        profile = self.profile
         return {
-            "centre_xy": list(profile.centre_xy),
-            "arm_deg": profile.arm_deg,
-            "distance_px": profile.distance_px.tolist(),
-            "observed": profile.observed.tolist(),
-            "sigma": None if profile.sigma is None else profile.sigma.tolist(),
-            "total": self.total.as_json() | {"simulated": self.total.simulated.tolist()},
-            "diffraction": None
-            if self.diffraction is None
-            else self.diffraction.as_json() | {"simulated": self.diffraction.simulated.tolist()},
-            "rms_factor": self.rms_factor,
-            "chi2_factor": self.chi2_factor,
+            **json_attributes(self.profile, "centre_xy", "arm_deg", "distance_px", "observed", "sigma"),
+            "total": self.total.as_json(),
+            "diffraction": None if self.diffraction is None else self.diffraction.as_json(),
+            **json_attributes(self, "rms_factor", "chi2_factor"),
             "explained_share_off_the_arm": self.explained,
         }
 
@@ -190,7 +180,6 @@ def arm_profile(
     *,
     variance: Plane | None = None,
     distances_px: tuple[float, float] = FITTED_PX,
-    half_width_px: float = HALF_WIDTH_PX,
 ) -> ArmProfile:
     """Profile along the arm that leaves the centre at `arm_deg`, degrees from +x towards +y.
 
@@ -207,10 +196,10 @@ def arm_profile(
     along = (x - centre_xy[0]) * np.cos(angle) + (y - centre_xy[1]) * np.sin(angle)
     across = -(x - centre_xy[0]) * np.sin(angle) + (y - centre_xy[1]) * np.cos(angle)
     distance = np.rint(along).astype(np.intp)
-    strip = (np.abs(across) <= half_width_px) & (distance >= distances_px[0]) & (distance <= distances_px[1])
+    strip = (np.abs(across) <= HALF_WIDTH_PX) & (distance >= distances_px[0]) & (distance <= distances_px[1])
     wanted = np.bincount(distance[strip], minlength=1)
     found = np.bincount(distance[strip & usable], minlength=wanted.size)
-    kept = np.flatnonzero((found > 0) & (2 * found >= np.maximum(wanted, half_width_px)))
+    kept = np.flatnonzero((found > 0) & (2 * found >= np.maximum(wanted, HALF_WIDTH_PX)))
     if kept.size < FEWEST_DISTANCES:
         raise DataError(
             "flare-short-arm",
@@ -234,34 +223,55 @@ def arm_profile(
     )
 
 
-def fit_flare(
-    profile: ArmProfile, kernel: Plane, *, matched_px: tuple[float, float] = MATCHED_PX, box_px: int = BOX_PX
-) -> FlareFit:
+def fit_flare(profile: ArmProfile, kernel: Plane) -> FlareFit:
     """Fit the intensities of the box so that the simulated profile matches the observed one, Eq. (2).
 
     kernel: a PSF [y, x], centre at [n // 2, n // 2]. Raises DataError "flare-no-light" if the mean difference at 60 to
     70 px is not positive.
     """
-    design = _design(profile, kernel, box_px)
-    observed = profile.observed
-    matched = (profile.distance_px >= matched_px[0]) & (profile.distance_px <= matched_px[1])
+    # Each column is the profile of unit light in one pixel of the box.
+    design = np.stack(
+        [
+            profile.mean(_at(kernel, profile.rows - row, profile.columns - column))
+            for row, column, _ in _box(profile, np.zeros((BOX_PX, BOX_PX)))
+        ],
+        axis=1,
+    )
+    observed, sigma = profile.observed, profile.sigma
+    matched = (profile.distance_px >= MATCHED_PX[0]) & (profile.distance_px <= MATCHED_PX[1])
     level = float(observed[matched].mean()) if matched.any() else 0.0
     if not level > 0:
         raise DataError(
             "flare-no-light",
-            f"expected light of the flare at {matched_px[0]:g} to {matched_px[1]:g} px along the arm; "
+            f"expected light of the flare at {MATCHED_PX[0]:g} to {MATCHED_PX[1]:g} px along the arm; "
             f"got a mean difference of {level:.3g} over {int(matched.sum())} distances",
         )
-    error = profile.sigma if profile.sigma is not None else _percent_error(observed, level)
+    # Without noise, d_u is the error, but at least a tenth of the level: a value near 0 would dominate the fit.
+    error = sigma if sigma is not None else np.maximum(observed, 0.1 * level)
     constraint = design[matched].mean(axis=0)
     weight = _CONSTRAINT_WEIGHT * np.sqrt(observed.size) / level
     # The solver needs columns of similar size. Without scaling, the light of the box is about 1e7, and the columns
     # differ.
     scale = np.linalg.norm(design / error[:, None], axis=0)
     rows = np.vstack((design / error[:, None], weight * constraint)) / np.where(scale > 0, scale, 1.0)
-    found, _ = nnls(rows, np.append(observed / error, weight * level))
-    light = found / np.where(scale > 0, scale, 1.0)
-    return _judged(profile, design, light.reshape(box_px, box_px), matched)
+    solved, _ = nnls(rows, np.append(observed / error, weight * level))
+    box = (solved / np.where(scale > 0, scale, 1.0)).reshape(BOX_PX, BOX_PX)
+    simulated, lit = design @ box.ravel(), observed > 0
+    used = int(np.count_nonzero(box > _USED_SHARE * box.sum()))
+    chi2 = noise_pct = None
+    if sigma is not None:
+        chi2 = float((((simulated - observed) / sigma) ** 2).sum())
+        noise_pct = float(100 * np.sqrt((sigma[matched] ** 2).sum()) / np.count_nonzero(matched) / level)
+    return FlareFit(
+        box=box,
+        simulated=simulated,
+        rms_pct=float(100 * np.sqrt(np.mean((simulated[lit] / observed[lit] - 1) ** 2))),
+        chi2_per_distance=None if chi2 is None else chi2 / observed.size,
+        reduced_chi2=None if chi2 is None else chi2 / max(1, observed.size - used + 1),
+        used_pixels=used,
+        matched=float(simulated[matched].mean() / level),
+        matched_noise_pct=noise_pct,
+    )
 
 
 def compare_on_flare(
@@ -273,7 +283,6 @@ def compare_on_flare(
     *,
     variance: Plane | None = None,
     distances_px: tuple[float, float] = FITTED_PX,
-    matched_px: tuple[float, float] = MATCHED_PX,
 ) -> FlareComparison:
     """Compare the total PSF with the light along one arm of a flare.
 
@@ -284,11 +293,11 @@ def compare_on_flare(
         difference, usable, centre_xy, arm_deg, variance=variance, distances_px=distances_px
     )
     alone = psf.components.get(DIFFRACTION) if SCATTER in psf.components else None
-    total = fit_flare(profile, psf.kernel, matched_px=matched_px)
+    total = fit_flare(profile, psf.kernel)
     return FlareComparison(
         profile=profile,
         total=total,
-        diffraction=None if alone is None else fit_flare(profile, alone, matched_px=matched_px),
+        diffraction=None if alone is None else fit_flare(profile, alone),
         explained=explained_share(difference, usable, profile, total, psf.kernel, variance=variance),
     )
 
@@ -327,47 +336,6 @@ def explained_share(
     noise = 0.0 if variance is None else float(variance[window][counted].sum())
     left_over = float(((simulated - observed)[counted] ** 2).sum()) - noise
     return 1 - left_over / max(float((observed[counted] ** 2).sum()) - noise, 1e-300)
-
-
-def _judged(profile: ArmProfile, design: Plane, box: Plane, matched: Flags) -> FlareFit:
-    """Make the result of the fit from the fitted box."""
-    simulated, observed = design @ box.ravel(), profile.observed
-    used = int(np.count_nonzero(box > _USED_SHARE * box.sum()))
-    chi2 = None if profile.sigma is None else float((((simulated - observed) / profile.sigma) ** 2).sum())
-    freedom = max(1, observed.size - used + 1)
-    lit = observed > 0
-    return FlareFit(
-        box=box,
-        simulated=simulated,
-        rms_pct=float(100 * np.sqrt(np.mean((simulated[lit] / observed[lit] - 1) ** 2))),
-        chi2_per_distance=None if chi2 is None else chi2 / observed.size,
-        reduced_chi2=None if chi2 is None else chi2 / freedom,
-        used_pixels=used,
-        matched=float(simulated[matched].mean() / observed[matched].mean()),
-        matched_noise_pct=_noise_of_mean_pct(profile, matched),
-    )
-
-
-def _noise_of_mean_pct(profile: ArmProfile, matched: Flags) -> float | None:
-    """Noise of the mean observed light at the matched distances, in percent of this mean."""
-    if profile.sigma is None:
-        return None
-    sigma = np.sqrt((profile.sigma[matched] ** 2).sum()) / np.count_nonzero(matched)
-    return float(100 * sigma / profile.observed[matched].mean())
-
-
-def _percent_error(observed: Vector, level: float) -> Vector:
-    """d_u, but at least a tenth of the mean at 60 to 70 px. Otherwise a value near 0 (by noise) would dominate the fit."""
-    return np.maximum(observed, 0.1 * level)
-
-
-def _design(profile: ArmProfile, kernel: Plane, box_px: int) -> Plane:
-    """Design matrix (distances, pixels of the box): each column is the profile of unit light in one pixel of the box."""
-    columns = [
-        profile.mean(_at(kernel, profile.rows - row, profile.columns - column))
-        for row, column, _ in _box(profile, np.zeros((box_px, box_px)))
-    ]
-    return np.stack(columns, axis=1)
 
 
 def _box(profile: ArmProfile, box: Plane) -> list[tuple[int, int, float]]:

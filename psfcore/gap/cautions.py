@@ -6,7 +6,7 @@ from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.measured_noise import MeasuredNoise
 from psfcore.gap.library.scene import MOST_POINTINGS
 from psfcore.gap.verdict.verdict import LEAST_IMAGES
-from psfcore.scatter.inversion import Solution
+from psfcore.scatter.reconstruction import Solution
 
 
 def cautions_of(solution: Solution, noise: MeasuredNoise | None, evidence: Evidence) -> tuple[str, ...]:

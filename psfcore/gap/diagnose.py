@@ -50,10 +50,10 @@ from psfcore.gap.verdict.verdict import Judgement, verdict_of
 from psfcore.gap.verdict.where import Axis, where
 from psfcore.gap.view import View
 from psfcore.psf import Psf
-from psfcore.scatter.inversion import Inverter, Progress, Solution, solution_of
+from psfcore.scatter.inversion import Inverter, solution_of
+from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_named
-from psfcore.transit.blocks import Fold
-from psfcore.transit.transit import Transit
+from psfcore.transit.transit import Fold, Transit
 
 SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0
 

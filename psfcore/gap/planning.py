@@ -26,7 +26,8 @@ from psfcore.gap.verdict.calibration import shipped_calibration
 from psfcore.gap.verdict.limits import Limits, limits
 from psfcore.gap.view import View
 from psfcore.instruments.files import instrument_names
-from psfcore.scatter.inversion import Progress, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import Progress
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.simulate.from_files import LARGEST_DIFFRACTION_PX, diffraction_kernel
 from psfcore.simulate.plan import Plan

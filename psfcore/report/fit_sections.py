@@ -20,12 +20,11 @@ from psfcore.psf import REACH_GRID_PX, Psf
 from psfcore.report.plot import beyond_of, curves_png, offsets_png, profile_png, totals_png, weights_png
 from psfcore.report.report import CrossValidated, PsfReport
 from psfcore.scatter.fit import RADII_PX, TransitFit
-from psfcore.scatter.samples import SCATTER
-from psfcore.scatter.validation.bands import Excess, ShellBands
-from psfcore.scatter.validation.cross_validation import RUNS
+from psfcore.scatter.total_psf import SCATTER
+from psfcore.scatter.validation.cross_validation import RUNS, Excess, ShellBands
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 from psfcore.tables.make import TOTAL
-from psfcore.transit.blocks import folds
+from psfcore.transit.transit import folds
 
 
 def found_sections(report: PsfReport) -> list[Part]:

@@ -19,9 +19,8 @@ from psfcore.drawing.page import (
     with_error,
 )
 from psfcore.evaluation.evaluation import INVERSION_STEPS, NOISE_REALISATIONS, Evaluation
-from psfcore.evaluation.frame import CENTRE_PX, FrameEvaluation
+from psfcore.evaluation.frame import CENTRE_PX, FrameEvaluation, Superposed
 from psfcore.evaluation.report import TREND_PX, Summary, summaries, trends
-from psfcore.evaluation.superposed import Superposed
 from psfcore.psf import REACH_GRID_PX
 from psfcore.report.fit_sections import found_sections, light_sections, uncertainty_sections
 from psfcore.report.plot import (
@@ -31,7 +30,8 @@ from psfcore.report.plot import (
     slices_png,
 )
 from psfcore.report.report import PsfReport, inputs_of
-from psfcore.scatter.inversion import CONVERGED_POINTS, DARK_MARGIN_PX, DARK_MARGIN_SIGMAS, LEAST_DARK_PIXELS
+from psfcore.scatter.inversion import CONVERGED_POINTS
+from psfcore.scatter.reconstruction import DARK_MARGIN_PX, DARK_MARGIN_SIGMAS, LEAST_DARK_PIXELS
 
 
 def page_of(report: PsfReport, provenance: dict[str, Any]) -> Page:

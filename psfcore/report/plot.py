@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from psfcore.drawing.page import PLOT_DPI
 from psfcore.drawing.plots import write_png
 from psfcore.evaluation.evaluation import Evaluation
+from psfcore.evaluation.frame import Superposed
 from psfcore.evaluation.plot import (
     draw_absolute,
     draw_centres,
@@ -24,12 +25,11 @@ from psfcore.evaluation.plot import (
     shown_slices,
     tidy,
 )
-from psfcore.evaluation.superposed import Superposed
 from psfcore.psf import REACH_GRID_PX
 from psfcore.report.report import CrossValidated, PsfReport
 from psfcore.scatter.fit import RADII_PX, TransitFit
-from psfcore.scatter.samples import DIFFRACTION, SCATTER
-from psfcore.scatter.validation.bands import ShellBands
+from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
+from psfcore.scatter.validation.cross_validation import ShellBands
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 from psfcore.tables.make import TOTAL
 

@@ -25,21 +25,21 @@ from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import Evaluation, evaluate
 from psfcore.evaluation.plot import sentence as evaluation_sentence
 from psfcore.evaluation.report import report as evaluation_json
+from psfcore.evaluation.shapes import held_out_kernels
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
-from psfcore.scatter.inversion import Inverter, Progress, Solution
+from psfcore.scatter.inversion import Inverter
+from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.report import fit_json
-from psfcore.scatter.validation.bands import Bands, bands
 from psfcore.scatter.validation.cross_validation import (
+    Bands,
     FoldFit,
-    FoldSample,
+    bands,
     bootstrap_samples,
     shared_fits,
-    shared_step,
 )
 from psfcore.scatter.validation.dark_offsets import OFFSETS_DN, DarkOffsetStudy, dark_offset_study
 from psfcore.tables.make import tables_of
-from psfcore.transit.blocks import folds
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
 
@@ -261,23 +261,11 @@ def _held_out_kernels(solution: Solution, missing: list[Missing]) -> Callable[[i
 
     If the images do not suffice, the result is None, and the reason is appended to `missing`.
     """
-    images = len(solution.transit.frames)
-    parts = folds(images)
-    kernels = []
     try:
-        if not parts:
-            raise DataError(
-                "too-few-images", f"expected at least 6 images for held-out folds; got {images}: add images"
-            )
-        for k, fold in enumerate(parts):
-            once = tuple(int(n in set(fold.fitted)) for n in range(images))
-            step = shared_step(solution, FoldSample(0, k, once, fold.held_out))
-            kernels.append(solution.total.kernel(solution.inversion.coordinates + step))
+        return held_out_kernels(solution)
     except DataError as error:
         missing.append(Missing("a test on held-out images", error.message))
         return None
-    which = {n: k for k, fold in enumerate(parts) for n in fold.held_out}
-    return lambda index: kernels[which[index]]
 
 
 def _offsets(

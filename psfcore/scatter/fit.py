@@ -21,6 +21,7 @@ report says so. Such an excess shows that the model lacks an effect, and averagi
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -34,21 +35,15 @@ from psfcore.psf import (
     Psf,
     crop_or_pad,
     cumulative_curve,
-    encircled_energy,
 )
-from psfcore.scatter.as_published.equations import Equations, SubsetFits, free_fit
-from psfcore.scatter.as_published.published import (
-    AS_PUBLISHED,
-    CORRECTED_ALONE,
-    Published,
-    invert_as_published,
-)
-from psfcore.scatter.as_published.ring_sums import segment_sums
-from psfcore.scatter.as_published.segments import Segments, shells_as_published
-from psfcore.scatter.inversion import Inversion, Inverter, Progress, Solution, solution_of
+from psfcore.scatter.inversion import Inverter, solution_of
 from psfcore.scatter.optics import Blur, pick
+from psfcore.scatter.published import AS_PUBLISHED, CORRECTED_ALONE, Published, invert_as_published
+from psfcore.scatter.published_equations import Equations, free_fit
+from psfcore.scatter.reconstruction import Inversion, Progress, Solution
+from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Vector, shape_named
-from psfcore.scatter.total_psf import CURVE_RADII_PX
+from psfcore.scatter.total_psf import CURVE_RADII_PX, curve_sigma
 from psfcore.scatter.validation.shape_comparison import ComparedShape, compare_shapes
 from psfcore.transit.first_guess import FirstGuess, first_guess
 from psfcore.transit.occulter import disc_distance
@@ -79,25 +74,25 @@ class Curve:
 class ShellWeightFits:
     """Scatter fitted shell by shell, without a formula, to subsets of equations.
 
-    segments: the shells. fits: the fits to the subsets; their weights have shape (subsets kept, shells). A shell that no
+    segments: the shells. weights: the weights per pixel from each subset, (subsets kept, shells). A shell that no
     pixel constrains stays at the fitted shape, so the spread of its weights contains no information.
     `psfcore.scatter.validation.free_shells` has another free fit: it fits deviations from the fitted shape to all
     dark pixels, as one linear least-squares problem.
     """
 
     segments: Segments
-    fits: SubsetFits
+    weights: NDArray[np.float64]
 
     def weights_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
         """The weight per pixel of each shell: percentiles of the fits to the subsets, (percentiles, shells)."""
-        return np.asarray(np.percentile(self.fits.fits, percentiles, axis=0))
+        return np.asarray(np.percentile(self.weights, percentiles, axis=0))
 
     def beyond_pct(self, percentiles: tuple[float, ...]) -> NDArray[np.float64]:
         """The percentage of the light that is scattered beyond the inner edge of each shell.
 
         The result holds percentiles of the fits to the subsets, (percentiles, shells).
         """
-        light = self.fits.fits * self.segments.counts
+        light = self.weights * self.segments.counts
         beyond = 100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1]
         return np.asarray(np.percentile(beyond, percentiles, axis=0))
 
@@ -159,26 +154,26 @@ def fit_transit(
     solution: an existing solution of this transit and shape, or a function that makes it; None: `invert` makes it.
     Raises DataError "unknown-shape", and the errors of `solution_of` and `invert`.
     """
-    wanted = shape_named(shape)
+    form = shape_named(shape)
+    power_law = form is SOFTENED_POWER_LAW
     guess = first_guess(transit)
     progress = _FitProgress(
         progress,
         len(transit.frames),
-        compared=wanted is SOFTENED_POWER_LAW,
+        compared=power_law,
         published=1 + len(CORRECTED_ALONE) if as_published else 0,
     )
-    solution = solution_of(transit, wanted, solution, threads=threads, progress=progress)
+    solution = solution_of(transit, form, solution, threads=threads, progress=progress)
     factor = overdispersion(solution.inversion)
     kernel, scatter, curve, diffuse = _on_full_reach(solution, factor, threads)
-    free = _free_shells(solution, seed, progress) if wanted.isotropic else None
-    shapes = compare_shapes(solution, progress=progress) if wanted is SOFTENED_POWER_LAW else ()
+    free = _free_shells(solution, seed, progress) if form.isotropic else None
+    shapes = compare_shapes(solution, progress=progress) if power_law else ()
+    options: dict[str, Any] = {"seed": seed, "threads": threads, "progress": progress}
     published, alone = None, {}
     if as_published:
-        published = invert_as_published(transit, AS_PUBLISHED, seed=seed, threads=threads, progress=progress)
+        published = invert_as_published(transit, AS_PUBLISHED, **options)
         alone = {
-            name: invert_as_published(
-                transit, choices, seed=seed, subsets=ALONE_SUBSETS, threads=threads, progress=progress
-            )
+            name: invert_as_published(transit, choices, subsets=ALONE_SUBSETS, **options)
             for name, choices in CORRECTED_ALONE.items()
         }
     return TransitFit(
@@ -249,16 +244,13 @@ def _on_full_reach(solution: Solution, factor: float, threads: int) -> tuple[Ker
     kernel = np.maximum(diffract.apply(scatter), 0.0)
     # Single precision is sufficient for the derivatives and takes half the time.
     diffract = Convolver(solution.transit.diffraction, grid, dtype=np.float32, threads=threads)
-    total_slopes, diffuse_slopes = [], []
-    for k in range(at.size):
-        slope = shape.slope(at, k, REACH_GRID_PX)
-        diffuse_slopes.append(-100 * encircled_energy(slope, radii))
-        total_slopes.append(-100 * encircled_energy(np.asarray(diffract.apply(slope), np.float64), radii))
+    diffuse_slopes = [shape.slope(at, k, REACH_GRID_PX) for k in range(at.size)]
+    total_slopes = (np.asarray(diffract.apply(slope), np.float64) for slope in diffuse_slopes)
 
-    def curve(of: Kernel, slopes: list[Vector]) -> Curve:
-        s = np.stack(slopes, axis=1)
-        variance = np.einsum("rk,kl,rl->r", s, inversion.covariance * factor, s)
-        return Curve(radii, cumulative_curve(of, radii), np.sqrt(np.maximum(variance, 0.0)))
+    def curve(of: Kernel, slopes: Iterable[Kernel]) -> Curve:
+        return Curve(
+            radii, cumulative_curve(of, radii), curve_sigma(slopes, inversion.covariance * factor, radii)
+        )
 
     return kernel, scatter, curve(kernel, total_slopes), curve(scatter, diffuse_slopes)
 
@@ -268,7 +260,7 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeig
 
     Shells that no pixel constrains stay at the fitted shape.
     """
-    segments = Segments(tuple(shells_as_published()))
+    segments = Segments(shells_as_published())
     diffract = Blur(solution.transit.diffraction, solution.transit.shape, threads=solution.threads)
     parts = []
     for step, n in enumerate(solution.part):
@@ -292,7 +284,8 @@ def _free_shells(solution: Solution, seed: int, progress: Progress) -> ShellWeig
     shape, at = solution.inversion.shape, solution.inversion.coordinates
     towards = segments.mean_of_map(shape.kernel(at, REACH_GRID_PX))
     counts = segments.counts.astype(np.float64)
-    return ShellWeightFits(segments, free_fit(Equations.joined(parts), counts, seed=seed, towards=towards))
+    fits = free_fit(Equations.joined(parts), counts, seed=seed, towards=towards)
+    return ShellWeightFits(segments, fits.fits)
 
 
 def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
@@ -303,12 +296,12 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
     pointings = {frame.pointing for frame in inversion.frames}
     if inversion.left_out:
         out.append(
-            f"the fit did not use {len(inversion.left_out)} image{'s' if len(inversion.left_out) > 1 else ''}: "
+            f"the fit did not use {_counted(len(inversion.left_out), 'image')}: "
             + "; ".join(f"{file} ({why})" for file, why in sorted(inversion.left_out.items())[:5])
         )
     if len(pointings) < 3:
         out.append(
-            f"with {len(pointings)} pointing{'s' if len(pointings) > 1 else ''}, the data hardly distinguish scatter "
+            f"with {_counted(len(pointings), 'pointing')}, the data hardly distinguish scatter "
             "over short distances from scatter over long distances; the errors assume the fitted shape"
         )
     open_at = [r for r, s in zip(curve.radii_px, curve.sigma, strict=True) if s > OPEN_POINTS]
@@ -334,11 +327,12 @@ def _limits(solution: Solution, curve: Curve, factor: float) -> tuple[str, ...]:
         )
     unsettled = [f.file for f in inversion.frames if not f.found.settled]
     if unsettled:
-        out.append(
-            f"the position of the occulter did not converge in {len(unsettled)} "
-            f"image{'s' if len(unsettled) > 1 else ''}"
-        )
+        out.append(f"the position of the occulter did not converge in {_counted(len(unsettled), 'image')}")
     return tuple(out)
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' if count > 1 else ''}"
 
 
 def fitted_psf(fit: TransitFit, *, name: str, version: str, provenance: dict[str, Any]) -> Psf:

@@ -42,9 +42,10 @@ from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.instruments.files import WAVELENGTH_TOLERANCE
 from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
-from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, crop_centred, encircled_energy
-from psfcore.scatter.samples import DIFFRACTION, SCATTER
-from psfcore.scatter.shapes import Shape, shape_named
+from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, crop_centred
+from psfcore.scatter import total_psf
+from psfcore.scatter.shapes import shape_named
+from psfcore.scatter.total_psf import DIFFRACTION, SCATTER, fit_of
 
 Kernel = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -136,17 +137,24 @@ def interpolated_psf(
     ghost; and the errors of `weight_at`.
     """
     weight = weight_at(before.time, after.time, time)
-    first, second = _fit_of(before.psf), _fit_of(after.psf)
+    first, second = fit_of(before.psf), fit_of(after.psf)
     _check_same_telescope(before.psf, after.psf)
     fitted = interpolated_shape(first, second, weight)
     diffraction = before.psf.components[DIFFRACTION]
     _check_same_diffraction(before.psf, after.psf)
     shape, size = shape_named(fitted.shape), before.psf.kernel.shape[0]
-    model = _Model(shape, diffraction, size, threads)
+    # Kernels are computed on the full reach and then cropped: light from outside the square is diffracted into it.
+    grid = max(size, REACH_GRID_PX)
+    convolver = Convolver(diffraction, (grid, grid), dtype=np.float64, threads=threads)
+
+    def total(fit: FittedShape) -> Kernel:
+        whole = convolver.apply(shape.kernel(np.array(fit.coordinates), grid))
+        return crop_centred(np.maximum(np.asarray(whole, np.float64), 0.0), (size, size))
+
     for psf, fit in ((before.psf, first), (after.psf, second)):
-        _check_of_its_shape(psf, model.total(fit))
+        _check_of_its_shape(psf, total(fit))
     return Psf(
-        kernel=model.total(fitted),
+        kernel=total(fitted),
         name=name,
         version=version,
         instrument=before.psf.instrument,
@@ -160,7 +168,16 @@ def interpolated_psf(
         provenance={
             **provenance,
             "interpolated_at": time.isoformat(),
-            "interpolated_between": [_said(before, 1 - weight), _said(after, weight)],
+            "interpolated_between": [
+                {
+                    **epoch.origin,
+                    "name": epoch.psf.name,
+                    "version": epoch.psf.version,
+                    "time": epoch.time.isoformat(),
+                    "weight": share,
+                }
+                for epoch, share in ((before, 1 - weight), (after, weight))
+            ],
         },
         fitted=fitted,
         cards=before.psf.cards,
@@ -169,16 +186,8 @@ def interpolated_psf(
 
 def parameters_of(fitted: FittedShape) -> dict[str, dict[str, Any]]:
     """The parameters of a fitted shape by name: value, standard error (sigma), unit and meaning."""
-    shape, sigma = shape_named(fitted.shape), np.sqrt(np.diag(np.array(fitted.covariance)))
-    return {
-        p.name: {
-            "value": p.value(coordinate),
-            "sigma": abs(p.slope(coordinate)) * float(error),
-            "unit": p.unit,
-            "meaning": p.meaning,
-        }
-        for p, coordinate, error in zip(shape.parameters, fitted.coordinates, sigma, strict=True)
-    }
+    shape, at = shape_named(fitted.shape), np.array(fitted.coordinates)
+    return shape.described(shape.values(at), shape.value_sigma(at, np.array(fitted.covariance)))
 
 
 def curve_sigma(psf: Psf, radii_px: Vector, *, threads: int = 1) -> Vector:
@@ -187,61 +196,35 @@ def curve_sigma(psf: Psf, radii_px: Vector, *, threads: int = 1) -> Vector:
     The covariance of the fitted coordinates is propagated through the derivatives of C(R). Raises DataError
     "psf-not-fitted".
     """
-    fitted, size = _fit_of(psf), psf.kernel.shape[0]
+    fitted, size = fit_of(psf), psf.kernel.shape[0]
     shape, at = shape_named(fitted.shape), np.array(fitted.coordinates)
     # Single precision is sufficient for the derivatives and takes half the time.
     convolver = Convolver(psf.components[DIFFRACTION], (size, size), dtype=np.float32, threads=threads)
-    slopes = [np.asarray(convolver.apply(shape.slope(at, k, size)), np.float64) for k in range(at.size)]
-    of_curve = np.stack([-100 * encircled_energy(slope, radii_px) for slope in slopes], axis=1)
-    variance = np.einsum("rk,kl,rl->r", of_curve, np.array(fitted.covariance), of_curve)
-    return np.sqrt(np.maximum(variance, 0.0))
-
-
-class _Model:
-    """Total PSFs of one shape and one diffraction PSF, on a square of ``size`` px.
-
-    They are computed on the full reach and then cropped: light from outside the square is diffracted into it.
-    """
-
-    def __init__(self, shape: Shape, diffraction: Kernel, size: int, threads: int) -> None:
-        self._shape, self._size = shape, size
-        self._grid = max(size, REACH_GRID_PX)
-        self._convolver = Convolver(diffraction, (self._grid, self._grid), dtype=np.float64, threads=threads)
-
-    def total(self, fitted: FittedShape) -> Kernel:
-        """The total PSF [y, x] at the coordinates of a fit."""
-        scatter = self._shape.kernel(np.array(fitted.coordinates), self._grid)
-        whole = np.maximum(np.asarray(self._convolver.apply(scatter), np.float64), 0.0)
-        return crop_centred(whole, (self._size, self._size))
-
-
-def _fit_of(psf: Psf) -> FittedShape:
-    if psf.fitted is None or DIFFRACTION not in psf.components:
-        raise DataError(
-            "psf-not-fitted",
-            f"expected a PSF with a fitted shape and its diffraction PSF, from a fit to a transit; got {psf.name} "
-            f"{psf.version} without them: fit a PSF with `heliopsf psf fit`",
-        )
-    return psf.fitted
+    slopes = (np.asarray(convolver.apply(shape.slope(at, k, size)), np.float64) for k in range(at.size))
+    return total_psf.curve_sigma(slopes, np.array(fitted.covariance), radii_px)
 
 
 def _check_same_telescope(before: Psf, after: Psf) -> None:
     """Raise DataError "psfs-differ" if the two PSFs are not of the same instrument, channel, filter and array."""
     pairs = {
-        "instrument": (before.instrument, after.instrument),
-        "cards": (dict(before.cards), dict(after.cards)),
-        "array": (before.kernel.shape, after.kernel.shape),
-        "wavelength (angstrom)": (before.wavelength_angstrom, after.wavelength_angstrom),
-        "plate scale (arcsec/px)": (before.plate_scale_arcsec, after.plate_scale_arcsec),
-    }
-    tolerances = {
-        "wavelength (angstrom)": WAVELENGTH_TOLERANCE,
-        "plate scale (arcsec/px)": PLATE_SCALE_TOLERANCE,
+        "instrument": (before.instrument, after.instrument, None),
+        "cards": (dict(before.cards), dict(after.cards), None),
+        "array": (before.kernel.shape, after.kernel.shape, None),
+        "wavelength (angstrom)": (
+            before.wavelength_angstrom,
+            after.wavelength_angstrom,
+            WAVELENGTH_TOLERANCE,
+        ),
+        "plate scale (arcsec/px)": (
+            before.plate_scale_arcsec,
+            after.plate_scale_arcsec,
+            PLATE_SCALE_TOLERANCE,
+        ),
     }
     differ = [
         f"{name} {one} and {other}"
-        for name, (one, other) in pairs.items()
-        if not _same(one, other, tolerances.get(name))
+        for name, (one, other, tolerance) in pairs.items()
+        if not _same(one, other, tolerance)
     ]
     if differ or before.kernel.shape[0] != before.kernel.shape[1]:
         raise DataError(
@@ -278,14 +261,3 @@ def _check_of_its_shape(psf: Psf, model: Kernel) -> None:
             f"differs from that by {100 * moved:.3g} % of the light, for example because it contains a corrected effect: "
             "name a PSF for the image instead (--psf)",
         )
-
-
-def _said(epoch: Epoch, weight: float) -> dict[str, Any]:
-    """The entry of one of the two PSFs in the provenance of an interpolated PSF."""
-    return {
-        **epoch.origin,
-        "name": epoch.psf.name,
-        "version": epoch.psf.version,
-        "time": epoch.time.isoformat(),
-        "weight": weight,
-    }

@@ -1,4 +1,4 @@
-"""Convolution with a PSF on one field, the inverse of this convolution, and the derivative of the inverse.
+"""Convolution with a PSF on one field, its inverse and the derivative of the inverse; noise that passes through both.
 
     inverse:     x <- x + G (y - H x)                       Eq. (1)
     derivative:  d x / d q = -G (dH / dq) x                 Eq. (2)
@@ -8,15 +8,28 @@ Eq. (1) converges in about five steps. Eq. (1) is linear and does not bias faint
 steps, fields stay in the memory order of the convolution engine (its "lanes"). Functions below read and write single
 pixels in this order.
 
+A frame y = H x + n has fully dark pixels D. The scene is estimated as G y, and its fully dark pixels are set to 0. The
+residual in the disc is then r = D [y - H (1 - D) G y]. The sum of the residual weighted by a template t is
+
+    t . r = b . n + (t . r without noise),   b = t - G^T (1 - D) H^T t                Eq. (3)
+    cov(t_1 . r, t_2 . r) = sum over all pixels of b_1 b_2 var(n)                     Eq. (4)
+
+The first term of b describes the noise of the disc's pixels. The second term describes the noise of the estimated scene,
+which the model scatters into the disc.
+
 | symbol | name |
 |---|---|
 | H, H^T | Blur.convolve, Blur.correlate |
 | G, G^T | Optics.invert_once |
 | x, y | scene and observation, both as lanes |
 | q | a parameter of the PSF |
+| t | template: a weight for each dark pixel |
+| n | photon and read noise, DN/s |
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +37,8 @@ from numpy.typing import NDArray
 from psfcore.convolution.engine import BLOCK_ROWS, Engine
 from psfcore.convolution.fft_kernels import LANES
 from psfcore.deconvolve.methods.linear import inverse_filter
+from psfcore.noise import Noise
+from psfcore.transit.transit import Frame
 
 Lanes = NDArray[np.float32]
 Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]  # (rows, columns) of single pixels
@@ -107,3 +122,22 @@ def put(lanes: Lanes, pixels: Pixels, values: NDArray[np.floating] | float) -> N
 def _index(pixels: Pixels) -> tuple[NDArray[np.intp], ...]:
     rows, columns = pixels
     return rows // BLOCK_ROWS, columns, rows % BLOCK_ROWS // LANES, rows % LANES
+
+
+def noise_covariance(
+    optics: Optics, frame: Frame, dark: Pixels, templates: Sequence[NDArray[np.float64]], noise: Noise
+) -> NDArray[np.float64]:
+    """Eq. (4): covariance (templates, templates) of the weighted sums over the dark pixels, in (DN/s)^2."""
+    spread = []
+    for template in templates:
+        here = np.zeros(optics.engine.lanes_shape, np.float32)
+        put(here, dark, template)
+        scattered = optics.correlate(here)
+        put(scattered, dark, 0.0)
+        here -= optics.invert_once(scattered, adjoint=True)  # Eq. (3)
+        spread.append(optics.field(here).ravel())
+    b = np.array(spread, dtype=np.float32)
+    # The variance is a linear function of the expected pixel value. The observed value can replace the expected value
+    # here, because the noise of the observed values averages out in the sum over the pixels.
+    variance = noise.variance(frame.pixels.astype(np.float64), frame.exposure_s).ravel()
+    return np.asarray((b * variance.astype(np.float32)) @ b.T, dtype=np.float64)  # Eq. (4)

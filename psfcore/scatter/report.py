@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from psfcore.scatter.as_published.published import Published
+from psfcore.json_values import json_attributes
 from psfcore.scatter.fit import Curve, ShellWeightFits, TransitFit
+from psfcore.scatter.published import Published
 from psfcore.scatter.shapes import stretch_of
-from psfcore.scatter.validation.bands import ONE_SIGMA, TWO_SIGMA
+from psfcore.scatter.validation.cross_validation import ONE_SIGMA, TWO_SIGMA
 
 SCHEMA = "psf-fit/1"
 
@@ -20,10 +21,7 @@ def fit_json(fit: TransitFit) -> dict[str, Any]:
         "schema": SCHEMA,
         "sentence": fit_sentence(fit),
         "shape": inversion.shape.name,
-        "parameters": {
-            p.name: {"value": values[p.name], "sigma": sigma[p.name], "unit": p.unit, "meaning": p.meaning}
-            for p in inversion.shape.parameters
-        },
+        "parameters": inversion.shape.described(values, sigma),
         "coordinates": {
             "scales": [p.scale for p in inversion.shape.parameters],
             "values": inversion.coordinates.tolist(),
@@ -36,11 +34,8 @@ def fit_json(fit: TransitFit) -> dict[str, Any]:
         "converged": inversion.converged,
         "rounds": [
             {
-                "frames": r.frames,
                 "parameters": r.values,
-                "curve_pct": list(r.curve_pct),
-                "moved_points": r.moved_points,
-                "chi2_per_pixel": r.chi2_per_pixel,
+                **json_attributes(r, "frames", "curve_pct", "moved_points", "chi2_per_pixel"),
             }
             for r in inversion.rounds
         ],
@@ -124,16 +119,12 @@ def _published_json(fit: TransitFit) -> dict[str, Any]:
 
     def one(p: Published) -> dict[str, Any]:
         return {
-            "a": p.a,
-            "b_px": p.b_px,
-            "c": p.c,
-            "total": p.total,
+            **json_attributes(p, "a", "b_px", "c", "total", "radii_px"),
             "counted_on_grid_px": p.grid_px,
             "lines": p.equations,
-            "radii_px": p.radii_px.tolist(),
             "light_beyond_pct": p.curve_pct.tolist(),
             "minus_default_points": [c - here[r] for r, c in zip(p.radii_px, p.curve_pct, strict=True)],
-            "rounds": [{"fit": r.fit, "curve_pct": list(r.curve_pct)} for r in p.rounds],
+            "rounds": [{"fit": fit, "curve_pct": curve.tolist()} for fit, curve in p.rounds],
         }
 
     return {

@@ -100,10 +100,6 @@ class Shape:
     radial: Callable[[Values], Radial] | None = None
     falloff: Falloff | None = None
 
-    def __post_init__(self) -> None:
-        if (self.radial is None) == (self.falloff is None):
-            raise ValueError(f"{self.name}: expected either `radial` or `falloff`; got both or neither")
-
     @property
     def isotropic(self) -> bool:
         """Whether the scatter is the same in all directions."""
@@ -123,6 +119,20 @@ class Shape:
         """Parameter values by name at these coordinates."""
         return {p.name: p.value(float(q)) for p, q in zip(self.parameters, coordinates, strict=True)}
 
+    def value_sigma(self, coordinates: Vector, covariance: NDArray[np.float64]) -> dict[str, float]:
+        """Standard errors of the parameters by name. covariance: that of the coordinates."""
+        return {
+            p.name: abs(p.slope(float(q))) * float(sigma)
+            for p, q, sigma in zip(self.parameters, coordinates, np.sqrt(np.diag(covariance)), strict=True)
+        }
+
+    def described(self, values: Values, sigma: Values) -> dict[str, dict[str, float | str]]:
+        """The parameters by name: value, standard error (sigma), unit and meaning."""
+        return {
+            p.name: {"value": values[p.name], "sigma": sigma[p.name], "unit": p.unit, "meaning": p.meaning}
+            for p in self.parameters
+        }
+
     def coordinates(self, values: Values) -> Vector:
         """Coordinates of these values. A parameter that is not in `values` gets the value at which a fit starts."""
         return np.array([p.coordinate(values.get(p.name, p.start)) for p in self.parameters])
@@ -140,7 +150,11 @@ class Shape:
         """The scatter kernel [y, x] of Eq. (1) on (size, size), centre at [size // 2, size // 2]."""
         values = self.values(coordinates)
         if self.radial is not None:
-            return _scaled_by_radius(self.radial(values), values["total"], size)
+            falloff_at, (r, count) = self.radial(values), _radii(REACH_GRID_PX)
+            whole = float((falloff_at(r) * count)[1:].sum())
+            by_radius = falloff_at(_radii(size)[0]) * (values["total"] / whole)
+            by_radius[0] = 1 - values["total"]
+            return np.asarray(by_radius[_radius_index(size)])
         assert self.falloff is not None
         reach = max(size, REACH_GRID_PX)
         falloff = self.falloff(values, reach)
@@ -161,12 +175,11 @@ class Shape:
         return np.asarray((ahead - behind) / (2 * DIFFERENCE))
 
 
-B = Parameter("b_px", "px", 6.0, "log", 0.5, "radius within which the power law flattens")
-C = Parameter("c", "", 2.5, "linear", 0.3, "exponent of the power law")
-TOTAL = Parameter(
-    "total", "", 0.4, "logit", 0.4, "fraction of the light that is scattered, on the full reach"
+_POWER_LAW = (
+    Parameter("b_px", "px", 6.0, "log", 0.5, "radius within which the power law flattens"),
+    Parameter("c", "", 2.5, "linear", 0.3, "exponent of the power law"),
+    Parameter("total", "", 0.4, "logit", 0.4, "fraction of the light that is scattered, on the full reach"),
 )
-_POWER_LAW = (B, C, TOTAL)
 
 
 def _softened(values: Values) -> Radial:
@@ -184,110 +197,56 @@ def _one_sided(values: Values, size: int) -> Kernel:
     r = np.hypot(d[:, None], d[None, :])
     r[size // 2, size // 2] = 1.0
     lean = 1 + (values["x_share"] * d[None, :] + values["y_share"] * d[:, None]) / r  # Eq. (4)
-    return np.asarray(_by_radius(size, _softened(values)) * np.maximum(lean, 0.0))
+    isotropic = _softened(values)(_radii(size)[0])[_radius_index(size)]
+    return np.asarray(isotropic * np.maximum(lean, 0.0))
 
 
 def _knee(values: Values) -> Radial:
-    def falloff(r: Vector) -> Vector:
-        bent = (1 + (r / KNEE_PX) ** 2) ** (-values["bend"] / 2)
-        return np.asarray((values["b_px"] + r) ** -values["c"] * bent)  # Eq. (5)
+    first = _softened(values)
+    return lambda r: np.asarray(first(r) * (1 + (r / KNEE_PX) ** 2) ** (-values["bend"] / 2))  # Eq. (5)
 
-    return falloff
+
+def _mixed(values: Values, share: float, second: Radial) -> Radial:
+    """Eq. (2) and a second term, which contains the fraction `share` of `total`."""
+    first, (r, count) = _softened(values), _radii(REACH_GRID_PX)
+    ratio = float((first(r) * count)[1:].sum()) / float((second(r) * count)[1:].sum())
+    return lambda r: np.asarray((1 - share) * first(r) + share * ratio * second(r))
 
 
 def _two(values: Values) -> Radial:
-    r, count = _radii(REACH_GRID_PX)
-    first, second = ((b + r) ** -values["c"] for b in (values["b_px"], HALO_B_PX))
-    ratio = float((first * count)[1:].sum() / (second * count)[1:].sum())
-    share = values["halo_share"]
-
-    def falloff(r: Vector) -> Vector:
-        near, far = ((b + r) ** -values["c"] for b in (values["b_px"], HALO_B_PX))
-        return np.asarray((1 - share) * near + share * ratio * far)  # Eq. (6)
-
-    return falloff
+    return _mixed(values, values["halo_share"], lambda r: (HALO_B_PX + r) ** -values["c"])  # Eq. (6)
 
 
 def _core(values: Values) -> Radial:
-    r, count = _radii(REACH_GRID_PX)
-    wide = float(((values["b_px"] + r) ** -values["c"] * count)[1:].sum())
-    narrow = float((np.exp(-0.5 * (r / CORE_PX) ** 2) * count)[1:].sum())
-    share = values["core_share"]
-
-    def falloff(r: Vector) -> Vector:
-        power_law, gaussian = (values["b_px"] + r) ** -values["c"], np.exp(-0.5 * (r / CORE_PX) ** 2)
-        return np.asarray((1 - share) * power_law + share * (wide / narrow) * gaussian)  # Eq. (7)
-
-    return falloff
+    return _mixed(values, values["core_share"], lambda r: np.exp(-0.5 * (r / CORE_PX) ** 2))  # Eq. (7)
 
 
+def _more(name: str, largest_step: float, meaning: str) -> Parameter:
+    """A parameter beside those of the power law; if it is zero, the shape is the power law."""
+    return Parameter(name, "", 0.0, "linear", largest_step, meaning)
+
+
+_ALONG_X = _more("stretch_p", 0.1, "ln(1 + stretch) along x")
+_BY_COS = _more("stretch_p", 0.1, "ln(1 + stretch) times cos of twice its angle")
+_BY_SIN = _more("stretch_q", 0.1, "ln(1 + stretch) times sin of twice its angle")
+_TOWARDS_X = _more("x_share", 0.2, "excess towards +x, deficit towards -x")
+_TOWARDS_Y = _more("y_share", 0.2, "excess towards +y, deficit towards -y")
+_BEND = _more("bend", 0.3, f"steepening beyond {KNEE_PX:g} px")
+_HALO = _more(
+    "halo_share", 0.1, f"fraction of the scatter in a second power law, softened at {HALO_B_PX:g} px"
+)
+_CORE = _more("core_share", 0.1, f"fraction of the scatter in a Gaussian with a sigma of {CORE_PX:g} px")
 SOFTENED_POWER_LAW = Shape("softened-power-law", _POWER_LAW, _softened)
 SHAPES: dict[str, Shape] = {
     shape.name: shape
     for shape in (
         SOFTENED_POWER_LAW,
-        Shape(
-            "stretched-along-x",
-            (*_POWER_LAW, Parameter("stretch_p", "", 0.0, "linear", 0.1, "ln(1 + stretch) along x")),
-            falloff=_stretched,
-        ),
-        Shape(
-            "stretched",
-            (
-                *_POWER_LAW,
-                Parameter(
-                    "stretch_p", "", 0.0, "linear", 0.1, "ln(1 + stretch) times cos of twice its angle"
-                ),
-                Parameter(
-                    "stretch_q", "", 0.0, "linear", 0.1, "ln(1 + stretch) times sin of twice its angle"
-                ),
-            ),
-            falloff=_stretched,
-        ),
-        Shape(
-            "one-sided",
-            (
-                *_POWER_LAW,
-                Parameter("x_share", "", 0.0, "linear", 0.2, "excess towards +x, deficit towards -x"),
-                Parameter("y_share", "", 0.0, "linear", 0.2, "excess towards +y, deficit towards -y"),
-            ),
-            falloff=_one_sided,
-        ),
-        Shape(
-            "knee",
-            (*_POWER_LAW, Parameter("bend", "", 0.0, "linear", 0.3, f"steepening beyond {KNEE_PX:g} px")),
-            _knee,
-        ),
-        Shape(
-            "two-power-laws",
-            (
-                *_POWER_LAW,
-                Parameter(
-                    "halo_share",
-                    "",
-                    0.0,
-                    "linear",
-                    0.1,
-                    f"fraction of the scatter in a second power law, softened at {HALO_B_PX:g} px",
-                ),
-            ),
-            _two,
-        ),
-        Shape(
-            "core",
-            (
-                *_POWER_LAW,
-                Parameter(
-                    "core_share",
-                    "",
-                    0.0,
-                    "linear",
-                    0.1,
-                    f"fraction of the scatter in a Gaussian with a sigma of {CORE_PX:g} px",
-                ),
-            ),
-            _core,
-        ),
+        Shape("stretched-along-x", (*_POWER_LAW, _ALONG_X), falloff=_stretched),
+        Shape("stretched", (*_POWER_LAW, _BY_COS, _BY_SIN), falloff=_stretched),
+        Shape("one-sided", (*_POWER_LAW, _TOWARDS_X, _TOWARDS_Y), falloff=_one_sided),
+        Shape("knee", (*_POWER_LAW, _BEND), _knee),
+        Shape("two-power-laws", (*_POWER_LAW, _HALO), _two),
+        Shape("core", (*_POWER_LAW, _CORE), _core),
     )
 }
 
@@ -321,20 +280,6 @@ def _radius_index(size: int) -> NDArray[np.int32]:
     distinct = np.unique(squares)
     position[distinct] = np.arange(distinct.size)
     return np.asarray(position[squares])
-
-
-def _by_radius(size: int, falloff: Radial) -> Kernel:
-    """An isotropic falloff on a square. The function is evaluated once for each distinct radius."""
-    return np.asarray(falloff(_radii(size)[0])[_radius_index(size)])
-
-
-def _scaled_by_radius(falloff: Radial, total: float, size: int) -> Kernel:
-    """The kernel of Eq. (1) on a square, for an isotropic falloff. The falloff is summed over the full reach."""
-    r, count = _radii(REACH_GRID_PX)
-    whole = float((falloff(r) * count)[1:].sum())
-    scaled = falloff(_radii(size)[0]) * (total / whole)
-    scaled[0] = 1 - total
-    return np.asarray(scaled[_radius_index(size)])
 
 
 @compiled()

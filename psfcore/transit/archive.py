@@ -1,4 +1,4 @@
-"""A transit in one archive file (.zip, .tar or .tar.gz): list, unpack and pack it.
+"""A transit in one archive file (.zip, .tar or .tar.gz), or in a folder: list, unpack, pack and identify it.
 
 The first bytes of the file identify the kind of archive. The members must be plain files with plain names, at the top
 level or in one folder. ``members`` reads them, ``admission`` decides which of them are accepted. If an archive is
@@ -9,6 +9,7 @@ This module imports no numerical library, so that the web process can list an up
 
 from __future__ import annotations
 
+import hashlib
 import io
 import shutil
 import tarfile
@@ -16,7 +17,7 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, cast
 
 from psfcore.errors import DataError, together
 from psfcore.transit.admission import ArchiveLimits
@@ -40,6 +41,16 @@ class ArchiveContents:
     kind: Kind
     manifest: TransitManifest
     files: dict[str, int]
+
+
+@dataclass(frozen=True)
+class FolderTransit:
+    """A folder with a transit that is not packed. sha256, bytes: hash and size of the .tar file that ``pack`` would write."""
+
+    folder: Path
+    sha256: str
+    bytes: int
+    contents: ArchiveContents
 
 
 def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
@@ -89,9 +100,8 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
     """
     folder = Path(folder)
     written: list[tuple[str, Path]] = []  # folder of the archive, and path
-    staged = {
-        "": folder
-    }  # by folder of the archive; no file has the name of a folder below, because file names do not begin with a full stop
+    # By folder of the archive. No file has the name of a folder below, because file names do not begin with a full stop.
+    staged = {"": folder}
     with ExitStack() as undo:
         if not folder.exists():
             folder.mkdir(parents=True)
@@ -101,7 +111,7 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
                 if member.folder not in staged:
                     staged[member.folder] = folder / f".{len(staged)}"
                     staged[member.folder].mkdir()
-                    undo.callback(_remove_folder, staged[member.folder])
+                    undo.callback(shutil.rmtree, staged[member.folder], ignore_errors=True)
                 target = staged[member.folder] / member.name
                 with target.open("xb") as file:
                     undo.callback(target.unlink, missing_ok=True)
@@ -121,12 +131,6 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
     return tuple(target.name for target in kept)
 
 
-def _remove_folder(folder: Path) -> None:
-    """Remove a folder that is empty, if it is still there."""
-    if folder.is_dir():
-        folder.rmdir()
-
-
 def pack(folder: str | Path, path: str | Path) -> TransitManifest:
     """Write the transit in a folder as a .tar: transit.json and the files that it names.
 
@@ -136,7 +140,7 @@ def pack(folder: str | Path, path: str | Path) -> TransitManifest:
     """
     manifest, _ = checked_folder(Path(folder))
     with Path(path).open("wb") as file:
-        pack_into(Path(folder), manifest, file)
+        _pack_into(Path(folder), manifest, file)
     return manifest
 
 
@@ -177,8 +181,37 @@ def _check_files(manifest: TransitManifest, starts: Mapping[str, bytes], where: 
         raise together([*missing, *no_fits])
 
 
-def pack_into(folder: Path, manifest: TransitManifest, target: IO[bytes]) -> None:
-    """Write the same .tar as ``pack``, but into an open file. Only ``write`` and ``tell`` of this file are called."""
+def transit_in(folder: str | Path) -> FolderTransit:
+    """Check and identify the transit in a folder, like its archive; nothing is written.
+
+    Raises the DataErrors of ``checked_folder``.
+    """
+    folder = Path(folder).resolve()
+    manifest, sizes = checked_folder(folder)
+    digest = _Digest()
+    _pack_into(folder, manifest, cast(IO[bytes], digest))
+    contents = ArchiveContents("tar", manifest, sizes)
+    return FolderTransit(folder, digest.hash.hexdigest(), digest.bytes, contents)
+
+
+class _Digest:
+    """A file object for writing. It keeps only the SHA-256 and the number of the bytes that are written to it."""
+
+    def __init__(self) -> None:
+        self.hash = hashlib.sha256()
+        self.bytes = 0
+
+    def write(self, content: bytes) -> int:
+        self.hash.update(content)
+        self.bytes += len(content)
+        return len(content)
+
+    def tell(self) -> int:
+        return self.bytes
+
+
+def _pack_into(folder: Path, manifest: TransitManifest, target: IO[bytes]) -> None:
+    """Write the .tar of ``pack`` into an open file. Only ``write`` and ``tell`` of this file are called."""
     with tarfile.open(fileobj=target, mode="w", format=tarfile.PAX_FORMAT) as archive:
         for name in (MANIFEST_NAME, *manifest.files):
             with (folder / name).open("rb") as file:
@@ -192,10 +225,12 @@ __all__ = [
     "START_BYTES",
     "ArchiveContents",
     "ArchiveLimits",
+    "FolderTransit",
     "archive_kind",
     "checked_folder",
     "could_be_archive",
     "list_archive",
     "pack",
+    "transit_in",
     "unpack",
 ]

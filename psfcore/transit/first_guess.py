@@ -24,7 +24,7 @@ quadrants of the shell. The larger ratio is the inhomogeneity.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
+from psfcore.json_values import json_attributes
 from psfcore.transit.transit import Frame, Place, Transit
 
 CENTRE_PX = 2.0
@@ -40,7 +41,6 @@ SHELL_PX = 50.0
 EDGE_PX = 2.0
 ESTIMATORS = ("image_mean", "image_median", "shell")
 
-Progress = Callable[[int, int], None]
 Flat = NDArray[np.float64]
 
 
@@ -62,7 +62,10 @@ class FrameGuess:
     @property
     def ratio(self) -> dict[str, float]:
         """The fraction of light that comes from farther than the radius of the disc, by estimator."""
-        return {name: _ratio(self.centre_dn_s, level) for name, level in self.characteristic_dn_s.items()}
+        return {
+            name: self.centre_dn_s / level if level > 0 else math.nan  # Eq. (1)
+            for name, level in self.characteristic_dn_s.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -100,16 +103,11 @@ class FirstGuess:
         the number of a pointing."""
         return {
             "best_fov": self.best_pointing,
-            "share": _number(self.share),
-            "share_spread": _number(self.share_spread),
-            "radius_px": self.radius_px,
+            **json_attributes(self, "share", "share_spread", "radius_px"),
             "pointings": [
                 {
                     "fov": guess.pointing,
-                    "images": guess.images,
-                    "mean": _numbers(guess.mean),
-                    "scatter": _numbers(guess.scatter),
-                    "inhomogeneity": _number(guess.inhomogeneity),
+                    **json_attributes(guess, "images", "mean", "scatter", "inhomogeneity"),
                 }
                 for guess in self.pointings
             ],
@@ -117,31 +115,19 @@ class FirstGuess:
                 {
                     "file": frame.file,
                     "fov": frame.pointing,
-                    "time_s": frame.time_s,
-                    "centre_dn_s": _number(frame.centre_dn_s),
-                    "ratio": _numbers(frame.ratio),
-                    "inhomogeneity": _number(frame.inhomogeneity),
+                    **json_attributes(frame, "time_s", "centre_dn_s", "ratio", "inhomogeneity"),
                 }
                 for frame in self.frames
             ],
         }
 
 
-def first_guess(
-    transit: Transit, *, places: Sequence[Place] | None = None, progress: Progress | None = None
-) -> FirstGuess:
-    """The first guess of a transit.
+def first_guess(transit: Transit) -> FirstGuess:
+    """The first guess of a transit, with the positions of the occulter from the ephemeris.
 
-    places: exact positions of the occulter, one per frame; default: the positions from the ephemeris. progress(done, of)
-    is called after each image. Raises DataError "no-first-guess" if no image shows the centre of the occulter in front of
-    the Sun.
+    Raises DataError "no-first-guess" if no image shows the centre of the occulter in front of the Sun.
     """
-    places = [frame.place for frame in transit.frames] if places is None else places
-    guesses = []
-    for done, (frame, place) in enumerate(zip(transit.frames, places, strict=True), start=1):
-        guesses.append(_frame_guess(frame, place))
-        if progress is not None:
-            progress(done, len(transit.frames))
+    guesses = [_frame_guess(frame) for frame in transit.frames]
     pointings = tuple(
         _pointing_guess(pointing, guesses) for pointing in sorted({guess.pointing for guess in guesses})
     )
@@ -154,7 +140,7 @@ def first_guess(
         raise DataError("no-first-guess", message)
     best = min(telling, key=lambda guess: guess.inhomogeneity)
     ratios = _finite([r for g in guesses if g.pointing == best.pointing for r in g.ratio.values()])
-    radii = [place.radius_px for g, place in zip(guesses, places, strict=True) if g.pointing == best.pointing]
+    radii = [frame.place.radius_px for frame in transit.frames if frame.pointing == best.pointing]
     return FirstGuess(
         frames=tuple(guesses),
         pointings=pointings,
@@ -165,7 +151,8 @@ def first_guess(
     )
 
 
-def _frame_guess(frame: Frame, place: Place) -> FrameGuess:
+def _frame_guess(frame: Frame) -> FrameGuess:
+    place = frame.place
     pixels, dx, dy = _surroundings(frame, place)
     r = np.hypot(dx, dy)
     centre = pixels[r <= CENTRE_PX]
@@ -219,10 +206,6 @@ def _pointing_guess(pointing: int, guesses: Sequence[FrameGuess]) -> PointingGue
     )
 
 
-def _ratio(centre_dn_s: float, level_dn_s: float) -> float:
-    return centre_dn_s / level_dn_s if level_dn_s > 0 else math.nan  # Eq. (1)
-
-
 def _range_over_mean(values: list[float]) -> float:
     """The range (largest minus smallest) of the finite values divided by their mean; infinite if the mean is not above 0."""
     known = _finite(values)
@@ -238,11 +221,3 @@ def _mean(values: Flat) -> float:
 def _finite(values: Sequence[float]) -> Flat:
     array = np.asarray(values, dtype=np.float64)
     return np.asarray(array[np.isfinite(array)])
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _numbers(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: _number(value) for name, value in values.items()}

@@ -7,10 +7,10 @@ Pixels are kept as float32: 126 images of 2048 px take 2.1 GiB.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -31,27 +31,14 @@ LARGEST_RADIUS_SHARE = 0.25  # largest radius of an occulter, as a fraction of t
 _NEGATIVE_TOLERANCE = 1e-6  # fraction of the peak: rounding can make weights negative by this amount
 
 Progress = Callable[[int, int], None]
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 KernelSource = Kernel | Callable[[str | None, tuple[int, int]], Kernel]
 
 
-def read_transit(
-    folder: str | Path,
-    limits: FitsLimits,
-    *,
-    progress: Progress | None = None,
-    diffraction: KernelSource | None = None,
-    noise: Noise | None = None,
-    saturation_dn: float | None = None,
-) -> Transit:
-    """Read the transit in a folder; arguments and errors as in ``read_prepared``, but no counts are returned."""
-    return read_prepared(
-        folder,
-        limits,
-        progress=progress,
-        diffraction=diffraction,
-        noise=noise,
-        saturation_dn=saturation_dn,
-    )[0]
+def read_transit(folder: str | Path, limits: FitsLimits, **options: Any) -> Transit:
+    """Read the transit in a folder; options and errors as in ``read_prepared``, but no counts are returned."""
+    return read_prepared(folder, limits, **options)[0]
 
 
 def read_prepared(
@@ -80,37 +67,48 @@ def read_prepared(
     manifest = read_manifest(folder)
     noise = noise or _noise(manifest)
     _check_present(folder, manifest)
-    headers = _summaries(folder, manifest, limits)
-    _check_frames(manifest.images, headers)
+
+    def summary(image: ImageEntry) -> HeaderSummary:
+        with _naming(image.file):
+            return read_summary(folder / image.file, limits)
+
+    headers = _each(summary, manifest.images)
+    _each(lambda n: _check_frame(n, manifest.images, headers), range(len(headers)))
     instrument = manifest.instrument or next((h.instrument for h in headers if h.instrument), None)
     known = _known_psf(folder, manifest, limits, diffraction, instrument, headers[0].shape)
-    looks = [
-        _Look(entry, time_s, header, saturation_dn)
-        for entry, time_s, header in zip(manifest.images, times_s(headers), headers, strict=True)
-    ]
-    looks.sort(key=lambda look: look.time_s)  # stable: equal times stay in the order of transit.json
-    exposures: list[Exposure] = []
-    scales: list[float | None] = []
-    faults: list[DataError] = []
-    for done, look in enumerate(looks, start=1):
+    starts_s = times_s(headers)
+    order = sorted(
+        range(len(headers)), key=lambda n: starts_s[n]
+    )  # stable: equal times stay in the order of transit.json
+
+    def exposure(done: int) -> tuple[Exposure, float | None]:
+        n = order[done]
+        entry = manifest.images[n]
         try:
-            exposure, scale = _read(folder, look, limits)
-        except DataError as fault:
-            faults.append(fault)
-        else:
-            exposures.append(exposure)
-            scales.append(scale)
-        if progress is not None:
-            progress(done, len(looks))
-    if faults:
-        raise together(faults)
-    frames, prepared = prepare(exposures)
+            with _naming(entry.file):
+                image = read_observation(folder / entry.file, limits, saturation_dn=saturation_dn)
+        finally:
+            if progress is not None:
+                progress(done + 1, len(order))
+        place, mode = Place(entry.x, entry.y, entry.r), headers[n].gain_mode
+        read = exposure_of(
+            image,
+            file=entry.file,
+            pointing=entry.pointing,
+            place=place,
+            time_s=starts_s[n],
+            gain_mode=mode,
+        )
+        return read, plate_scale_arcsec(image.header)
+
+    exposures = _each(exposure, range(len(order)))
+    frames, prepared = prepare([each for each, _ in exposures])
     transit = Transit(
         frames=frames,
         diffraction=known,
         noise=noise,
         instrument=instrument,
-        plate_scale_arcsec=next((scale for scale in scales if scale is not None), None),
+        plate_scale_arcsec=next((scale for _, scale in exposures if scale is not None), None),
         sha256={name: _sha256(folder / name) for name in (MANIFEST_NAME, *manifest.files)},
     )
     return transit, prepared
@@ -119,30 +117,18 @@ def read_prepared(
 # --- images -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Look:
-    """The facts about an image that are known before its pixels are read."""
-
-    entry: ImageEntry
-    time_s: float
-    header: HeaderSummary
-    saturation_dn: float | None
-
-
-def _read(folder: Path, look: _Look, limits: FitsLimits) -> tuple[Exposure, float | None]:
-    """One exposure, and its plate scale in arcsec/px."""
-    entry = look.entry
-    with _naming(entry.file):
-        image = read_observation(folder / entry.file, limits, saturation_dn=look.saturation_dn)
-    exposure = exposure_of(
-        image,
-        file=entry.file,
-        pointing=entry.pointing,
-        place=Place(entry.x, entry.y, entry.r),
-        time_s=look.time_s,
-        gain_mode=look.header.gain_mode,
-    )
-    return exposure, plate_scale_arcsec(image.header)
+def _each(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """The results of a function for all items. Raises one DataError that has the messages of all items."""
+    results: list[Result] = []
+    faults: list[DataError] = []
+    for item in items:
+        try:
+            results.append(function(item))
+        except DataError as fault:
+            faults.append(fault)
+    if faults:
+        raise together(faults)
+    return results
 
 
 @contextmanager
@@ -152,21 +138,6 @@ def _naming(file: str) -> Iterator[None]:
         yield
     except DataError as error:
         raise type(error)(error.code, f"{file}: {error.message}") from None
-
-
-def _summaries(folder: Path, manifest: TransitManifest, limits: FitsLimits) -> list[HeaderSummary]:
-    """The headers of all images. Raises one DataError that names all files whose header cannot be used."""
-    found: list[HeaderSummary] = []
-    faults: list[DataError] = []
-    for image in manifest.images:
-        try:
-            with _naming(image.file):
-                found.append(read_summary(folder / image.file, limits))
-        except DataError as fault:
-            faults.append(fault)
-    if faults:
-        raise together(faults)
-    return found
 
 
 def _check_present(folder: Path, manifest: TransitManifest) -> None:
@@ -179,24 +150,12 @@ def _check_present(folder: Path, manifest: TransitManifest) -> None:
         )
 
 
-def _check_frames(images: Sequence[ImageEntry], headers: Sequence[HeaderSummary]) -> None:
-    """Raise one DataError that names all images whose shape or occulter is wrong."""
-    faults: list[DataError] = []
-    for index, (image, header) in enumerate(zip(images, headers, strict=True)):
-        try:
-            _check_frame(f"images[{index}] ({image.file})", image, header, images[0].file, headers[0].shape)
-        except DataError as fault:
-            faults.append(fault)
-    if faults:
-        raise together(faults)
-
-
-def _check_frame(
-    label: str, image: ImageEntry, header: HeaderSummary, first_file: str, first: tuple[int, int]
-) -> None:
-    ny, nx = header.shape
-    if header.shape != first:
-        size = f"{first[1]} x {first[0]} px, the size of {first_file}"
+def _check_frame(n: int, images: Sequence[ImageEntry], headers: Sequence[HeaderSummary]) -> None:
+    """Raise DataError if the shape or the occulter of an image is wrong."""
+    image, (ny, nx), first = images[n], headers[n].shape, headers[0].shape
+    label = f"images[{n}] ({image.file})"
+    if (ny, nx) != first:
+        size = f"{first[1]} x {first[0]} px, the size of {images[0].file}"
         raise DataError(
             "transit-shapes", f"{label}: expected {size}; got {nx} x {ny} px: cut all images to one size"
         )
@@ -206,7 +165,7 @@ def _check_frame(
         raise DataError(
             "occulter-too-large", f"{label}: {message}; got {image.r:g} px: correct r in {MANIFEST_NAME}"
         )
-    check_reaches_in(Place(image.x, image.y, image.r), header.shape, label)
+    check_reaches_in(Place(image.x, image.y, image.r), (ny, nx), label)
 
 
 def times_s(headers: Sequence[HeaderSummary]) -> list[float]:

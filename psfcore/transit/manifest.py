@@ -173,16 +173,12 @@ def _check_once(manifest: TransitManifest) -> None:
             message = f"expected each file once; got the same file as images[{seen[image.file]}]"
             raise _bad(f"images[{index}] ({image.file}): {message}")
         if image.file in (MANIFEST_NAME, manifest.known_psf):
-            raise _bad(
-                f"images[{index}] ({image.file}): expected the file of an image; got the file of the {_role(manifest, image)}"
-            )
+            role = "known PSF" if image.file == manifest.known_psf else "manifest"
+            message = f"expected the file of an image; got the file of the {role}"
+            raise _bad(f"images[{index}] ({image.file}): {message}")
         seen[image.file] = index
     if manifest.known_psf == MANIFEST_NAME:
         raise _bad(f"known_psf: expected a FITS file; got {MANIFEST_NAME}")
-
-
-def _role(manifest: TransitManifest, image: ImageEntry) -> str:
-    return "known PSF" if image.file == manifest.known_psf else "manifest"
 
 
 def _first_problem(error: ValidationError, data: dict[str, Any]) -> str:

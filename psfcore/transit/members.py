@@ -21,7 +21,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, BinaryIO, Literal, Protocol, Self, cast
+from typing import IO, BinaryIO, Literal, Self, cast
 
 from psfcore.errors import DataError
 from psfcore.transit.admission import Admitted, ArchiveLimits, Gate, not_plain, shown
@@ -29,8 +29,13 @@ from psfcore.transit.admission import Admitted, ArchiveLimits, Gate, not_plain, 
 Kind = Literal["zip", "tar", "tar.gz"]
 START_BYTES = 262  # number of bytes at the start of a file that identify its kind
 _CHUNK = 1 << 20
-_TAR_MAGIC = b"ustar"
-_TAR_MAGIC_AT = 257
+# The kinds of files, and bytes at a position that identify them.
+_STARTS: tuple[tuple[Literal["zip", "tar", "gzip"], int, bytes], ...] = (
+    ("zip", 0, b"PK\x03\x04"),
+    ("zip", 0, b"PK\x05\x06"),
+    ("gzip", 0, b"\x1f\x8b"),
+    ("tar", 257, b"ustar"),
+)
 _MAX_HEADER_BYTES = 1 << 16  # limit for all headers of one member together: pax records, GNU long names
 _MAX_GLOBAL_RECORDS = 64
 _PAX_TYPES = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
@@ -60,25 +65,12 @@ _DAMAGE = (
 
 def could_be_archive(start: bytes) -> bool:
     """False if the first bytes of a file rule out every kind of archive. `start` may have any length."""
-    if _starts_like(start, b"PK\x03\x04") or _starts_like(start, b"PK\x05\x06"):
-        return True
-    if _starts_like(start, b"\x1f\x8b"):
-        return True
-    return _starts_like(start[_TAR_MAGIC_AT:], _TAR_MAGIC)
+    return any(known.startswith(start[at : at + len(known)]) for _, at, known in _STARTS)
 
 
 def archive_kind(start: bytes) -> Literal["zip", "tar", "gzip"] | None:
     """The kind of a file from its first START_BYTES, or None. ``opened`` checks that a gzip file contains a tar."""
-    if start.startswith((b"PK\x03\x04", b"PK\x05\x06")):
-        return "zip"
-    if start.startswith(b"\x1f\x8b"):
-        return "gzip"
-    return "tar" if start[_TAR_MAGIC_AT:].startswith(_TAR_MAGIC) else None
-
-
-def _starts_like(start: bytes, known: bytes) -> bool:
-    """True if `start` begins with `known`, or if `known` begins with `start`."""
-    return start.startswith(known) or known.startswith(start)
+    return next((kind for kind, at, known in _STARTS if start[at:].startswith(known)), None)
 
 
 class Member:
@@ -103,19 +95,22 @@ class Member:
         return got
 
 
-class OpenArchive(Protocol):
+class OpenArchive:
     """An archive that is open for reading, once, from its start to its end."""
 
     kind: Kind
 
+    def __init__(self, gate: Gate) -> None:
+        self._gate = gate
+
     def members(self) -> Iterator[Member]:
         """The accepted members, which may include files that are not in ``main_folder``. Each member must be read before the next
         member is requested."""
-        ...
+        raise NotImplementedError
 
     def main_folder(self) -> str:
         """The folder of the transit's files, after all members were read. Files elsewhere are ignored. Raises DataError."""
-        ...
+        return self._gate.main_folder()
 
 
 @contextmanager
@@ -197,11 +192,12 @@ class _BoundedFile:
         return True
 
 
-class _Zip:
+class _Zip(OpenArchive):
     kind: Kind = "zip"
 
     def __init__(self, archive: zipfile.ZipFile, gate: Gate) -> None:
-        self._archive, self._gate = archive, gate
+        super().__init__(gate)
+        self._archive = archive
 
     def members(self) -> Iterator[Member]:
         """Yield the accepted members; all entries are checked before the first member is read."""
@@ -213,10 +209,6 @@ class _Zip:
             if file.folder == main:
                 with self._archive.open(info) as stream:
                     yield Member(file, info.file_size, stream, self._gate)
-
-    def main_folder(self) -> str:
-        """The folder of the transit's files."""
-        return self._gate.main_folder()
 
     def _admit(self, info: zipfile.ZipInfo) -> Admitted | None:
         kind = stat.S_IFMT(info.external_attr >> 16) if info.create_system != 0 else 0
@@ -349,9 +341,10 @@ def _checked_headers(source: _TarInput, gate: Gate) -> type[tarfile.TarInfo]:
     return Header
 
 
-class _Tar:
+class _Tar(OpenArchive):
     def __init__(self, kind: Kind, source: _TarInput, gate: Gate) -> None:
-        self.kind, self._source, self._gate = kind, source, gate
+        super().__init__(gate)
+        self.kind, self._source = kind, source
 
     def members(self) -> Iterator[Member]:
         with tarfile.TarFile(  # the constructor reads the first header
@@ -376,10 +369,6 @@ class _Tar:
                 if file is not None and stream is not None:
                     with stream:
                         yield Member(file, info.size, stream)
-
-    def main_folder(self) -> str:
-        """The folder of the transit's files."""
-        return self._gate.main_folder()
 
     def _admit(self, info: tarfile.TarInfo) -> Admitted | None:
         if any(key.startswith("GNU.sparse") for key in info.pax_headers):

@@ -19,14 +19,14 @@ If no neighbour shows the scene, Q and P are the mean of a ring around the disc 
 |---|---|---|
 | y, var (in the sum) | observed, variance: patch around the position from the ephemeris | DN/s, (DN/s)^2 |
 | c | coverage | - |
-| s | ephemeris_sigma_px | px |
+| s | EPHEMERIS_SIGMA_PX | px |
 | t | SCALE_SIGMA | - |
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,16 +164,14 @@ def neighbours_of(index: int, frames: Sequence[Frame], places: Sequence[Place], 
 def find_occulter(
     index: int,
     frames: Sequence[Frame],
-    scenes: Sequence[NDArray[np.float32]],
+    scene_of: Callable[[int], NDArray[np.float32]],
     places: Sequence[Place],
     psf_kernel: Plane,
     noise: Noise,
-    *,
-    ephemeris_sigma_px: float = EPHEMERIS_SIGMA_PX,
 ) -> FoundPlace:
     """Find the position of the occulter in frame `index`.
 
-    scenes: deconvolved frames [y, x], DN/s. places: the best known positions of the occulter in all frames; they decide
+    scene_of: the deconvolved frame [y, x] of an index, DN/s. places: the best known positions of the occulter in all frames; they decide
     which frames are neighbours. psf_kernel: weights [y, x], centre at [n // 2, n // 2].
     """
     frame, start = frames[index], frames[index].place
@@ -184,7 +182,7 @@ def find_occulter(
         share = _shares(chosen, frames, window, noise)
         seen, behind = (
             sum(w * p[window].astype(np.float64) for w, p in zip(share, planes, strict=True))
-            for planes in ([frames[k].pixels for k in chosen], [scenes[k] for k in chosen])
+            for planes in ([frames[k].pixels for k in chosen], [scene_of(k) for k in chosen])
         )
         neighbours_noise = sum(
             w**2 * noise.variance(_level(seen), frames[k].exposure_s)
@@ -200,27 +198,9 @@ def find_occulter(
     def variance(model: Plane) -> Plane:
         return np.asarray(noise.variance(_level(model), frame.exposure_s) + neighbours_noise)
 
-    solved = _solve(simulated, observed, variance, local, ephemeris_sigma_px)
-    place = Place(
-        float(solved.at[0] + window[1].start), float(solved.at[1] + window[0].start), start.radius_px
-    )
-    sigma = np.sqrt(np.diag(scaled_inverse(solved.normal)))
-    chi2_per_pixel = solved.chi2 / observed.size
-    described = chi2_per_pixel < UNDESCRIBED
-    # If the simulation does not describe the patch, the position may be wrong. Then it must be near the ephemeris.
-    reach_px = LARGEST_SHIFT_PX - 1e-6 if described else DOUBT_SIGMAS * ephemeris_sigma_px
-    return FoundPlace(
-        place=place,
-        sigma_x_px=float(sigma[0]),
-        sigma_y_px=float(sigma[1]),
-        chi2_per_pixel=chi2_per_pixel,
-        neighbours=len(chosen),
-        steps_done=solved.steps_done,
-        settled=solved.settled,
-        depth=solved.depth,
-        depth_sigma=solved.depth_sigma,
-        within_reach=max(abs(place.x_px - start.x_px), abs(place.y_px - start.y_px)) < reach_px,
-    )
+    found = _solve(simulated, observed, variance, local, len(chosen))
+    x_px, y_px = found.place.x_px + window[1].start, found.place.y_px + window[0].start
+    return replace(found, place=Place(x_px, y_px, start.radius_px))
 
 
 def _shares(
@@ -248,31 +228,21 @@ class _SimulatedDisc:
         return np.asarray(self._blur.apply(self.behind * covered))
 
 
-@dataclass(frozen=True)
-class _Solved:
-    """The minimum of Eq. (2). at: x, y, scale and level. normal: the inverse of the covariance of these values."""
-
-    at: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    chi2: float
-    steps_done: int
-    settled: bool
-    depth: float
-    depth_sigma: float
-
-
 def _solve(
     disc: _SimulatedDisc,
     observed: Plane,
     variance: Callable[[Plane], Plane],
     start: Place,
-    sigma_px: float,
-) -> _Solved:
-    """Minimise Eq. (2) by Gauss-Newton steps. Weights come from the simulation; the observed noise would bias them."""
+    neighbours: int,
+) -> FoundPlace:
+    """Minimise Eq. (2) by Gauss-Newton steps. Weights come from the simulation; the observed noise would bias them.
+
+    The fitted values `at` are x and y on the patch, scale and level.
+    """
     at = np.array([start.x_px, start.y_px, 1.0, 0.0])
     origin, radius = at.copy(), start.radius_px
     # Noise of the neighbours would bias a free scale towards 0, and the rest of the scene's gradient would shift the disc.
-    prior = np.diag([sigma_px**-2, sigma_px**-2, SCALE_SIGMA**-2, 0.0])
+    prior = np.diag([EPHEMERIS_SIGMA_PX**-2, EPHEMERIS_SIGMA_PX**-2, SCALE_SIGMA**-2, 0.0])
     h = _DIFFERENCE_PX
     settled, done = False, 0
     while done < STEPS and not settled:
@@ -308,14 +278,22 @@ def _solve(
     inverse = scaled_inverse(normal_2)
     more = inverse @ (templates * weight.ravel()) @ misfit.ravel()
     excess = _excess(weight, misfit)
-    return _Solved(
-        at=at,
-        normal=normal / excess + prior,
-        chi2=float(np.sum(weight * misfit**2)),
+    sigma = np.sqrt(np.diag(scaled_inverse(normal / excess + prior)))
+    chi2_per_pixel = float(np.sum(weight * misfit**2)) / observed.size
+    # If the simulation does not describe the patch, the position may be wrong. Then it must be near the ephemeris.
+    described = chi2_per_pixel < UNDESCRIBED
+    reach_px = LARGEST_SHIFT_PX - 1e-6 if described else DOUBT_SIGMAS * EPHEMERIS_SIGMA_PX
+    return FoundPlace(
+        place=Place(float(at[0]), float(at[1]), radius),
+        sigma_x_px=float(sigma[0]),
+        sigma_y_px=float(sigma[1]),
+        chi2_per_pixel=chi2_per_pixel,
+        neighbours=neighbours,
         steps_done=done,
         settled=settled,
         depth=float(1 + more[0]),
         depth_sigma=float(np.sqrt(inverse[0, 0] * excess)),
+        within_reach=bool(np.abs(at[:2] - origin[:2]).max() < reach_px),
     )
 
 

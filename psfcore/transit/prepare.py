@@ -142,21 +142,21 @@ def prepare(exposures: Sequence[Exposure]) -> tuple[tuple[Frame, ...], Prepared]
     median of its neighbours. The pixel arrays of the exposures are changed in place; the frames use the same arrays.
     Raises DataError "all-saturated" if more than half of the pixels of a frame stay saturated.
     """
-    done = [(_frame(exposure), counts) for exposure, counts in ((e, _fill(e, exposures)) for e in exposures)]
-    return tuple(frame for frame, _ in done), Prepared(tuple(counts for _, counts in done))
-
-
-def _frame(exposure: Exposure) -> Frame:
-    return Frame(
-        file=exposure.file,
-        pixels=exposure.pixels,
-        pointing=exposure.pointing,
-        place=exposure.place,
-        exposure_s=exposure.exposure_s,
-        time_s=exposure.time_s,
-        gain_mode=exposure.gain_mode,
-        filled=exposure.gaps,
+    counts = [_fill(exposure, exposures) for exposure in exposures]
+    frames = tuple(
+        Frame(
+            file=exposure.file,
+            pixels=exposure.pixels,
+            pointing=exposure.pointing,
+            place=exposure.place,
+            exposure_s=exposure.exposure_s,
+            time_s=exposure.time_s,
+            gain_mode=exposure.gain_mode,
+            filled=exposure.gaps,
+        )
+        for exposure in exposures
     )
+    return frames, Prepared(tuple(counts))
 
 
 def _fill(exposure: Exposure, exposures: Sequence[Exposure]) -> FrameCounts:
@@ -196,7 +196,8 @@ def _fill_from_frames(exposure: Exposure, exposures: Sequence[Exposure]) -> Pixe
     # Gaps on the occulter are not filled here, because another frame shows the Sun at these pixels.
     off = ~_on_disc(exposure.place, rows, columns)
     rows, columns = rows[off], columns[off]
-    for donor in _donors(exposure, exposures):
+    donors = [other for other in exposures if other is not exposure and other.pointing == exposure.pointing]
+    for donor in sorted(donors, key=lambda other: abs(other.time_s - exposure.time_s)):
         if not rows.size:
             break
         shown = ~_on_disc(donor.place, rows, columns)
@@ -208,11 +209,6 @@ def _fill_from_frames(exposure: Exposure, exposures: Sequence[Exposure]) -> Pixe
             left[here] = False
             rows, columns = rows[~shown], columns[~shown]
     return left
-
-
-def _donors(exposure: Exposure, exposures: Sequence[Exposure]) -> list[Exposure]:
-    same = [other for other in exposures if other is not exposure and other.pointing == exposure.pointing]
-    return sorted(same, key=lambda other: abs(other.time_s - exposure.time_s))
 
 
 def _on_disc(place: Place, rows: Places, columns: Places) -> PixelMask:

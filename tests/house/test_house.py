@@ -95,7 +95,6 @@ LIGHT = (
     "psfcore.errors",
     "psfcore.noise_figures",
     "psfcore.transit.archive",
-    "psfcore.transit.in_place",
     "psfcore.transit.manifest",
     "psfcore.whole_files",
 )

@@ -13,13 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from psfcore.scatter.inversion import Solution
+from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.total_psf import CURVE_RADII_PX
-from psfcore.scatter.validation.bands import NEAR_CENTRE_PX, PARTING_SIGMAS, Bands, bands
 from psfcore.scatter.validation.cross_validation import (
+    NEAR_CENTRE_PX,
+    PARTING_SIGMAS,
+    Bands,
     FoldFit,
     FoldSample,
+    bands,
     bootstrap_samples,
     exact_fit,
     shared_fits,

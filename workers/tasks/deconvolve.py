@@ -133,7 +133,7 @@ class _Asked:
         psf = read_psf(self.context.store.verified(self.inputs.psf_row.file_sha256), self.context.limits)
         if psf.fitted is None:
             return []
-        from psfcore.scatter.samples import possible_psfs  # most deconvolutions compute no errors
+        from psfcore.scatter.total_psf import possible_psfs  # most deconvolutions compute no errors
 
         possible = possible_psfs(psf, threads=self.context.settings.threads)
         return [psf_for_image(one, self.inputs.image.header) for one in possible]

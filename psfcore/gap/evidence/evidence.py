@@ -25,8 +25,8 @@ from psfcore.gap.evidence.unocculted_blocks import (
     unocculted_blocks,
 )
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Progress, Solution
 from psfcore.scatter.optics import Blur
+from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.transit.occulter import UNDESCRIBED, FoundPlace
 from psfcore.transit.transit import Frame
 

@@ -18,7 +18,8 @@ import numpy as np
 from psfcore.gap.evidence.evidence import Evidence, residuals_at
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Progress, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import Progress
 from psfcore.transit.transit import Transit
 
 

@@ -47,7 +47,8 @@ from psfcore.gap.evidence.likelihood import MEASURED
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.evidence.unocculted_blocks import UnoccultedBlocks, unocculted_blocks
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Progress, Solution, dark_pixels, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import Progress, Solution, dark_pixels
 from psfcore.transit.transit import Transit
 
 Vector = NDArray[np.float64]

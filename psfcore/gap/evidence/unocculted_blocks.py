@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Progress, Solution
+from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.transit.occulter import disc_distance
 
 Matrix = NDArray[np.float64]

@@ -25,7 +25,7 @@ from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.report.report import best_words, words
 from psfcore.gap.verdict.correction import ROUNDS
-from psfcore.scatter.inversion import Inversion
+from psfcore.scatter.reconstruction import Inversion
 
 Report = dict[str, Any]
 

@@ -20,7 +20,7 @@ from psfcore.gap.verdict.closure import Interval
 from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names
 from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement
-from psfcore.scatter.inversion import Inversion
+from psfcore.scatter.reconstruction import Inversion
 
 SCHEMA = "gap/2"
 MOST_READ = 12  # if an effect has more parameters, the report summarises them

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.transit.blocks import Fold, folds
+from psfcore.transit.transit import Fold, folds
 
 Vector = NDArray[np.float64]
 

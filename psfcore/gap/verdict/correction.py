@@ -25,7 +25,8 @@ from psfcore.gap.evidence.evidence import Evidence, gather, residuals_at
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.unused_memory import return_unused_memory
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Progress, Solution, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.transit.transit import Transit
 
 Vector = NDArray[np.float64]

@@ -17,7 +17,7 @@ from psfcore.gap.unused_memory import return_unused_memory
 from psfcore.gap.verdict.correction import Corrected, add_to_model
 from psfcore.gap.verdict.posterior import Names, at_refit
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Progress
+from psfcore.scatter.reconstruction import Progress
 
 VISIBLE_SIGMA = 2.0
 MOST_TRIES = 2

@@ -1,4 +1,4 @@
-"""Cross-validation of a fit: hold out blocks of images and bootstrap the rest, in many runs.
+"""Cross-validation of a fit: hold out blocks of images and bootstrap the rest, in many runs; bands over all fits.
 
 Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Results". The images are divided into ten
 blocks in the order of time (fewer blocks if there are fewer than 30 images). Each block is held out once, with a guard on
@@ -25,7 +25,8 @@ the formula:
 There are two estimates of the error of an excess. The first is the spread over the samples, which contains the noise of
 the images. This spread is too small if a weight is at its lower bound of zero, or if only the prior determines a shell.
 The second estimate follows from the covariance matrix of the free fit. This matrix ignores the bounds and includes the
-prior. The larger of the two estimates is used.
+prior. The larger of the two estimates is used. A band extends from a low to a high percentile of a quantity over the
+samples.
 
 | symbol | name |
 |---|---|
@@ -36,22 +37,35 @@ prior. The larger of the two estimates is used.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+from scipy.special import ndtr
 
 from psfcore.errors import DataError
+from psfcore.json_values import json_attributes, json_values
 from psfcore.psf import cumulative_curve
-from psfcore.scatter.inversion import Progress, Solution, refit
-from psfcore.scatter.shapes import Shape, Vector
-from psfcore.scatter.total_psf import TotalPsf
-from psfcore.scatter.validation.free_shells import FreeLight, FreeShares, free_shares, law_light
-from psfcore.transit.blocks import Fold, folds
+from psfcore.scatter.inversion import refit
+from psfcore.scatter.reconstruction import Progress, Solution
+from psfcore.scatter.shapes import Vector
+from psfcore.scatter.validation.free_shells import FreeShares, free_shares, law_light, shells
+from psfcore.transit.transit import folds
 
 RUNS = 10
 RESOLVE_STEPS = 5
 SETTLE_STEPS = 1
+# The percentiles of a Gaussian at one and two standard deviations below and above its mean.
+ONE_SIGMA: tuple[float, float] = (100 * float(ndtr(-1)), 100 * float(ndtr(1)))
+TWO_SIGMA: tuple[float, float] = (100 * float(ndtr(-2)), 100 * float(ndtr(2)))
+LIMITS = (TWO_SIGMA[0], ONE_SIGMA[0], 50.0, ONE_SIGMA[1], TWO_SIGMA[1])
+LIMIT_NAMES = ("minus_2_sigma", "minus_1_sigma", "median", "plus_1_sigma", "plus_2_sigma")
+# Within this distance, the free fit of the paper differs from the power law of the paper.
+NEAR_CENTRE_PX = 3.0
+PARTING_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -76,16 +90,6 @@ class FoldShells:
     law: tuple[float, ...]
     excess_sigma: tuple[float, ...]
 
-    @staticmethod
-    def of(fitted: FreeLight) -> FoldShells:
-        """The shells of a free fit."""
-        within = np.cumsum(np.cumsum(fitted.covariance, axis=0), axis=1)
-        return FoldShells(
-            free=tuple(fitted.light.tolist()),
-            law=tuple(fitted.law_light.tolist()),
-            excess_sigma=tuple(np.sqrt(np.diag(within)).tolist()),
-        )
-
 
 @dataclass(frozen=True)
 class FoldFit:
@@ -105,28 +109,16 @@ class FoldFit:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
-        return {
-            **vars(self),
-            "held_out_pct": {str(k): v for k, v in self.held_out_pct.items()},
-            "shells": None if self.shells is None else dict(vars(self.shells)),
-        }
+        return dict(json_values(self))
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> FoldFit:
         """The fit from the values of `to_json`."""
-        held_out = {int(k): float(v) for k, v in content["held_out_pct"].items()}
-        of_shells = content.get("shells")
-        return FoldFit(
-            run=int(content["run"]),
-            fold=int(content["fold"]),
-            coordinates=tuple(content["coordinates"]),
-            values=dict(content["values"]),
-            curve_pct=tuple(content["curve_pct"]),
-            held_out_pct=held_out,
-            shells=None
-            if of_shells is None
-            else FoldShells(**{name: tuple(values) for name, values in of_shells.items()}),
-        )
+        fit: FoldFit = _FOLD_FIT.validate_python(content)
+        return fit
+
+
+_FOLD_FIT = TypeAdapter(FoldFit)
 
 
 def bootstrap_samples(images: int, *, runs: int = RUNS, seed: int = 1) -> tuple[FoldSample, ...]:
@@ -140,24 +132,16 @@ def bootstrap_samples(images: int, *, runs: int = RUNS, seed: int = 1) -> tuple[
             "too-few-images", f"expected at least 6 images for held-out blocks; got {images}: add images"
         )
     rng = np.random.default_rng(seed)
-    return tuple(
-        _bootstrap_sample(run, fold, blocks, images, rng)
-        for run in range(runs)
-        for fold in range(len(blocks))
-    )
-
-
-def _bootstrap_sample(
-    run: int, fold: int, blocks: tuple[Fold, ...], images: int, rng: np.random.Generator
-) -> FoldSample:
-    """Resample the images of each remaining block with replacement. Images in the guard are removed first."""
-    counts = np.zeros(images, dtype=np.int64)
-    fitted = set(blocks[fold].fitted)
-    for k, block in enumerate(blocks):
-        left = [image for image in block.held_out if image in fitted]
-        if k != fold and left:
-            np.add.at(counts, rng.choice(left, len(left)), 1)
-    return FoldSample(run, fold, tuple(int(c) for c in counts), blocks[fold].held_out)
+    samples = []
+    for run in range(runs):
+        for fold, block in enumerate(blocks):
+            counts, fitted = np.zeros(images, dtype=np.int64), set(block.fitted)
+            for other in blocks:  # resample each with replacement, without the images in the guard
+                left = [image for image in other.held_out if image in fitted]
+                if left:
+                    np.add.at(counts, rng.choice(left, len(left)), 1)
+            samples.append(FoldSample(run, fold, tuple(counts.tolist()), block.held_out))
+    return tuple(samples)
 
 
 def shared_fits(
@@ -186,8 +170,7 @@ def shared_fits(
             for n in sample.held_out
             if n in frames
         }
-        free = None if shares is None else _fold_shells(shares, shape, sample, at + move)
-        out.append(_fold_fit(sample, shape, solution.total, at + move, held_out, free))
+        out.append(_fold_fit(sample, solution, at + move, held_out, shares))
     return tuple(out)
 
 
@@ -215,40 +198,41 @@ def exact_fit(
     solution: the fit to all images. progress: called before each image is processed, so that a worker can send a
     heartbeat or stop the fit. Raises the errors of `shared_fits` and `invert`.
     """
-    shape = solution.inversion.shape
     start = solution.inversion.coordinates + shared_step(solution, sample)
-    found = refit(solution, sample.counts, start, progress=progress)
-    sky, at = found.sky, found.coordinates
+    fitted, at = refit(solution, sample.counts, start, progress=progress)
+    sky, left_out = fitted.sky, fitted.sky.left_out()
     held_out = {}
     for step, n in enumerate(sample.held_out):
         progress("images held out", step, len(sample.held_out))
-        if solution.transit.frames[n].file in found.left_out:
+        if solution.transit.frames[n].file in left_out:
             continue
-        sky.scenes[n] = found.optics.invert(sky.observed[n], sky.scenes[n], steps=RESOLVE_STEPS)
-        residual, expected = found.residual(n)
+        sky.scenes[n] = fitted.optics.invert(sky.observed[n], sky.scenes[n], steps=RESOLVE_STEPS)
+        residual, expected = fitted.residual(n)
         held_out[n] = float(-100 * residual.mean() / (expected + residual).mean())
-    free = None
-    if shape.isotropic:
+    shares = None
+    if solution.inversion.shape.isotropic:
         # The last step of the fit changed the PSF by a negligible amount but did not update the scenes. Update them here.
-        for step, n in enumerate(found.part):
-            progress("settling", step, len(found.part))
-            sky.scenes[n] = found.optics.invert(sky.observed[n], sky.scenes[n], steps=SETTLE_STEPS)
-        free = _fold_shells(free_shares(found, at, progress=progress), shape, sample, at)
-    return _fold_fit(sample, shape, solution.total, at, held_out, free)
-
-
-def _fold_shells(shares: FreeShares, shape: Shape, sample: FoldSample, at: Vector) -> FoldShells:
-    return FoldShells.of(shares.fit(sample.counts, law_light(shape, at)))
+        for step, n in enumerate(fitted.part):
+            progress("settling", step, len(fitted.part))
+            sky.scenes[n] = fitted.optics.invert(sky.observed[n], sky.scenes[n], steps=SETTLE_STEPS)
+        shares = free_shares(fitted, at, progress=progress)
+    return _fold_fit(sample, solution, at, held_out, shares)
 
 
 def _fold_fit(
     sample: FoldSample,
-    shape: Shape,
-    total: TotalPsf,
+    solution: Solution,
     at: Vector,
     held_out: dict[int, float],
-    free: FoldShells | None,
+    shares: FreeShares | None,
 ) -> FoldFit:
+    """The fit at these coordinates, with free shells if there are shares."""
+    shape, total, shells_of_fold = solution.inversion.shape, solution.total, None
+    if shares is not None:
+        free = shares.fit(sample.counts, law_light(shape, at))
+        within = np.cumsum(np.cumsum(free.covariance, axis=0), axis=1)
+        vectors = (free.light, free.law_light, np.sqrt(np.diag(within)))
+        shells_of_fold = FoldShells(*(tuple(vector.tolist()) for vector in vectors))
     return FoldFit(
         run=sample.run,
         fold=sample.fold,
@@ -256,5 +240,172 @@ def _fold_fit(
         values=shape.values(at),
         curve_pct=tuple(float(c) for c in cumulative_curve(total.kernel(at), total.radii_px)),
         held_out_pct=held_out,
-        shells=free,
+        shells=shells_of_fold,
+    )
+
+
+# --- bands ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class ShellBands:
+    """The free fits and the formulas of all samples, shell by shell.
+
+    Arrays (5, shells) contain percentiles over the samples, at -2, -1, 0, +1 and +2 sigma. "law" stands for the formula.
+    edges_px: edges of the shells, (shells + 1,). free_weight, law_weight: weight per pixel of each shell, (5, shells).
+    free_beyond_pct, law_beyond_pct: percentage of the light that is scattered beyond the inner edge of each shell,
+    (5, shells). excess_pct: excess of Eq. (2) within the outer edge of each shell, in percentage points of all light,
+    (5, shells). excess_sigma: error of the excess, (shells,). law_within_pct: median of the formula's light within the
+    outer edge of each shell, (shells,).
+    """
+
+    edges_px: Vector
+    free_weight: NDArray[np.float64]
+    law_weight: NDArray[np.float64]
+    free_beyond_pct: NDArray[np.float64]
+    law_beyond_pct: NDArray[np.float64]
+    excess_pct: NDArray[np.float64]
+    excess_sigma: Vector
+    law_within_pct: Vector
+
+    def excess(self, shell: int) -> Excess:
+        """The excess within the outer edge of a shell."""
+        return Excess(
+            within_px=float(self.edges_px[shell + 1]),
+            points=float(self.excess_pct[2, shell]),
+            sigma=float(self.excess_sigma[shell]),
+            of_formula_pct=100 * float(self.excess_pct[2, shell] / self.law_within_pct[shell]),
+        )
+
+    @property
+    def near_centre(self) -> Excess:
+        """The excess within NEAR_CENTRE_PX.
+
+        This excess includes all shells that contain only pixels up to this distance.
+        """
+        beyond = np.sqrt(NEAR_CENTRE_PX**2 + 1)
+        return self.excess(int(np.flatnonzero(self.edges_px[1:] < beyond)[-1]))
+
+    @property
+    def largest(self) -> Excess:
+        """The excess with the largest ratio of its absolute value to its error."""
+        return self.excess(int(np.argmax(np.abs(self.excess_pct[2] / self.excess_sigma))))
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "edges_px": self.edges_px.tolist(),
+            "weight": {"free": _limits_json(self.free_weight), "formula": _limits_json(self.law_weight)},
+            "diffuse_light_beyond_inner_edge_pct": {
+                "free": _limits_json(self.free_beyond_pct),
+                "formula": _limits_json(self.law_beyond_pct),
+            },
+            "excess_within_outer_edge_points": _limits_json(self.excess_pct)
+            | {"sigma": self.excess_sigma.tolist()},
+            "excess_near_centre": vars(self.near_centre),
+            "largest_excess": vars(self.largest) | {"parts": self.largest.parts},
+        }
+
+
+def _limits_json(limits: NDArray[np.float64]) -> dict[str, Any]:
+    return dict(zip(LIMIT_NAMES, limits.tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class Excess:
+    """The light of the free fit within a distance minus the light of the formula within the same distance.
+
+    points: the difference in percent of all light. sigma: error of `points`. of_formula_pct: the same difference in
+    percent of the light that the formula puts within the distance.
+    """
+
+    within_px: float
+    points: float
+    sigma: float
+    of_formula_pct: float
+
+    @property
+    def parts(self) -> bool:
+        """Whether the free fit and the formula differ by more than PARTING_SIGMAS standard errors."""
+        return abs(self.points) > PARTING_SIGMAS * self.sigma
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Medians and bands of all samples: percentiles at -2, -1, 0, +1 and +2 sigma.
+
+    curve_pct: percentiles of C(R) at radii_px, (5, radii). values: percentiles of each parameter, (5,). totals: the total
+    of scatter of each fit. held_out_pct: mean residual of each held-out image, percent. shells: percentiles by shell;
+    None if the formula is not isotropic.
+    """
+
+    radii_px: Vector
+    curve_pct: NDArray[np.float64]
+    values: dict[str, Vector]
+    totals: Vector
+    held_out_pct: dict[int, float]
+    shells: ShellBands | None
+
+    @property
+    def held_out(self) -> dict[str, float]:
+        """Mean, rms and largest absolute value of the held-out residuals, in percent.
+
+        Each image counts once, with its mean residual over the samples.
+        """
+        found = np.array(list(self.held_out_pct.values()))
+        if found.size == 0:
+            return {}
+        return {
+            "mean_pct": float(found.mean()),
+            "rms_pct": float(np.sqrt((found**2).mean())),
+            "largest_pct": float(np.abs(found).max()),
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "light_beyond_pct": _limits_json(self.curve_pct),
+            "parameters": {name: _limits_json(limits) for name, limits in self.values.items()},
+            "shells": None if self.shells is None else self.shells.to_json(),
+            **json_attributes(self, "radii_px", "totals", "held_out", "held_out_pct"),
+        }
+
+
+def bands(fits: tuple[FoldFit, ...], radii_px: Vector) -> Bands:
+    """Medians and percentiles over the samples. radii_px: the radii at which the fits' curves C(R) are given."""
+    held_out: dict[int, list[float]] = {}
+    for fit in fits:
+        for image, residual in fit.held_out_pct.items():
+            held_out.setdefault(image, []).append(residual)
+    with_shells = [fit.shells for fit in fits if fit.shells is not None]
+    return Bands(
+        radii_px=radii_px,
+        curve_pct=np.percentile([fit.curve_pct for fit in fits], LIMITS, axis=0),
+        values={name: np.percentile([fit.values[name] for fit in fits], LIMITS) for name in fits[0].values},
+        totals=np.array([fit.values["total"] for fit in fits]),
+        held_out_pct={image: float(np.mean(found)) for image, found in sorted(held_out.items())},
+        shells=shell_bands(with_shells) if len(with_shells) == len(fits) else None,
+    )
+
+
+def shell_bands(folds: Sequence[FoldShells]) -> ShellBands:
+    """Medians and percentiles over the samples, for each shell."""
+    free, law = np.array([fold.free for fold in folds]), np.array([fold.law for fold in folds])
+    counts = shells().counts
+    excess = 100 * np.cumsum(free - law, axis=1)  # Eq. (2)
+    spread = np.subtract(*np.percentile(excess, ONE_SIGMA[::-1], axis=0)) / 2
+    expected = 100 * np.median([fold.excess_sigma for fold in folds], axis=0)
+
+    def beyond_pct(light: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.percentile(100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1], LIMITS, axis=0))
+
+    return ShellBands(
+        edges_px=np.array(shells().edges_px),
+        free_weight=np.percentile(free / counts, LIMITS, axis=0),
+        law_weight=np.percentile(law / counts, LIMITS, axis=0),
+        free_beyond_pct=beyond_pct(free),
+        law_beyond_pct=beyond_pct(law),
+        excess_pct=np.percentile(excess, LIMITS, axis=0),
+        excess_sigma=np.maximum(spread, expected),
+        law_within_pct=100 * np.median(np.cumsum(law, axis=1), axis=0),
     )

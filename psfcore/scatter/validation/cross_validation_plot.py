@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 
 from psfcore.drawing.plots import INK, write_png
 from psfcore.scatter.shapes import Vector
-from psfcore.scatter.validation.bands import Bands, ShellBands
-from psfcore.scatter.validation.cross_validation import FoldFit
+from psfcore.scatter.validation.cross_validation import Bands, FoldFit, ShellBands
 
 FORMULA, FREE = "#2f6db0", "#2b8a4e"
 _POINTINGS = ("#1b4f91", "#c73e2b", "#2b8a6e", "#e0a100", "#7b3fa0")

@@ -23,8 +23,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
-from psfcore.scatter.inversion import Inversion, Progress, invert
-from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import Inversion, Progress, labelled
+from psfcore.scatter.shapes import Vector
 from psfcore.scatter.total_psf import TotalPsf
 from psfcore.transit.transit import Transit
 
@@ -65,17 +66,20 @@ class DarkOffsetStudy:
     @property
     def largest_weight_change_pct(self) -> float:
         """Largest relative change of the diffuse weight per pixel, percent."""
-        return max(float(np.abs(o.weight_change_pct).max()) for o in self.offsets)
+        return self._largest("weight_change_pct")
 
     @property
     def largest_curve_change_points(self) -> float:
         """Largest change of C(R) of the scatter kernel, percentage points."""
-        return max(float(np.abs(o.curve_change_points).max()) for o in self.offsets)
+        return self._largest("curve_change_points")
 
     @property
     def largest_total_curve_change_points(self) -> float:
         """Largest change of C(R) of the total PSF, percentage points."""
-        return max(float(np.abs(o.total_curve_change_points).max()) for o in self.offsets)
+        return self._largest("total_curve_change_points")
+
+    def _largest(self, name: str) -> float:
+        return max(float(np.abs(getattr(offset, name)).max()) for offset in self.offsets)
 
 
 def dark_offset_study(
@@ -83,35 +87,43 @@ def dark_offset_study(
     offsets_dn: Sequence[float] = OFFSETS_DN,
     *,
     nominal: Inversion | None = None,
-    shape: Shape = SOFTENED_POWER_LAW,
     threads: int = 1,
     progress: Progress = lambda stage, step, steps: None,
 ) -> DarkOffsetStudy:
     """Repeat the fit of a transit with each offset, starting from the fit without an offset.
 
-    nominal: the fit without an offset; its shape is used for all fits, and `shape` is ignored. Default: a new fit of
-    `shape`. Raises
-    the errors of `invert`.
+    nominal: the fit without an offset; its shape is used for all fits. Default: a new fit of the softened power law.
+    Raises the errors of `invert`.
     """
     if nominal is None:
-        nominal = invert(transit, shape, threads=threads, progress=progress).inversion
-    curves = _WeightsAndCurves(transit, nominal.shape, threads)
-    before = curves.at(nominal.coordinates)
-    found = []
+        nominal = invert(transit, threads=threads, progress=progress).inversion
+    total_psf = TotalPsf(transit.diffraction, nominal.shape, transit.shape, threads=threads)
+    farthest = min(max(transit.shape), REACH_GRID_PX // 2) - 1
+    radii_px = np.unique(np.geomspace(1, farthest, _RADII).round())
+    curve_radii_px = np.concatenate(([0.5], radii_px))
+
+    def weights_and_curves(coordinates: Vector) -> tuple[Vector, Vector, Vector]:
+        """The diffuse weight at radii_px, and C(R) of the scatter kernel and the total PSF at curve_radii_px."""
+        scatter = nominal.shape.kernel(coordinates, REACH_GRID_PX)
+        ring, mean = radial_profile(scatter)
+        return (
+            mean[np.searchsorted(ring, radii_px)],
+            cumulative_curve(scatter, curve_radii_px),
+            cumulative_curve(total_psf.kernel(coordinates), curve_radii_px),
+        )
+
+    before = weights_and_curves(nominal.coordinates)
+    changes = []
     for offset_dn in offsets_dn:
-
-        def report(stage: str, step: int, steps: int, offset_dn: float = offset_dn) -> None:
-            progress(f"{offset_dn:+g} DN: {stage}", step, steps)
-
         at = invert(
             with_offset(transit, offset_dn),
             nominal.shape,
             start=nominal.coordinates,
             threads=threads,
-            progress=report,
+            progress=labelled(progress, f"{offset_dn:+g} DN"),
         ).inversion
-        weights, diffuse, total = curves.at(at.coordinates)
-        found.append(
+        weights, diffuse, total = weights_and_curves(at.coordinates)
+        changes.append(
             DarkOffset(
                 offset_dn=float(offset_dn),
                 values=at.values,
@@ -122,7 +134,7 @@ def dark_offset_study(
                 total_curve_change_points=total - before[2],
             )
         )
-    return DarkOffsetStudy(curves.radii_px, curves.curve_radii_px, nominal.values, tuple(found))
+    return DarkOffsetStudy(radii_px, curve_radii_px, nominal.values, tuple(changes))
 
 
 def with_offset(transit: Transit, offset_dn: float) -> Transit:
@@ -132,23 +144,3 @@ def with_offset(transit: Transit, offset_dn: float) -> Transit:
         for frame in transit.frames
     )
     return replace(transit, frames=frames)
-
-
-class _WeightsAndCurves:
-    """Computes the diffuse weights and the curves C(R) of a shape at fixed distances."""
-
-    def __init__(self, transit: Transit, shape: Shape, threads: int) -> None:
-        self._total = TotalPsf(transit.diffraction, shape, transit.shape, threads=threads)
-        farthest = min(max(transit.shape), REACH_GRID_PX // 2) - 1
-        self.radii_px = np.unique(np.geomspace(1, farthest, _RADII).round())
-        self.curve_radii_px = np.concatenate(([0.5], self.radii_px))
-
-    def at(self, coordinates: Vector) -> tuple[Vector, Vector, Vector]:
-        """Mean diffuse weight at radii_px; C(R) of the scatter kernel and of the total PSF at curve_radii_px, percent."""
-        scatter = self._total.shape.kernel(coordinates, REACH_GRID_PX)
-        ring, mean = radial_profile(scatter)
-        return (
-            mean[np.searchsorted(ring, self.radii_px)],
-            cumulative_curve(scatter, self.curve_radii_px),
-            cumulative_curve(self._total.kernel(coordinates), self.curve_radii_px),
-        )

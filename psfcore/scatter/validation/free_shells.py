@@ -2,7 +2,7 @@
 
 Source: Hofmeister et al., The point-spread function of HRI_EUV, section "Results". That section compares a free fit
 with the power law for all samples of the cross-validation. Near a fitted PSF, both fits are steps of the same linear
-problem, Eq. (4) of `psfcore.scatter.inversion.inversion`. That module also defines H, G, D and r; w are the weights 1 /
+problem, Eq. (4) of `psfcore.scatter.inversion`. That module also defines H, G, D and r; w are the weights 1 /
 v of its Eq. (3). The unknown d contains, for each shell, the light of the free fit minus the light of the formula:
 
     r = D [H D G c d + noise],   c_S = A_S / n_S - B                              Eq. (1)
@@ -45,10 +45,9 @@ from scipy.optimize import lsq_linear
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.psf import REACH_GRID_PX
-from psfcore.scatter.as_published.ring_sums import segment_sums
-from psfcore.scatter.as_published.segments import Segments, shells_as_published
-from psfcore.scatter.inversion import Progress, Reconstruction
 from psfcore.scatter.optics import Blur, pick
+from psfcore.scatter.reconstruction import Progress, Reconstruction
+from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
 from psfcore.scatter.shapes import Shape, Vector
 from psfcore.scatter.total_psf import Kernel
 
@@ -102,7 +101,7 @@ class FreeShares:
 @cache
 def shells() -> Segments:
     """The 50 shells of the paper, on the full reach."""
-    return Segments(tuple(shells_as_published()))
+    return Segments(shells_as_published())
 
 
 def law_light(shape: Shape, coordinates: Vector) -> Vector:

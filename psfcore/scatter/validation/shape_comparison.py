@@ -26,11 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.scatter.inversion import Progress, Solution
 from psfcore.scatter.optics import Blur
+from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW, Shape
 from psfcore.scatter.total_psf import TotalPsf
-from psfcore.transit.blocks import folds
+from psfcore.transit.transit import folds
 
 Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -50,11 +50,6 @@ class ComparedShape:
     gain: float
     held_out_gain: float | None
 
-    @property
-    def significance(self) -> float:
-        """Gain divided by the number of additional parameters."""
-        return self.gain / len(self.added)
-
 
 def compare_shapes(
     solution: Solution, *, progress: Progress = lambda stage, step, steps: None
@@ -67,18 +62,16 @@ def compare_shapes(
     if base.name != SOFTENED_POWER_LAW.name:
         raise DataError("unknown-shape", f"expected a fit of {SOFTENED_POWER_LAW.name}; got {base.name}")
     shapes = [shape for shape in SHAPES.values() if shape.name != base.name]
-    columns: dict[str, list[int]] = {}
+    at, field_shape, threads = solution.inversion, solution.transit.shape, solution.threads
     names: list[str] = []
-    blurs = []
-    for shape in shapes:
-        columns[shape.name] = []
+    blurs = [Blur(slope, field_shape, threads=threads) for slope in solution.total.slopes(at.coordinates)]
+    for shape in shapes:  # derivatives of the total PSF, at the solution of the power law
+        total = TotalPsf(solution.transit.diffraction, shape, field_shape, threads=threads)
         for k, parameter in enumerate(shape.parameters[BASE:], start=BASE):
             if parameter.name not in names:
                 names.append(parameter.name)
-                blurs.append(_slope(solution, shape, k))
-            columns[shape.name].append(BASE + names.index(parameter.name))
-    base_slopes = solution.total.slopes(solution.inversion.coordinates)
-    blurs = [*(Blur(s, solution.transit.shape, threads=solution.threads) for s in base_slopes), *blurs]
+                slope = total.slope(shape.coordinates(at.values), k)
+                blurs.append(Blur(slope, field_shape, threads=threads))
     normals, scores = [], []
     for step, n in enumerate(solution.part):
         progress("comparing shapes", step, len(solution.part))
@@ -88,50 +81,33 @@ def compare_shapes(
         normals.append(weighted @ jacobian.T)
         scores.append(weighted @ residual)
     normal, score = np.array(normals), np.array(scores)
-    return tuple(_compared(shape, columns[shape.name], normal, score) for shape in shapes)
-
-
-def _slope(solution: Solution, shape: Shape, parameter: int) -> Blur:
-    """The derivative of the total PSF with respect to one parameter of a shape, at the solution of the power law."""
-    total = TotalPsf(solution.transit.diffraction, shape, solution.transit.shape, threads=solution.threads)
-    at = shape.coordinates(solution.inversion.values)
-    return Blur(total.slope(at, parameter), solution.transit.shape, threads=solution.threads)
+    added = [[BASE + names.index(name) for name in shape.names[BASE:]] for shape in shapes]
+    return tuple(_compared(shape, of, normal, score) for shape, of in zip(shapes, added, strict=True))
 
 
 def _compared(shape: Shape, extra: list[int], normal: Matrix, score: Matrix) -> ComparedShape:
-    every = [*range(BASE), *extra]
-    whole, alone = _ParameterSubset(normal, score, every), _ParameterSubset(normal, score, list(range(BASE)))
-    step, covariance = whole.solved()
-    sigma = np.sqrt(np.diag(covariance))
-    gains = []
-    for fold in folds(len(normal)):
-        fitted, held = list(fold.fitted), list(fold.held_out)
-        gains.append(whole.gain(fitted, held) - alone.gain(fitted, held))
+    whole, alone = [*range(BASE), *extra], list(range(BASE))
+
+    def gain(fitted: list[int], held: list[int]) -> float:
+        """The gain of the shape minus that of the power law, on held-out images."""
+        return _gain(normal, score, whole, fitted, held) - _gain(normal, score, alone, fitted, held)
+
     everything = list(range(len(normal)))
+    covariance = np.linalg.inv(normal[:, whole][:, :, whole].sum(axis=0))
+    step, sigma = covariance @ score[:, whole].sum(axis=0), np.sqrt(np.diag(covariance))
+    gains = [gain(list(fold.fitted), list(fold.held_out)) for fold in folds(len(normal))]
     return ComparedShape(
         name=shape.name,
         added={
-            p.name: (float(step[BASE + k]), float(sigma[BASE + k]))
-            for k, p in enumerate(shape.parameters[BASE:])
+            name: (float(step[k]), float(sigma[k])) for k, name in enumerate(shape.names[BASE:], start=BASE)
         },
-        gain=whole.gain(everything, everything) - alone.gain(everything, everything),
+        gain=gain(everything, everything),
         held_out_gain=float(np.sum(gains)) if gains else None,
     )
 
 
-class _ParameterSubset:
-    """The normal equations of a subset of the parameters."""
-
-    def __init__(self, normal: Matrix, score: Matrix, columns: list[int]) -> None:
-        self._normal = normal[:, columns][:, :, columns]
-        self._score = score[:, columns]
-
-    def solved(self) -> tuple[Vector, Matrix]:
-        """Gauss-Newton step and covariance of the parameters, from all images."""
-        covariance = np.linalg.inv(self._normal.sum(axis=0))
-        return covariance @ self._score.sum(axis=0), covariance
-
-    def gain(self, fitted: list[int], held: list[int]) -> float:
-        """The gain of one fold on its held-out images, from Eq. (1) and (2)."""
-        step = np.linalg.solve(self._normal[fitted].sum(axis=0), self._score[fitted].sum(axis=0))
-        return float(2 * step @ self._score[held].sum(axis=0) - step @ self._normal[held].sum(axis=0) @ step)
+def _gain(normal: Matrix, score: Matrix, columns: list[int], fitted: list[int], held: list[int]) -> float:
+    """The gain of some parameters (columns) on held-out images, from Eq. (1) and (2)."""
+    normal, score = normal[:, columns][:, :, columns], score[:, columns]
+    step = np.linalg.solve(normal[fitted].sum(axis=0), score[fitted].sum(axis=0))
+    return float(2 * step @ score[held].sum(axis=0) - step @ normal[held].sum(axis=0) @ step)

@@ -11,6 +11,7 @@ from scipy.sparse.linalg import LinearOperator, gmres
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.evaluation.evaluation import Evaluation, evaluate
+from psfcore.evaluation.frame import FrameEvaluation
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy, dark_offset_study
 from psfcore.simulate.scatter_truth import total_kernel
 from psfcore.transit.transit import Kernel
@@ -52,6 +53,12 @@ def exact_scene(through: Convolver, image: NDArray[np.float64]) -> NDArray[np.fl
     scene, failed = gmres(operator, image.ravel(), rtol=1e-7)
     assert failed == 0
     return np.asarray(scene).reshape(image.shape)
+
+
+def residual_against_pct(frame: FrameEvaluation, plane: NDArray[np.floating]) -> float:
+    """The residual in percent against a noise-free image [y, x] instead of the observation."""
+    mean = float(np.mean(plane[frame.dark], dtype=np.float64))
+    return 100 * (frame.simulated_dn_s - mean) / mean
 
 
 def rms(values: object) -> float:

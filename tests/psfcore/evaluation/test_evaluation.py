@@ -10,16 +10,23 @@ import pytest
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import evaluate
+from psfcore.evaluation.frame import Superposed, half_width_px, superposed, superposed_maps
 from psfcore.evaluation.report import report, summaries
 from psfcore.evaluation.summary_lines import summary_lines
-from psfcore.evaluation.superposed import Superposition
 from psfcore.noise import Noise
-from psfcore.scatter.inversion import LEAST_DARK_PIXELS
-from psfcore.scatter.noise_transfer import noise_covariance
-from psfcore.scatter.optics import Optics, pick, put
+from psfcore.scatter.optics import Optics, noise_covariance, pick, put
+from psfcore.scatter.reconstruction import LEAST_DARK_PIXELS
 from psfcore.transit.occulter import fully_dark
 from psfcore.transit.transit import Frame, Place
-from tests.psfcore.evaluation.small_evaluations import SEEDS, exact_scene, judged, kernel_with, noisy, rms
+from tests.psfcore.evaluation.small_evaluations import (
+    SEEDS,
+    exact_scene,
+    judged,
+    kernel_with,
+    noisy,
+    residual_against_pct,
+    rms,
+)
 from tests.psfcore.small_transits import (
     IMAGES,
     SCATTER,
@@ -39,7 +46,7 @@ def test_the_true_psf_leaves_no_residual() -> None:
     assert max(float(np.abs(f.pe_pct).max()) for f in found.frames) < 0.1
     assert found.superposed.mape_mean_pct < 0.01
     for n, frame in enumerate(found.frames):
-        assert frame.residual_against_pct(sky().noise_free[n]) == pytest.approx(frame.residual_pct, abs=1e-4)
+        assert residual_against_pct(frame, sky().noise_free[n]) == pytest.approx(frame.residual_pct, abs=1e-4)
 
 
 def test_a_wrong_psf_leaves_the_residual_of_an_exact_inverse() -> None:
@@ -94,7 +101,7 @@ def test_residuals_scatter_by_their_stated_noise() -> None:
     assert abs(np.mean(centre)) < 0.35 and abs(np.mean([f.residual_pct / f.noise_pct for f in frames])) < 0.35
     assert all(3 * f.noise_pct < f.centre_noise_pct < 8 * f.noise_pct for f in frames)
     # Noise of the disc's own pixels makes most of a residual: relative to images without noise it is small.
-    against = [f.residual_against_pct(sky().noise_free[f.index]) for f in noisy(11).frames]
+    against = [residual_against_pct(f, sky().noise_free[f.index]) for f in noisy(11).frames]
     assert rms(against) < 0.6 < rms([f.noise_pct for f in noisy(11).frames])
 
 
@@ -202,11 +209,28 @@ def test_maps_for_the_true_psf_are_those_of_noise_alone() -> None:
 
 
 def test_errors_are_mapped_to_the_nearest_pixel_and_averaged_where_discs_are_dark() -> None:
-    laid = Superposition(3.0, 1)
     rows, columns = np.array([20, 21, 20]), np.array([30, 30, 33])
-    laid.add(Place(30.4, 19.6, 3.0), (rows, columns), np.array([1.0, 2.0, 3.0]), [np.array([4.0, -4.0, 0.0])])
-    laid.add(Place(29.6, 20.4, 3.0), (rows[:2], columns[:2]), np.array([-3.0, 4.0]), [np.array([-2.0, 2.0])])
-    maps = laid.superposed()
+    discs = [
+        (Place(30.4, 19.6, 3.0), 3, [1.0, 2.0, 3.0], [4.0, -4.0, 0.0]),
+        (Place(29.6, 20.4, 3.0), 2, [-3.0, 4.0], [-2.0, 2.0]),
+        *[(Place(30.0, 20.0, 3.0), 1, [0.0], [0.0])] * 3,
+    ]
+
+    def laid(count: int) -> Superposed:
+        """The maps of the first discs."""
+        frames = [
+            dataclasses.replace(
+                noisy(11).frames[0],
+                found=dataclasses.replace(noisy(11).frames[0].found, place=place),
+                dark=(rows[:pixels], columns[:pixels]),
+            )
+            for place, pixels, _, _ in discs[:count]
+        ]
+        pe, noise = ([np.array(disc[k]) for disc in discs[:count]] for k in (2, 3))
+        half_px = half_width_px(3.0)
+        return superposed(superposed_maps(frames, pe, half_px), superposed_maps(frames, noise, half_px)[None])
+
+    maps = laid(2)
     assert maps.images == 2 and maps.half_px == 4 and maps.count.shape == (9, 9)
     assert maps.count[4, 4] == 2 and maps.count[4, 7] == 1 and maps.count.sum() == 5
     assert (maps.mpe_pct[4, 4], maps.mape_pct[4, 4]) == (-1.0, 2.0)
@@ -215,6 +239,5 @@ def test_errors_are_mapped_to_the_nearest_pixel_and_averaged_where_discs_are_dar
     assert np.isnan(maps.mpe_pct).sum() == 81 - 3
     assert (maps.mape_mean_pct, maps.mape_largest_pct) == (8 / 3, 3.0)
     assert maps.mpe_rms_pct == pytest.approx(np.sqrt(19 / 3))
-    for _ in range(3):  # the map omits a position that fewer than half of the images show
-        laid.add(Place(30.0, 20.0, 3.0), (rows[:1], columns[:1]), np.array([0.0]), [np.array([0.0])])
-    assert np.isfinite(laid.superposed().mpe_pct).sum() == 1
+    # The map omits a position that fewer than half of the images show.
+    assert np.isfinite(laid(5).mpe_pct).sum() == 1

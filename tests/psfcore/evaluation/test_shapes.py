@@ -28,9 +28,9 @@ from psfcore.scatter.shapes import SHAPES
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.transit import simulate
-from psfcore.transit.blocks import folds
+from psfcore.transit.transit import folds
 from studies.transits import diffraction, drawn_truth
-from tests.psfcore.evaluation.small_evaluations import rms
+from tests.psfcore.evaluation.small_evaluations import residual_against_pct, rms
 from tests.psfcore.small_transits import BRIGHT, IMAGES, observed, sky, solved
 
 
@@ -87,12 +87,9 @@ def test_figures_are_those_of_the_evaluation() -> None:
     assert figures["mape_mean_pct"][0] == pytest.approx(looked.superposed.mape_mean_pct)
 
 
-def test_it_is_written_as_json_and_as_a_table() -> None:
-    found = compared()
-    said = json.loads(json.dumps(found.to_json(), allow_nan=False))
+def test_it_is_written_as_json() -> None:
+    said = json.loads(json.dumps(compared().to_json(), allow_nan=False))
     assert said["shapes"][1]["parameters"]["bend"]["sigma"] > 0
-    assert len(found.lines()) == 2 + 3 + 2
-    assert f"{found.shapes[0].figures['mpe_rms_pct'][0]:.2f}" in found.lines()[1]
 
 
 def test_other_shapes_and_few_images_are_refused() -> None:
@@ -114,7 +111,7 @@ def test_every_image_has_the_psf_of_the_fold_that_holds_it_out() -> None:
     for fold, kernel in zip(parts, of_fold, strict=True):
         assert all(kernels(n) is kernel for n in fold.held_out)
     found = evaluate(observed(sky()).transit, kernels)
-    against = [f.residual_against_pct(sky().noise_free[f.index]) for f in found.frames]
+    against = [residual_against_pct(f, sky().noise_free[f.index]) for f in found.frames]
     assert 0.2 < rms(against) < 2.5
 
 
@@ -132,7 +129,7 @@ def test_held_out_discs_of_clean_transits_are_predicted() -> None:
         print("\n".join(["", f"seed {seed}", *summary_lines(report(found))]))
         for fov in off:
             planes = made.noise_free
-            here = [f.residual_against_pct(planes[f.index]) for f in found.frames if f.pointing == fov]
+            here = [residual_against_pct(f, planes[f.index]) for f in found.frames if f.pointing == fov]
             print(f"pointing {fov}, discs without noise: mean {np.mean(here):+.2f} %, rms {rms(here):.2f} %")
             assert abs(np.mean(here)) < 1.5 and rms(here) < 2
             off[fov] += here

@@ -11,6 +11,7 @@ from astropy.io import fits
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
+from psfcore.flare import arm_profile as arm_profile_module
 from psfcore.flare.arm_profile import (
     BOX_PX,
     FlareComparison,
@@ -109,13 +110,14 @@ def test_without_noise_the_light_of_the_flare_is_recovered() -> None:
     assert fit.box.sum(axis=0) / truth.sum() == pytest.approx(truth.sum(axis=0) / truth.sum(), abs=0.1)
 
 
-def test_a_box_of_one_pixel_is_the_kernel_itself() -> None:
+def test_a_box_of_one_pixel_is_the_kernel_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     """Eq. (1) by convolution, on a strip at an odd angle."""
     one = np.zeros((SIZE, SIZE))
     one[CENTRE[1], CENTRE[0]] = 1e6
     light = observed(one, None)
     profile = arm_profile(light, EVERYWHERE, CENTRE, 33.0, distances_px=(8, 75))
-    fit = fit_flare(profile, flare_psf().kernel, box_px=1)
+    monkeypatch.setattr(arm_profile_module, "BOX_PX", 1)
+    fit = fit_flare(profile, flare_psf().kernel)
     assert fit.box == pytest.approx(np.array([[1e6]]), rel=1e-6)
     assert fit.simulated == pytest.approx(profile.observed, rel=1e-6)
 
@@ -163,7 +165,7 @@ def test_flares_that_cannot_be_compared_are_refused() -> None:
     cases = [
         ("flare-bad-centre", light, {"centre_xy": (SIZE, 3)}),
         ("flare-short-arm", light, {"centre_xy": (SIZE - 15, 90)}),
-        ("flare-no-light", light, {"centre_xy": CENTRE, "matched_px": (200.0, 210.0)}),
+        ("flare-no-light", light, {"centre_xy": CENTRE, "distances_px": (10.0, 50.0)}),
         ("flare-no-light", -light, {"centre_xy": CENTRE}),
     ]
     for code, plane, where in cases:

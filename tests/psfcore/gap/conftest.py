@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence, gather
-from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import Solution
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Transit

@@ -7,7 +7,8 @@ from functools import cache
 from psfcore.gap.effect import Effect
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import Solution
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Transit

@@ -21,7 +21,8 @@ from psfcore.gap.verdict import where
 from psfcore.gap.verdict.calibration import Calibration
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN
 from psfcore.noise import Noise
-from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import Solution
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Transit

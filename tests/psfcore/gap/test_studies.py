@@ -12,7 +12,7 @@ import pytest
 from psfcore.gap.verdict.limits import ParameterLimits
 from psfcore.gap.verdict.posterior import NONE, PRIOR, UNKNOWN, Kind, Names
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Solution
+from psfcore.scatter.reconstruction import Solution
 from psfcore.transit.transit import Transit
 from studies import gap_limits
 from studies.gap_calibration import KINDS, TEMPERATURES, Case, best_prior, calibrated, required, table

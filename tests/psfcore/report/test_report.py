@@ -23,14 +23,13 @@ from psfcore.report.page import page_of
 from psfcore.report.plot import beyond_of
 from psfcore.report.report import PsfReport, make_report, report_json
 from psfcore.scatter import fit
-from psfcore.scatter.as_published.equations import free_fit
-from psfcore.scatter.samples import SCATTER
+from psfcore.scatter.published_equations import free_fit
+from psfcore.scatter.total_psf import SCATTER
 from psfcore.scatter.validation.cross_validation import FoldSample, bootstrap_samples, shared_step
 from psfcore.simulate.scatter_truth import total_kernel
 from psfcore.tables.make import TOTAL, tables_of
-from psfcore.transit.blocks import folds
 from psfcore.transit.prepare import FrameCounts, Prepared
-from psfcore.transit.transit import Transit
+from psfcore.transit.transit import Transit, folds
 from tests.blank_figures import blank_figures
 from tests.html_page import check_stands_alone, read_page
 from tests.psfcore import small_transits

@@ -17,10 +17,11 @@ import pytest
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter import fit as fit_module
-from psfcore.scatter.as_published.published import AS_PUBLISHED, CORRECTED_ALONE, Choices, Published
 from psfcore.scatter.fit import ALONE_SUBSETS, RADII_PX, TransitFit, fit_transit, fitted_psf, overdispersion
 from psfcore.scatter.fit_plot import fit_png
-from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.published import AS_PUBLISHED, CORRECTED_ALONE, Choices, Published
+from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.report import fit_json, fit_sentence
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
 from psfcore.simulate.transit import observed_transit
@@ -169,7 +170,7 @@ def test_free_shells_agree_with_the_truth_within_the_field() -> None:
     assert (np.diff(beyond) <= 1e-9).all()
     assert beyond[0] == pytest.approx(fitted().diffuse_curve.pct[0], abs=3)
     held = edges[:-1] > 2 * 128  # no two pixels of the field are that far apart
-    of_held = free.fits.fits[:, held]
+    of_held = free.weights[:, held]
     assert of_held.shape[0] == 14
     np.testing.assert_allclose(of_held, np.broadcast_to(truth[held], of_held.shape), rtol=0.2)
 
@@ -279,7 +280,8 @@ def test_the_report_contains_the_published_recipe_on_request(monkeypatch: pytest
     def published_recipe(transit: Transit, choices: Choices, *, subsets: int = 100, **_: Any) -> Published:
         asked.append((choices, subsets))
         found = recipe(AS_PUBLISHED)[0]
-        return dataclasses.replace(found, curve_pct=found.curve_pct + len(asked) - 1)
+        (*first, (name, curve)) = found.rounds
+        return dataclasses.replace(found, rounds=(*first, (name, curve + len(asked) - 1)))
 
     monkeypatch.setattr(fit_module, "invert_as_published", published_recipe)
     fit = fit_of(monkeypatch, solved(), as_published=True)

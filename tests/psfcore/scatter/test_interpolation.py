@@ -26,9 +26,8 @@ from psfcore.scatter.interpolation import (
     weight_at,
 )
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.samples import possible_psfs
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
-from psfcore.scatter.total_psf import CURVE_RADII_PX
+from psfcore.scatter.total_psf import CURVE_RADII_PX, possible_psfs
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from tests.psfcore.conftest import LIMITS
 from tests.psfcore.small_transits import DIFFRACTION, observed, sky, solved

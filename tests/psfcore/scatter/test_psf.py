@@ -12,7 +12,7 @@ from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.psf import REACH_GRID_PX, crop_centred, cumulative_curve
 from psfcore.scatter.optics import Blur, Optics, pick, put
 from psfcore.scatter.power_law import scatter_kernel
-from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
+from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.scatter.total_psf import CURVE_RADII_PX, TotalPsf
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from tests.psfcore.small_transits import DIFFRACTION, SCATTER
@@ -42,21 +42,6 @@ def test_a_pattern_larger_than_the_square_counts_where_it_reaches() -> None:
     total = TotalPsf(wide, SOFTENED_POWER_LAW, (64, 64))
     scatter = SOFTENED_POWER_LAW.kernel(AT, 128)
     np.testing.assert_allclose(total.kernel(AT), 0.9 * scatter, rtol=1e-9, atol=1e-15)
-
-
-def test_slopes_are_differences_of_kernels() -> None:
-    for name, k in (*(("softened-power-law", k) for k in range(3)), ("stretched", 4)):
-        shape = SHAPES[name]
-        total = TotalPsf(DIFFRACTION, shape, (64, 64))
-        at = shape.coordinates({"b_px": 6.15, "c": 2.53, "total": 0.411})
-        axis = np.eye(at.size)[k]
-        near, far = (
-            (total.kernel(at + h * axis) - total.kernel(at - h * axis)) / (2 * h) for h in (4e-3, 8e-3)
-        )
-        expected = (4 * near - far) / 3
-        largest = np.abs(expected).max()
-        assert largest > 1e-4
-        np.testing.assert_allclose(total.slope(at, k), expected, atol=1e-5 * largest)
 
 
 def test_curve_slopes_are_differences_of_curves() -> None:
@@ -163,9 +148,3 @@ def test_single_pixels_are_the_right_ones() -> None:
         one = (np.array([shape[0] - 1]), np.array([3]))
         put(lanes, one, np.array([7.0]))
         assert pick(lanes, one) == 7.0 and blur.field(lanes)[-1, 3] == 7.0
-
-
-def test_threads_change_nothing() -> None:
-    x = scene((100, 131))
-    one, two = (Optics(LOPSIDED, (100, 131), threads=threads) for threads in (1, 2))
-    np.testing.assert_array_equal(one.invert(one.lanes(x)), two.invert(two.lanes(x)))

@@ -29,9 +29,9 @@ from psfcore.transit.archive import (
     could_be_archive,
     list_archive,
     pack,
+    transit_in,
     unpack,
 )
-from psfcore.transit.in_place import transit_in
 from tests.transit_files import write_transit
 from workers.files.store import sha256_of
 

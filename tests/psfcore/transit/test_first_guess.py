@@ -73,9 +73,7 @@ def two_pointings() -> Transit:
 
 
 def test_for_a_homogeneous_sun_it_is_the_light_beyond_the_radius(two_pointings: Transit) -> None:
-    steps: list[tuple[int, int]] = []
-    guess = first_guess(two_pointings, progress=lambda done, of: steps.append((done, of)))
-    assert steps == [(i, 6) for i in range(1, 7)]
+    guess = first_guess(two_pointings)
     truth = float(cumulative_curve(wide_kernel(), RADIUS_PX)) / 100
     assert 0.1 < truth < 0.3
     assert guess.best_pointing == 2 and guess.radius_px == RADIUS_PX
@@ -102,16 +100,6 @@ def test_the_estimators_agree_with_their_names() -> None:
         {"image_mean": pixels.mean(), "image_median": 60.0, "shell": 100.0}
     )
     assert frame.ratio == pytest.approx({"image_mean": 30 / pixels.mean(), "image_median": 0.5, "shell": 0.3})
-
-
-def test_given_places_replace_those_of_the_ephemeris(two_pointings: Transit) -> None:
-    frame = two_pointings.frames[4]
-    wrong = Place(frame.place.x_px + 15, frame.place.y_px, RADIUS_PX)
-    off = transit_of((frame.pixels.astype(np.float64), 2, wrong))
-    assert first_guess(off).share > 0.9
-    assert first_guess(off, places=[frame.place]).share == pytest.approx(
-        first_guess(two_pointings).share, rel=0.05
-    )
 
 
 def test_filled_pixels_are_not_used(two_pointings: Transit) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from psfcore.noise import Noise
 from psfcore.simulate.disc import covered_share
 from psfcore.simulate.plan import Shot, default_plan
 from psfcore.simulate.sky import TrueSky, true_sky
+from psfcore.transit import occulter
 from psfcore.transit.occulter import (
     LEAST_NEIGHBOURS,
     PATCH_MARGIN_PX,
@@ -88,8 +90,9 @@ def found_in(
 ) -> list[FoundPlace]:
     """The places found in some frames, with the true scenes and PSF."""
     scenes = [of.true_scene(n).astype(np.float32) for n in range(len(transit.frames))]
-    known = (transit.frames, scenes, places_of(transit), of.kernel, transit.noise)
-    return [find_occulter(n, *known, ephemeris_sigma_px=ephemeris_sigma_px) for n in indices]
+    known = (transit.frames, scenes.__getitem__, places_of(transit), of.kernel, transit.noise)
+    with patch.object(occulter, "EPHEMERIS_SIGMA_PX", ephemeris_sigma_px):
+        return [find_occulter(n, *known) for n in indices]
 
 
 def errors(of: TrueSky, found: Sequence[FoundPlace], indices: Sequence[int]) -> NDArray[np.float64]:
@@ -298,7 +301,7 @@ def test_a_disc_that_touches_the_edge_is_found() -> None:
     assert np.abs(errors(of, found, range(3))).max() < 0.03
     cut = [crop(frame, 8) for frame in noise_free(of).frames]
     scenes = [of.true_scene(n)[:, 8:].astype(np.float32) for n in range(3)]
-    one = find_occulter(0, cut, scenes, [f.place for f in cut], of.kernel, of.plan.noise)
+    one = find_occulter(0, cut, scenes.__getitem__, [f.place for f in cut], of.kernel, of.plan.noise)
     assert (one.place.x_px, one.place.y_px) == pytest.approx((RADIUS_PX - 8, 60.2), abs=0.1)
 
 

@@ -15,15 +15,9 @@ import logging
 import time
 
 from psfcore.errors import DataError
-from psfcore.scatter.inversion import (
-    ALGORITHM_VERSION,
-    Inverter,
-    Progress,
-    Solution,
-    invert,
-    read_solution,
-    write_solution,
-)
+from psfcore.scatter.inversion import ALGORITHM_VERSION, Inverter, invert
+from psfcore.scatter.kept import read_solution, write_solution
+from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.shapes import Shape, Vector
 from psfcore.transit.transit import Transit
 from workers.catalogue.owners import OverQuota

@@ -7,8 +7,8 @@ import pytest
 
 from psfcore.gap.evidence.cells import cells_of, disc_cells, sensitivities
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Solution
 from psfcore.scatter.optics import pick, put
+from psfcore.scatter.reconstruction import Solution
 
 
 def left_in_disc(solution: Solution, n: int, image: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.gap_test import p_value_of_gap
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.library.detector import EFFECTS
-from psfcore.scatter.inversion import Solution
+from psfcore.scatter.reconstruction import Solution
 from tests.psfcore.gap.linear_models import (
     discs_only,
     drawn,

@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.linear_model import FLOOR, UNLIKELY, LinearModel
 from psfcore.gap.library.detector import EFFECTS
-from psfcore.scatter.inversion import Solution
+from psfcore.scatter.reconstruction import Solution
 from tests.psfcore.gap.linear_models import dense, discs_only, effect_of, with_residuals
 
 

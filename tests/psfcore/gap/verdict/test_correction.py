@@ -21,7 +21,8 @@ from psfcore.gap.verdict import correction
 from psfcore.gap.verdict.correction import Corrected, add_to_model, images_without
 from psfcore.gap.verdict.same_data import with_same_data
 from psfcore.gap.view import View
-from psfcore.scatter.inversion import Solution, invert
+from psfcore.scatter.inversion import invert
+from psfcore.scatter.reconstruction import Solution
 from psfcore.transit.transit import Frame, Transit
 from tests.psfcore.gap.small_gaps import changed
 from tests.psfcore.gap.small_transits import clean, effect

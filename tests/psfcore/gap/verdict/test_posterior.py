@@ -23,7 +23,7 @@ from psfcore.gap.verdict.posterior import (
     posterior,
     without_idle,
 )
-from psfcore.scatter.inversion import Solution
+from psfcore.scatter.reconstruction import Solution
 from tests.psfcore.gap.linear_models import with_residuals
 
 OFFSET: Names = ("dark_offset",)

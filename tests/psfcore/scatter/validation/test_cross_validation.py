@@ -16,18 +16,24 @@ from psfcore.scatter import shapes
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.optics import Lanes, Optics
 from psfcore.scatter.shapes import SHAPES
-from psfcore.scatter.validation.bands import LIMITS, ONE_SIGMA, TWO_SIGMA, Bands, Excess, bands, shell_bands
 from psfcore.scatter.validation.cross_validation import (
+    LIMITS,
+    ONE_SIGMA,
+    TWO_SIGMA,
+    Bands,
+    Excess,
     FoldFit,
     FoldShells,
+    bands,
     bootstrap_samples,
     exact_fit,
     shared_fits,
     shared_step,
+    shell_bands,
 )
 from psfcore.scatter.validation.cross_validation_plot import cross_validation_png
 from psfcore.scatter.validation.free_shells import shells
-from psfcore.transit.blocks import folds
+from psfcore.transit.transit import folds
 from tests.psfcore.small_transits import IMAGES, TRUE_VALUES, observed, sky, solved
 
 

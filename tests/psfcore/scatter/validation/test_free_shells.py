@@ -9,8 +9,8 @@ import pytest
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.psf import REACH_GRID_PX
-from psfcore.scatter.inversion import Solution
 from psfcore.scatter.optics import Blur
+from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
 from psfcore.scatter.total_psf import TotalPsf
 from psfcore.scatter.validation.free_shells import (

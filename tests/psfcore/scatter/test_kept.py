@@ -14,7 +14,10 @@ import numpy as np
 import pytest
 
 from psfcore.errors import DataError
-from psfcore.scatter.inversion import Solution, kept, read_solution, solution_of, write_solution
+from psfcore.scatter import kept
+from psfcore.scatter.inversion import solution_of
+from psfcore.scatter.kept import read_solution, write_solution
+from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
 from psfcore.transit.transit import Transit
 from tests.psfcore.small_transits import observed, sky, solved, solved_noise_free

@@ -80,32 +80,14 @@ class Equations:
 class SubsetFits:
     """Fits to subsets of equations; the worst fits are dropped.
 
-    fits: coefficients, (subsets kept, n). cost: sum of the squared misfits divided by the number of equations.
+    fits: coefficients, (subsets kept, n): of the segments, or a, b (px) and c. cost: sum of the squared misfits divided
+    by the number of equations. mean: mean coefficients over the kept subsets. For the power law, the mean is computed in
+    coordinates with nearly Gaussian errors, because a varies by powers of ten between subsets.
     """
 
     fits: Matrix
     cost: Vector
-
-    @property
-    def mean(self) -> Vector:
-        """Mean coefficients over the kept subsets."""
-        return np.asarray(self.fits.mean(axis=0))
-
-
-@dataclass(frozen=True, eq=False)
-class PowerLawSubsetFits:
-    """Fits of Eq. (3) to subsets of equations: mean a, b (px) and c. fits: a, b, c of each kept subset, (subsets, 3)."""
-
-    a: float
-    b_px: float
-    c: float
-    fits: Matrix
-    cost: Vector
-
-    @property
-    def law(self) -> Vector:
-        """a, b and c."""
-        return np.array([self.a, self.b_px, self.c])
+    mean: Vector
 
 
 def choose_subset(equations: Equations, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -122,9 +104,8 @@ def choose_subset(equations: Equations, rng: np.random.Generator) -> NDArray[np.
         )
     share = -(-OCCULTED_EQUATIONS // strata.size)
     chosen = [_some(np.flatnonzero(equations.stratum == stratum), share, rng) for stratum in strata]
-    return np.concatenate(
-        [*chosen, _some(np.flatnonzero(equations.stratum == UNOCCULTED), UNOCCULTED_EQUATIONS, rng)]
-    )
+    unocculted = np.flatnonzero(equations.stratum == UNOCCULTED)
+    return np.concatenate([*chosen, _some(unocculted, UNOCCULTED_EQUATIONS, rng)])
 
 
 def _some(of: NDArray[np.intp], number: int, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -145,14 +126,11 @@ def free_fit(
     prior_weight = (
         np.full_like(counts, PRIOR_WEIGHT) if towards is None else 1 / np.maximum(light, LEAST_LIGHT)
     )
-    rng = np.random.default_rng(seed)
-    return _fit_subsets(
-        equations,
-        counts,
-        rng,
-        subsets,
-        lambda matrix, target: _solve_free(matrix, target, counts, prior_at, prior_weight),
-    )
+
+    def solve(matrix: Matrix, target: Vector) -> tuple[Vector, float]:
+        return _solve_free(matrix, target, counts, prior_at, prior_weight)
+
+    return _fit_subsets(equations, counts, seed, subsets, solve)
 
 
 def power_law_fit(
@@ -163,14 +141,15 @@ def power_law_fit(
     *,
     seed: int,
     subsets: int = SUBSETS,
-) -> PowerLawSubsetFits:
+) -> SubsetFits:
     """The fit of Eq. (3): a, b (px) and c.
 
     radii: for each segment, the distances of its pixels (px) and the number of pixels at each distance. start: the values
     of a, b and c at which the fit starts.
     """
-    rng = np.random.default_rng(seed)
     mean = SegmentMean(radii)
+    a, b, c = start
+    pivot_start = np.array([np.log(a) - c * np.log(b + PIVOT_PX), np.log(b), c])
 
     def solve(matrix: Matrix, target: Vector) -> tuple[Vector, float]:
         def misfit(theta: Vector) -> Vector:
@@ -180,23 +159,16 @@ def power_law_fit(
         # determine this weight well.
         solved = least_squares(
             misfit,
-            _to_pivot(start),
+            pivot_start,
             method="trf",
             bounds=([-np.inf, np.log(0.05), 0.5], [np.inf, np.log(500.0), 8.0]),
             x_scale=[0.1, 0.3, 0.1],
         )
         return solved.x, float(2 * solved.cost)
 
-    fitted = _fit_subsets(equations, counts, rng, subsets, solve)
-    # The mean is computed in coordinates with nearly Gaussian errors, because a varies by powers of ten between subsets.
-    a, b, c = _from_pivot(fitted.mean)
-    return PowerLawSubsetFits(
-        float(a),
-        float(b),
-        float(c),
-        fits=np.array([_from_pivot(fit) for fit in fitted.fits]),
-        cost=fitted.cost,
-    )
+    fitted = _fit_subsets(equations, counts, seed, subsets, solve)
+    law = np.array([_from_pivot(fit) for fit in fitted.fits])
+    return SubsetFits(law, fitted.cost, _from_pivot(fitted.mean))
 
 
 class SegmentMean:
@@ -216,11 +188,6 @@ class SegmentMean:
         )
         mean = np.add.reduceat(weight * self._share, np.minimum(self._start, self._share.size - 1))
         return np.where(self._empty, 0.0, mean)
-
-
-def _to_pivot(abc: Vector) -> Vector:
-    a, b, c = abc
-    return np.array([np.log(a) - c * np.log(b + PIVOT_PX), np.log(b), c])
 
 
 def _from_pivot(theta: Vector) -> Vector:
@@ -250,12 +217,11 @@ def _solve_free(
     return out, float(np.sum((light @ solved.x - target) ** 2))
 
 
-def _fit_subsets(
-    equations: Equations, counts: Vector, rng: np.random.Generator, subsets: int, solve: Solve
-) -> SubsetFits:
+def _fit_subsets(equations: Equations, counts: Vector, seed: int, subsets: int, solve: Solve) -> SubsetFits:
     """Fit many random subsets, and keep the best 70 %, as the paper does."""
     matrix = (equations.ring_sums - equations.unscattered[:, None] * counts) / equations.scale[:, None]
     target = (equations.observed - equations.unscattered) / equations.scale
+    rng = np.random.default_rng(seed)
     fits, cost = [], []
     # These factorisations are so small that threads make them slower, above all when the cores are busy.
     with threadpool_limits(limits=1, user_api="blas"):
@@ -265,4 +231,5 @@ def _fit_subsets(
             fits.append(fit)
             cost.append(misfit / chosen.size)
     best = np.argsort(cost, kind="stable")[: max(1, subsets * KEPT_SUBSETS // SUBSETS)]
-    return SubsetFits(np.array(fits)[best], np.array(cost)[best])
+    kept = np.array(fits)[best]
+    return SubsetFits(kept, np.array(cost)[best], kept.mean(axis=0))

@@ -1,34 +1,20 @@
-"""A transit reconstructed with one PSF: its scenes, and the light in its discs that the PSF does not explain.
+"""A transit reconstructed with one PSF: its scenes, the light in its discs that the PSF does not explain, and the fit.
 
 Source: Hofmeister et al., The point-spread function of HRI_EUV, section "The inversion algorithm", steps (d) to (f).
-H is the convolution with the total PSF on the field. D selects the fully dark pixels. x = H^-1 y is the scene of an
-image y:
-
-    r = D [y - H (1 - D) x]                                           Eq. (1)
-    v = variance of photon and read noise at the model's intensity    Eq. (3)
-    dr/dq = -D [(dH/dq) (1 - D) x - H (1 - D) G (dH/dq) x]            Eq. (4)
-
-The equations have the same numbers as in `psfcore.scatter.inversion.inversion`.
-
-| symbol | name | unit |
-|---|---|---|
-| y | frame.pixels | DN/s |
-| q | coordinates of the shape's parameters | - |
-| D | dark: rows and columns of the fully dark pixels | - |
-| G | optics.invert_once: inverse of H | - |
+The equations and the symbols are those of `psfcore.scatter.inversion`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from copy import copy
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.scatter.optics import Blur, Lanes, Optics, Pixels, pick, put
-from psfcore.scatter.shapes import Vector
+from psfcore.scatter.shapes import Shape, Vector
 from psfcore.scatter.total_psf import Kernel, TotalPsf
 from psfcore.transit.occulter import LARGEST_SHIFT_PX, FoundPlace, find_occulter, fully_dark
 from psfcore.transit.transit import Frame, Transit
@@ -41,46 +27,40 @@ LARGEST_DARK_MARGIN_PX = 2.5
 LEAST_DARK_PIXELS = 30
 # The variance of a pixel is computed from its expected intensity, but at least from this fraction of the disc's mean.
 LEAST_LEVEL = 0.2
+SCENES_KEPT = 13
 
 
+def labelled(progress: Progress, label: str) -> Progress:
+    """The same progress function; the names of the stages begin with a label."""
+    return lambda stage, step, steps: progress(f"{label}: {stage}", step, steps)
+
+
+@dataclass(eq=False)
 class TransitScenes:
     """All images of a transit, with their latest scenes and occulter positions.
 
     Images and scenes are stored in the memory order of the convolution engine (see `psfcore.scatter.optics`).
     """
 
-    def __init__(self, transit: Transit, optics: Optics, progress: Progress) -> None:
-        self.transit = transit
-        self.observed: list[Lanes] = []
-        self.scenes: list[Lanes] = []
-        for n, frame in enumerate(transit.frames):
-            progress("reconstructing", n, len(transit.frames))
-            self.observed.append(optics.lanes(frame.pixels))
-            self.scenes.append(optics.invert(self.observed[-1]))
-        self.found: list[FoundPlace] = []
-        self.dark: list[Pixels] = []
+    transit: Transit
+    observed: list[Lanes]
+    scenes: list[Lanes]
+    found: list[FoundPlace] = field(default_factory=list)
+    dark: list[Pixels] = field(default_factory=list)
 
     @classmethod
-    def restored(
-        cls,
-        transit: Transit,
-        optics: Optics,
-        *,
-        scenes: list[Lanes],
-        found: list[FoundPlace],
-        dark: list[Pixels],
-    ) -> TransitScenes:
-        """The scenes of an earlier reconstruction of a transit. optics: used only for the memory order of the engine."""
-        sky = cls.__new__(cls)
-        sky.transit, sky.scenes, sky.found, sky.dark = transit, scenes, found, dark
-        sky.observed = [optics.lanes(frame.pixels) for frame in transit.frames]
+    def reconstructed(cls, transit: Transit, optics: Optics, progress: Progress) -> TransitScenes:
+        """Step (d): the scenes of all images; no occulter is located yet."""
+        sky = cls(transit, [], [])
+        for n, frame in enumerate(transit.frames):
+            progress("reconstructing", n, len(transit.frames))
+            sky.observed.append(optics.lanes(frame.pixels))
+            sky.scenes.append(optics.invert(sky.observed[-1]))
         return sky
 
     def copy(self) -> TransitScenes:
         """A second object with the same contents. Arrays are shared, because no code writes to them."""
-        other = copy(self)
-        other.scenes, other.found, other.dark = list(self.scenes), list(self.found), list(self.dark)
-        return other
+        return replace(self, scenes=list(self.scenes), found=list(self.found), dark=list(self.dark))
 
     def find(
         self,
@@ -90,27 +70,24 @@ class TransitScenes:
     ) -> None:
         """Step (e): locate every occulter and select the fully dark pixels."""
         frames = self.transit.frames
-        scenes = _SceneFields(self.scenes, optics)
+        scene_of = lru_cache(maxsize=SCENES_KEPT)(lambda n: optics.field(self.scenes[n]))
         places = [f.place for f in self.found] or [frame.place for frame in frames]
         self.found = []
         for n in range(len(frames)):
             progress("finding occulters", n, len(frames))
-            self.found.append(find_occulter(n, frames, scenes, places, psf_kernel, self.transit.noise))
+            self.found.append(find_occulter(n, frames, scene_of, places, psf_kernel, self.transit.noise))
         self.dark = [dark_pixels(frame, found) for frame, found in zip(frames, self.found, strict=True)]
 
     def left_out(self) -> dict[str, str]:
         """The files that the fit cannot use, with the reason for each."""
         reasons = {}
         for frame, dark, found in zip(self.transit.frames, self.dark, self.found, strict=True):
+            at = f"expected an occulter at ({frame.place.x_px:g}, {frame.place.y_px:g}) px"
             if not found.within_reach:
-                reasons[frame.file] = (
-                    f"expected an occulter at ({frame.place.x_px:g}, {frame.place.y_px:g}) px; "
-                    f"found no occulter within {LARGEST_SHIFT_PX:g} px"
-                )
+                reasons[frame.file] = f"{at}; found no occulter within {LARGEST_SHIFT_PX:g} px"
             elif not found.seen:
                 reasons[frame.file] = (
-                    f"expected an occulter at ({frame.place.x_px:g}, {frame.place.y_px:g}) px; "
-                    f"got a depth of {100 * found.depth:.0f} ± {100 * found.depth_sigma:.0f} % of the light that "
+                    f"{at}; got a depth of {100 * found.depth:.0f} ± {100 * found.depth_sigma:.0f} % of the light that "
                     "an occulter would block"
                 )
             elif dark[0].size < LEAST_DARK_PIXELS:
@@ -118,24 +95,6 @@ class TransitScenes:
                     f"expected at least {LEAST_DARK_PIXELS} fully dark pixels; got {dark[0].size}"
                 )
         return reasons
-
-
-class _SceneFields(Sequence[NDArray[np.float32]]):
-    """Scenes as fields [y, x]. A scene is rearranged from the engine's order only when it is read."""
-
-    def __init__(self, lanes: Sequence[Lanes], optics: Optics) -> None:
-        self._lanes, self._optics = lanes, optics
-        self._last: dict[int, NDArray[np.float32]] = {}
-
-    def __len__(self) -> int:
-        return len(self._lanes)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        if index not in self._last:
-            if len(self._last) > 12:
-                self._last.pop(next(iter(self._last)))
-            self._last[index] = self._optics.field(self._lanes[index])
-        return self._last[index]
 
 
 def dark_pixels(frame: Frame, found: FoundPlace) -> Pixels:
@@ -189,6 +148,92 @@ class Reconstruction:
     def jacobian(self, n: int, slope: Blur) -> Vector:
         """The derivative of the expected light in the dark pixels of image n, from Eq. (4). slope: derivative of the total PSF."""
         return jacobian_row(self.optics, slope, self.blanked_scene(n), self.sky.dark[n])
+
+
+@dataclass(frozen=True)
+class Round:
+    """One Gauss-Newton step. frames: number of images. moved_points: largest change of C(R), in percentage points."""
+
+    frames: int
+    values: dict[str, float]
+    curve_pct: tuple[float, ...]
+    moved_points: float
+    chi2_per_pixel: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFit:
+    """The fit of one image: the position of its occulter, and the observed and expected light in the disc.
+
+    observed, expected: means over the fully dark pixels, DN/s. noise: standard error of the mean residual, DN/s.
+    normal, score: matrix and right-hand side that this image adds to the normal equations of the coordinates.
+    mean_jacobian: derivatives of `expected` with respect to the coordinates, DN/s.
+    """
+
+    file: str
+    pointing: int
+    found: FoundPlace
+    dark: Pixels
+    observed: float
+    expected: float
+    noise: float
+    chi2: float
+    normal: NDArray[np.float64]
+    score: Vector
+    mean_jacobian: Vector
+
+    @property
+    def residual_pct(self) -> float:
+        """Expected mean minus observed mean, in percent of the observed mean."""
+        return 100 * (self.expected - self.observed) / self.observed
+
+
+@dataclass(frozen=True, eq=False)
+class Inversion:
+    """The scatter that was fitted to a transit: coordinates with their covariance, and the curve C(R) with its errors.
+
+    curve_pct, curve_sigma: C(R) = 100 (1 - encircled energy) of the total PSF at radii_px, and its standard error. The
+    radii lie within the array of TotalPsf. covariance: covariance matrix of the coordinates; it follows from the photon
+    and read noise of all pixels, propagated through the whole fit. left_out: files that the fit did not use, with the
+    reasons.
+    """
+
+    shape: Shape
+    coordinates: Vector
+    covariance: NDArray[np.float64]
+    radii_px: Vector
+    curve_pct: Vector
+    curve_sigma: Vector
+    rounds: tuple[Round, ...]
+    converged: bool
+    frames: tuple[FrameFit, ...]
+    left_out: dict[str, str]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter values by name."""
+        return self.shape.values(self.coordinates)
+
+    @property
+    def value_sigma(self) -> dict[str, float]:
+        """Standard errors of the parameters by name."""
+        return self.shape.value_sigma(self.coordinates, self.covariance)
+
+    @property
+    def chi2_per_pixel(self) -> float:
+        """chi2 of all dark pixels divided by the degrees of freedom.
+
+        The result is about 1 if photon and read noise explain the residuals.
+        """
+        pixels = sum(frame.dark[0].size for frame in self.frames)
+        return sum(frame.chi2 for frame in self.frames) / (pixels - self.coordinates.size)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution(Reconstruction):
+    """An inversion together with its scenes and optics, for later analyses. part: ordered like inversion.frames."""
+
+    inversion: Inversion
 
 
 def pixel_weight(transit: Transit, n: int, expected: Vector) -> Vector:

@@ -15,7 +15,7 @@ from the normal equations with all other quantities free; they are multiplied by
 S must be at least one pixel wide, as in real images. If each order of a point source filled a single pixel, the fit
 could only find the centres of these pixels.
 
-`search` finds the first values, `image` prepares the data, `orders` implements Eq. (1) and `fit` implements Eq. (2).
+`arms_search` prepares the data and finds the first values; `arms_fit` implements Eq. (1) and Eq. (2).
 
 | symbol | name | unit |
 |---|---|---|
@@ -33,22 +33,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from psfcore.flare.arms.fit import FitResult, FitState, first_fit, first_source, iterate
-from psfcore.flare.arms.image import (
+from psfcore.flare.arms_fit import (
+    FitResult,
+    FitState,
+    Geometry,
+    Orders,
+    first_fit,
+    first_source,
+    iterate,
+    order_positions,
+)
+from psfcore.flare.arms_search import (
     Flags,
     Plane,
     expected_light,
     pixel_sigma,
     prepared,
     ring_halo,
+    search_arms,
     smooth,
     source_centre,
 )
-from psfcore.flare.arms.orders import Geometry, Orders, order_positions
-from psfcore.flare.arms.search import search_arms
 
-SMALLEST_SPACING_PX = 4.0
-LARGEST_SPACING_PX = 40.0
 _LARGEST_SEARCH_PX = 300.0
 _NEAR_PX = 100.0  # the first fit uses the orders within this radius
 _NEAR_ORDERS = 6  # the first fit uses at least this number of orders on each side of an arm
@@ -101,21 +107,15 @@ def measure_arms(
     centre_xy: tuple[float, float] | None = None,
     *,
     reference: Plane | None = None,
-    noise: tuple[float, float] | None = None,
     saturated: Flags | None = None,
     n_arms: int = 2,
-    spacing_range_px: tuple[float, float] = (SMALLEST_SPACING_PX, LARGEST_SPACING_PX),
-    angles_near_deg: tuple[float, ...] | None = None,
     source_radius_px: float | None = None,
     reach_px: float | None = None,
 ) -> ArmMeasurement:
     """Measure `n_arms` arms around a flare in `image` [y, x] (DN), or in `image` minus `reference`.
 
     centre_xy: position of the source; default: the middle of the largest saturated patch, else the brightest pixel.
-    noise: (DN per photon, rms of the read noise in DN); default: estimated from the residuals.
     saturated: True where pixels must not be used; pixels that are not finite are never used.
-    angles_near_deg: one arm is searched within 3 degrees of each of these angles. spacing_range_px: the search is
-    limited to spacings between these two.
     source_radius_px: half size of S; default: from the saturated patch. reach_px: largest radius at which orders are used.
 
     Raises DataError "arms-bad-input", "all-masked", "no-flare", "too-few-peaks".
@@ -125,16 +125,14 @@ def measure_arms(
     half = source_radius_px or float(np.clip(patch_radius + 2.0, 3.0, 8.0))
     inner = 2 * (patch_radius + half)  # at smaller radii, a plane does not describe the smooth light well
     reach = min(reach_px or np.inf, _LARGEST_SEARCH_PX, float(np.hypot(*image.shape)))
-    angles, spacing = search_arms(
-        difference, usable, centre, n_arms, spacing_range_px, angles_near_deg, (inner, reach)
-    )
+    angles, spacing = search_arms(difference, usable, centre, n_arms, (inner, reach))
     halo = ring_halo(difference, usable, centre, angles, half)
     difference = difference - halo
     expected = expected_light(image, reference, usable)
     # The near orders are fitted first, because the angles of the search are too uncertain for the far orders.
     near = Geometry(centre, half, (inner, min(reach, max(_NEAR_PX, inner + _NEAR_ORDERS * spacing))))
     geometry = Geometry(centre, half, (inner, reach))
-    sigma = pixel_sigma(expected, noise)
+    sigma = pixel_sigma(expected)
     pattern = np.append(np.deg2rad(angles), spacing)
     state, orders = first_fit(difference, usable, sigma, near, pattern, first_source(near))
     state, _ = iterate(orders, near, state)
@@ -142,7 +140,7 @@ def measure_arms(
     state, result = iterate(orders, geometry, state)
     # Fit once more, with weights from the light of the fitted model.
     rest = (expected - smooth(difference, usable, 2.0))[orders.row, orders.column]
-    orders = replace(orders, sigma=pixel_sigma(result.light + rest, noise))
+    orders = replace(orders, sigma=pixel_sigma(result.light + rest))
     state, result = iterate(orders, geometry, state)
     return _measurement(orders, geometry, state, result, halo)
 

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.scatter.as_published.segments import Segments
+from psfcore.scatter.segments import Segments
 
 
 def segment_sums_plain(
     image: NDArray[np.floating], targets: NDArray[np.integer], segments: Segments
 ) -> NDArray[np.float64]:
-    """Eq. (1) of psfcore.scatter.as_published.ring_sums, (n, segments), by the label map."""
+    """Eq. (3) of psfcore.scatter.segments, (n, segments), by the label map."""
     ny, nx = image.shape
     # Targets lie on the image, so every offset is shorter than the longer side of the image.
     size = 2 * max(ny, nx) + 1

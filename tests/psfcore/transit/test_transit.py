@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from psfcore.transit.blocks import folds
+from psfcore.transit.transit import folds
 
 
 def test_blocks_and_guard() -> None:

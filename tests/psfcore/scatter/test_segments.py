@@ -1,4 +1,4 @@
-"""Sums over segments equal plain sums and convolutions, for any image, targets and threads."""
+"""Segments of the PSF: edges, pixels, means of kernels; sums over them equal plain sums for any image and threads."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.scatter.as_published.ring_sums import segment_sums
-from psfcore.scatter.as_published.segments import Segments, shells_as_published
-from tests.psfcore.scatter.as_published.ring_sum_references import segment_sums_plain
+from psfcore.psf import squared_radii
+from psfcore.scatter.power_law import scatter_kernel
+from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
+from tests.psfcore.scatter.ring_sum_references import segment_sums_plain
 
-PUBLISHED = tuple(shells_as_published(90.0))
+PUBLISHED = shells_as_published(90.0)
 PIXEL_WIDE = tuple(np.arange(0.5, 91.0))
 
 
@@ -61,7 +62,7 @@ def test_segments_of_any_kind_of_image_equal_the_plain_sum() -> None:
 def test_published_shells_of_a_large_image_equal_the_plain_sum() -> None:
     image = scene((1024, 1024)).astype(np.float32)
     targets = np.array([[0, 0], [500, 700], [500, 701], [1023, 1023]])
-    segments = Segments(tuple(shells_as_published()))
+    segments = Segments(shells_as_published())
     expected = segment_sums_plain(image, targets, segments)
     np.testing.assert_allclose(segment_sums(image, targets, segments), expected, rtol=1e-9, atol=1e-6)
 
@@ -118,12 +119,53 @@ def test_what_cannot_be_summed_is_refused() -> None:
         image[50, 10] = value
         with pytest.raises(DataError, match=r"image-nonfinite: .* got 1"):
             segment_sums(image, np.array([[2, 40]]), Segments((0.5, 5.0)))
-    for shape, targets, message in (
-        ((20,), [[1, 1]], "two axes"),
-        ((20, 20), [1, 1], "integer targets"),
-        ((20, 20), [[1.0, 1.0]], "integer targets"),
-        ((20, 20), [[20, 1]], "outside it"),
-        ((20, 20), [[1, -1]], "outside it"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            segment_sums(np.zeros(shape), np.array(targets), Segments(PUBLISHED))
+    for targets in ([[20, 1]], [[1, -1]]):
+        with pytest.raises(ValueError, match="outside it"):
+            segment_sums(np.zeros((20, 20)), np.array(targets), Segments(PUBLISHED))
+
+
+def test_published_shells_are_ten_five_and_thirty_five_none_empty() -> None:
+    edges = shells_as_published()
+    assert len(edges) == 51 and (edges[10], edges[15]) == (5.0, 10.0)
+    widths = np.diff(edges[15:])
+    np.testing.assert_allclose(widths[1:] / widths[:-1], widths[1] / widths[0])
+    counts = Segments(edges).counts
+    assert counts.min() > 0
+    assert counts.sum() == 2048**2 - 1
+
+
+def test_a_pixel_on_an_edge_belongs_to_the_shell_that_begins_there() -> None:
+    label = Segments((1.0, 2.0, 5.0), reach_grid_px=16).label_map(13)
+    r = np.sqrt(squared_radii((13, 13)))
+    expected = np.full(r.shape, -1)
+    expected[(r >= 1) & (r < 2)] = 0
+    expected[(r >= 2) & (r < 5)] = 1
+    np.testing.assert_array_equal(label, expected)
+    assert label[6, 6 + 5] == label[6, 6] == -1
+    assert label[6 + 3, 6 + 4] == -1
+
+
+def test_a_map_of_any_size_is_a_crop_of_the_reach_grid_and_runs_are_its_rows() -> None:
+    segments = Segments(shells_as_published(50.0), 64)
+    for size in (1, 40, 63, 64, 65, 100):
+        dy, dx = np.indices((size, size)) - size // 2
+        on_grid = (np.minimum(dx, dy) >= -32) & (np.maximum(dx, dy) < 32)
+        r = np.hypot(dx, dy)
+        shell = np.searchsorted(segments.edges_px, r, side="right") - 1
+        expected = np.where(on_grid & (r > 0) & (r < 50), shell, -1)
+        np.testing.assert_array_equal(segments.label_map(size), expected)
+    label = segments.label_map(64)
+    np.testing.assert_array_equal(np.bincount(label[label >= 0], minlength=segments.size), segments.counts)
+    runs, drawn = segments.runs, np.full((64, 64), -1)
+    for row in range(64):
+        for i in range(runs.row[row], runs.row[row + 1]):
+            columns = slice(runs.dx_start[i] + 32, runs.dx_stop[i] + 32)
+            assert columns.start < columns.stop
+            drawn[row + runs.first_dy + 32, columns] = runs.segment[i]
+    np.testing.assert_array_equal(drawn, label)
+
+
+def test_means_times_counts_sum_to_the_light_of_the_full_reach() -> None:
+    segments = Segments(shells_as_published())
+    kernel = scatter_kernel(6.15, 2.53, 0.411, 2048)
+    assert segments.counts @ segments.mean_of_map(kernel) == pytest.approx(0.411, rel=1e-12)

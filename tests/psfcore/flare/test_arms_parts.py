@@ -1,4 +1,4 @@
-"""The parts of the measurement of arms: the prepared image, the search, the orders that are used, and the fit."""
+"""The parts of the measurement of arms: the prepared image, the search, and the orders that are used."""
 
 from __future__ import annotations
 
@@ -7,17 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.flare.arms import fit
-from psfcore.flare.arms.image import pixel_sigma, prepared, ring_halo, smooth, source_centre
-from psfcore.flare.arms.orders import (
+from psfcore.flare.arms_fit import (
     Geometry,
-    Orders,
     check_enough_orders,
     order_positions,
     orders_between,
     select_pixels,
 )
-from psfcore.flare.arms.search import search_arms
+from psfcore.flare.arms_search import prepared, ring_halo, search_arms, smooth, source_centre
 
 # --- the image -------------------------------------------------------------------------------------------
 
@@ -65,12 +62,6 @@ def test_the_halo_is_the_ring_median_without_the_arms() -> None:
     np.testing.assert_allclose(found[away], halo[away], rtol=0.15)
 
 
-def test_noise_is_that_of_photons_and_reading() -> None:
-    expected = np.full(SHAPE, 9.0)
-    assert pixel_sigma(expected, (4.0, 8.0))[0, 0] == pytest.approx(10.0)
-    assert pixel_sigma(expected, None)[0, 0] == pytest.approx(3.0)
-
-
 # --- the search ------------------------------------------------------------------------------------------
 
 
@@ -94,10 +85,9 @@ def with_orders() -> NDArray[np.float64]:
 def test_angles_and_spacing_are_found() -> None:
     image = with_orders()
     everywhere = np.ones(image.shape, dtype=bool)
-    for near in (None, (-69.0, 21.5)):
-        angles, spacing = search_arms(image, everywhere, SEARCHED_CENTRE, 2, (5.0, 15.0), near, (12.0, 95.0))
-        assert angles == pytest.approx(ANGLES_DEG, abs=0.5)
-        assert spacing == pytest.approx(SPACING_PX, rel=0.01)
+    angles, spacing = search_arms(image, everywhere, SEARCHED_CENTRE, 2, (12.0, 95.0))
+    assert angles == pytest.approx(ANGLES_DEG, abs=0.5)
+    assert spacing == pytest.approx(SPACING_PX, rel=0.01)
 
 
 # --- the orders ------------------------------------------------------------------------------------------
@@ -137,55 +127,3 @@ def test_an_arm_of_few_orders_is_refused() -> None:
     with pytest.raises(DataError, match=r"expected at least 3 orders .*; got 3, 1") as caught:
         check_enough_orders(np.array([0, 0, 0, 1]), 2)
     assert caught.value.code == "too-few-peaks"
-
-
-# --- the fit ----------------------------------------------------------------------------------------------
-
-FIT_GEOMETRY = Geometry((50.2, 49.7), 4.0, (15.0, 40.0))
-FIT_PATTERN = np.array([0.1, 1.6, 9.3])
-
-
-def fitted_orders() -> Orders:
-    arm, k = orders_between(FIT_PATTERN, FIT_GEOMETRY.radii_px)
-    plane = np.zeros((101, 101))
-    return select_pixels(plane, plane == 0, plane + 1, FIT_GEOMETRY, FIT_PATTERN, arm, k)
-
-
-def test_the_splines_sum_to_1_and_their_slope_is_the_derivative() -> None:
-    t = np.linspace(-2.5, 2.5, 101)
-    inside = np.linspace(-0.5, 0.5, 11)
-    np.testing.assert_allclose(sum(fit._spline(inside - knot) for knot in range(-3, 4)), 1.0)
-    slope = (fit._spline(t + 1e-6) - fit._spline(t - 1e-6)) / 2e-6
-    np.testing.assert_allclose(fit._spline_slope(t), slope, atol=1e-5)
-
-
-def test_the_jacobian_is_the_derivative_of_the_model() -> None:
-    orders = fitted_orders()
-    rng = np.random.default_rng(0)
-    source = FIT_GEOMETRY.source(rng.random(int(FIT_GEOMETRY.disc.sum())))
-    state = fit.FitState(FIT_PATTERN, rng.random(orders.k.size) + 0.5, source)
-    bases = fit._bases(orders, FIT_GEOMETRY, state.pattern)
-    jacobian = np.hstack(
-        (
-            fit._columns_of_pattern(orders, bases, state),
-            fit._columns_of_stamps(orders, bases, bases.stamps(state.source)),
-            fit._columns_of_source(orders, bases, FIT_GEOMETRY, state.amplitude),
-        )
-    )
-
-    def light(step: np.ndarray) -> np.ndarray:
-        moved = state.moved(step, FIT_GEOMETRY)
-        return fit._light(orders, fit._bases(orders, FIT_GEOMETRY, moved.pattern), moved)
-
-    for column in (0, 1, 2, 3, 3 + orders.k.size, jacobian.shape[1] - 1):
-        step = np.zeros(jacobian.shape[1])
-        step[column] = 1e-6
-        derivative = (light(step) - light(-step)) / 2e-6
-        np.testing.assert_allclose(jacobian[:, column], derivative, atol=1e-5)
-
-
-def test_undetermined_combinations_stay_zero() -> None:
-    columns = np.array([[1.0, 1.0], [2.0, 2.0], [0.5, 0.5]])
-    solution, _, rank = fit._solve(columns, columns @ np.array([3.0, 1.0]))
-    assert rank == 1
-    assert solution == pytest.approx([2.0, 2.0])

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from astropy.io.fits import Header
@@ -29,16 +30,8 @@ from psfcore.deconvolve.methods.richardson_lucy import deconvolve
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import CENTRE_TOLERANCE, REACH_GRID_PX, Psf, crop_or_pad, cumulative_curve, squared_radii
-from psfcore.scatter.as_published.equations import (
-    UNOCCULTED,
-    Equations,
-    PowerLawSubsetFits,
-    SubsetFits,
-    free_fit,
-    power_law_fit,
-)
-from psfcore.scatter.as_published.ring_sums import segment_sums
-from psfcore.scatter.as_published.segments import Segments, shells_as_published
+from psfcore.scatter.published_equations import UNOCCULTED, Equations, free_fit, power_law_fit
+from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
 from psfcore.scatter.total_psf import CURVE_RADII_PX
 from psfcore.transit.occulter import FoundPlace, disc_distance, find_occulter, fully_dark
 from psfcore.transit.transit import Frame, Transit
@@ -84,18 +77,6 @@ CORRECTED_ALONE = {
     "light counted on the full reach": replace(AS_PUBLISHED, counted_on_array=False),
     "only fully dark pixels blanked": replace(AS_PUBLISHED, whole_disc_blanked=False),
 }
-ALL_CORRECTED = Choices(False, False, False, False)
-
-
-@dataclass(frozen=True)
-class PublishedRound:
-    """One round of the published fit. fit: free shells or power law.
-
-    curve_pct: 1 - encircled energy of the total PSF of this round, percent.
-    """
-
-    fit: str
-    curve_pct: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +85,9 @@ class Published:
 
     a, b_px, c: the power law of the last round. spread: standard deviations of a, b_px and c over the subsets; None if
     fewer than two subsets were kept. total: the fraction of scattered light, summed over a square grid of grid_px pixels.
-    free: the subset fits of the last round with free shells. segments: these shells. curve_pct: 1 - encircled energy (in
-    percent) of the final total PSF at radii_px; this PSF is the scatter kernel convolved with the diffraction PSF.
-    equations: the number of equations in the last round.
+    rounds: for each round, "free shells" or "softened power law", and 1 - encircled energy (in percent) at radii_px of the
+    total PSF, which is the scatter kernel convolved with the diffraction PSF. equations: the number of equations in the
+    last round.
     """
 
     a: float
@@ -115,12 +96,14 @@ class Published:
     spread: dict[str, float] | None
     total: float
     grid_px: int
-    free: SubsetFits
-    segments: Segments
     radii_px: Vector
-    curve_pct: Vector
-    rounds: tuple[PublishedRound, ...]
+    rounds: tuple[tuple[str, Vector], ...]
     equations: int
+
+    @property
+    def curve_pct(self) -> Vector:
+        """1 - encircled energy of the final total PSF at radii_px, percent."""
+        return self.rounds[-1][1]
 
     @property
     def scatter(self) -> Kernel:
@@ -142,8 +125,7 @@ def invert_as_published(
     Raises DataError "no-lines" if no pixel is occulted. Raises DataError "no-scatter" if the fit is not physical: it
     scatters more than all light, or the maximum of its PSF is not at the centre.
     """
-    recipe = _Recipe(transit, choices, seed, subsets, threads, progress)
-    return recipe.run()
+    return _Recipe(transit, choices, seed, subsets, threads, progress).run()
 
 
 class _Recipe:
@@ -159,7 +141,7 @@ class _Recipe:
             min(transit.diffraction.shape[0], REACH_GRID_PX) if choices.counted_on_array else REACH_GRID_PX
         )
         reach = float(np.hypot(self.grid // 2, self.grid // 2)) + 1.0
-        self.segments = Segments(tuple(shells_as_published(reach)), reach_grid_px=self.grid)
+        self.segments = Segments(shells_as_published(reach), reach_grid_px=self.grid)
         self.psf_size = min(2 * field, REACH_GRID_PX)
         self.to_total = Convolver(
             transit.diffraction, (self.psf_size, self.psf_size), dtype=np.float64, threads=threads
@@ -171,28 +153,19 @@ class _Recipe:
     def run(self) -> Published:
         kernel = crop_or_pad(self.transit.diffraction, self.psf_size)
         rounds = []
-        law = np.array([0.15, 6.0, 2.5])
-        free: SubsetFits | None = None
-        count = 0
+        law, middle = np.array([0.15, 6.0, 2.5]), self.grid // 2
+        counts = self.segments.counts.astype(np.float64)
         for n in range(FREE_ROUNDS + POWER_LAW_ROUNDS):
             equations = self._equations(kernel, n)
-            count = len(equations)
-            counts = self.segments.counts.astype(np.float64)
+            draws: dict[str, Any] = {"seed": self.seed * 100 + n, "subsets": self.subsets}
             if n < FREE_ROUNDS:
-                free = free_fit(equations, counts, seed=self.seed * 100 + n, subsets=self.subsets)
-                scatter, name = self._free_kernel(free.mean), "free shells"
+                name, fitted = "free shells", free_fit(equations, counts, **draws)
+                scatter = self._free_kernel(fitted.mean)
             else:
-                fitted = power_law_fit(
-                    equations,
-                    counts,
-                    self.radius_of_segment,
-                    law,
-                    seed=self.seed * 100 + n,
-                    subsets=self.subsets,
-                )
-                law, name = fitted.law, "softened power law"
+                fitted = power_law_fit(equations, counts, self.radius_of_segment, law, **draws)
+                name, law = "softened power law", fitted.mean
                 scatter = _power_law_kernel(law, self.grid)
-            centre = float(scatter[self.grid // 2, self.grid // 2])
+            centre = float(scatter[middle, middle])
             if not centre > 0:
                 raise DataError(
                     "no-scatter",
@@ -201,22 +174,18 @@ class _Recipe:
                 )
             kernel = np.maximum(self.to_total.apply(crop_or_pad(scatter, self.psf_size)), 0.0)
             _check_brightest_at_centre(kernel, f"round {n + 1}: {name}")
-            curve = cumulative_curve(kernel, self.radii)
-            rounds.append(PublishedRound(name, tuple(float(c) for c in curve)))
-        assert free is not None
+            rounds.append((name, cumulative_curve(kernel, self.radii)))
+        spread = fitted.fits.std(axis=0, ddof=1).tolist() if len(fitted.fits) > 1 else None
         return Published(
             a=float(law[0]),
             b_px=float(law[1]),
             c=float(law[2]),
-            spread=_spread(fitted),
+            spread=None if spread is None else dict(zip(("a", "b_px", "c"), spread, strict=True)),
             total=1 - centre,
             grid_px=self.grid,
-            free=free,
-            segments=self.segments,
             radii_px=self.radii,
-            curve_pct=np.array(rounds[-1].curve_pct),
             rounds=tuple(rounds),
-            equations=count,
+            equations=len(equations),
         )
 
     def _equations(self, kernel: Kernel, n: int) -> Equations:
@@ -228,7 +197,7 @@ class _Recipe:
         for k, frame in enumerate(frames):
             self.progress(f"round {n + 1}: equations", k, len(frames))
             found = find_occulter(
-                k, frames, scenes, [f.place for f in frames], kernel, self.transit.noise
+                k, frames, scenes.__getitem__, [f.place for f in frames], kernel, self.transit.noise
             )  # step (e)
             part = self._equations_of_frame(frame, scenes[k], found, rng)
             if part is not None:
@@ -306,7 +275,7 @@ class _Recipe:
         return np.asarray(kernel)
 
 
-def _check_brightest_at_centre(kernel: Kernel, found: str) -> None:
+def _check_brightest_at_centre(kernel: Kernel, label: str) -> None:
     """Raise DataError "no-scatter" if the central pixel is not the maximum; such a PSF is not physical."""
     middle = (kernel.shape[0] // 2, kernel.shape[1] // 2)
     if kernel[middle] < kernel.max() * (1 - CENTRE_TOLERANCE):
@@ -314,16 +283,9 @@ def _check_brightest_at_centre(kernel: Kernel, found: str) -> None:
         distance = np.hypot(y - middle[0], x - middle[1])
         raise DataError(
             "no-scatter",
-            f"{found}: expected a PSF with its maximum at the centre; got {kernel[middle]:.3g} of the light there "
+            f"{label}: expected a PSF with its maximum at the centre; got {kernel[middle]:.3g} of the light there "
             f"and {kernel.max():.3g} in a pixel at a distance of {distance:.3g} px",
         )
-
-
-def _spread(fitted: PowerLawSubsetFits) -> dict[str, float] | None:
-    """Standard deviations of a, b and c over the subsets; None for fewer than two subsets."""
-    if len(fitted.fits) < 2:
-        return None
-    return dict(zip(("a", "b_px", "c"), fitted.fits.std(axis=0, ddof=1).tolist(), strict=True))
 
 
 def _power_law_kernel(law: Vector, size: int) -> Kernel:
