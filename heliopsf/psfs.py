@@ -14,7 +14,7 @@ from psfcore.built.recipe import Recipe
 from psfcore.errors import module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.mask_file import read_mask_image
+from psfcore.fits.images import read_mask_image
 from psfcore.instruments.files import instrument_path, turned_text
 from psfcore.instruments.model import load_instrument, read_instrument_text
 from psfcore.psf import Psf as CorePsf

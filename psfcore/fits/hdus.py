@@ -12,7 +12,8 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, BinaryIO
@@ -24,9 +25,9 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.fits.blocks import FitsLimits, Source, first_image, open_source, walk
+from psfcore.fits.blocks import FitsLimits, Hdu, Source, first_image, open_source, skip_data, walk
 from psfcore.fits.compression import may_hold_unwritten_memory
-from psfcore.fits.header import HeaderSummary, optional_number
+from psfcore.fits.header import HeaderSummary, is_plane, optional_number, summary_of
 from psfcore.limited import fill_new_memory, run_limited
 from psfcore.whole_files import probe
 
@@ -62,20 +63,44 @@ PIXEL_TROUBLE = (
 )
 
 
-def read_pixels(
-    path: str | Path, summary: HeaderSummary, limits: FitsLimits
-) -> tuple[NDArray[np.float64], fits.Header]:
-    """Pixels [y, x] (float64) and header of the image that `summary` describes.
+@dataclass(frozen=True, eq=False)
+class StoredImage:
+    """Pixels [y, x] (float64) and header of an image, as its file has them.
 
-    A plain image is read as it stands. A tile-compressed image is decoded by astropy in a process of its own, and its header
-    is that of the image. Raises HeaderError, DataError "unreadable-pixels", and OSError if the disk fails.
+    others: the images that follow in the file, without planes of products, if they were asked for.
     """
+
+    summary: HeaderSummary
+    pixels: NDArray[np.float64]
+    header: fits.Header
+    others: tuple[Hdu, ...] = ()
+
+
+def read_pixels(
+    path: str | Path, limits: FitsLimits, *, hdu: int | None = None, others: bool = False
+) -> StoredImage:
+    """Read the first 2-D image of a file, or the image in HDU `hdu`. others: look for further images.
+
+    A plain image is read as it stands, in one pass through the file. A tile-compressed image is decoded by astropy in a
+    process of its own, and its header is that of the image. Raises HeaderError, DataError "unreadable-pixels", and OSError
+    if the disk fails.
+    """
+    further: list[Hdu] = []
     with open_source(Path(path), limits) as source:
-        header = first_image(walk(source, limits), limits, summary.hdu).header
-        if summary.codec is None:
-            return _plain_pixels(source, header, summary), header
+        hdus = walk(source, limits)
+        image = first_image(hdus, limits, hdu)
+        header, summary = image.header, summary_of(image, gzipped=source.gzipped)
+        plain = None if summary.codec is not None else _plain_pixels(source, header, summary)
+        skip_data(source, image, limits)
+        # What follows an image is not needed to use it, so damage there is no error.
+        with suppress(HeaderError):
+            further += (one for one in hdus if others and one.kind == "image" and not is_plane(one))
+    if plain is not None:
+        return StoredImage(summary, plain, header, tuple(further))
     twice = may_hold_unwritten_memory(header)
-    return _decoded_pixels(path, summary, twice=twice), _image_header(header)
+    return StoredImage(
+        summary, _decoded_pixels(path, summary, twice=twice), _image_header(header), tuple(further)
+    )
 
 
 def _plain_pixels(source: Source, header: fits.Header, summary: HeaderSummary) -> NDArray[np.float64]:

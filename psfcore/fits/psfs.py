@@ -14,16 +14,15 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.columns import read_columns
+from psfcore.fits.compression import read_columns
 from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import (
     FitsLimits,
-    check_all_headers,
+    all_hdus,
     optional_number,
     optional_text,
     origin_of,
     plate_scale_arcsec,
-    read_summary,
     wavelength_angstrom,
 )
 from psfcore.psf import (
@@ -140,8 +139,8 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     convolution does not need them.
     Raises HeaderError; DataError "unreadable-pixels" and the errors of `Psf` ("psf-not-centred", "psf-sum", ...).
     """
-    summary = read_summary(path, limits)
-    kernel, header = read_pixels(path, summary, limits)
+    stored = read_pixels(path, limits)
+    kernel, header = stored.pixels, stored.header
     own = "PSFNAME" in header
     components, provenance, fitted = (
         _read_extras(path, limits, kernel.shape) if own and parts else ({}, {}, None)
@@ -169,7 +168,7 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
     Also None if the file was changed after `write_psf` wrote it (CHECKSUM and DATASUM of every HDU are checked), or if
     it was derived from the file of another PSF. Raises HeaderError.
     """
-    check_all_headers(path, limits)
+    all_hdus(path, limits)
     try:
         with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
             lines = [str(line) for line in hdus[0].header.get("HISTORY", [])]
@@ -194,7 +193,7 @@ def _read_extras(
     provenance: dict[str, Any] = {}
     # Any file can have a card PSFNAME. Therefore the size limits are checked for all HDUs. HDUs that write_psf never
     # writes are ignored: compressed components, and components of another shape.
-    check_all_headers(path, limits)
+    all_hdus(path, limits)
     try:
         with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
             provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]

@@ -11,10 +11,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.instruments.files import instrument_names
+from psfcore.instruments.files import PLATE_SCALE_TOLERANCE, instrument_names
 from psfcore.instruments.model import load_instrument
 from psfcore.instruments.without_file import Telescope, telescope_without_file
-from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
 
 WAYS = (
     {

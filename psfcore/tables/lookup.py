@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
+from psfcore.instruments.files import PLATE_SCALE_TOLERANCE
 from psfcore.tables.layout import SCHEMA as SCHEMA
 from psfcore.tables.layout import TOTAL, WHOLE_TO_PX
 

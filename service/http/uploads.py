@@ -17,7 +17,7 @@ from fastapi.concurrency import run_in_threadpool
 
 from psfcore.errors import DataError, HeaderError
 from psfcore.fits.header import FitsLimits, HeaderSummary, read_summary
-from psfcore.fits.weights import check_is_psf
+from psfcore.fits.stored_psf import check_is_psf
 from psfcore.transit.archive import (
     START_BYTES,
     ArchiveContents,

@@ -14,7 +14,7 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FILTER_CARDS, optional_text, plate_scale_arcsec
-from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
+from psfcore.instruments.files import PLATE_SCALE_TOLERANCE
 from workers.versions.series import word
 
 SEPARATOR = "-"  # a word of a header card never contains it

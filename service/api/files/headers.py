@@ -11,7 +11,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
-from psfcore.fits.viewing.all_cards import all_cards
+from psfcore.fits.header import all_cards
 from service.http import downloads as files
 from service.http.callers import Reading
 from service.http.problems import RESPONSES, problem

@@ -17,7 +17,7 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
-from psfcore.fits.cutout import Cutout, cutout
+from psfcore.fits.stored_psf import Cutout, cutout
 from psfcore.tables import lookup as psf_lookup
 from service.http import downloads as files
 from service.http.callers import Caller, Reading

@@ -16,7 +16,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from psfcore.errors import HeaderError
-from psfcore.fits.header import FitsLimits, check_all_headers, read_summary
+from psfcore.fits.header import FitsLimits, all_hdus, read_summary
 from tests.psfcore.fits.raw_files import block, compressed, cube, empty_primary, good, image_cards, table
 
 SMALL = FitsLimits(max_pixels=4096 * 4096, max_header_bytes=64 * 1024, max_hdus=8)
@@ -120,9 +120,9 @@ def test_all_headers_together_obey_one_limit(tmp_path: Path) -> None:
         long.header.add_history(f"{number}")
     more = [fits.ImageHDU(header=long.header.copy()) for _ in range(5)]
     fits.HDUList([long, *more]).writeto(tmp_path / "long.fits")
-    check_all_headers(tmp_path / "long.fits", FitsLimits(max_pixels=100, max_header_bytes=250_000))
+    all_hdus(tmp_path / "long.fits", FitsLimits(max_pixels=100, max_header_bytes=250_000))
     with pytest.raises(HeaderError, match=r"^header-too-long"):
-        check_all_headers(tmp_path / "long.fits", FitsLimits(max_pixels=100, max_header_bytes=150_000))
+        all_hdus(tmp_path / "long.fits", FitsLimits(max_pixels=100, max_header_bytes=150_000))
 
 
 def damaged(base: bytes, changes: list[tuple[int, bytes]]) -> bytes:

@@ -10,7 +10,7 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
-from psfcore.fits.mask_file import read_mask_image
+from psfcore.fits.images import read_mask_image
 
 
 def test_png_and_fits_of_one_mask_agree(tmp_path: Path) -> None:

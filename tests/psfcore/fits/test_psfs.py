@@ -14,9 +14,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.cutout import cutout
 from psfcore.fits.header import FitsLimits, read_summary
 from psfcore.fits.psfs import read_psf, write_psf
+from psfcore.fits.stored_psf import cutout
 from psfcore.instruments.files import instrument_path
 from psfcore.psf import Psf
 from psfcore.scatter.power_law import scatter_kernel

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, read_summary
 from psfcore.fits.psfs import read_psf
-from psfcore.fits.weights import check_is_psf
-from psfcore.weight_rules import REACH_GRID_PX
+from psfcore.fits.stored_psf import check_is_psf
+from psfcore.psf import REACH_GRID_PX
 from tests.conftest import write_image, write_psf
 
 LIMITS = FitsLimits(max_pixels=2**24)
@@ -103,6 +103,6 @@ def test_images_and_products_are_no_psfs(tmp_path: Path) -> None:
 
 
 def test_the_check_needs_no_numerics() -> None:
-    code = "import sys, psfcore.fits.weights; print('\\n'.join(sys.modules))"
+    code = "import sys, psfcore.fits.stored_psf; print('\\n'.join(sys.modules))"
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
     assert {"numpy", "astropy"} & set(loaded.split()) == set()

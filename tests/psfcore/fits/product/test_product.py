@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 from psfcore.deconvolve.assess.quality import MEANINGS, QualityBit
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
-from psfcore.fits.images import write_image
+from psfcore.fits.images import described, read_planes, write_image
 from psfcore.fits.observation import read_observation
-from psfcore.fits.product.cards import described
-from psfcore.fits.product.planes import read_planes
 from tests.psfcore.fits.test_images import AIA, CARDS, ramp, save
 
 Find = Callable[[str], Path]

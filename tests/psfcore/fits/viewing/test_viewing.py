@@ -21,12 +21,10 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.header import FitsLimits, all_cards
 from psfcore.fits.images import write_image
 from psfcore.fits.viewing import planes as kept_planes
-from psfcore.fits.viewing.all_cards import all_cards
-from psfcore.fits.viewing.decode import decode_plane
-from psfcore.fits.viewing.planes import Decoded, Plane, Planes
+from psfcore.fits.viewing.planes import Decoded, Plane, Planes, decode_plane
 from psfcore.fits.viewing.windows import Window, window_of
 from psfcore.fits.viewing.windows import pixels as pixels_of
 from psfcore.image import Image

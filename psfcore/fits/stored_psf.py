@@ -1,4 +1,4 @@
-"""Write the central part of a stored PSF as a FITS file, without loading the whole PSF.
+"""A stored PSF, without its pixels in this process: check that a file can be a PSF, and write the central part of one.
 
 A FITS image stores its rows one after the other (FITS standard 4.0, section 3.3.2), so a cut-out consists of a range
 of bytes from each row. The image must be uncompressed and in the first HDU. Every PSF that heliopsf writes is stored
@@ -8,17 +8,19 @@ in this way. A cut-out is read in pieces, because a server may send many of them
 from __future__ import annotations
 
 import math
+import os
 import sys
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from psfcore.errors import DataError
-from psfcore.fits.blocks import BLOCK_BYTES, CARD_BYTES, END_CARD
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.blocks import BLOCK_BYTES
+from psfcore.fits.header import PRODUCT, FitsLimits, HeaderSummary, read_first_image
+from psfcore.limited import run_limited
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
@@ -27,6 +29,30 @@ _FLOATS = {-32: "f", -64: "d"}
 _PIECE_BYTES = 2**18
 # Cards that describe the whole image and would be wrong in a cut-out.
 _DROPPED = ("EXTEND", "CHECKSUM", "DATASUM", "DATAMIN", "DATAMAX", "DATAMEAN", "PCOUNT", "GCOUNT")
+
+
+def check_is_psf(path: str | Path, summary: HeaderSummary, limits: FitsLimits) -> None:
+    """Raise DataError if a file is not a PSF. The weights are read in a process of its own.
+
+    summary: the summary of the file's header. Codes: "image-as-psf" for a product; "psf-nonfinite", "psf-negative",
+    "psf-sum", "psf-not-centred", "psf-off-centre" for weights that no PSF can have; "unreadable-pixels"; and the codes of
+    HeaderError.
+    """
+    if summary.content == PRODUCT:
+        raise DataError(
+            "image-as-psf",
+            "expected a PSF; the header (PSFID) says that the file is a deconvolved image: name the file of a PSF",
+        )
+    with open(os.devnull, "wb") as unused:
+        run_limited(read_weights, path, unused, pixels=math.prod(summary.shape), limits=asdict(limits))
+
+
+def read_weights(target: BinaryIO, *, path: str, limits: dict[str, int]) -> dict[str, Any]:
+    """Read a PSF and check it. Nothing is written to ``target``. Raises the errors of `psfcore.fits.psfs.read_psf`."""
+    from psfcore.fits.psfs import read_psf  # loads the numerical libraries
+
+    read_psf(path, FitsLimits(**limits), parts=False)
+    return {}
 
 
 @dataclass(frozen=True)
@@ -64,7 +90,7 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> Cutout:
     Raises DataError "cutout-too-large" if the PSF is smaller, and "cutout-not-plain" if the file is compressed or does not
     store the weights as plain floats.
     """
-    summary = read_summary(path, limits)
+    summary, image = read_first_image(path, limits)
     ny, nx = summary.shape
     if not 1 <= size <= min(ny, nx):
         raise DataError("cutout-too-large", f"expected a size of 1 to {min(ny, nx)} px; got {size}")
@@ -75,16 +101,15 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> Cutout:
             "expected a PSF stored as uncompressed floats in the first HDU; this PSF is compressed, stored as integers, or "
             "in a later HDU. Download the file and run `heliopsf psf cutout` on it",
         )
+    if "BSCALE" in image.header or "BZERO" in image.header:
+        raise DataError(
+            "cutout-not-plain",
+            "expected a PSF without BSCALE and BZERO. Download the file and run `heliopsf psf cutout` on it",
+        )
+    rows = _Rows(image.start, (ny, nx), size, summary.bitpix)
     with path.open("rb") as file:
-        header = _header(file)
-        if "BSCALE" in header or "BZERO" in header:
-            raise DataError(
-                "cutout-not-plain",
-                "expected a PSF without BSCALE and BZERO. Download the file and run `heliopsf psf cutout` on it",
-            )
-        rows = _Rows(file.tell(), (ny, nx), size, summary.bitpix)
         total = math.fsum(chain.from_iterable(map(rows.weights, rows.read(file))))
-    text = _cut_header(header, (ny, nx), size, total).tostring().encode("ascii")
+    text = _cut_header(image.header, (ny, nx), size, total).tostring().encode("ascii")
     return Cutout(path, text, rows)
 
 
@@ -133,18 +158,6 @@ class _Rows:
         if sys.byteorder == "little":
             found.byteswap()
         return found
-
-
-def _header(file: BinaryIO) -> Header:
-    """Read the first header; the file is then at the first byte of its data."""
-    from astropy.io.fits import Header  # see psfcore.fits.blocks: slow to import
-
-    raw = bytearray()
-    block = b""
-    while not any(block[at : at + CARD_BYTES] == END_CARD for at in range(0, len(block), CARD_BYTES)):
-        block = file.read(BLOCK_BYTES)  # the loop ends, because read_summary found an END card
-        raw += block
-    return Header.fromstring(bytes(raw))
 
 
 def _cut_header(header: Header, shape: tuple[int, int], size: int, total: float) -> Header:
