@@ -27,8 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from psfcore.diffraction.fresnel import FresnelStep, Grid, Vector, Wave, binned_light
-from psfcore.diffraction.light_path import MM_PER_UM, REACH_PX, SAMPLES_PER_PIXEL, LightPath, focal_mm
+from psfcore.diffraction.fresnel import MM_PER_UM, FresnelStep, Grid, Vector, Wave, binned_light
+from psfcore.diffraction.light_path import REACH_PX, SAMPLES_PER_PIXEL, LightPath, focal_mm
 from psfcore.errors import DataError
 
 SEARCH_MM = 0.05
@@ -70,11 +70,9 @@ class _WithoutWheel:
         self.path = path
         self.detector = path.detector_grid
         length_mm = path.secondary_to_detector_mm
-        self._secondary = path.secondary_grid(next_width_mm=self.detector.width_mm, distance_mm=length_mm)
+        self._secondary = path.secondary_grid(self.detector.width_mm, length_mm)
         self._aperture, self._primary = path.entrance_grids()
-        self._step = FresnelStep(
-            self._secondary, self.detector, wavelength_mm=path.wavelength_mm, distance_mm=length_mm
-        )
+        self._step = FresnelStep(self._secondary, self.detector, length_mm)
         # At x2 = 0, the integral in Eq. (1) of fresnel is the sum of E1 times this phase factor.
         self._to_axis = np.exp(1j * np.pi / path.wavelength_mm / length_mm * self._secondary.x_mm**2)
 

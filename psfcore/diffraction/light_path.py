@@ -21,10 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from psfcore.diffraction.fresnel import (
+    MM_PER_UM,
     Grid,
     Vector,
     Wave,
-    aperture_openings_mm,
     common_openings_mm,
     grid_for,
     mesh_openings_mm,
@@ -37,8 +37,8 @@ from psfcore.instruments.model import Aperture, Instrument, Mesh, Mirror
 
 REACH_PX = 1023
 SAMPLES_PER_PIXEL = 16
-MM_PER_UM = 1e-3
 _MM_PER_ANGSTROM = 1e-7
+_PLACES = ("entrance", "filter_wheel")
 
 
 @dataclass(frozen=True)
@@ -61,19 +61,20 @@ class LightPath:
     def detector_grid(self) -> Grid:
         """The grid of the detector: SAMPLES_PER_PIXEL samples for each pixel within REACH_PX of the axis."""
         samples = (2 * REACH_PX + 1) * SAMPLES_PER_PIXEL
-        return Grid("detector", samples, self.pixel_mm / SAMPLES_PER_PIXEL)
+        return Grid("detector", samples, self.pixel_mm / SAMPLES_PER_PIXEL, self.wavelength_mm)
 
     @property
     def aperture_mm(self) -> Vector:
-        """The openings of the entrance without its mesh, rows of (begin, end)."""
-        return aperture_openings_mm(self.aperture)
+        """The openings of the entrance without its mesh on a line through its middle, rows of (begin, end)."""
+        rim, hub = self.aperture.diameter_mm / 2, self.aperture.obscuration_diameter_mm / 2
+        return np.array([[-rim, -hub], [hub, rim]]) if hub else np.array([[-rim, rim]])
 
     @property
     def entrance_mm(self) -> Vector:
         """The openings of the entrance with its mesh, rows of (begin, end)."""
         # If the number of windows is odd, a window lies on the axis; if it is even, a wire lies on the axis.
         phase = 0.0 if self.entrance_mesh.windows % 2 else 0.5
-        windows_mm = mesh_windows_mm(self.entrance_mesh, phase, self.aperture.diameter_mm)
+        windows_mm = mesh_openings_mm(self.entrance_mesh, phase, self.aperture.diameter_mm)
         return common_openings_mm(self.aperture_mm, windows_mm)
 
     def slope_per_mm(self, separation_mm: float) -> float:
@@ -96,17 +97,14 @@ class LightPath:
 
         Their steps are so small that light reaches the full width of the next mirror.
         """
-        return self._grid(
-            "aperture", self.aperture.diameter_mm, self.primary.diameter_mm, self.aperture_to_primary_mm
-        ), self._grid(
-            "primary", self.primary.diameter_mm, self.secondary.diameter_mm, self.printed_separation_mm
+        first, second = self.primary.diameter_mm, self.secondary.diameter_mm
+        return (
+            self._grid("aperture", self.aperture.diameter_mm, first, self.aperture_to_primary_mm),
+            self._grid("primary", first, second, self.printed_separation_mm),
         )
 
-    def secondary_grid(self, *, next_width_mm: float, distance_mm: float) -> Grid:
-        """The grid of the secondary. Its step is so small that light reaches the full width of the next plane.
-
-        next_width_mm, distance_mm: width of the next plane and its distance.
-        """
+    def secondary_grid(self, next_width_mm: float, distance_mm: float) -> Grid:
+        """The grid of the secondary. next_width_mm, distance_mm: width of the next plane and its distance."""
         return self._grid("secondary", self.secondary.diameter_mm, next_width_mm, distance_mm)
 
     def wheel_grid(self, distance_mm: float) -> Grid:
@@ -122,9 +120,9 @@ class LightPath:
     def _grid(self, plane: str, width_mm: float, next_width_mm: float, distance_mm: float) -> Grid:
         return grid_for(
             plane,
+            self.wavelength_mm,
             width_mm=width_mm,
             next_width_mm=next_width_mm,
-            wavelength_mm=self.wavelength_mm,
             distance_mm=distance_mm,
         )
 
@@ -132,27 +130,15 @@ class LightPath:
         """The field behind the primary, for a plane wave along the axis. The light that enters through the openings is 1."""
         field = open_share(aperture, openings_mm).astype(np.complex128)
         field /= np.sqrt(aperture.light(field))
-        field = propagate(
-            field,
-            aperture,
-            primary,
-            wavelength_mm=self.wavelength_mm,
-            distance_mm=self.aperture_to_primary_mm,
-        )
-        return np.asarray(field * mirror_transmission(self.primary, primary, self.wavelength_mm))
+        field = propagate(field, aperture, primary, self.aperture_to_primary_mm)
+        return np.asarray(field * mirror_transmission(self.primary, primary))
 
     def field_at_secondary(
         self, at_primary: Wave, primary: Grid, secondary: Grid, separation_mm: float
     ) -> Wave:
         """The field behind the secondary, from the field behind the primary."""
-        field = propagate(
-            at_primary,
-            primary,
-            secondary,
-            wavelength_mm=self.wavelength_mm,
-            distance_mm=separation_mm,
-        )
-        return np.asarray(field * mirror_transmission(self.secondary, secondary, self.wavelength_mm))
+        field = propagate(at_primary, primary, secondary, separation_mm)
+        return np.asarray(field * mirror_transmission(self.secondary, secondary))
 
 
 def focal_mm(mirror: Mirror) -> float:
@@ -160,37 +146,27 @@ def focal_mm(mirror: Mirror) -> float:
     return mirror.radius_mm / 2 if mirror.figure == "concave" else -mirror.radius_mm / 2
 
 
-def mesh_windows_mm(mesh: Mesh, phase: float, width_mm: float) -> Vector:
-    """The windows of a mesh over at least `width_mm`, rows of (begin, end)."""
-    return mesh_openings_mm(
-        pitch_mm=mesh.pitch_um * MM_PER_UM,
-        wire_mm=mesh.wire_um * MM_PER_UM,
-        phase=phase,
-        width_mm=width_mm,
-    )
-
-
 def light_path(instrument: Instrument) -> LightPath:
     """The optical path of an instrument.
 
     Raises DataError "bad-instrument-file"; the message names the missing or unsuitable key.
     """
-    if len(instrument.mirrors) != 2:
-        raise _lacking(
-            instrument, "mirrors", "a primary and a secondary", f"{len(instrument.mirrors)} mirrors"
-        )
-    if instrument.distances is None:
-        raise _lacking(instrument, "distances", "the distances along the optical path", "none")
-    entrance, wheel = (_one_mesh(instrument, place) for place in ("entrance", "filter_wheel"))
-    if (entrance.angle_deg - wheel.angle_deg) % 90:
-        angles = f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees"
-        raise _lacking(
-            instrument,
-            "meshes.angle_deg",
-            "meshes with the same axes, for propagation in one dimension",
-            angles,
-        )
     distances = instrument.distances
+    meshes = [mesh for place in _PLACES for mesh in instrument.meshes if mesh.place == place]
+    if len(instrument.mirrors) != 2:
+        got = f"{len(instrument.mirrors)} mirrors"
+        raise _lacking(instrument, "mirrors", "a primary and a secondary", got)
+    if distances is None:
+        raise _lacking(instrument, "distances", "the distances along the optical path", "none")
+    for place in _PLACES:
+        count = sum(mesh.place == place for mesh in meshes)
+        if count != 1:
+            raise _lacking(instrument, "meshes", f"one mesh at place {place!r}", str(count))
+    entrance, wheel = meshes
+    if (entrance.angle_deg - wheel.angle_deg) % 90:
+        wanted = "meshes with the same axes, for propagation in one dimension"
+        got = f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees"
+        raise _lacking(instrument, "meshes.angle_deg", wanted, got)
     return LightPath(
         wavelength_mm=instrument.wavelength_angstrom * _MM_PER_ANGSTROM,
         aperture=instrument.aperture,
@@ -206,13 +182,6 @@ def light_path(instrument: Instrument) -> LightPath:
         printed_distance_mm=distances.filter_wheel_to_detector_mm,
         pixel_mm=instrument.detector.pixel_pitch_um * MM_PER_UM,
     )
-
-
-def _one_mesh(instrument: Instrument, place: str) -> Mesh:
-    found = [mesh for mesh in instrument.meshes if mesh.place == place]
-    if len(found) != 1:
-        raise _lacking(instrument, "meshes", f"one mesh at place {place!r}", str(len(found)))
-    return found[0]
 
 
 def _lacking(instrument: Instrument, key: str, expected: str, got: str) -> DataError:
