@@ -126,22 +126,14 @@ def _mesh(
     halo: NDArray[np.float64] | None,
 ) -> MeshDesign:
     windows = max(1, round(instrument.aperture.diameter_mm * 1e3 / pitch_um))
-    pixel_um = instrument.detector.pixel_pitch_um
-    spacing = order_spacing_px(
-        wavelength_angstrom=instrument.wavelength_angstrom,
-        distance_mm=instrument.focal_length_mm,
-        pitch_um=pitch_um,
-        pixel_pitch_um=pixel_um,
-    )
-    line = mesh_line(
-        wavelength_angstrom=instrument.wavelength_angstrom,
-        distance_mm=instrument.focal_length_mm,
-        pitch_um=pitch_um,
-        wire_um=wire_um,
-        windows=windows,
-        pixel_pitch_um=pixel_um,
-        size=REACH_GRID_PX,
-    )
+    optics = {
+        "wavelength_angstrom": instrument.wavelength_angstrom,
+        "distance_mm": instrument.focal_length_mm,
+        "pitch_um": pitch_um,
+        "pixel_pitch_um": instrument.detector.pixel_pitch_um,
+    }
+    spacing = order_spacing_px(**optics)
+    line = mesh_line(**optics, wire_um=wire_um, windows=windows, size=REACH_GRID_PX)
     beyond = cumulative_curve(mesh_kernel(line, line), [NEAR_PX, FAR_PX])
     open_share = 1 - wire_um / pitch_um
     return MeshDesign(

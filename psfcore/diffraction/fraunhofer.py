@@ -163,27 +163,19 @@ def _survey(mask: MaskGrid, pool: ThreadPoolExecutor) -> _Survey:
 
     mask.rows(0, 1)  # compile the kernels in this thread, whose listener tells the user
     after, before, open_cells = [], np.zeros(mask.cells), 0.0
-    for strip_after, strip_before, strip_sum in pool.map(multiply, _strips(mask.cells)):
+    for strip_after, strip_before, strip_sum in pool.map(multiply, range(0, mask.cells, STRIP_ROWS)):
         after.append(strip_after)
         before += strip_before
         open_cells += strip_sum
     by_row, by_mirrored_row = np.concatenate(after).T  # M r, M r[::-1]
     area_mm2 = open_cells * mask.cell_mm**2
-    mirror_x = _agree(by_row, by_mirrored_row)
     # If M is mirrored in y, its product with r is (M r)[::-1].
-    mirror_y = _agree(by_row, by_row[::-1])
-    if not (mirror_x or mirror_y):
-        return _Survey(area_mm2, NO_SYMMETRY, mirror_x=False, mirror_y=False)
-    symmetry = MIRROR_AND_TRANSPOSE if _agree(by_row, before) else MIRROR
-    return _Survey(area_mm2, symmetry, mirror_x=mirror_x, mirror_y=mirror_y)
-
-
-def _agree(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
-    return float(np.abs(a - b).max()) < _SYMMETRY_TOLERANCE_CELLS
-
-
-def _strips(cells: int) -> range:
-    return range(0, cells, STRIP_ROWS)
+    mirror_x, mirror_y, transpose = (
+        float(np.abs(by_row - other).max()) < _SYMMETRY_TOLERANCE_CELLS
+        for other in (by_mirrored_row, by_row[::-1], before)
+    )
+    mirrored = MIRROR_AND_TRANSPOSE if transpose else MIRROR
+    return _Survey(area_mm2, mirrored if mirror_x or mirror_y else NO_SYMMETRY, mirror_x, mirror_y)
 
 
 class _Transforms:

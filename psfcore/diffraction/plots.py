@@ -25,14 +25,12 @@ _COLOURS = ("#1b4f8a", "#7b3fa0", "#c2402f", "#e0a100", "#2b8a6e", "#1b1b1b")
 _Number = Callable[[MeshDesign], float | None]
 
 
-def fresnel_png(study: FresnelStudy, path: str | Path, *, distance_mm: float | None = None) -> None:
+def fresnel_png(study: FresnelStudy, path: str | Path) -> None:
     """Draw three panels: the centre of the PSF, 1 - encircled energy with the difference, and all distances.
 
-    distance_mm: the first two panels show the distance of the study that is nearest to this value; default: the printed
-    distance.
+    The first two panels show the distance of the study that is nearest to the printed distance.
     """
-    wanted_mm = study.printed_distance_mm if distance_mm is None else distance_mm
-    shown = min(study.distances, key=lambda result: abs(result.distance_mm - wanted_mm))
+    shown = min(study.distances, key=lambda result: abs(result.distance_mm - study.printed_distance_mm))
     figure = Figure(
         figsize=(15.6, 5.4), dpi=100, facecolor="white", layout=ConstrainedLayoutEngine(w_pad=0.1)
     )

@@ -28,9 +28,8 @@ from psfcore.gap.view import View
 from psfcore.instruments.files import instrument_names
 from psfcore.scatter.inversion import Progress, invert
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
-from psfcore.simulate.from_files import LARGEST_DIFFRACTION_PX, diffraction_kernel
+from psfcore.simulate.inputs import LARGEST_DIFFRACTION_PX, diffraction_kernel, read_plan
 from psfcore.simulate.plan import Plan
-from psfcore.simulate.read_plan import read_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.sky import true_sky
 from psfcore.simulate.transit import observed_transit

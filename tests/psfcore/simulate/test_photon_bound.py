@@ -17,10 +17,9 @@ from psfcore.psf import cumulative_curve
 from psfcore.simulate import bound as bound_module
 from psfcore.simulate import scatter_truth
 from psfcore.simulate import sky as sky_module
-from psfcore.simulate.bound import PhotonBound, bound_of_folder, bound_of_sky, photon_bound
+from psfcore.simulate.bound import PhotonBound, bound_of_folder, bound_of_sky
 from psfcore.simulate.disc import fully_dark
 from psfcore.simulate.plan import Plan, default_plan
-from psfcore.simulate.pointings import drawn_scene
 from psfcore.simulate.scatter_truth import (
     ScatterTruth,
     amplitude_slopes,
@@ -28,6 +27,7 @@ from psfcore.simulate.scatter_truth import (
     kernel_slopes,
     total_kernel,
 )
+from psfcore.simulate.scene import drawn_scene
 from psfcore.simulate.sky import TrueSky, true_sky
 from psfcore.simulate.transit import observed_transit, simulate
 from psfcore.simulate.transit_files import write
@@ -222,7 +222,7 @@ def test_clipped_pixels_around_the_disc_are_not_used(bound: PhotonBound, sky: Tr
 def test_the_bound_of_a_folder_is_that_of_its_transit(tmp_path: Path) -> None:
     simulated = simulate(default_plan(3, 64), dataclasses.replace(SCATTER, stretch=0.1), DIFFRACTION, 2)
     write(simulated, tmp_path)
-    kept, read = photon_bound(simulated), bound_of_folder(tmp_path)
+    kept, read = bound_of_sky(simulated.sky), bound_of_folder(tmp_path)
     for name in ("b_px", "c", "total", "stretch"):
         assert getattr(read, name) == pytest.approx(getattr(kept, name), rel=0.02)
     np.testing.assert_allclose(read.places_px, kept.places_px, rtol=0.1)
@@ -235,4 +235,4 @@ def test_the_bound_of_a_folder_is_that_of_its_transit(tmp_path: Path) -> None:
 def test_without_scatter_there_is_no_bound() -> None:
     simulated = simulate(default_plan(1, 64), dataclasses.replace(SCATTER, total=0.0), DIFFRACTION, 1)
     with pytest.raises(DataError, match="no-bound"):
-        photon_bound(simulated)
+        bound_of_sky(simulated.sky)
