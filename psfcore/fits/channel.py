@@ -16,7 +16,8 @@ from typing import Protocol
 
 from psfcore.errors import DataError
 from psfcore.fits.cards import Cards
-from psfcore.fits.header import known_instrument, optional_text, plate_scale_arcsec, wavelength_angstrom
+from psfcore.fits.frame import frame_of
+from psfcore.fits.header import known_instrument, optional_text, wavelength_angstrom
 from psfcore.instruments.files import (
     PLATE_SCALE_TOLERANCE,
     WAVELENGTH_TOLERANCE,
@@ -135,7 +136,7 @@ def binning_factor(psf: Origin, header: Cards) -> int:
     """
     if psf.plate_scale_arcsec is None:
         return 1
-    scales = [plate_scale_arcsec(header, axis) for axis in (1, 2)]
+    scales = frame_of(header).scale_arcsec
     factors = {_factor(scale / psf.plate_scale_arcsec) for scale in scales if scale is not None}
     if factors <= {1}:
         return 1

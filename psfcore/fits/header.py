@@ -21,6 +21,7 @@ from psfcore.fits.cards import Cards, card_count, card_flag, card_text, card_tro
 from psfcore.fits.cards import optional_number as optional_number
 from psfcore.fits.cards import optional_text as optional_text
 from psfcore.fits.cards import optional_value as optional_value
+from psfcore.fits.frame import frame_of
 from psfcore.fits.frame import plate_scale_arcsec as plate_scale_arcsec
 from psfcore.instruments.files import match_instrument
 
@@ -219,6 +220,7 @@ def optional_exposure_s(header: Cards) -> float | None:
 def seen_by(header: Cards) -> dict[str, Any]:
     """The values of a header that describe the observation: the fields of `HeaderSummary` from instrument to
     gain_mode."""
+    scale_x, scale_y = frame_of(header).scale_arcsec
     return {
         "instrument": known_instrument(header),
         "telescop": optional_text(header, "TELESCOP"),
@@ -228,8 +230,8 @@ def seen_by(header: Cards) -> dict[str, Any]:
         "date_obs": observed_at(header),
         "exposure_s": optional_exposure_s(header),
         "unit": optional_text(header, "BUNIT", "PIXLUNIT"),
-        "cdelt1": plate_scale_arcsec(header, 1),
-        "cdelt2": plate_scale_arcsec(header, 2),
+        "cdelt1": scale_x,
+        "cdelt2": scale_y,
         "gain_mode": optional_text(header, "GAINCOMB"),
     }
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names
-from psfcore.instruments.unknown import agreement_with_image, channel_of, same_as_image, unknown_instrument
+from psfcore.instruments.unknown import agreement, channel_of, unknown_instrument
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfRow
@@ -40,7 +40,7 @@ def _candidates(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> 
     for row in catalogue.psfs.page(PsfFilter(), owner, limit=MOST_SEARCHED):
         scale = row.details.get("plate_scale_arcsec")
         channel = None if row.channel is None else without_variant(row.channel)
-        same = same_as_image(row.instrument, channel, scale, header)
+        same, told = agreement(row.instrument, channel, scale, header)
         other_channel = wanted is not None and channel is not None and channel != wanted
         if not _usable(row) or other_channel or not {"telescope", "plate_scale"} & set(same):
             continue
@@ -52,7 +52,7 @@ def _candidates(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> 
             "instrument": row.instrument,
             "channel": row.channel,
             "same": same,
-            "told": agreement_with_image(same, channel, scale, header),
+            "told": told,
         }
         found += 1
         if found == MOST_NAMED:
