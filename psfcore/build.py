@@ -58,10 +58,14 @@ def build_psf(
     Raises DataError "bad-size", "unknown-component", "bad-mount", or "bad-instrument-file" if the file describes an
     instrument that needs too large arrays.
     """
-    _check_size(size)
+    if size % 2 or not SMALLEST_SIZE_PX <= size <= LARGEST_SIZE_PX:
+        wanted = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
+        raise DataError("bad-size", f"expected {wanted}; got {size}")
     check_workload(instrument, instrument.name)
-    names = component_names(instrument) if component is None else (component,)
-    _check_component(instrument, names)
+    known = component_names(instrument)
+    if component not in (None, *known):
+        raise DataError("unknown-component", f"expected one of {', '.join(known)}; got {component!r}")
+    names = known if component is None else (component,)
     if component is None and not parts:
         names = tuple(name for name in names if name in (DIFFRACTION, SCATTER))
     grid = max(size, REACH_GRID_PX)
@@ -184,18 +188,6 @@ def _provenance(instrument: Instrument, notes: dict[str, Any]) -> dict[str, Any]
             "scatter_a": amplitude_for_total(law.b_px, law.c, law.total),
         }
     return about
-
-
-def _check_size(size: int) -> None:
-    if size % 2 or not SMALLEST_SIZE_PX <= size <= LARGEST_SIZE_PX:
-        wanted = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
-        raise DataError("bad-size", f"expected {wanted}; got {size}")
-
-
-def _check_component(instrument: Instrument, names: tuple[str, ...]) -> None:
-    known = component_names(instrument)
-    if not set(names) <= set(known):
-        raise DataError("unknown-component", f"expected one of {', '.join(known)}; got {names[0]!r}")
 
 
 def known_diffraction(instrument: str | None, *, threads: int = 1) -> Kernel:

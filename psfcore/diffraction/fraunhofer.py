@@ -123,19 +123,17 @@ def far_field(
                 Place(_offset(s, samples), _offset(t, samples), weight)
                 for s, t, weight in _places(samples, survey.symmetry)
             ]
-            pattern = _completed(mirrored.summed(places, progress or _silent), survey.symmetry)
+            pattern = _completed(
+                mirrored.summed(places, progress or (lambda done, of: None)), survey.symmetry
+            )
         else:
             transforms = _Transforms(mask, survey, samples, n, size, pool, threads)
-            pattern = transforms.summed(progress or _silent)
+            pattern = transforms.summed(progress or (lambda done, of: None))
     pattern /= float(n) ** 2 * samples**2 * survey.open_area_mm2 / cell_mm**2
     sinc = np.sinc((np.arange(size) - size // 2) / n)
     pattern /= sinc[:, None] ** 2
     pattern /= sinc[None, :] ** 2
     return FarField(pattern, survey.open_area_mm2, samples, survey.symmetry)
-
-
-def _silent(done: int, of: int) -> None:
-    """Ignore progress."""
 
 
 @dataclass(frozen=True)

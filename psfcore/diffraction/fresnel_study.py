@@ -163,7 +163,7 @@ def fresnel_study(
     path = light_path(instrument)
     windows = path.wheel_mesh.windows if windows is None else windows
     _check(path, distances_mm, phases, windows)
-    report = progress or _silent
+    report = progress or (lambda done, of: None)
     steps = 1 + len(distances_mm) * phases
     report(0, steps)
     focus = best_focus(path, nominal_focal_length_mm=instrument.focal_length_mm)
@@ -347,7 +347,3 @@ def _distance_json(result: DistanceResult, kept: NDArray[np.int64]) -> dict[str,
         **{name: getattr(result, name)[near].tolist() for name in lines},
         **{name: getattr(result, name)[kept].tolist() for name in curves},
     }
-
-
-def _silent(done: int, of: int) -> None:
-    """Ignore progress."""

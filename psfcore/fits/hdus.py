@@ -97,10 +97,10 @@ def read_pixels(
             further += (one for one in hdus if others and one.kind == "image" and not is_plane(one))
     if plain is not None:
         return StoredImage(summary, plain, header, tuple(further))
-    twice = may_hold_unwritten_memory(header)
-    return StoredImage(
-        summary, _decoded_pixels(path, summary, twice=twice), _image_header(header), tuple(further)
-    )
+    decoded = _decoded_pixels(path, summary, twice=may_hold_unwritten_memory(header))
+    # The header of the image is that of the table without the cards of its tiles.
+    header = fits.Header([card for card in header.cards if not TABLE_CARD.fullmatch(card.keyword)])
+    return StoredImage(summary, decoded, header, tuple(further))
 
 
 def _plain_pixels(source: Source, header: fits.Header, summary: HeaderSummary) -> NDArray[np.float64]:
@@ -173,15 +173,6 @@ def _tiles(path: str, number: int) -> NDArray[Any]:
         return np.asarray(hdus[number].data)
 
 
-def _image_header(table: fits.Header) -> fits.Header:
-    """The header of a tile-compressed image without the cards of the table that holds its tiles."""
-    header = fits.Header()
-    for card in table.cards:
-        if not TABLE_CARD.fullmatch(card.keyword):
-            header.append(card, end=True)
-    return header
-
-
 @contextmanager
 def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
     """Raise DataError "unreadable-pixels" for the errors of astropy in the block. part: the name of the part, for the
@@ -191,19 +182,11 @@ def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
     except DataError:
         raise
     except PIXEL_TROUBLE as error:
-        _raise_if_storage(error)
+        if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
+            raise  # the disk caused the error; the content of a file causes others, such as a negative size
         wanted = f"expected readable pixels in {part} of {Path(path).name}"
         message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
         raise DataError("unreadable-pixels", message) from None
-
-
-def _raise_if_storage(error: Exception) -> None:
-    """Raise the error again if the disk caused it.
-
-    Do nothing if the content of the file caused it, such as a negative size.
-    """
-    if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
-        raise error
 
 
 def ascii_text(text: str) -> str:

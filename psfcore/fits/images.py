@@ -151,8 +151,7 @@ def write_image(
         header["DATAMIN"] = (float(finite.min()), "smallest finite pixel")
         header["DATAMAX"] = (float(finite.max()), "largest finite pixel")
         header["DATAMEAN"] = (float(finite.mean(dtype=np.float64)), "mean of finite pixels")
-    for key, (value, comment) in cards.items():
-        header[key] = (ascii_text(value) if isinstance(value, str) else value, ascii_text(comment))
+    header.update(_ascii(cards))
     for line in history:
         header.add_history(ascii_text(line))
     hdus: list[Any] = [fits.PrimaryHDU(pixels, header)]
@@ -165,11 +164,17 @@ def write_image(
 
 def write_plane(path: str | Path, pixels: NDArray[Any], *, cards: Cards) -> None:
     """Write pixels [y, x] and `cards` to a file. Integers are stored as int32, floats as float32."""
-    header = fits.Header()
-    for key, (value, comment) in cards.items():
-        header[key] = (ascii_text(value) if isinstance(value, str) else value, ascii_text(comment))
     stored = pixels.astype(np.int32 if pixels.dtype.kind in "iu" else np.float32)
+    header = fits.Header()
+    header.update(_ascii(cards))
     write_hdus(path, [fits.PrimaryHDU(stored, header)])
+
+
+def _ascii(cards: Cards) -> dict[str, tuple[CardValue, str]]:
+    return {
+        key: (ascii_text(value) if isinstance(value, str) else value, ascii_text(comment))
+        for key, (value, comment) in cards.items()
+    }
 
 
 def _plane_hdu(

@@ -12,7 +12,7 @@ import os
 import sys
 from array import array
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -57,16 +57,24 @@ def read_weights(target: BinaryIO, *, path: str, limits: dict[str, int]) -> dict
 
 @dataclass(frozen=True)
 class Cutout:
-    """A FITS file that holds the central (size, size) px of a PSF. The centre of the PSF is at [size // 2, size // 2]."""
+    """A FITS file that holds the central (size, size) px of a PSF. The centre of the PSF is at [size // 2, size // 2].
 
-    path: Path
+    header: the bytes of its header. path, shape, bitpix: the file of the PSF, and its image; first: the place of its first
+    pixel in the file, bytes.
+    """
+
     header: bytes
-    rows: _Rows
+    path: Path
+    first: int
+    shape: tuple[int, int]
+    bitpix: int
+    size: int
 
     @property
     def length(self) -> int:
         """Number of bytes of the FITS file."""
-        return len(self.header) + self.rows.length + -self.rows.length % BLOCK_BYTES
+        data = self.size**2 * abs(self.bitpix) // 8
+        return len(self.header) + data + -data % BLOCK_BYTES
 
     def pieces(self) -> Iterator[bytes]:
         """The bytes of the FITS file, one piece after the other.
@@ -74,9 +82,25 @@ class Cutout:
         Raises OSError, and EOFError if the PSF's file has become shorter.
         """
         yield self.header
+        yield from self.rows()
+        yield bytes(-(self.size**2) * abs(self.bitpix) // 8 % BLOCK_BYTES)
+
+    def rows(self) -> Iterator[bytes]:
+        """The pixels with the type and byte order of the file, a few rows at a time. Raises the errors of ``pieces``."""
+        (ny, nx), pixel_bytes = self.shape, abs(self.bitpix) // 8
+        top, left = ny // 2 - self.size // 2, nx // 2 - self.size // 2
+        row_bytes, piece = self.size * pixel_bytes, bytearray()
         with self.path.open("rb") as file:
-            yield from self.rows.read(file)
-        yield bytes(-self.rows.length % BLOCK_BYTES)
+            for row in range(top, top + self.size):
+                file.seek(self.first + (row * nx + left) * pixel_bytes)
+                pixels = file.read(row_bytes)
+                if len(pixels) < row_bytes:
+                    raise EOFError(f"expected {row_bytes} bytes of row {row} of the PSF; got {len(pixels)}")
+                piece += pixels
+                if len(piece) >= _PIECE_BYTES:
+                    yield bytes(piece)
+                    piece.clear()
+        yield bytes(piece)
 
     def write(self, target: Path) -> None:
         """Write the FITS file. Raises the errors of ``pieces``."""
@@ -106,58 +130,19 @@ def cutout(path: Path, size: int, limits: FitsLimits) -> Cutout:
             "cutout-not-plain",
             "expected a PSF without BSCALE and BZERO. Download the file and run `heliopsf psf cutout` on it",
         )
-    rows = _Rows(image.start, (ny, nx), size, summary.bitpix)
-    with path.open("rb") as file:
-        total = math.fsum(chain.from_iterable(map(rows.weights, rows.read(file))))
+    part = Cutout(b"", path, image.start, (ny, nx), summary.bitpix, size)
+    total = math.fsum(chain.from_iterable(_weights(piece, summary.bitpix) for piece in part.rows()))
     text = _cut_header(image.header, (ny, nx), size, total).tostring().encode("ascii")
-    return Cutout(path, text, rows)
+    return replace(part, header=text)
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """The central rows of an image of shape (ny, nx), whose first pixel is at byte ``first`` of its file."""
-
-    first: int
-    shape: tuple[int, int]
-    size: int
-    bitpix: int
-
-    @property
-    def length(self) -> int:
-        """Number of bytes of the pixels."""
-        return self.size * self._row_bytes
-
-    @property
-    def _pixel_bytes(self) -> int:
-        return abs(self.bitpix) // 8
-
-    @property
-    def _row_bytes(self) -> int:
-        return self.size * self._pixel_bytes
-
-    def read(self, file: BinaryIO) -> Iterator[bytes]:
-        """The pixels with the type and byte order of the file, a few rows at a time."""
-        ny, nx = self.shape
-        top, left = ny // 2 - self.size // 2, nx // 2 - self.size // 2
-        piece = bytearray()
-        for row in range(top, top + self.size):
-            file.seek(self.first + (row * nx + left) * self._pixel_bytes)
-            pixels = file.read(self._row_bytes)
-            if len(pixels) < self._row_bytes:
-                raise EOFError(f"expected {self._row_bytes} bytes of row {row} of the PSF; got {len(pixels)}")
-            piece += pixels
-            if len(piece) >= _PIECE_BYTES:
-                yield bytes(piece)
-                piece.clear()
-        yield bytes(piece)
-
-    def weights(self, piece: bytes) -> array[float]:
-        """The pixels of a piece as numbers."""
-        found: array[float] = array(_FLOATS[self.bitpix])
-        found.frombytes(piece)
-        if sys.byteorder == "little":
-            found.byteswap()
-        return found
+def _weights(piece: bytes, bitpix: int) -> array[float]:
+    """The pixels of a piece as numbers."""
+    weights: array[float] = array(_FLOATS[bitpix])
+    weights.frombytes(piece)
+    if sys.byteorder == "little":
+        weights.byteswap()
+    return weights
 
 
 def _cut_header(header: Header, shape: tuple[int, int], size: int, total: float) -> Header:

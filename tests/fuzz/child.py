@@ -43,6 +43,7 @@ def read_an_image(content: bytes, folder: Path) -> str:
     path.write_bytes(content)
     summary = read_summary(path, LIMITS)
     json.dumps(dataclasses.asdict(summary), allow_nan=False)
+    assert 0 < summary.shape[0] * summary.shape[1] <= LIMITS.max_pixels
     images = []
     for filling in (0x11, 0x77):
         limited.FILLING = filling

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -54,12 +52,6 @@ def test_unusable_descriptive_cards_count_as_missing(tmp_path: Path) -> None:
     cards = image_cards(32, 16, 16, "DATE_OBS= '2012-06-05T22:00:00.123'")
     path.write_bytes(block(*cards, data=bytes(1024)))
     assert read_summary(path, SMALL).date_obs == "2012-06-05T22:00:00.123"
-
-
-def test_the_header_reader_imports_no_numerical_library() -> None:
-    code = "import sys, psfcore.fits.header; print([m for m in ('scipy', 'numba', 'matplotlib') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 REAL = [
