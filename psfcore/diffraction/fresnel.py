@@ -82,7 +82,7 @@ class Grid:
 
 
 def grid_for(
-    plane: str, wavelength_mm: float, *, width_mm: float, next_width_mm: float, distance_mm: float
+    plane: str, wavelength_mm: float, width_mm: float, next_width_mm: float, distance_mm: float
 ) -> Grid:
     """The grid of a plane. Its step is so small that the light reaches the full width of the next plane.
 

@@ -118,13 +118,7 @@ class LightPath:
         return self._grid("filter wheel", width_mm, detector_mm, distance_mm)
 
     def _grid(self, plane: str, width_mm: float, next_width_mm: float, distance_mm: float) -> Grid:
-        return grid_for(
-            plane,
-            self.wavelength_mm,
-            width_mm=width_mm,
-            next_width_mm=next_width_mm,
-            distance_mm=distance_mm,
-        )
+        return grid_for(plane, self.wavelength_mm, width_mm, next_width_mm, distance_mm)
 
     def field_at_primary(self, openings_mm: Vector, aperture: Grid, primary: Grid) -> Wave:
         """The field behind the primary, for a plane wave along the axis. The light that enters through the openings is 1."""

@@ -24,7 +24,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from psfcore.errors import HeaderError
-from psfcore.fits.cards import LARGEST_COUNT, card_count, card_flag, card_text, card_trouble, optional_text
+from psfcore.fits.cards import (
+    LARGEST_COUNT,
+    bad_card,
+    card_count,
+    card_flag,
+    card_text,
+    card_trouble,
+    optional_text,
+)
 from psfcore.fits.compression import check_compression, check_counts
 
 if TYPE_CHECKING:
@@ -283,7 +291,7 @@ def _find_end(block: bytes) -> int | None:
             return at
         if _DAMAGED_END.match(block, at):
             got = block[at : at + CARD_BYTES].rstrip()
-            raise HeaderError("bad-card", f"expected END followed by 77 spaces; got {got!r:.100}")
+            raise bad_card("END followed by 77 spaces", f"{got!r:.100}")
     return None
 
 
@@ -335,7 +343,7 @@ def _check_image(header: Header, limits: FitsLimits) -> None:
     z = "Z" if card_flag(header, "ZIMAGE") else ""
     bitpix = card_count(header, f"{z}BITPIX", smallest=-64, largest=64)
     if bitpix not in _BITPIX:
-        raise HeaderError("bad-card", f"expected {z}BITPIX of {_BITPIX}; got {bitpix}")
+        raise bad_card(f"{z}BITPIX of {_BITPIX}", bitpix)
     nx, ny = (card_count(header, f"{z}NAXIS{axis}") for axis in (1, 2))
     if nx == 0 or ny == 0:
         raise HeaderError("zero-size", f"expected at least one pixel on each axis; got {nx} x {ny}")
@@ -354,7 +362,7 @@ def _data_bytes(header: Header, hdu: int) -> int:
     """Declared size of the data, FITS standard Eq. (2): |BITPIX| / 8 * GCOUNT * (PCOUNT + prod NAXISn)."""
     bitpix = card_count(header, "BITPIX", smallest=-64, largest=64)
     if bitpix not in _BITPIX:
-        raise HeaderError("bad-card", f"expected BITPIX of {_BITPIX} in HDU {hdu}; got {bitpix}")
+        raise bad_card(f"BITPIX of {_BITPIX} in HDU {hdu}", bitpix)
     axes = card_count(header, "NAXIS", largest=999)
     if axes == 0:
         return 0

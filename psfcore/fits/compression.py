@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from psfcore.errors import HeaderError
-from psfcore.fits.cards import card_count, card_text, card_value
+from psfcore.fits.cards import bad_card, card_count, card_text, card_value
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
@@ -87,11 +87,9 @@ def read_columns(header: Header) -> list[Column]:
         text = card_text(header, f"TFORM{number}")
         form = None if text is None else _FORM.fullmatch(text.upper())
         if form is None or (form[2] in "PQ") != bool(form[3]):
-            raise HeaderError("bad-card", f"expected TFORM{number} to be a binary format; got {text!r:.40}")
+            raise bad_card(f"TFORM{number} to be a binary format", f"{text!r:.40}")
         if name in names:
-            raise HeaderError(
-                "bad-card", f"expected each column once; got {name:.40} again as column {number}"
-            )
+            raise bad_card("each column once", f"{name:.40} again as column {number}")
         names.add(name)
         columns.append(Column(name, int(form[1] or 1), form[2], form[3]))
     row_bytes = sum(column.row_bytes for column in columns)
@@ -106,14 +104,13 @@ def check_compression(header: Header, nx: int, ny: int) -> None:
     """
     codec = card_text(header, "ZCMPTYPE")
     if codec not in ALLOWED_CODECS:
-        wanted = ", ".join(ALLOWED_CODECS)
-        raise HeaderError("codec-not-allowed", f"expected compression by one of {wanted}; got {codec}")
+        message = f"expected compression by one of {', '.join(ALLOWED_CODECS)}; got {codec}"
+        raise HeaderError("codec-not-allowed", message)
     _check_keywords(header)
     _check_tiling(header, nx, ny)
-    bitpix = card_count(header, "ZBITPIX", smallest=-64, largest=64)
     settings = _settings(header)
     if codec == "RICE_1":
-        _check_rice(settings, bitpix)
+        _check_rice(settings, card_count(header, "ZBITPIX", smallest=-64, largest=64))
     _check_columns(header)
     _check_dither(header)
     _check_heap(header)
@@ -133,9 +130,7 @@ def _check_keywords(header: Header) -> None:
     """
     for keyword in header:
         if set("*?") & set(keyword) or keyword.endswith("..."):
-            raise HeaderError(
-                "bad-card", f"expected keywords without '*', '?' and '...'; got {keyword!r:.40}"
-            )
+            raise bad_card("keywords without '*', '?' and '...'", f"{keyword!r:.40}")
 
 
 def _check_tiling(header: Header, nx: int, ny: int) -> None:
@@ -162,10 +157,9 @@ def _settings(header: Header) -> dict[str, object]:
         value = card_value(header, f"ZVAL{number}")
         known = {"BYTEPIX", "BLOCKSIZE", "SCALE", "SMOOTH", "NOISEBIT"}
         if name not in known or name in settings:
-            wanted = f"expected ZNAME{number} of {', '.join(sorted(known))}, each once"
-            raise HeaderError("bad-card", f"{wanted}; got {name!r:.40}")
+            raise bad_card(f"ZNAME{number} of {', '.join(sorted(known))}, each once", f"{name!r:.40}")
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST_INT:
-            raise HeaderError("bad-card", f"expected a number in ZVAL{number} ({name}); got {value!r:.40}")
+            raise bad_card(f"a number in ZVAL{number} ({name})", f"{value!r:.40}")
         settings[name] = value
     return settings
 
@@ -174,13 +168,11 @@ def _check_rice(settings: dict[str, object], bitpix: int) -> None:
     for name, allowed in (("BYTEPIX", _RICE_BYTEPIX), ("BLOCKSIZE", _RICE_BLOCKSIZE)):
         value = settings.get(name, allowed[0])
         if not isinstance(value, int) or value not in allowed:
-            raise HeaderError("bad-card", f"expected {name} of {allowed} for RICE_1; got {value!r:.40}")
+            raise bad_card(f"{name} of {allowed} for RICE_1", f"{value!r:.40}")
     most = abs(bitpix) // 8
     if settings.get("BYTEPIX", 0) > most:  # type: ignore[operator]
-        raise HeaderError(
-            "bad-card",
-            f"expected BYTEPIX of at most {most}, the bytes of a pixel with ZBITPIX = {bitpix}; got {settings['BYTEPIX']}",
-        )
+        wanted = f"BYTEPIX of at most {most}, the bytes of a pixel with ZBITPIX = {bitpix}"
+        raise bad_card(wanted, settings["BYTEPIX"])
 
 
 def _check_columns(header: Header) -> None:
@@ -193,24 +185,21 @@ def _check_columns(header: Header) -> None:
             wanted = f"one number of {', '.join(_NUMBERS_OF.get(column.name, _NUMBERS))}"
             good = column.repeat == 1 and column.form in _NUMBERS_OF.get(column.name, _NUMBERS)
         if not good:
-            raise HeaderError("bad-card", f"expected column {column.name:.40} as {wanted}; got {column}")
+            raise bad_card(f"column {column.name:.40} as {wanted}", column)
         for key in ("TSCAL", "TZERO", "TDIM"):
             if card_value(header, f"{key}{number}") is not None:
-                raise HeaderError(
-                    "bad-card", f"expected no card {key}{number} in a compressed image; got one"
-                )
+                raise bad_card(f"no card {key}{number} in a compressed image", "one")
     names = {column.name for column in columns}
     if COMPRESSED not in names:
-        raise HeaderError("bad-card", f"expected a column {COMPRESSED} in a compressed image; got none")
+        raise bad_card(f"a column {COMPRESSED} in a compressed image", "none")
     if ("ZSCALE" in names) != ("ZZERO" in names):
-        raise HeaderError("bad-card", "expected both columns ZSCALE and ZZERO, or neither; got one of them")
+        raise bad_card("both columns ZSCALE and ZZERO, or neither", "one of them")
 
 
 def _check_dither(header: Header) -> None:
     method = card_text(header, "ZQUANTIZ")
     if card_value(header, "ZQUANTIZ") is not None and method not in (*_DITHERS, *_NO_DITHERS):
-        wanted = ", ".join((*_DITHERS, "NO_DITHER"))
-        raise HeaderError("bad-card", f"expected ZQUANTIZ of {wanted}; got {method!r:.40}")
+        raise bad_card(f"ZQUANTIZ of {', '.join((*_DITHERS, 'NO_DITHER'))}", f"{method!r:.40}")
     smallest, largest = _DITHER_SEEDS
     if method in _DITHERS:
         card_count(header, "ZDITHER0", smallest=smallest, largest=largest)

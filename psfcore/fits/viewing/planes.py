@@ -75,7 +75,8 @@ class Planes:
         self._temporary = temporary
         self._kept: OrderedDict[Key, Plane] = OrderedDict()
         self._lock = threading.Lock()
-        self._turns: WeakValueDictionary[Key, _Turn] = WeakValueDictionary()
+        # The right to decode a plane.
+        self._turns: WeakValueDictionary[Key, threading.Lock] = WeakValueDictionary()
 
     def kept(self, key: Key) -> Plane | None:
         """The plane, if it is still kept."""
@@ -91,35 +92,24 @@ class Planes:
         If several threads request the same plane at the same time, one of them decodes it and the others wait.
         """
         with self._lock:
-            turn = self._turns.setdefault(key, _Turn())
-        with turn.lock:
+            turn = self._turns.setdefault(key, threading.Lock())
+        with turn:
             plane = self.kept(key)
             if plane is None:
-                plane = self._made(decode)
+                with self._temporary() as path:
+                    with path.open("wb") as target:
+                        decoded = decode(target)
+                    plane = Plane(path, decoded)
                 self._keep(key, plane)
             return plane
-
-    def _made(self, decode: Callable[[BinaryIO], Decoded]) -> Plane:
-        with self._temporary() as path:
-            with path.open("wb") as target:
-                decoded = decode(target)
-            return Plane(path, decoded)
 
     def _keep(self, key: Key, plane: Plane) -> None:
         with self._lock:
             self._kept[key] = plane
-            while len(self._kept) > MOST_PLANES or self._bytes() > MOST_BYTES:
+            while (
+                len(self._kept) > MOST_PLANES or sum(one.length for one in self._kept.values()) > MOST_BYTES
+            ):
                 self._kept.popitem(last=False)
-
-    def _bytes(self) -> int:
-        return sum(plane.length for plane in self._kept.values())
-
-
-class _Turn:
-    """The right to decode one plane."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
 
 
 def decode_plane(path: str | Path, name: str, limits: FitsLimits, target: BinaryIO) -> Decoded:

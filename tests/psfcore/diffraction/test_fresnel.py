@@ -109,7 +109,7 @@ def test_a_gaussian_beam_spreads_by_its_formula() -> None:
 
 
 def test_a_slit_gives_the_fresnel_integrals() -> None:
-    source = grid_for("slit", LAMBDA_MM, width_mm=1.3, next_width_mm=6.0, distance_mm=273.0)
+    source = grid_for("slit", LAMBDA_MM, 1.3, 6.0, 273.0)
     target = Grid("screen", 2001, 0.001, LAMBDA_MM)
     field = open_share(source, np.array([[-0.61, 0.62]])).astype(complex)
     after = through(field, source, target, 273.0)
