@@ -75,7 +75,7 @@ def build_psf(
         wanted=names,
         mount_image=mount_image,
         threads=threads,
-        progress=_nine_tenths_of(progress),
+        progress=None if progress is None else lambda done, of: progress(900 * done // of, 1000),
     )
     provenance = _provenance(instrument, patterns.notes)
     kernels: dict[str, Kernel] = {}
@@ -148,16 +148,6 @@ def build_recipe(
 def component_names(instrument: Instrument) -> tuple[str, ...]:
     """The names of the components that a PSF of this instrument has."""
     return available_parts(instrument) + (() if instrument.scatter is None else (SCATTER,))
-
-
-def _nine_tenths_of(progress: Progress | None) -> Progress:
-    """Report the steps of diffraction as the first nine tenths of the work."""
-
-    def report(done: int, of: int) -> None:
-        if progress is not None:
-            progress(900 * done // of, 1000)
-
-    return report
 
 
 def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:

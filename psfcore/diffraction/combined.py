@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.airy import airy_kernel
 from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
-from psfcore.diffraction.mesh_series import mesh_kernel, mesh_line, rotated_mesh_kernel
+from psfcore.diffraction.mesh_series import mesh_line, rotated_mesh_kernel
 from psfcore.diffraction.pupil import entrance_pupil
 from psfcore.instruments.model import Instrument, Mesh, Mount
 from psfcore.instruments.workload import MOST_MASK_SAMPLES, PERIOD_PX, windows_of
@@ -84,10 +84,7 @@ def route_of(instrument: Instrument) -> Route:
     mask = samples <= MOST_MASK_SAMPLES
     plain = all(mesh.share == 1 and mesh.angle_deg % 90 == 0 for mesh in _meshes(instrument, "entrance"))
     return Route(
-        samples=samples,
-        mask=mask,
-        meshes_in_mask=mask and plain,
-        mount=mask and instrument.mount is not None,
+        samples=samples, mask=mask, meshes_in_mask=mask and plain, mount=mask and instrument.mount is not None
     )
 
 
@@ -258,7 +255,7 @@ class _OneWavelength:
         }
         if mesh.angle_deg % 90 == 0:
             line = mesh_line(**optics)
-            return mesh_kernel(line, line)
+            return np.outer(line, line)
         return rotated_mesh_kernel(angle_deg=mesh.angle_deg, **optics)
 
     def _convolved(self, a: Kernel, b: Kernel) -> Kernel:

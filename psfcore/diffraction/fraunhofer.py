@@ -217,9 +217,7 @@ class _Transforms:
 
     def _transform_along_x(self, columns: range) -> None:
         """Compute spectra[y, j] of all rows, for several s. The spectra do not depend on t."""
-        phases = [
-            _phases(_turns(s, self.samples, self.period), self.mask.cells, self.period) for s in columns
-        ]
+        phases = [self._phases(s) for s in columns]
 
         def transform(block: slice) -> None:
             strip = np.empty((STRIP_ROWS, self.mask.cells), dtype=np.float32)
@@ -235,13 +233,23 @@ class _Transforms:
 
     def _transform_along_y(self, spectrum: NDArray[np.complex64], t: int) -> None:
         """Compute field[j_y, j_x] for one t, for all j_y of the period."""
-        within, of_period = _phases(_turns(t, self.samples, self.period), self.mask.cells, self.period)
+        within, of_period = self._phases(t)
 
         def fold(block: slice) -> None:
             _fold_block(spectrum, self.mask.cells, within, of_period, self.field, block.start, block.stop)
 
         list(self.pool.map(fold, _blocks(self.period, self.threads)))
         self.field = transform_axis(self.field, axis=0, threads=self.threads)
+
+    def _phases(self, place: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        """exp(-2 pi i turns (m + k n) / n) as a product of two factors: the first for each m, the second for each k.
+
+        turns: o_s - n // 2. Because of the term n // 2, the centre of the pattern is at [n // 2], and no shift is needed.
+        """
+        turns, n = _offset(place, self.samples) - self.period // 2, self.period
+        within = np.exp(-2j * np.pi * turns * np.arange(n) / n)
+        of_period = np.exp(-2j * np.pi * turns * np.arange(math.ceil(self.mask.cells / n)))
+        return within.astype(np.complex64), of_period.astype(np.complex64)
 
     def _add(self, weight: float) -> None:
         field = self.field[self.kept]
@@ -280,22 +288,9 @@ def _completed(total: NDArray[np.float64], symmetry: str) -> NDArray[np.float64]
     return np.asarray(total + total[:, mirror])
 
 
-def _turns(place: int, samples: int, size: int) -> float:
-    """o_s - n // 2. Because of the term n // 2, the centre of the pattern is at [n // 2], and no shift is needed."""
-    return _offset(place, samples) - size // 2
-
-
 def _offset(place: int, samples: int) -> float:
     """o_s of Eq. (2)."""
     return (place + 0.5) / samples - 0.5
-
-
-def _phases(turns: float, cells: int, size: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-    """exp(-2 pi i turns (m + k n) / n) as a product of two factors. Two results: the first factor for each m, and the
-    second factor for each k."""
-    within = np.exp(-2j * np.pi * turns * np.arange(size) / size)
-    of_period = np.exp(-2j * np.pi * turns * np.arange(math.ceil(cells / size)))
-    return within.astype(np.complex64), of_period.astype(np.complex64)
 
 
 def _blocks(size: int, threads: int) -> list[slice]:

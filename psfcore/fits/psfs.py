@@ -24,13 +24,7 @@ from psfcore.fits.header import (
     plate_scale_arcsec,
     wavelength_angstrom,
 )
-from psfcore.psf import (
-    FittedShape,
-    Psf,
-    cumulative_curve,
-    encircled_energy,
-    radial_profile,
-)
+from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy, radial_profile
 
 _STATED = re.compile(r"psf_id: ([0-9a-f]{64})")
 

@@ -143,7 +143,7 @@ TELESCOPES = (
         reason="the sources of the AIA files describe the seven EUV channels alone",
         ways={
             "fit": "AIA observed the transit of Venus of 2012, for example at 1600 angstrom; heliopsf can fit the scatter to "
-            "such images",
+            "such images"
         },
         angstrom=(1600.0, 1700.0, 4500.0),
     ),
