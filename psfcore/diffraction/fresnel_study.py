@@ -33,7 +33,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import linear_convolve
-from psfcore.diffraction.best_focus import BestFocus, best_focus
 from psfcore.diffraction.fresnel import (
     MM_PER_UM,
     SAMPLING_MARGIN,
@@ -48,7 +47,14 @@ from psfcore.diffraction.fresnel import (
     open_share,
     propagate,
 )
-from psfcore.diffraction.light_path import REACH_PX, SAMPLES_PER_PIXEL, LightPath, light_path
+from psfcore.diffraction.light_path import (
+    REACH_PX,
+    SAMPLES_PER_PIXEL,
+    BestFocus,
+    LightPath,
+    best_focus,
+    light_path,
+)
 from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
 from psfcore.instruments.model import Instrument

@@ -15,7 +15,6 @@ from scipy.special import fresnel as fresnel_integrals
 
 from psfcore.convolution.convolver import ChirpTransform
 from psfcore.diffraction import fresnel as waves
-from psfcore.diffraction.best_focus import BestFocus, best_focus, paraxial_separation_mm
 from psfcore.diffraction.fresnel import (
     Grid,
     binned_light,
@@ -30,7 +29,14 @@ from psfcore.diffraction.fresnel import (
     propagate,
 )
 from psfcore.diffraction.fresnel_study import FresnelStudy, fresnel_study
-from psfcore.diffraction.light_path import LightPath, focal_mm, light_path
+from psfcore.diffraction.light_path import (
+    BestFocus,
+    LightPath,
+    best_focus,
+    focal_mm,
+    light_path,
+    paraxial_separation_mm,
+)
 from psfcore.diffraction.plots import fresnel_png
 from psfcore.errors import DataError
 from psfcore.instruments.model import Aperture, Instrument, Mirror, load_instrument
