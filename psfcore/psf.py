@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
+from psfcore.instruments.workload import REACH_GRID_PX as REACH_GRID_PX
 
 Kernel = NDArray[np.float64]
 
-REACH_GRID_PX = 2048
 LARGEST_SUM = 1 + 1e-3
 SMALLEST_SUM = 0.05
 # Because of rounding, the central weight may be below the largest weight by this fraction.
