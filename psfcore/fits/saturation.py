@@ -128,14 +128,12 @@ def _levels(image: Image, requested_dn: float | None, instrument_dn: float | Non
     """All known levels in the unit of the image, by their sources."""
     cards = {key: optional_number(image.header, key) for key in _LEVEL_CARDS}
     levels = {key: level for key, level in cards.items() if level is not None and level > 0}
-    in_dn = {REQUEST: requested_dn}
-    if requested_dn is None:
-        in_dn = {INSTRUMENT: instrument_dn, "NSATPIX": _aia_level_dn(image.header)}
     unit = parse_unit(image.unit)
     if requested_dn is not None:
         scale = per_dn(unit, image.exposure_s, "because the saturation level is in DN")
-    else:
-        scale = unit.dn_per_unit(image.exposure_s) or 0.0
+        return levels | ({REQUEST: requested_dn / scale} if scale > 0 else {})
+    scale = unit.dn_per_unit(image.exposure_s) or 0.0
+    in_dn = {INSTRUMENT: instrument_dn, "NSATPIX": _aia_level_dn(image.header)}
     if scale > 0:
         levels |= {source: level / scale for source, level in in_dn.items() if level is not None}
     return levels

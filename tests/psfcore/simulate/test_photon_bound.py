@@ -1,4 +1,4 @@
-"""The photon bound agrees with differences of whole simulations and with the scatter of noisy fits."""
+"""The photon bound agrees with differences of whole simulations."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from psfcore.simulate.scatter_truth import (
 )
 from psfcore.simulate.scene import drawn_scene
 from psfcore.simulate.sky import TrueSky, true_sky
-from psfcore.simulate.transit import observed_transit, simulate
+from psfcore.simulate.transit import simulate
 from psfcore.simulate.transit_files import write
 from tests.psfcore.conftest import gaussian
 
@@ -126,29 +126,6 @@ def test_the_bound_agrees_with_differences_of_whole_simulations(
     assert bound.stretch == pytest.approx(np.sqrt(np.linalg.inv(information)[3, 3]), rel=2e-4)
     assert bound.dark_pixels == slopes.shape[1]
     assert bound.images == 6
-
-
-def test_a_fit_scatters_by_the_bound(bound: PhotonBound, sky: TrueSky, slopes: Plane) -> None:
-    """The best linear fit of b, c, total to 120 noisy transits."""
-    weighted = slopes[:3] / dark_variances(sky)
-    fit = np.linalg.solve(weighted @ slopes[:3].T, weighted)
-    expected, size = dark_pixels(sky), sky.plan.size_px
-    discs = [fully_dark(sky.plan.place(n), (0, 0), (size, size)) for n in range(6)]
-    found = []
-    for seed in range(120):
-        frames = observed_transit(sky, seed).transit.frames
-        seen = np.concatenate([frame.pixels[disc] for frame, disc in zip(frames, discs, strict=True)])
-        found.append(fit @ (seen - expected))
-    sigmas = np.array([bound.b_px, bound.c, bound.total])
-    # 120 draws know a width to 6.5 %; whole DN add 1 % to the readout's variance.
-    np.testing.assert_allclose(np.std(found, axis=0), sigmas, rtol=0.2)
-    np.testing.assert_allclose(np.mean(found, axis=0) / sigmas, 0, atol=4 / np.sqrt(120))
-    np.testing.assert_allclose(np.corrcoef(found, rowvar=False)[0, 1], correlation(bound), atol=0.15)
-
-
-def correlation(bound: PhotonBound) -> float:
-    """The correlation of b with c."""
-    return bound.covariance[0][1] / (bound.b_px * bound.c)
 
 
 def test_errors_of_curves_follow_from_their_slopes(bound: PhotonBound) -> None:
