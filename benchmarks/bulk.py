@@ -33,7 +33,7 @@ from benchmarks.figures import tell
 from psfcore.build import build_psf
 from psfcore.deconvolve.assess.contact_sheet import treat
 from psfcore.deconvolve.conditions import Conditions, EngineCache
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.instruments.model import load_instrument

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.timing import THREADS, reference
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.validation.cross_validation import FoldFit, bands, bootstrap_samples, shared_fits
 from psfcore.simulate.plan import default_plan

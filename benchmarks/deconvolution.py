@@ -26,7 +26,7 @@ from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.diffraction.fraunhofer import FEWEST_SAMPLES, far_field
 from psfcore.diffraction.pupil import entrance_pupil
 from psfcore.drawing.plots import preview_png
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.observation import read_observation
 from psfcore.instruments.model import Instrument, load_instrument
 from psfcore.psf import Psf

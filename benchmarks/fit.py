@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import tell
 from benchmarks.timing import THREADS, peak_gib, reference
 from psfcore.convolution.convolver import Convolver
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.psf import cumulative_curve
 from psfcore.scatter.fit import fit_transit
 from psfcore.scatter.inversion import invert

@@ -16,7 +16,7 @@ from psfcore.build import build_recipe
 from psfcore.built.cache import FITS, PROVENANCE, TOTAL_FITS, TOTAL_PROVENANCE, CachedFile, PsfCache
 from psfcore.built.recipe import Recipe
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import Psf
 from workers.cache_folder import psf_cache

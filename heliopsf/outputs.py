@@ -22,8 +22,8 @@ from psfcore.deconvolve.region import BoxWork
 from psfcore.deconvolve.result import Deconvolved
 from psfcore.deconvolve.whole import Assessed, Work
 from psfcore.errors import module_of_extra
-from psfcore.fits.header import optional_text
-from psfcore.fits.product.cards import CARD_OF_PASS, passes_of
+from psfcore.fits.cards import optional_text
+from psfcore.fits.images import CARD_OF_PASS, passes_of
 from psfcore.image import Image
 
 if TYPE_CHECKING:

@@ -7,15 +7,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from psfcore.fits.times import utc_time
+
 from heliopsf.kept import kept_psf
 from heliopsf.progress import Told, told
 from psfcore.built.cache import sha256_of_file
 from psfcore.built.recipe import Recipe
 from psfcore.errors import module_of_extra
 from psfcore.fits import psfs
-from psfcore.fits.header import FitsLimits
-from psfcore.fits.mask_file import read_mask_image
-from psfcore.fits.times import utc_time
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.images import read_mask_image
 from psfcore.instruments.files import instrument_path, turned_text
 from psfcore.instruments.model import load_instrument, read_instrument_text
 from psfcore.psf import Psf as CorePsf

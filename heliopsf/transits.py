@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from heliopsf.progress import Stages, told_stages
 from heliopsf.psfs import LIMITS, Psf, build_psf
+from psfcore.build import check_known
 from psfcore.errors import module_of_extra
 from psfcore.gap import diagnose
 from psfcore.gap.report.report import gap_report
 from psfcore.gap.verdict.calibration import COVERAGE
-from psfcore.known_diffraction import check_known
 from psfcore.noise import Noise
 from psfcore.psf import Kernel
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf

@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore import software_version
 from psfcore.built.recipe import Recipe
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.combined import DIFFRACTION, available_parts, diffraction_patterns
 from psfcore.errors import DataError
-from psfcore.fits.product.version import software_version
-from psfcore.instruments.model import Instrument, parse_instrument
+from psfcore.instruments.files import instrument_names
+from psfcore.instruments.model import Instrument, load_instrument, parse_instrument
 from psfcore.instruments.workload import LARGEST_SIZE_PX, check_workload
 from psfcore.psf import REACH_GRID_PX, Psf, crop_centred
 from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel
@@ -52,15 +53,19 @@ def build_psf(
     component: build only this component, one of component_names(); the result is then a PSF without components.
     parts: False: compute only what the total PSF needs, and return it without components. The kernel is the same bit for
     bit.
-    mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see fits.mask_file).
+    mount_image: pixels of the mount's mask image [y, x], row 0 at the lowest y (see `psfcore.fits.images`).
     progress: called with (step, steps); it may raise to stop the work.
     Raises DataError "bad-size", "unknown-component", "bad-mount", or "bad-instrument-file" if the file describes an
     instrument that needs too large arrays.
     """
-    _check_size(size)
+    if size % 2 or not SMALLEST_SIZE_PX <= size <= LARGEST_SIZE_PX:
+        wanted = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
+        raise DataError("bad-size", f"expected {wanted}; got {size}")
     check_workload(instrument, instrument.name)
-    names = component_names(instrument) if component is None else (component,)
-    _check_component(instrument, names)
+    known = component_names(instrument)
+    if component not in (None, *known):
+        raise DataError("unknown-component", f"expected one of {', '.join(known)}; got {component!r}")
+    names = known if component is None else (component,)
     if component is None and not parts:
         names = tuple(name for name in names if name in (DIFFRACTION, SCATTER))
     grid = max(size, REACH_GRID_PX)
@@ -70,7 +75,7 @@ def build_psf(
         wanted=names,
         mount_image=mount_image,
         threads=threads,
-        progress=_nine_tenths_of(progress),
+        progress=None if progress is None else lambda done, of: progress(900 * done // of, 1000),
     )
     provenance = _provenance(instrument, patterns.notes)
     kernels: dict[str, Kernel] = {}
@@ -145,16 +150,6 @@ def component_names(instrument: Instrument) -> tuple[str, ...]:
     return available_parts(instrument) + (() if instrument.scatter is None else (SCATTER,))
 
 
-def _nine_tenths_of(progress: Progress | None) -> Progress:
-    """Report the steps of diffraction as the first nine tenths of the work."""
-
-    def report(done: int, of: int) -> None:
-        if progress is not None:
-            progress(900 * done // of, 1000)
-
-    return report
-
-
 def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
     """Scale the weights so that they sum to 1 on the full reach; also return the share of the light beyond the
     reach."""
@@ -185,13 +180,22 @@ def _provenance(instrument: Instrument, notes: dict[str, Any]) -> dict[str, Any]
     return about
 
 
-def _check_size(size: int) -> None:
-    if size % 2 or not SMALLEST_SIZE_PX <= size <= LARGEST_SIZE_PX:
-        wanted = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
-        raise DataError("bad-size", f"expected {wanted}; got {size}")
+def known_diffraction(instrument: str | None, *, threads: int = 1) -> Kernel:
+    """The diffraction PSF of a known instrument, as weights [y, x], for a transit whose transit.json names no file of it.
+
+    Raises DataError "no-known-psf" if the instrument is not known.
+    """
+    known = load_instrument(check_known(instrument))
+    return build_psf(known, component="DIFFRACTION", threads=threads).kernel
 
 
-def _check_component(instrument: Instrument, names: tuple[str, ...]) -> None:
-    known = component_names(instrument)
-    if not set(names) <= set(known):
-        raise DataError("unknown-component", f"expected one of {', '.join(known)}; got {names[0]!r}")
+def check_known(instrument: str | None) -> str:
+    """The name of a known instrument. Raises DataError "no-known-psf" if the instrument is not known."""
+    if instrument not in instrument_names():
+        known = ", ".join(instrument_names())
+        raise DataError(
+            "no-known-psf",
+            f'expected "known_psf" in transit.json, or an instrument with a known diffraction PSF ({known}); '
+            f"got {instrument or 'neither'}",
+        )
+    return instrument

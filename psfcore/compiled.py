@@ -241,7 +241,9 @@ class KernelFiles(IndexDataCacheFile):
         return any(self._is_good(path.name) for path in Path(self._cache_path).glob(pattern))
 
     def _found(self, name: str) -> Any:
-        if not (self._is_good(name) and self._is_ours(name)):
+        if not (
+            self._is_good(name) and trusted(Path(self._cache_path)) and trusted(Path(self._data_path(name)))
+        ):
             return None
         data = self._load_data(name)
         # A process of another version may have replaced the file in the meantime.
@@ -253,10 +255,6 @@ class KernelFiles(IndexDataCacheFile):
         except FileNotFoundError:
             return False
         return kept[-SEAL_BYTES:] == self._seal(kept[:-SEAL_BYTES])
-
-    def _is_ours(self, name: str) -> bool:
-        """Whether nobody else can change the kernel file or add files to its folder."""
-        return trusted(Path(self._cache_path)) and trusted(Path(self._data_path(name)))
 
     def _seal(self, payload: bytes) -> bytes:
         stamp = repr((self._version, self._source_stamp, sources_sha256()))

@@ -6,12 +6,8 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
-_OWN = {
-    "heliopsf",
-    "psfcore",
-    "workers",
-    "service",
-}  # if a module of heliopsf itself is missing, the installation is faulty
+# If a module of heliopsf itself is missing, the installation is faulty.
+_OWN = ("heliopsf", "psfcore", "workers", "service")
 MOST_TOLD = 20  # if a request has many errors, only the texts of the first ones are given
 
 

@@ -63,7 +63,7 @@ def run_limited(
     }
     content = json.dumps(request).encode()
     reply = _answered(content, target)
-    if not reply and _has_no_server():  # it was killed, and with it perhaps this request
+    if not reply and (_server is None or _server.ended):  # it was killed, and with it perhaps this request
         reply = _answered(content, target)
     if not reply:
         raise DataError(
@@ -151,10 +151,6 @@ def _running() -> _Server:
         _stop()
         _server = _Server()
     return _server
-
-
-def _has_no_server() -> bool:
-    return _server is None or _server.ended
 
 
 @atexit.register

@@ -11,20 +11,25 @@ away. A smaller array holds the part of the light that falls on it; its sum is b
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from psfcore.errors import DataError
-from psfcore.plate_scale import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
-from psfcore.weight_rules import CENTRE_TOLERANCE as CENTRE_TOLERANCE
-from psfcore.weight_rules import REACH_GRID_PX as REACH_GRID_PX
-from psfcore.weight_rules import check_core, check_weights, core_offset_px, is_peak
+from psfcore.instruments.files import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
+from psfcore.instruments.workload import REACH_GRID_PX as REACH_GRID_PX
 
 Kernel = NDArray[np.float64]
+
+LARGEST_SUM = 1 + 1e-3
+SMALLEST_SUM = 0.05
+# Because of rounding, the central weight may be below the largest weight by this fraction.
+CENTRE_TOLERANCE = 1e-3
+LARGEST_OFFSET_PX = 0.05  # a PSF moves every image by the offset of its core
 
 
 @dataclass(frozen=True)
@@ -91,15 +96,17 @@ def _check_weights(kernel: Kernel) -> None:
         raise DataError(
             "psf-nonfinite", f"expected finite weights; got {bad} weights that are NaN or infinite"
         )
-    largest, smallest = float(kernel.max()), float(kernel.min())
+    smallest = float(kernel.min())
+    if smallest < -1e-12 * max(float(kernel.max()), 0.0):
+        raise DataError("psf-negative", f"expected weights >= 0; the smallest is {smallest:.3g}")
     # The sum is defined over the full reach; a larger array may sum to more than 1.
-    within = _within_reach(kernel.shape)
+    within = (min(kernel.shape[0], REACH_GRID_PX), min(kernel.shape[1], REACH_GRID_PX))
     total = float((kernel if kernel.shape == within else crop_centred(kernel, within)).sum())
-    check_weights(smallest, largest, total)
-
-
-def _within_reach(shape: tuple[int, ...]) -> tuple[int, int]:
-    return min(shape[0], REACH_GRID_PX), min(shape[1], REACH_GRID_PX)
+    if not SMALLEST_SUM < total <= LARGEST_SUM:
+        wanted = f"weights that sum to 1 over the full reach, or to less if cropped ({SMALLEST_SUM} to {LARGEST_SUM})"
+        raise DataError(
+            "psf-sum", f"expected {wanted}; got {total:.6g}. Divide the weights by their sum first"
+        )
 
 
 def _check_centre(kernel: Kernel) -> None:
@@ -108,7 +115,7 @@ def _check_centre(kernel: Kernel) -> None:
     A PSF with another centre would shift every deconvolved image.
     """
     centre = (kernel.shape[0] // 2, kernel.shape[1] // 2)
-    if not is_peak(float(kernel[centre]), float(kernel.max())):
+    if kernel[centre] < kernel.max() * (1 - CENTRE_TOLERANCE):
         peak = np.unravel_index(int(kernel.argmax()), kernel.shape)
         found = tuple(int(p) for p in peak)
         hint = " (the corner origin of a Fourier transform)" if found == (0, 0) else ""
@@ -119,10 +126,39 @@ def _check_centre(kernel: Kernel) -> None:
 
 
 def _check_core(kernel: Kernel) -> None:
+    """Check that the core of the PSF is not beside the central pixel."""
     y, x = kernel.shape[0] // 2, kernel.shape[1] // 2
     core = kernel[y - 1 : y + 2, x - 1 : x + 2]
-    if core.shape == (3, 3):
-        check_core(core_offset_px(*core.sum(axis=0)), core_offset_px(*core.sum(axis=1)))
+    if core.shape != (3, 3):
+        return
+    offset_x_px, offset_y_px = _core_offset_px(*core.sum(axis=0)), _core_offset_px(*core.sum(axis=1))
+    if max(abs(offset_x_px), abs(offset_y_px)) > LARGEST_OFFSET_PX:
+        raise DataError(
+            "psf-off-centre",
+            f"expected the core of the PSF at the centre of the pixel [ny // 2, nx // 2], within {LARGEST_OFFSET_PX:g} px; got "
+            f"it at x {offset_x_px:+.2f}, y {offset_y_px:+.2f} px from there, which would move every image by as much: "
+            "shift the PSF by whole and part pixels, for example with scipy.ndimage.shift",
+        )
+
+
+def _core_offset_px(before: float, centre: float, after: float) -> float:
+    """The offset of the core from the central pixel along one axis, px, from the sums of three lines of 3 weights.
+
+    A Gaussian through the three sums has its peak at this offset; a core without light beside the central pixel has the
+    offset of its centroid.
+    """
+    if min(before, after) <= 0 or centre <= 0:
+        total = before + centre + after
+        return (after - before) / total if total > 0 else 0.0
+    curvature = 2 * math.log(centre) - math.log(before) - math.log(after)
+    slope = math.log(after) - math.log(before)
+    return (
+        0.0
+        if slope == 0
+        else 0.5 * slope / curvature
+        if curvature > abs(slope)
+        else math.copysign(0.5, slope)
+    )
 
 
 def crop_centred(kernel: Kernel, shape: tuple[int, int]) -> Kernel:
@@ -133,6 +169,22 @@ def crop_centred(kernel: Kernel, shape: tuple[int, int]) -> Kernel:
     ny, nx = shape
     top, left = kernel.shape[0] // 2 - ny // 2, kernel.shape[1] // 2 - nx // 2
     return kernel[top : top + ny, left : left + nx].copy()
+
+
+def central_part(psf: Psf, size_px: int) -> Psf:
+    """The central (size_px, size_px) px of a PSF and of its components. The weights are not renormalised.
+
+    Raises DataError "cutout-too-large" if the PSF is smaller.
+    """
+    smallest = min(psf.kernel.shape)
+    if size_px > smallest:
+        raise DataError("cutout-too-large", f"expected a size of 1 to {smallest} px; got {size_px}")
+    shape = (size_px, size_px)
+    return replace(
+        psf,
+        kernel=crop_centred(psf.kernel, shape),
+        components={name: crop_centred(part, shape) for name, part in psf.components.items()},
+    )
 
 
 def crop_or_pad(kernel: Kernel, size: int) -> Kernel:

@@ -34,8 +34,8 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.binning import binning_factor
 from psfcore.fits.cards import Cards
+from psfcore.fits.channel import binning_factor
 from psfcore.fits.frame import SILENT_DEG, UNIT, Matrix, frame_of, plate_scale_arcsec
 from psfcore.image import Image
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred

@@ -20,10 +20,10 @@ from psfcore import limited
 from psfcore.built.cache import PsfCache
 from psfcore.deconvolve.memory import MIB, check_memory
 from psfcore.errors import DataError
-from psfcore.fits.cutout import cutout
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.header import read_summary
 from psfcore.fits.psfs import stated_id
-from psfcore.fits.weights import check_is_psf
+from psfcore.fits.stored_psf import check_is_psf, cutout
 from psfcore.tables import lookup
 from psfcore.transit.archive import ArchiveLimits, FolderTransit, list_archive, transit_in
 from service.client.errors import ServiceError

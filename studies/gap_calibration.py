@@ -31,6 +31,7 @@ from heliopsf.psfs import LIMITS
 from psfcore.blind.case_set import BlindSet, SetPlan, make_set
 from psfcore.blind.score import wilson
 from psfcore.blind.scoring import required_names
+from psfcore.build import known_diffraction
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import linear_model_of
 from psfcore.gap.evidence.likelihood import TEMPLATE_ERRORS
@@ -42,7 +43,6 @@ from psfcore.gap.verdict.posterior import NONE, PRIOR, UNKNOWN, Kind, Names, Pos
 from psfcore.gap.verdict.refits import Refits
 from psfcore.gap.verdict.settled import settled_posterior
 from psfcore.gap.view import View
-from psfcore.known_diffraction import known_diffraction
 from psfcore.scatter.inversion import invert
 from psfcore.transit.folder import read_transit
 from psfcore.whole_files import write_whole

@@ -33,7 +33,7 @@ from psfcore.gap.verdict.refits import Refits
 from psfcore.gap.verdict.settled import settled_posterior
 from psfcore.gap.view import View
 from psfcore.scatter.inversion import invert
-from psfcore.simulate.from_files import diffraction_kernel
+from psfcore.simulate.inputs import diffraction_kernel
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.transit import simulate

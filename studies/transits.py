@@ -38,7 +38,7 @@ from psfcore.scatter.published import AS_PUBLISHED, invert_as_published
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import SHAPES, stretch_of
 from psfcore.scatter.validation.cross_validation import bands, bootstrap_samples, shared_fits
-from psfcore.simulate.bound import photon_bound
+from psfcore.simulate.bound import bound_of_sky
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
 from psfcore.simulate.transit import SimulatedTransit, simulate
@@ -81,7 +81,7 @@ def one(seed: int, size: int, images: int, published: bool, stretch: bool) -> di
     inversion = solution.inversion
     radii = inversion.radii_px
     true_curve = cumulative_curve(total_kernel(truth, kernel, REACH_GRID_PX), radii)
-    bound = photon_bound(simulated)
+    bound = bound_of_sky(simulated.sky)
     out: dict[str, Any] = {
         "seed": seed,
         "radii": radii.tolist(),
@@ -190,7 +190,7 @@ def _noise_free(simulated: SimulatedTransit, true_curve: NDArray[np.float64]) ->
     frames = tuple(
         replace(frame, pixels=seen.astype(np.float32), place=place)
         for frame, seen, place in zip(
-            simulated.transit.frames, simulated.noise_free, simulated.truth.places, strict=True
+            simulated.transit.frames, simulated.sky.noise_free, simulated.truth.places, strict=True
         )
     )
     inversion = invert(replace(simulated.transit, frames=frames)).inversion

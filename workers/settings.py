@@ -15,7 +15,7 @@ from platformdirs import user_data_path
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from psfcore.fits.product.version import software_version as software_version
+from psfcore import software_version as software_version
 from psfcore.transit.archive import ArchiveLimits
 from workers.contract.queues import Queue, queues_named
 from workers.machine import cores, memory_bytes

@@ -14,8 +14,8 @@ import numpy as np
 
 import heliopsf
 from benchmarks.timing import THREADS, memory_bytes, seconds
-from psfcore.central_part import central_part
 from psfcore.deconvolve.memory import Asked, deconvolution_bytes
+from psfcore.psf import central_part
 from psfcore.scatter.fit import fit_transit
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate

@@ -333,7 +333,7 @@ def main() -> None:
             "image with AIA_IMAGE=FILE"
         )
         return
-    from psfcore.fits.header import FitsLimits
+    from psfcore.fits.blocks import FitsLimits
     from psfcore.fits.observation import read_observation
 
     with TemporaryDirectory(prefix="heliopsf-aia-") as name:

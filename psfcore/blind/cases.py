@@ -34,8 +34,8 @@ from psfcore.blind.effects.scene import patches
 from psfcore.errors import DataError
 from psfcore.noise import Noise
 from psfcore.simulate.plan import WEST, Plan, Shot, default_plan
-from psfcore.simulate.pointings import drawn_scene, scene_from_image
 from psfcore.simulate.scatter_truth import ScatterTruth
+from psfcore.simulate.scene import drawn_scene, scene_from_image
 
 Plane = NDArray[np.float64]
 Range = tuple[float, float]

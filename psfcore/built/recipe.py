@@ -11,7 +11,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from psfcore.weight_rules import REACH_GRID_PX
+from psfcore.instruments.workload import REACH_GRID_PX
 
 BUILD_VERSION = 3  # raise this number when a change of the code changes the PSF of a recipe
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from psfcore import software_version
 from psfcore.deconvolve.result import Deconvolved
-from psfcore.fits.product.version import software_version
 from psfcore.image import Saturation
 
 

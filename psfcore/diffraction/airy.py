@@ -28,7 +28,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_simpson
-from scipy.special import j0, j1, jn_zeros
+from scipy.special import j0, j1
 
 from psfcore.compiled import compiled
 from psfcore.instruments.workload import AIRY_STEP
@@ -81,11 +81,6 @@ def airy_kernel(
     quarter[0, 0] += 1  # Eq. (3)
     distance = np.abs(np.arange(size) - half)
     return np.ascontiguousarray(quarter[distance[:, None], distance[None, :]])
-
-
-def first_dark_ring_v() -> float:
-    """v at the first zero of the Airy pattern of a disc, 1.22 pi."""
-    return float(jn_zeros(1, 1)[0])
 
 
 @compiled()

@@ -31,9 +31,9 @@ from numpy.typing import NDArray
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.airy import airy_kernel
 from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
-from psfcore.diffraction.mesh_series import mesh_kernel, mesh_line, rotated_mesh_kernel
-from psfcore.diffraction.pupil import Pupil, entrance_pupil
-from psfcore.instruments.model import Instrument, Mesh, SpectralLine
+from psfcore.diffraction.mesh_series import mesh_line, rotated_mesh_kernel
+from psfcore.diffraction.pupil import entrance_pupil
+from psfcore.instruments.model import Instrument, Mesh, Mount
 from psfcore.instruments.workload import MOST_MASK_SAMPLES, PERIOD_PX, windows_of
 
 STEPS_A_PUPIL = 20  # steps of progress for each component
@@ -84,10 +84,7 @@ def route_of(instrument: Instrument) -> Route:
     mask = samples <= MOST_MASK_SAMPLES
     plain = all(mesh.share == 1 and mesh.angle_deg % 90 == 0 for mesh in _meshes(instrument, "entrance"))
     return Route(
-        samples=samples,
-        mask=mask,
-        meshes_in_mask=mask and plain,
-        mount=mask and instrument.mount is not None,
+        samples=samples, mask=mask, meshes_in_mask=mask and plain, mount=mask and instrument.mount is not None
     )
 
 
@@ -130,68 +127,70 @@ def diffraction_patterns(
     The patterns of the spectral lines are multiplied by the weights of the lines and added. mount_image: pixels [y, x] of
     the mount's mask image, if the instrument has one. progress: called with (done, of).
     """
-    needed = needed_parts(instrument, wanted)
-    made = Patterns(notes={"entrance_route": str(route_of(instrument))})
+    route, needed = route_of(instrument), needed_parts(instrument, wanted)
+    patterns = Patterns(notes={"entrance_route": str(route)})
     lines = instrument.spectral_lines
-    steps = len(needed) * STEPS_A_PUPIL
-    for index, line in enumerate(lines):
-        work = _OneWavelength(instrument, line, size, mount_image, threads, made.notes)
-        for place, name in enumerate(part for part in available_parts(instrument) if part in needed):
-            before = (index * len(needed) + place) * STEPS_A_PUPIL
-            work.make(name, _scaled(progress, before, steps * len(lines)))
-        for name, kernel in work.kernels.items():
-            if len(lines) > 1:
-                kernel = line.weight * kernel
-            made.kernels[name] = made.kernels[name] + kernel if name in made.kernels else kernel
-    return made
-
-
-def _scaled(progress: Progress | None, before: int, steps: int) -> Progress:
-    """Report the progress of one component as progress of the whole computation."""
+    steps = len(lines) * len(needed) * STEPS_A_PUPIL
+    before = 0
 
     def report(done: int, of: int) -> None:
         if progress is not None:
             progress(before + STEPS_A_PUPIL * done // of, steps)
 
-    return report
+    for line in lines:
+        work = _OneWavelength(
+            instrument, route, line.wavelength_angstrom, size, mount_image, threads, patterns.notes
+        )
+        for name in (part for part in available_parts(instrument) if part in needed):
+            report(0, 1)
+            work.kernels[name] = work.kernel(name, report)
+            report(1, 1)
+            before += STEPS_A_PUPIL
+        for name, kernel in work.kernels.items():
+            if len(lines) > 1:
+                kernel = line.weight * kernel
+            patterns.kernels[name] = patterns.kernels[name] + kernel if name in patterns.kernels else kernel
+    return patterns
 
 
+@dataclass
 class _OneWavelength:
     """All components at one wavelength, each computed from the aperture or from earlier components."""
 
-    def __init__(
-        self,
-        instrument: Instrument,
-        line: SpectralLine,
-        size: int,
-        mount_image: NDArray[np.floating] | None,
-        threads: int,
-        notes: dict[str, Any],
-    ) -> None:
-        self.instrument = instrument
-        self.wavelength_angstrom = line.wavelength_angstrom
-        self.size = size
-        self.mount_image = mount_image
-        self.threads = threads
-        self.notes = notes
-        self.route = route_of(instrument)
-        self.kernels: dict[str, Kernel] = {}
+    instrument: Instrument
+    route: Route
+    wavelength_angstrom: float
+    size: int
+    mount_image: NDArray[np.floating] | None
+    threads: int
+    notes: dict[str, Any]
+    kernels: dict[str, Kernel] = field(default_factory=dict)
 
-    def make(self, name: str, progress: Progress) -> None:
-        """Compute one component. The components from which it is computed must exist already."""
-        progress(0, 1)
-        makers: dict[str, Callable[[Progress], Kernel]] = {
-            AIRY: self._airy,
-            ENTRANCE_MESH: self._entrance_mesh,
-            MOUNT: self._mount,
-            ENTRANCE: self._entrance,
-            FILTER_WHEEL: lambda _: self._series("filter_wheel"),
-            DIFFRACTION: self._diffraction,
-        }
-        self.kernels[name] = makers[name](progress)
-        progress(1, 1)
+    def kernel(self, name: str, progress: Progress) -> Kernel:
+        """One component. The components from which it is computed must exist in `kernels`."""
+        there, in_mask = self.kernels, self.route.meshes_in_mask
+        meshes, mount = _meshes(self.instrument, "entrance"), self.instrument.mount
+        if name == AIRY:
+            return self._airy()
+        if name == ENTRANCE_MESH and in_mask:
+            return self._far_field(name, meshes, None, progress)
+        if name == ENTRANCE_MESH:
+            return self._convolved(there[AIRY], self._series("entrance"))
+        if name == MOUNT:
+            return self._far_field(name, (), mount, progress)
+        if name == FILTER_WHEEL:
+            return self._series("filter_wheel")
+        if name == DIFFRACTION:
+            wheel = there.get(FILTER_WHEEL)
+            return there[ENTRANCE] if wheel is None else self._convolved(there[ENTRANCE], wheel)
+        # The whole entrance pupil. If it has no mesh or no mount, its pattern has been computed already.
+        if not (meshes and self.route.mount):
+            return there[ENTRANCE_MESH if meshes else MOUNT if self.route.mount else AIRY]
+        if in_mask:
+            return self._far_field(name, meshes, mount, progress)
+        return self._convolved(there[MOUNT], self._series("entrance"))
 
-    def _airy(self, _: Progress) -> Kernel:
+    def _airy(self) -> Kernel:
         aperture = self.instrument.aperture
         return airy_kernel(
             wavelength_angstrom=self.wavelength_angstrom,
@@ -202,41 +201,13 @@ class _OneWavelength:
             size=self.size,
         )
 
-    def _entrance_mesh(self, progress: Progress) -> Kernel:
-        if not self.route.meshes_in_mask:
-            return self._convolved(self.kernels[AIRY], self._series("entrance"))
-        meshes = _meshes(self.instrument, "entrance")
-        return self._far_field(
-            ENTRANCE_MESH, entrance_pupil(self.instrument.aperture, meshes=meshes), progress
-        )
-
-    def _mount(self, progress: Progress) -> Kernel:
-        return self._far_field(MOUNT, self._mounted(()), progress)
-
-    def _entrance(self, progress: Progress) -> Kernel:
-        """The pattern of the whole entrance pupil. If it has no mesh or no mount, this pattern has been computed already."""
-        has_mesh, has_mount = bool(_meshes(self.instrument, "entrance")), self.route.mount
-        if has_mesh and has_mount and self.route.meshes_in_mask:
-            pupil = self._mounted(_meshes(self.instrument, "entrance"))
-            return self._far_field(ENTRANCE, pupil, progress)
-        if has_mesh and has_mount:
-            return self._convolved(self.kernels[MOUNT], self._series("entrance"))
-        return self.kernels[ENTRANCE_MESH if has_mesh else MOUNT if has_mount else AIRY]
-
-    def _diffraction(self, _: Progress) -> Kernel:
-        if FILTER_WHEEL not in self.kernels:
-            return self.kernels[ENTRANCE]
-        return self._convolved(self.kernels[ENTRANCE], self.kernels[FILTER_WHEEL])
-
-    def _mounted(self, meshes: tuple[Mesh, ...]) -> Pupil:
-        mount = self.instrument.mount
-        return entrance_pupil(
-            self.instrument.aperture, mount=mount, mount_image=self.mount_image, meshes=meshes
-        )
-
-    def _far_field(self, name: str, pupil: Pupil, progress: Progress) -> Kernel:
-        found = far_field(
-            pupil,
+    def _far_field(
+        self, name: str, meshes: tuple[Mesh, ...], mount: Mount | None, progress: Progress
+    ) -> Kernel:
+        far = far_field(
+            entrance_pupil(
+                self.instrument.aperture, mount=mount, mount_image=self.mount_image, meshes=meshes
+            ),
             wavelength_angstrom=self.wavelength_angstrom,
             focal_length_mm=self.instrument.focal_length_mm,
             pixel_pitch_um=self.instrument.detector.pixel_pitch_um,
@@ -246,11 +217,11 @@ class _OneWavelength:
             progress=progress,
         )
         self.notes[name.lower()] = {
-            "open_area_mm2": found.open_area_mm2,
-            "symmetry": found.symmetry,
-            "light_beyond_grid": 1 - float(found.pattern.sum()),
+            "open_area_mm2": far.open_area_mm2,
+            "symmetry": far.symmetry,
+            "light_beyond_grid": 1 - float(far.pattern.sum()),
         }
-        return found.pattern
+        return far.pattern
 
     def _series(self, place: str) -> Kernel:
         """The pattern of all meshes at the entrance, or of all meshes at the filter wheel.
@@ -284,7 +255,7 @@ class _OneWavelength:
         }
         if mesh.angle_deg % 90 == 0:
             line = mesh_line(**optics)
-            return mesh_kernel(line, line)
+            return np.outer(line, line)
         return rotated_mesh_kernel(angle_deg=mesh.angle_deg, **optics)
 
     def _convolved(self, a: Kernel, b: Kernel) -> Kernel:

@@ -29,7 +29,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.diffraction.mesh_series import mesh_kernel, mesh_line, order_spacing_px
+from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
 from psfcore.instruments.model import Instrument
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
@@ -119,30 +119,18 @@ def _check(pitches: Sequence[float], wires: Sequence[float], flare_px: int) -> N
 
 
 def _mesh(
-    instrument: Instrument,
-    pitch_um: float,
-    wire_um: float,
-    flare_px: int,
-    halo: NDArray[np.float64] | None,
+    instrument: Instrument, pitch_um: float, wire_um: float, flare_px: int, halo: NDArray[np.float64] | None
 ) -> MeshDesign:
     windows = max(1, round(instrument.aperture.diameter_mm * 1e3 / pitch_um))
-    pixel_um = instrument.detector.pixel_pitch_um
-    spacing = order_spacing_px(
-        wavelength_angstrom=instrument.wavelength_angstrom,
-        distance_mm=instrument.focal_length_mm,
-        pitch_um=pitch_um,
-        pixel_pitch_um=pixel_um,
-    )
-    line = mesh_line(
-        wavelength_angstrom=instrument.wavelength_angstrom,
-        distance_mm=instrument.focal_length_mm,
-        pitch_um=pitch_um,
-        wire_um=wire_um,
-        windows=windows,
-        pixel_pitch_um=pixel_um,
-        size=REACH_GRID_PX,
-    )
-    beyond = cumulative_curve(mesh_kernel(line, line), [NEAR_PX, FAR_PX])
+    optics = {
+        "wavelength_angstrom": instrument.wavelength_angstrom,
+        "distance_mm": instrument.focal_length_mm,
+        "pitch_um": pitch_um,
+        "pixel_pitch_um": instrument.detector.pixel_pitch_um,
+    }
+    spacing = order_spacing_px(**optics)
+    line = mesh_line(**optics, wire_um=wire_um, windows=windows, size=REACH_GRID_PX)
+    beyond = cumulative_curve(np.outer(line, line), [NEAR_PX, FAR_PX])
     open_share = 1 - wire_um / pitch_um
     return MeshDesign(
         pitch_um=float(pitch_um),

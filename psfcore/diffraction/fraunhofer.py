@@ -123,19 +123,17 @@ def far_field(
                 Place(_offset(s, samples), _offset(t, samples), weight)
                 for s, t, weight in _places(samples, survey.symmetry)
             ]
-            pattern = _completed(mirrored.summed(places, progress or _silent), survey.symmetry)
+            pattern = _completed(
+                mirrored.summed(places, progress or (lambda done, of: None)), survey.symmetry
+            )
         else:
             transforms = _Transforms(mask, survey, samples, n, size, pool, threads)
-            pattern = transforms.summed(progress or _silent)
+            pattern = transforms.summed(progress or (lambda done, of: None))
     pattern /= float(n) ** 2 * samples**2 * survey.open_area_mm2 / cell_mm**2
     sinc = np.sinc((np.arange(size) - size // 2) / n)
     pattern /= sinc[:, None] ** 2
     pattern /= sinc[None, :] ** 2
     return FarField(pattern, survey.open_area_mm2, samples, survey.symmetry)
-
-
-def _silent(done: int, of: int) -> None:
-    """Ignore progress."""
 
 
 @dataclass(frozen=True)
@@ -163,27 +161,19 @@ def _survey(mask: MaskGrid, pool: ThreadPoolExecutor) -> _Survey:
 
     mask.rows(0, 1)  # compile the kernels in this thread, whose listener tells the user
     after, before, open_cells = [], np.zeros(mask.cells), 0.0
-    for strip_after, strip_before, strip_sum in pool.map(multiply, _strips(mask.cells)):
+    for strip_after, strip_before, strip_sum in pool.map(multiply, range(0, mask.cells, STRIP_ROWS)):
         after.append(strip_after)
         before += strip_before
         open_cells += strip_sum
     by_row, by_mirrored_row = np.concatenate(after).T  # M r, M r[::-1]
     area_mm2 = open_cells * mask.cell_mm**2
-    mirror_x = _agree(by_row, by_mirrored_row)
     # If M is mirrored in y, its product with r is (M r)[::-1].
-    mirror_y = _agree(by_row, by_row[::-1])
-    if not (mirror_x or mirror_y):
-        return _Survey(area_mm2, NO_SYMMETRY, mirror_x=False, mirror_y=False)
-    symmetry = MIRROR_AND_TRANSPOSE if _agree(by_row, before) else MIRROR
-    return _Survey(area_mm2, symmetry, mirror_x=mirror_x, mirror_y=mirror_y)
-
-
-def _agree(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
-    return float(np.abs(a - b).max()) < _SYMMETRY_TOLERANCE_CELLS
-
-
-def _strips(cells: int) -> range:
-    return range(0, cells, STRIP_ROWS)
+    mirror_x, mirror_y, transpose = (
+        float(np.abs(by_row - other).max()) < _SYMMETRY_TOLERANCE_CELLS
+        for other in (by_mirrored_row, by_row[::-1], before)
+    )
+    mirrored = MIRROR_AND_TRANSPOSE if transpose else MIRROR
+    return _Survey(area_mm2, mirrored if mirror_x or mirror_y else NO_SYMMETRY, mirror_x, mirror_y)
 
 
 class _Transforms:
@@ -227,9 +217,7 @@ class _Transforms:
 
     def _transform_along_x(self, columns: range) -> None:
         """Compute spectra[y, j] of all rows, for several s. The spectra do not depend on t."""
-        phases = [
-            _phases(_turns(s, self.samples, self.period), self.mask.cells, self.period) for s in columns
-        ]
+        phases = [self._phases(s) for s in columns]
 
         def transform(block: slice) -> None:
             strip = np.empty((STRIP_ROWS, self.mask.cells), dtype=np.float32)
@@ -245,13 +233,23 @@ class _Transforms:
 
     def _transform_along_y(self, spectrum: NDArray[np.complex64], t: int) -> None:
         """Compute field[j_y, j_x] for one t, for all j_y of the period."""
-        within, of_period = _phases(_turns(t, self.samples, self.period), self.mask.cells, self.period)
+        within, of_period = self._phases(t)
 
         def fold(block: slice) -> None:
             _fold_block(spectrum, self.mask.cells, within, of_period, self.field, block.start, block.stop)
 
         list(self.pool.map(fold, _blocks(self.period, self.threads)))
         self.field = transform_axis(self.field, axis=0, threads=self.threads)
+
+    def _phases(self, place: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        """exp(-2 pi i turns (m + k n) / n) as a product of two factors: the first for each m, the second for each k.
+
+        turns: o_s - n // 2. Because of the term n // 2, the centre of the pattern is at [n // 2], and no shift is needed.
+        """
+        turns, n = _offset(place, self.samples) - self.period // 2, self.period
+        within = np.exp(-2j * np.pi * turns * np.arange(n) / n)
+        of_period = np.exp(-2j * np.pi * turns * np.arange(math.ceil(self.mask.cells / n)))
+        return within.astype(np.complex64), of_period.astype(np.complex64)
 
     def _add(self, weight: float) -> None:
         field = self.field[self.kept]
@@ -290,22 +288,9 @@ def _completed(total: NDArray[np.float64], symmetry: str) -> NDArray[np.float64]
     return np.asarray(total + total[:, mirror])
 
 
-def _turns(place: int, samples: int, size: int) -> float:
-    """o_s - n // 2. Because of the term n // 2, the centre of the pattern is at [n // 2], and no shift is needed."""
-    return _offset(place, samples) - size // 2
-
-
 def _offset(place: int, samples: int) -> float:
     """o_s of Eq. (2)."""
     return (place + 0.5) / samples - 0.5
-
-
-def _phases(turns: float, cells: int, size: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-    """exp(-2 pi i turns (m + k n) / n) as a product of two factors. Two results: the first factor for each m, and the
-    second factor for each k."""
-    within = np.exp(-2j * np.pi * turns * np.arange(size) / size)
-    of_period = np.exp(-2j * np.pi * turns * np.arange(math.ceil(cells / size)))
-    return within.astype(np.complex64), of_period.astype(np.complex64)
 
 
 def _blocks(size: int, threads: int) -> list[slice]:

@@ -43,10 +43,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from psfcore.convolution.convolver import ChirpTransform
 from psfcore.errors import DataError
-from psfcore.instruments.model import Aperture, Mirror
+from psfcore.instruments.model import Mesh, Mirror
 
 SAMPLING_MARGIN = 1.5
 MOST_SAMPLES = 8_000_000
+MM_PER_UM = 1e-3
 
 Wave = NDArray[np.complex128]
 Vector = NDArray[np.float64]
@@ -54,11 +55,12 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Grid:
-    """Samples of one plane at equal steps, symmetric about the axis."""
+    """Samples of one plane at equal steps, symmetric about the axis, for light of one wavelength."""
 
     plane: str
     samples: int
     step_mm: float
+    wavelength_mm: float
 
     @property
     def width_mm(self) -> float:
@@ -80,7 +82,7 @@ class Grid:
 
 
 def grid_for(
-    plane: str, *, width_mm: float, next_width_mm: float, wavelength_mm: float, distance_mm: float
+    plane: str, wavelength_mm: float, width_mm: float, next_width_mm: float, distance_mm: float
 ) -> Grid:
     """The grid of a plane. Its step is so small that the light reaches the full width of the next plane.
 
@@ -96,14 +98,14 @@ def grid_for(
             f"{plane}: expected a distance to the next plane that needs at most {MOST_SAMPLES} samples; "
             f"got {distance_mm:g} mm, which needs {samples}",
         )
-    return Grid(plane, samples, step_mm)
+    return Grid(plane, samples, step_mm, wavelength_mm)
 
 
 class FresnelStep:
     """Propagation through free space between two grids, Eq. (1): prepared once, then applied to any number of fields."""
 
-    def __init__(self, source: Grid, target: Grid, *, wavelength_mm: float, distance_mm: float) -> None:
-        reach_mm2 = wavelength_mm * distance_mm
+    def __init__(self, source: Grid, target: Grid, distance_mm: float) -> None:
+        reach_mm2 = source.wavelength_mm * distance_mm
         self._transform = ChirpTransform(
             source.step_mm * target.step_mm / reach_mm2, source.samples, target.samples
         )
@@ -116,9 +118,9 @@ class FresnelStep:
         return np.asarray(self._after * self._transform.apply(field * self._before))  # Eq. (1)
 
 
-def propagate(field: Wave, source: Grid, target: Grid, *, wavelength_mm: float, distance_mm: float) -> Wave:
+def propagate(field: Wave, source: Grid, target: Grid, distance_mm: float) -> Wave:
     """Propagate one field through free space, Eq. (1)."""
-    return FresnelStep(source, target, wavelength_mm=wavelength_mm, distance_mm=distance_mm).apply(field)
+    return FresnelStep(source, target, distance_mm).apply(field)
 
 
 def conic_sag_mm(x_mm: ArrayLike, *, radius_mm: float, conic: float) -> Vector:
@@ -129,31 +131,26 @@ def conic_sag_mm(x_mm: ArrayLike, *, radius_mm: float, conic: float) -> Vector:
     return np.asarray(square / (radius_mm * (1 + depth)))  # Eq. (3)
 
 
-def mirror_transmission(mirror: Mirror, grid: Grid, wavelength_mm: float) -> Wave:
+def mirror_transmission(mirror: Mirror, grid: Grid) -> Wave:
     """The factor by which a mirror multiplies a field, shape (samples,): the phase of Eq. (2), and 0 outside the rim."""
     sign = 1.0 if mirror.figure == "convex" else -1.0
     radius_mm = mirror.diameter_mm / 2
     inside = open_share(grid, np.array([[-radius_mm, radius_mm]]))
     x_mm = np.clip(grid.x_mm, -radius_mm, radius_mm)
     sag_mm = conic_sag_mm(x_mm, radius_mm=mirror.radius_mm, conic=mirror.conic)
-    return np.asarray(inside * np.exp(1j * sign * 4 * np.pi / wavelength_mm * sag_mm))  # Eq. (2)
+    return np.asarray(inside * np.exp(1j * sign * 4 * np.pi / grid.wavelength_mm * sag_mm))  # Eq. (2)
 
 
-def mesh_openings_mm(*, pitch_mm: float, wire_mm: float, phase: float, width_mm: float) -> Vector:
+def mesh_openings_mm(mesh: Mesh, phase: float, width_mm: float) -> Vector:
     """Windows of a mesh over at least `width_mm`, rows of (begin, end).
 
     phase: shift of the mesh divided by the pitch. At 0 a window is centred on the axis; at 0.5 a wire is centred on it.
     """
+    pitch_mm, wire_mm = mesh.pitch_um * MM_PER_UM, mesh.wire_um * MM_PER_UM
     reach = math.ceil(width_mm / pitch_mm / 2) + 1
     centres_mm = (np.arange(-reach, reach + 1) + phase) * pitch_mm
     half_mm = (pitch_mm - wire_mm) / 2
     return np.stack([centres_mm - half_mm, centres_mm + half_mm], axis=1)
-
-
-def aperture_openings_mm(aperture: Aperture) -> Vector:
-    """A cut through the middle of the entrance pupil, rows of (begin, end)."""
-    rim, hub = aperture.diameter_mm / 2, aperture.obscuration_diameter_mm / 2
-    return np.array([[-rim, -hub], [hub, rim]]) if hub else np.array([[-rim, rim]])
 
 
 def common_openings_mm(first: Vector, second: Vector) -> Vector:
@@ -172,14 +169,12 @@ def open_share(grid: Grid, openings_mm: Vector) -> Vector:
     return np.diff(open_mm) / grid.step_mm
 
 
-def fraunhofer_field(
-    openings_mm: Vector, grid: Grid, *, wavelength_mm: float, focal_length_mm: float
-) -> Wave:
+def fraunhofer_field(openings_mm: Vector, grid: Grid, focal_length_mm: float) -> Wave:
     """The field in focus of an evenly illuminated pupil, shape (samples,): the sum of the transforms of the openings.
 
     An opening of width w around c gives w sinc(pi w u) exp(-2 pi i c u), with u = x / (lambda f).
     """
-    reach_mm2 = wavelength_mm * focal_length_mm
+    reach_mm2 = grid.wavelength_mm * focal_length_mm
     u = grid.x_mm / reach_mm2
     field = np.zeros(grid.samples, dtype=np.complex128)
     for begin_mm, end_mm in openings_mm:

@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import linear_convolve
-from psfcore.diffraction.best_focus import BestFocus, best_focus
 from psfcore.diffraction.fresnel import (
+    MM_PER_UM,
     SAMPLING_MARGIN,
     FresnelStep,
     Grid,
@@ -43,16 +43,17 @@ from psfcore.diffraction.fresnel import (
     binned_light,
     fraunhofer_field,
     line_light_beyond,
+    mesh_openings_mm,
     open_share,
     propagate,
 )
 from psfcore.diffraction.light_path import (
-    MM_PER_UM,
     REACH_PX,
     SAMPLES_PER_PIXEL,
+    BestFocus,
     LightPath,
+    best_focus,
     light_path,
-    mesh_windows_mm,
 )
 from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
@@ -140,19 +141,11 @@ class FresnelStudy:
         Curves are given at every radius up to ZOOM_PX and in growing steps beyond; lines are given up to ZOOM_PX. The
         largest differences are taken over all radii.
         """
-        kept = _thinned(self.radii_px)
-        return {
-            "instrument": self.instrument,
-            "version": self.version,
-            "wavelength_angstrom": self.wavelength_angstrom,
-            "printed_distance_mm": self.printed_distance_mm,
-            "focus": asdict(self.focus),
-            "phases": self.phases,
-            "windows": self.windows,
-            "reach_px": self.reach_px,
-            "samples_per_pixel": self.samples_per_pixel,
-            "sampling_margin": self.sampling_margin,
-            "radii_px": self.radii_px[kept].tolist(),
+        far = np.geomspace(ZOOM_PX, self.radii_px.size - 1, 96).round().astype(np.int64)
+        kept = np.unique(np.concatenate([np.arange(ZOOM_PX), far]))
+        content = vars(self) | {"focus": asdict(self.focus), "radii_px": self.radii_px[kept].tolist()}
+        del content["distances"]
+        return content | {
             "offsets_px": list(range(-ZOOM_PX, ZOOM_PX + 1)),
             "distances": [_distance_json(result, kept) for result in self.distances],
         }
@@ -176,7 +169,7 @@ def fresnel_study(
     path = light_path(instrument)
     windows = path.wheel_mesh.windows if windows is None else windows
     _check(path, distances_mm, phases, windows)
-    report = progress or _silent
+    report = progress or (lambda done, of: None)
     steps = 1 + len(distances_mm) * phases
     report(0, steps)
     focus = best_focus(path, nominal_focal_length_mm=instrument.focal_length_mm)
@@ -213,7 +206,7 @@ def _grids(path: LightPath, distance_mm: float) -> tuple[Grid, Grid]:
     """The grids of the secondary and of a filter wheel at this distance from the detector."""
     wheel = path.wheel_grid(distance_mm)
     behind_mm = path.secondary_to_detector_mm - distance_mm
-    return path.secondary_grid(next_width_mm=wheel.width_mm, distance_mm=behind_mm), wheel
+    return path.secondary_grid(wheel.width_mm, behind_mm), wheel
 
 
 class _AtWheel:
@@ -229,13 +222,11 @@ class _AtWheel:
         self._lights: list[float] = []
         self._upstream: list[tuple[Grid, float]] = []
         self._field = self._arriving(at_primary, separation_mm)
-        self._step = FresnelStep(
-            self._grid, self._detector, wavelength_mm=path.wavelength_mm, distance_mm=distance_mm
-        )
+        self._step = FresnelStep(self._grid, self._detector, distance_mm)
 
     def line(self, phase: float) -> Vector:
         """Light in each pixel, for the mesh shifted by `phase` of its pitch."""
-        openings_mm = mesh_windows_mm(self.path.wheel_mesh, phase, self._grid.width_mm)
+        openings_mm = mesh_openings_mm(self.path.wheel_mesh, phase, self._grid.width_mm)
         field = self._field * open_share(self._grid, openings_mm)
         self._lights.append(self._grid.light(field))
         return binned_light(self._step.apply(field), self._detector, SAMPLES_PER_PIXEL)
@@ -268,21 +259,13 @@ class _AtWheel:
             (primary, primary.light(at_primary)),
             (secondary, secondary.light(at_secondary)),
         ]
-        return propagate(
-            at_secondary,
-            secondary,
-            self._grid,
-            wavelength_mm=path.wavelength_mm,
-            distance_mm=self.behind_secondary_mm,
-        )
+        return propagate(at_secondary, secondary, self._grid, self.behind_secondary_mm)
 
 
 def _entrance_line(path: LightPath, focal_length_mm: float) -> Vector:
     """Fraunhofer image of entrance aperture and mesh in pixels, sum 1."""
     grid = path.detector_grid
-    field = fraunhofer_field(
-        path.entrance_mm, grid, wavelength_mm=path.wavelength_mm, focal_length_mm=focal_length_mm
-    )
+    field = fraunhofer_field(path.entrance_mm, grid, focal_length_mm)
     line = binned_light(field, grid, SAMPLES_PER_PIXEL)
     return np.asarray(line / line.sum())
 
@@ -350,14 +333,9 @@ def _check(path: LightPath, distances_mm: Sequence[float], phases: int, windows:
             raise DataError(code, f"expected 1 to {most} {code.removeprefix('bad-')}; got {value}")
 
 
-def _thinned(radii_px: Vector) -> NDArray[np.int64]:
-    """Indices of the radii that the JSON keeps."""
-    far = np.geomspace(ZOOM_PX, radii_px.size - 1, 96).round().astype(np.int64)
-    return np.unique(np.concatenate([np.arange(ZOOM_PX), far]))
-
-
 def _distance_json(result: DistanceResult, kept: NDArray[np.int64]) -> dict[str, Any]:
     near = slice(REACH_PX - ZOOM_PX, REACH_PX + ZOOM_PX + 1)
+    lines = ("fresnel_line", "combined_line")
     curves = (
         "fresnel_beyond_pct",
         "combined_beyond_pct",
@@ -365,20 +343,13 @@ def _distance_json(result: DistanceResult, kept: NDArray[np.int64]) -> dict[str,
         "phase_lowest_points",
         "phase_highest_points",
     )
+    numbers = ("distance_mm", "beam_mm", "beam_pitches", "wheel_order_spacing_px")
     return {
-        "distance_mm": result.distance_mm,
-        "beam_mm": result.beam_mm,
-        "beam_pitches": result.beam_pitches,
-        "wheel_order_spacing_px": result.wheel_order_spacing_px,
+        **{name: getattr(result, name) for name in numbers},
         "sampling": [asdict(plane) for plane in result.sampling],
         "largest_points": result.largest_points,
         "largest_single_points": result.largest_single_points,
         "phase_largest_points": result.phase_largest_points.tolist(),
-        "fresnel_line": result.fresnel_line[near].tolist(),
-        "combined_line": result.combined_line[near].tolist(),
+        **{name: getattr(result, name)[near].tolist() for name in lines},
         **{name: getattr(result, name)[kept].tolist() for name in curves},
     }
-
-
-def _silent(done: int, of: int) -> None:
-    """Ignore progress."""

@@ -1,4 +1,4 @@
-"""The optical path of a two-mirror telescope: the planes that a wave crosses, and the paths of rays.
+"""The optical path of a two-mirror telescope: the planes that a wave crosses, the paths of rays, and its best focus.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Fresnel propagation": the wave goes from
 the entrance aperture to primary, secondary, filter wheel and detector, in this order. Eq. (1) describes a ray that
@@ -6,11 +6,23 @@ enters parallel to the axis at height 1. The mirrors are thin: f = R / 2 for a c
 
     y2 = 1 - s / f1,   u2 = -1 / f1 - y2 / f2,   y(z) = y2 + z u2,   focal length = -1 / u2        Eq. (1)
 
+The paper's section "The instrument" prints radii and distances that are not consistent: with them the detector is far out
+of focus. `best_focus` solves for the separation of the mirrors. The focus is most sensitive to this length, because the
+secondary magnifies an error of this length. All other lengths keep their printed values, and the result states by how much
+the separation was shifted. Rays near the axis meet on the detector where y(L) = 0:
+
+    s = f1 - L / (1 - L / f2)                                                                      Eq. (2)
+
+The search starts at this separation. Best focus is the separation at which the wave through the open aperture, without
+meshes, has the largest intensity on the axis. Light in the pixels of the detector would be a less precise criterion,
+because the pixels are too coarse.
+
 | symbol | name | unit |
 |---|---|---|
 | s | separation_mm, of the mirrors | mm |
 | f1, f2 | focal_mm of primary and secondary | mm |
 | z | distance behind the secondary | mm |
+| L | secondary_to_detector_mm | mm |
 | y, u | height and slope of a ray that enters at height 1 | -, 1/mm |
 """
 
@@ -19,12 +31,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from psfcore.diffraction.fresnel import (
+    MM_PER_UM,
+    FresnelStep,
     Grid,
     Vector,
     Wave,
-    aperture_openings_mm,
+    binned_light,
     common_openings_mm,
     grid_for,
     mesh_openings_mm,
@@ -37,8 +52,11 @@ from psfcore.instruments.model import Aperture, Instrument, Mesh, Mirror
 
 REACH_PX = 1023
 SAMPLES_PER_PIXEL = 16
-MM_PER_UM = 1e-3
+SEARCH_MM = 0.05
+TOLERANCE_MM = 1e-5
+HIGHEST_ORDER = 15
 _MM_PER_ANGSTROM = 1e-7
+_PLACES = ("entrance", "filter_wheel")
 
 
 @dataclass(frozen=True)
@@ -61,19 +79,20 @@ class LightPath:
     def detector_grid(self) -> Grid:
         """The grid of the detector: SAMPLES_PER_PIXEL samples for each pixel within REACH_PX of the axis."""
         samples = (2 * REACH_PX + 1) * SAMPLES_PER_PIXEL
-        return Grid("detector", samples, self.pixel_mm / SAMPLES_PER_PIXEL)
+        return Grid("detector", samples, self.pixel_mm / SAMPLES_PER_PIXEL, self.wavelength_mm)
 
     @property
     def aperture_mm(self) -> Vector:
-        """The openings of the entrance without its mesh, rows of (begin, end)."""
-        return aperture_openings_mm(self.aperture)
+        """The openings of the entrance without its mesh on a line through its middle, rows of (begin, end)."""
+        rim, hub = self.aperture.diameter_mm / 2, self.aperture.obscuration_diameter_mm / 2
+        return np.array([[-rim, -hub], [hub, rim]]) if hub else np.array([[-rim, rim]])
 
     @property
     def entrance_mm(self) -> Vector:
         """The openings of the entrance with its mesh, rows of (begin, end)."""
         # If the number of windows is odd, a window lies on the axis; if it is even, a wire lies on the axis.
         phase = 0.0 if self.entrance_mesh.windows % 2 else 0.5
-        windows_mm = mesh_windows_mm(self.entrance_mesh, phase, self.aperture.diameter_mm)
+        windows_mm = mesh_openings_mm(self.entrance_mesh, phase, self.aperture.diameter_mm)
         return common_openings_mm(self.aperture_mm, windows_mm)
 
     def slope_per_mm(self, separation_mm: float) -> float:
@@ -96,17 +115,14 @@ class LightPath:
 
         Their steps are so small that light reaches the full width of the next mirror.
         """
-        return self._grid(
-            "aperture", self.aperture.diameter_mm, self.primary.diameter_mm, self.aperture_to_primary_mm
-        ), self._grid(
-            "primary", self.primary.diameter_mm, self.secondary.diameter_mm, self.printed_separation_mm
+        first, second = self.primary.diameter_mm, self.secondary.diameter_mm
+        return (
+            self._grid("aperture", self.aperture.diameter_mm, first, self.aperture_to_primary_mm),
+            self._grid("primary", first, second, self.printed_separation_mm),
         )
 
-    def secondary_grid(self, *, next_width_mm: float, distance_mm: float) -> Grid:
-        """The grid of the secondary. Its step is so small that light reaches the full width of the next plane.
-
-        next_width_mm, distance_mm: width of the next plane and its distance.
-        """
+    def secondary_grid(self, next_width_mm: float, distance_mm: float) -> Grid:
+        """The grid of the secondary. next_width_mm, distance_mm: width of the next plane and its distance."""
         return self._grid("secondary", self.secondary.diameter_mm, next_width_mm, distance_mm)
 
     def wheel_grid(self, distance_mm: float) -> Grid:
@@ -120,39 +136,21 @@ class LightPath:
         return self._grid("filter wheel", width_mm, detector_mm, distance_mm)
 
     def _grid(self, plane: str, width_mm: float, next_width_mm: float, distance_mm: float) -> Grid:
-        return grid_for(
-            plane,
-            width_mm=width_mm,
-            next_width_mm=next_width_mm,
-            wavelength_mm=self.wavelength_mm,
-            distance_mm=distance_mm,
-        )
+        return grid_for(plane, self.wavelength_mm, width_mm, next_width_mm, distance_mm)
 
     def field_at_primary(self, openings_mm: Vector, aperture: Grid, primary: Grid) -> Wave:
         """The field behind the primary, for a plane wave along the axis. The light that enters through the openings is 1."""
         field = open_share(aperture, openings_mm).astype(np.complex128)
         field /= np.sqrt(aperture.light(field))
-        field = propagate(
-            field,
-            aperture,
-            primary,
-            wavelength_mm=self.wavelength_mm,
-            distance_mm=self.aperture_to_primary_mm,
-        )
-        return np.asarray(field * mirror_transmission(self.primary, primary, self.wavelength_mm))
+        field = propagate(field, aperture, primary, self.aperture_to_primary_mm)
+        return np.asarray(field * mirror_transmission(self.primary, primary))
 
     def field_at_secondary(
         self, at_primary: Wave, primary: Grid, secondary: Grid, separation_mm: float
     ) -> Wave:
         """The field behind the secondary, from the field behind the primary."""
-        field = propagate(
-            at_primary,
-            primary,
-            secondary,
-            wavelength_mm=self.wavelength_mm,
-            distance_mm=separation_mm,
-        )
-        return np.asarray(field * mirror_transmission(self.secondary, secondary, self.wavelength_mm))
+        field = propagate(at_primary, primary, secondary, separation_mm)
+        return np.asarray(field * mirror_transmission(self.secondary, secondary))
 
 
 def focal_mm(mirror: Mirror) -> float:
@@ -160,37 +158,27 @@ def focal_mm(mirror: Mirror) -> float:
     return mirror.radius_mm / 2 if mirror.figure == "concave" else -mirror.radius_mm / 2
 
 
-def mesh_windows_mm(mesh: Mesh, phase: float, width_mm: float) -> Vector:
-    """The windows of a mesh over at least `width_mm`, rows of (begin, end)."""
-    return mesh_openings_mm(
-        pitch_mm=mesh.pitch_um * MM_PER_UM,
-        wire_mm=mesh.wire_um * MM_PER_UM,
-        phase=phase,
-        width_mm=width_mm,
-    )
-
-
 def light_path(instrument: Instrument) -> LightPath:
     """The optical path of an instrument.
 
     Raises DataError "bad-instrument-file"; the message names the missing or unsuitable key.
     """
-    if len(instrument.mirrors) != 2:
-        raise _lacking(
-            instrument, "mirrors", "a primary and a secondary", f"{len(instrument.mirrors)} mirrors"
-        )
-    if instrument.distances is None:
-        raise _lacking(instrument, "distances", "the distances along the optical path", "none")
-    entrance, wheel = (_one_mesh(instrument, place) for place in ("entrance", "filter_wheel"))
-    if (entrance.angle_deg - wheel.angle_deg) % 90:
-        angles = f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees"
-        raise _lacking(
-            instrument,
-            "meshes.angle_deg",
-            "meshes with the same axes, for propagation in one dimension",
-            angles,
-        )
     distances = instrument.distances
+    meshes = [mesh for place in _PLACES for mesh in instrument.meshes if mesh.place == place]
+    if len(instrument.mirrors) != 2:
+        got = f"{len(instrument.mirrors)} mirrors"
+        raise _lacking(instrument, "mirrors", "a primary and a secondary", got)
+    if distances is None:
+        raise _lacking(instrument, "distances", "the distances along the optical path", "none")
+    for place in _PLACES:
+        count = sum(mesh.place == place for mesh in meshes)
+        if count != 1:
+            raise _lacking(instrument, "meshes", f"one mesh at place {place!r}", str(count))
+    entrance, wheel = meshes
+    if (entrance.angle_deg - wheel.angle_deg) % 90:
+        wanted = "meshes with the same axes, for propagation in one dimension"
+        got = f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees"
+        raise _lacking(instrument, "meshes.angle_deg", wanted, got)
     return LightPath(
         wavelength_mm=instrument.wavelength_angstrom * _MM_PER_ANGSTROM,
         aperture=instrument.aperture,
@@ -208,12 +196,155 @@ def light_path(instrument: Instrument) -> LightPath:
     )
 
 
-def _one_mesh(instrument: Instrument, place: str) -> Mesh:
-    found = [mesh for mesh in instrument.meshes if mesh.place == place]
-    if len(found) != 1:
-        raise _lacking(instrument, "meshes", f"one mesh at place {place!r}", str(len(found)))
-    return found[0]
-
-
 def _lacking(instrument: Instrument, key: str, expected: str, got: str) -> DataError:
     return DataError("bad-instrument-file", f"{instrument.name}: {key}: expected {expected}; got {got}")
+
+
+@dataclass(frozen=True)
+class BestFocus:
+    """The separation of best focus, and the quantities that follow from it.
+
+    printed_blur_px: width of the geometric image of a point at the printed separation.
+    beyond_central_pixel_*: share of the light outside the central pixel, at the printed separation and in focus. This
+    share is computed in one dimension, for the open aperture without meshes.
+    nominal_focal_length_mm: the focal length of the instrument file.
+    order_spacing_px: spacing of the orders of the entrance mesh, measured in the focused image. The distance from order
+    -`orders` to order +`orders` is divided by 2 x `orders`.
+    """
+
+    printed_separation_mm: float
+    separation_mm: float
+    shift_mm: float
+    paraxial_separation_mm: float
+    focal_length_mm: float
+    nominal_focal_length_mm: float
+    order_spacing_px: float
+    orders: int
+    focal_length_from_orders_mm: float
+    printed_blur_px: float
+    beyond_central_pixel_printed: float
+    beyond_central_pixel_focused: float
+    message: str
+
+
+class _WithoutWheel:
+    """Waves from the aperture to the detector without the mesh of the filter wheel."""
+
+    def __init__(self, path: LightPath) -> None:
+        self.path = path
+        self.detector = path.detector_grid
+        length_mm = path.secondary_to_detector_mm
+        self._secondary = path.secondary_grid(self.detector.width_mm, length_mm)
+        self._aperture, self._primary = path.entrance_grids()
+        self._step = FresnelStep(self._secondary, self.detector, length_mm)
+        # At x2 = 0, the integral in Eq. (1) of fresnel is the sum of E1 times this phase factor.
+        self._to_axis = np.exp(1j * np.pi / path.wavelength_mm / length_mm * self._secondary.x_mm**2)
+
+    def at_primary(self, openings_mm: Vector) -> Wave:
+        return self.path.field_at_primary(openings_mm, self._aperture, self._primary)
+
+    def on_axis(self, at_primary: Wave, separation_mm: float) -> float:
+        """Intensity on the axis, in arbitrary units."""
+        return float(np.abs(np.dot(self._at_secondary(at_primary, separation_mm), self._to_axis)) ** 2)
+
+    def at_detector(self, at_primary: Wave, separation_mm: float) -> Wave:
+        return self._step.apply(self._at_secondary(at_primary, separation_mm))
+
+    def _at_secondary(self, at_primary: Wave, separation_mm: float) -> Wave:
+        return self.path.field_at_secondary(at_primary, self._primary, self._secondary, separation_mm)
+
+
+def paraxial_separation_mm(path: LightPath) -> float:
+    """The separation at which rays near the axis meet on the detector, Eq. (2).
+
+    Raises DataError "no-focus" if there is no such separation.
+    """
+    f1, f2, length = focal_mm(path.primary), focal_mm(path.secondary), path.secondary_to_detector_mm
+    separation_mm = f1 - length * f2 / (f2 - length) if f2 != length else 0.0  # Eq. (2)
+    if separation_mm <= 0:
+        found = f"{separation_mm:g} mm" if f2 != length else "no finite separation"
+        raise DataError(
+            "no-focus",
+            f"expected mirrors that can focus on the detector at a positive separation; got {found}: "
+            "correct their radii or distances in the instrument file",
+        )
+    return separation_mm
+
+
+def best_focus(path: LightPath, *, nominal_focal_length_mm: float) -> BestFocus:
+    """Solve for the separation of best focus.
+
+    nominal_focal_length_mm: the focal length of the instrument file, for comparison. Raises DataError "no-focus" if there
+    is no maximum within SEARCH_MM of the paraxial separation.
+    """
+    waves = _WithoutWheel(path)
+    at_primary = waves.at_primary(path.aperture_mm)
+    paraxial_mm = paraxial_separation_mm(path)
+    separation_mm = _sharpest(waves, at_primary, paraxial_mm)
+    spacing_px, orders = _order_spacing_px(waves, separation_mm)
+    printed_mm = path.printed_separation_mm
+    pitch_mm = path.entrance_mesh.pitch_um * MM_PER_UM
+    return BestFocus(
+        printed_separation_mm=printed_mm,
+        separation_mm=separation_mm,
+        shift_mm=separation_mm - printed_mm,
+        paraxial_separation_mm=paraxial_mm,
+        focal_length_mm=path.focal_length_mm(separation_mm),
+        nominal_focal_length_mm=nominal_focal_length_mm,
+        order_spacing_px=spacing_px,
+        orders=orders,
+        focal_length_from_orders_mm=spacing_px * path.pixel_mm * pitch_mm / path.wavelength_mm,
+        printed_blur_px=path.beam_mm(printed_mm, path.secondary_to_detector_mm) / path.pixel_mm,
+        beyond_central_pixel_printed=_beyond_central_pixel(waves, at_primary, printed_mm),
+        beyond_central_pixel_focused=_beyond_central_pixel(waves, at_primary, separation_mm),
+        message=(
+            f"mirror separation moved from the printed {printed_mm:.3f} mm by {separation_mm - printed_mm:+.3f} mm "
+            f"to {separation_mm:.3f} mm. There the wave through the open aperture is most intense on the axis"
+        ),
+    )
+
+
+def _sharpest(waves: _WithoutWheel, at_primary: Wave, paraxial_mm: float) -> float:
+    found = minimize_scalar(
+        lambda separation_mm: -waves.on_axis(at_primary, separation_mm),
+        bounds=(paraxial_mm - SEARCH_MM, paraxial_mm + SEARCH_MM),
+        method="bounded",
+        options={"xatol": TOLERANCE_MM},
+    )
+    separation_mm = float(found.x)
+    if abs(separation_mm - paraxial_mm) > 0.95 * SEARCH_MM:
+        raise DataError(
+            "no-focus",
+            f"expected best focus within {SEARCH_MM} mm of the paraxial separation {paraxial_mm:.3f} mm; got no maximum "
+            "there: correct the radii or distances of the mirrors in the instrument file",
+        )
+    return separation_mm
+
+
+def _order_spacing_px(waves: _WithoutWheel, separation_mm: float) -> tuple[float, int]:
+    """Mean spacing (px) of the orders of the entrance mesh, measured between the orders -n and +n; and n."""
+    path = waves.path
+    field = waves.at_detector(waves.at_primary(path.entrance_mm), separation_mm)
+    pitch_mm = path.entrance_mesh.pitch_um * MM_PER_UM
+    expected_px = path.wavelength_mm * path.focal_length_mm(separation_mm) / pitch_mm / path.pixel_mm
+    orders = max(1, min(HIGHEST_ORDER, int(REACH_PX / expected_px - 1)))
+    low, high = (
+        _peak_px(np.abs(field) ** 2, waves.detector, path.pixel_mm, side * orders * expected_px)
+        for side in (-1, 1)
+    )
+    return (high - low) / (2 * orders), orders
+
+
+def _peak_px(intensity: Vector, grid: Grid, pixel_mm: float, near_px: float) -> float:
+    """Position (px) of the highest sample at most 1 px from `near_px`, refined by a parabola."""
+    x_px = grid.x_mm / pixel_mm
+    window = np.flatnonzero(np.abs(x_px - near_px) <= 1.0)
+    top = int(window[np.argmax(intensity[window])])
+    before, peak, after = intensity[top - 1 : top + 2]
+    shift = (before - after) / (2 * (before - 2 * peak + after))
+    return float(x_px[top] + shift * grid.step_mm / pixel_mm)
+
+
+def _beyond_central_pixel(waves: _WithoutWheel, at_primary: Wave, separation_mm: float) -> float:
+    line = binned_light(waves.at_detector(at_primary, separation_mm), waves.detector, SAMPLES_PER_PIXEL)
+    return 1 - float(line[REACH_PX] / line.sum())

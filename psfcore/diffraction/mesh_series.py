@@ -88,11 +88,6 @@ def mesh_line(
     return np.asarray(line / line.sum())
 
 
-def mesh_kernel(line_y: NDArray[np.float64], line_x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The pattern of a mesh [y, x], the outer product of its two lines."""
-    return np.outer(line_y, line_x)
-
-
 def rotated_mesh_kernel(
     *,
     wavelength_angstrom: float,

@@ -83,7 +83,8 @@ class MirroredTransforms:
         self._turn = _turns(pixel / (2 * period))  # exp(-pi i j / n) of Eq. (3)
         self._buffers: queue.SimpleQueue[_Buffers] = queue.SimpleQueue()
         for _ in range(threads):
-            self._buffers.put(_Buffers.of(mask.cells, self.cells, period))
+            shapes = (BLOCK, mask.cells), (self.cells, 2, LANES), period * BLOCK, (BLOCK, LANES)
+            self._buffers.put(_Buffers(*(np.empty(shape, np.float32) for shape in shapes)))
 
     def summed(self, places: Sequence[Place], progress: Progress) -> NDArray[np.float64]:
         """The sum of |E|^2 over the places, each multiplied by its weight; shape (size, size). progress(done, of)."""
@@ -161,15 +162,6 @@ class _Buffers:
     lanes: Single
     buffer: Single
     corner: Single
-
-    @classmethod
-    def of(cls, cells: int, half: int, period: int) -> _Buffers:
-        return cls(
-            strip=np.empty((BLOCK, cells), np.float32),
-            lanes=np.empty((half, 2, LANES), np.float32),
-            buffer=np.empty(period * BLOCK, np.float32),
-            corner=np.empty((BLOCK, LANES), np.float32),
-        )
 
 
 def _turns(turns: NDArray[np.floating]) -> Single:

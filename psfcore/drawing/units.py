@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from psfcore.fits.header import optional_text
+from psfcore.fits.cards import optional_text
 from psfcore.image import Image
 
 _UNKNOWN = "unit unknown"

@@ -21,12 +21,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Protocol
+from typing import TYPE_CHECKING, BinaryIO
 
 from psfcore.errors import HeaderError
-from psfcore.fits.cards import LARGEST_COUNT, card_count, card_flag, card_text, card_trouble
-from psfcore.fits.columns import check_counts
-from psfcore.fits.compression import check_compression
+from psfcore.fits.cards import (
+    LARGEST_COUNT,
+    bad_card,
+    card_count,
+    card_flag,
+    card_text,
+    card_trouble,
+    optional_text,
+)
+from psfcore.fits.compression import check_compression, check_counts
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
@@ -82,21 +89,15 @@ class Hdu:
         """Where the data end, by their declared size. Raises HeaderError "bad-card" or "random-groups"."""
         return self.start + _data_bytes(self.header, self.number)
 
-
-class Source(Protocol):
-    """A stream of bytes that can be read or skipped, only forwards. position: bytes that were read or skipped."""
-
-    gzipped: bool
-
     @property
-    def position(self) -> int: ...
-
-    def read(self, count: int) -> bytes: ...
-
-    def skip(self, count: int) -> int: ...
+    def name(self) -> str:
+        """EXTNAME; empty if there is none."""
+        return optional_text(self.header, "EXTNAME") or ""
 
 
 class _PlainSource:
+    """A file that is read or skipped, only forwards."""
+
     gzipped = False
 
     def __init__(self, file: BinaryIO) -> None:
@@ -105,19 +106,26 @@ class _PlainSource:
 
     @property
     def position(self) -> int:
+        """Number of bytes that were read or skipped."""
         return self._file.tell()
 
     def read(self, count: int) -> bytes:
-        return self._file.read(count)
+        # A damaged header may ask for many bytes that the file does not have; the memory for them is not reserved.
+        return self._file.read(self._left(count))
 
     def skip(self, count: int) -> int:
         """Skip up to `count` bytes; returns the number of skipped bytes, which is smaller at the end of the file."""
-        there = max(0, min(count, self._size - self._file.tell()))
+        there = self._left(count)
         self._file.seek(there, io.SEEK_CUR)
         return there
 
+    def _left(self, count: int) -> int:
+        return max(0, min(count, self._size - self._file.tell()))
+
 
 class _GzipSource:
+    """As `_PlainSource`, for the decompressed bytes of a file."""
+
     gzipped = True
 
     def __init__(self, file: BinaryIO, budget_bytes: int) -> None:
@@ -150,6 +158,9 @@ class _GzipSource:
             if not self.read(min(_SKIP_BYTES, start + count - self.position)):
                 break
         return self.position - start
+
+
+Source = _PlainSource | _GzipSource
 
 
 @contextmanager
@@ -231,12 +242,8 @@ def _check_size(source: Source, hdu: Hdu, limits: FitsLimits) -> None:
         raise HeaderError("too-many-bytes", message)
 
 
-def _counted(kinds: list[str]) -> str:
-    return "1 HDU" if len(kinds) == 1 else f"{len(kinds)} HDUs"
-
-
 def _no_image(kinds: list[str]) -> HeaderError:
-    wanted = "expected a two-dimensional image"
+    wanted, count = "expected a two-dimensional image", "1 HDU" if len(kinds) == 1 else f"{len(kinds)} HDUs"
     if any(kind.startswith("cube") for kind in kinds):
         hdu, kind = next((n, kind) for n, kind in enumerate(kinds) if kind.startswith("cube"))
         axes = int(kind.split()[1])
@@ -249,13 +256,9 @@ def _no_image(kinds: list[str]) -> HeaderError:
     if "line" in kinds:
         return HeaderError("not-2d", f"{wanted}; got an image of one axis: store the image with two axes")
     if "table" in kinds:
-        return HeaderError(
-            "table-only", f"{wanted}; got only tables ({_counted(kinds)}): use a file with an image"
-        )
-    return HeaderError(
-        "no-image",
-        f"{wanted}; got {_counted(kinds)}, and none has data with two axes: use a file with an image",
-    )
+        return HeaderError("table-only", f"{wanted}; got only tables ({count}): use a file with an image")
+    message = f"{wanted}; got {count}, and none has data with two axes: use a file with an image"
+    return HeaderError("no-image", message)
 
 
 def _read_header(source: Source, most: int, limits: FitsLimits, *, first: bool) -> bytes | None:
@@ -288,7 +291,7 @@ def _find_end(block: bytes) -> int | None:
             return at
         if _DAMAGED_END.match(block, at):
             got = block[at : at + CARD_BYTES].rstrip()
-            raise HeaderError("bad-card", f"expected END followed by 77 spaces; got {got!r:.100}")
+            raise bad_card("END followed by 77 spaces", f"{got!r:.100}")
     return None
 
 
@@ -326,16 +329,12 @@ def _kind(header: Header, hdu: int) -> str:
     extension = "IMAGE" if hdu == 0 else card_text(header, "XTENSION")
     if hdu > 0:
         check_counts(header)
-    if extension == "BINTABLE" and card_flag(header, "ZIMAGE"):
-        return _axes_kind(card_count(header, "ZNAXIS", largest=999))
-    if extension in ("BINTABLE", "TABLE", "A3DTABLE"):
+    z = "Z" if extension == "BINTABLE" and card_flag(header, "ZIMAGE") else ""
+    if not z and extension in ("BINTABLE", "TABLE", "A3DTABLE"):
         return "table"
-    if extension not in ("IMAGE", "IUEIMAGE"):
+    if not z and extension not in ("IMAGE", "IUEIMAGE"):
         return "other"
-    return _axes_kind(card_count(header, "NAXIS", largest=999))
-
-
-def _axes_kind(axes: int) -> str:
+    axes = card_count(header, f"{z}NAXIS", largest=999)
     return {0: "empty", 1: "line", 2: "image"}.get(axes, f"cube {axes}")
 
 
@@ -344,21 +343,17 @@ def _check_image(header: Header, limits: FitsLimits) -> None:
     z = "Z" if card_flag(header, "ZIMAGE") else ""
     bitpix = card_count(header, f"{z}BITPIX", smallest=-64, largest=64)
     if bitpix not in _BITPIX:
-        raise HeaderError("bad-card", f"expected {z}BITPIX of {_BITPIX}; got {bitpix}")
+        raise bad_card(f"{z}BITPIX of {_BITPIX}", bitpix)
     nx, ny = (card_count(header, f"{z}NAXIS{axis}") for axis in (1, 2))
     if nx == 0 or ny == 0:
         raise HeaderError("zero-size", f"expected at least one pixel on each axis; got {nx} x {ny}")
     if nx * ny > limits.max_pixels:
         message = f"expected at most {limits.max_pixels} pixels; got {nx} x {ny} = {nx * ny}"
         raise HeaderError("too-many-pixels", message)
-    if not z:
-        _check_plain(header)
-    else:
+    if z:
         check_compression(header, nx, ny)
-
-
-def _check_plain(header: Header) -> None:
-    """Raise HeaderError if the data of an image contain more than its pixels (FITS standard 4.0, section 7.1.1)."""
+        return
+    # The data of an image contain its pixels alone (FITS standard 4.0, section 7.1.1).
     for key, value in (("PCOUNT", 0), ("GCOUNT", 1)):
         card_count(header, key, smallest=value, largest=value, default=value)
 
@@ -367,7 +362,7 @@ def _data_bytes(header: Header, hdu: int) -> int:
     """Declared size of the data, FITS standard Eq. (2): |BITPIX| / 8 * GCOUNT * (PCOUNT + prod NAXISn)."""
     bitpix = card_count(header, "BITPIX", smallest=-64, largest=64)
     if bitpix not in _BITPIX:
-        raise HeaderError("bad-card", f"expected BITPIX of {_BITPIX} in HDU {hdu}; got {bitpix}")
+        raise bad_card(f"BITPIX of {_BITPIX} in HDU {hdu}", bitpix)
     axes = card_count(header, "NAXIS", largest=999)
     if axes == 0:
         return 0

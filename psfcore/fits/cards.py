@@ -33,11 +33,16 @@ def card_trouble() -> tuple[type[Exception], ...]:
     return VerifyError, ValueError, TypeError, IndexError, OverflowError
 
 
+def bad_card(expected: str, got: object) -> HeaderError:
+    """The error for a card that the software cannot use."""
+    return HeaderError("bad-card", f"expected {expected}; got {got}")
+
+
 def card_value(header: Header, key: str) -> object:
     """Value of a structural card, or None. Raises HeaderError if the card is unreadable or occurs more than once."""
     try:
         if header.count(key) > 1:
-            raise HeaderError("bad-card", f"expected card {key} once; got it {header.count(key)} times")
+            raise bad_card(f"card {key} once", f"it {header.count(key)} times")
         return header[key]
     except KeyError:
         return None
@@ -55,9 +60,7 @@ def card_count(
     if value is None and default is not None:
         return default
     if isinstance(value, bool) or not isinstance(value, int) or not smallest <= value <= largest:
-        raise HeaderError(
-            "bad-card", f"expected {key} = integer from {smallest} to {largest}; got {value!r:.40}"
-        )
+        raise bad_card(f"{key} = integer from {smallest} to {largest}", f"{value!r:.40}")
     return value
 
 

@@ -1,9 +1,11 @@
-"""Compare the telescope, the channel and the filter of an image with those of a PSF.
+"""Compare the telescope, the channel, the filter and the pixels of an image with those of a PSF.
 
 This module compares the instrument that the instrument files know, the wavelength, and the cards TELESCOP, INSTRUME,
 DETECTOR and FILTER. It compares only values that both the image and the PSF give. The order of the words in a card is
 ignored, and one text may have more words than the other, as SDO and SDO/AIA. Wavelengths count as equal if they differ
 by at most 1 %, because headers round the wavelength. The channels of AIA, EUI and similar telescopes differ by more.
+
+This module imports no numerical library.
 """
 
 from __future__ import annotations
@@ -13,19 +15,22 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from psfcore.errors import DataError
-from psfcore.fits.cards import Cards
-from psfcore.fits.header import known_instrument, optional_text, wavelength_angstrom
-from psfcore.instruments.files import WAVELENGTH_TOLERANCE, instrument_names, match_table
+from psfcore.fits.cards import Cards, optional_text
+from psfcore.fits.frame import frame_of
+from psfcore.fits.header import known_instrument, wavelength_angstrom
+from psfcore.instruments.files import (
+    PLATE_SCALE_TOLERANCE,
+    WAVELENGTH_TOLERANCE,
+    instrument_names,
+    match_table,
+)
 from psfcore.instruments.model import load_instrument
 
 _TO_ALLOW = "set other_channel (--other-channel)"
 
 
 class Origin(Protocol):
-    """The properties of a PSF that are compared with an image header, to decide whether both are of the same channel.
-
-    `psfcore.psf.Psf` has these properties.
-    """
+    """The properties of a PSF that are compared with an image header. `psfcore.psf.Psf` has these properties."""
 
     @property
     def name(self) -> str: ...
@@ -33,6 +38,8 @@ class Origin(Protocol):
     def instrument(self) -> str | None: ...
     @property
     def wavelength_angstrom(self) -> float | None: ...
+    @property
+    def plate_scale_arcsec(self) -> float | None: ...
     @property
     def cards(self) -> Mapping[str, str]: ...
 
@@ -57,8 +64,8 @@ def check_channel(psf: Origin, header: Cards, *, other_channel: bool = False) ->
         return f"the PSF is of another channel than the image: {'; '.join(differences)}"
     silent = [
         name
-        for name, found in (("PSF", _psf_wavelength(psf)), ("image", _image_wavelength(header)))
-        if not found
+        for name, angstrom in (("PSF", _psf_wavelength(psf)), ("image", _image_wavelength(header)))
+        if not angstrom
     ]
     if silent:
         return f"the channels of image and PSF were not compared: {' and '.join(silent)} without wavelength (WAVELNTH)"
@@ -116,3 +123,41 @@ def _psf_wavelength(psf: Origin) -> float | None:
 def _same_words(one: str, other: str) -> bool:
     first, second = (set(re.findall(r"[a-z0-9.]+", text.lower())) for text in (one, other))
     return first <= second or second <= first
+
+
+def binning_factor(psf: Origin, header: Cards) -> int:
+    """The number of PSF pixels in one image pixel, along each axis.
+
+    The factor is 1 if the plate scales agree to 1 %, or if one of them is not known. If the plate scale of the image is
+    a whole multiple of the plate scale of the PSF, the same on both axes, the factor is this multiple. This requires
+    that the image is from the PSF's instrument, or that the PSF names no instrument. Otherwise the multiple may be a
+    coincidence: for example, a pixel of FSI is as wide as nine pixels of HRI_EUV. Raises DataError
+    "plate-scale-mismatch".
+    """
+    if psf.plate_scale_arcsec is None:
+        return 1
+    scales = frame_of(header).scale_arcsec
+    factors = {_factor(scale / psf.plate_scale_arcsec) for scale in scales if scale is not None}
+    if factors <= {1}:
+        return 1
+    whole = factors.pop() if len(factors) == 1 else None
+    if whole is not None and psf.instrument in (None, known_instrument(header)):
+        return whole
+    text = " x ".join("unknown" if scale is None else f"{scale:g}" for scale in scales)
+    advice = (
+        "use a PSF of the image's pixels"
+        if whole is None
+        else f"rebin the PSF with `heliopsf psf rebin PSF --factor {whole} -o FILE`, and use FILE as the PSF"
+    )
+    raise DataError(
+        "plate-scale-mismatch",
+        f"expected {psf.plate_scale_arcsec:g} arcsec/px, the plate scale of PSF {psf.name}, or binned images of its "
+        f"instrument; got CDELT1 x CDELT2 = {text} arcsec/px: {advice}",
+        {"psf": psf.name, "psf_arcsec": psf.plate_scale_arcsec, "image_arcsec": text, "factor": whole},
+    )
+
+
+def _factor(ratio: float) -> int | None:
+    """The whole number that agrees with the ratio of two plate scales to 1 %; None if there is no such number."""
+    whole = round(ratio)
+    return whole if whole >= 1 and abs(ratio / whole - 1) <= PLATE_SCALE_TOLERANCE else None

@@ -1,25 +1,34 @@
-"""Check the header of a tile-compressed image before any decoder runs.
+"""Check the header of a binary table and of a tile-compressed image in it, before astropy reads the data.
 
 Source: FITS standard 4.0 (Pence et al. 2010; IAU FITS working group 2018), sections 7.3 and 10.1. The decoders of
 astropy are C functions that trust the header. With BYTEPIX = 8, the decoder of RICE_1 returns twice the number of bytes
 that it has written; the second half is arbitrary memory of the process. With a large BLOCKSIZE, it reads and writes
 past its buffers. With dithering and an invalid ZDITHER0, astropy reads outside the table of random numbers. Therefore
-every card on which a decoder depends must have a value that the standard allows. This module reads no pixels, so the
-web process can import it.
+every card on which a decoder depends must have a value that the standard allows.
+
+astropy makes an object for each column that TFIELDS declares, and reserves the memory that the cards TFORMn declare for
+each row, even if the file is shorter. Therefore this module limits TFIELDS and compares the columns with the size of a
+row. It reads no data, so the web process can import it.
 """
 
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from psfcore.errors import HeaderError
-from psfcore.fits.cards import card_count, card_text, card_value
-from psfcore.fits.columns import MOST_COLUMNS, read_columns
+from psfcore.fits.cards import bad_card, card_count, card_text, card_value
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
+MOST_COLUMNS = 999  # section 7.2.1: the largest TFIELDS
+ITEM_BYTES = {
+    **dict.fromkeys("LBA", 1), "I": 2, **dict.fromkeys("JE", 4), **dict.fromkeys("KDCP", 8), **dict.fromkeys("MQ", 16),
+}  # fmt: skip
+_FORM = re.compile(r"(\d{0,9})([LXBIJKAEDCMPQ])([LXBIJKAEDCM]?)(\(\d{1,18}\))?")
 ALLOWED_CODECS = ("RICE_1", "GZIP_1", "GZIP_2", "NOCOMPRESS")
 MOST_TILES = 65_536  # astropy decodes tile by tile in Python, about 0.1 ms each
 COMPRESSED, GZIPPED, UNCOMPRESSED = "COMPRESSED_DATA", "GZIP_COMPRESSED_DATA", "UNCOMPRESSED_DATA"
@@ -33,6 +42,61 @@ _NUMBERS_OF = {"ZSCALE": "ED", "ZZERO": "ED", "ZBLANK": "BIJ"}
 _NUMBERS = "LBIJKED"  # the allowed types of a column that the decoders do not use
 
 
+@dataclass(frozen=True)
+class Column:
+    """A column: its name in capitals, and its format (table 18 of the standard).
+
+    repeat: items in a row. form: the letter of the type. item: for P and Q, the letter of the type in the heap.
+    """
+
+    name: str
+    repeat: int
+    form: str
+    item: str
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of this column in one row."""
+        return -(-self.repeat // 8) if self.form == "X" else self.repeat * ITEM_BYTES[self.form]
+
+    @property
+    def in_heap(self) -> bool:
+        """Whether a row holds descriptors (length, offset) of data in the heap."""
+        return self.form in "PQ"
+
+    def __str__(self) -> str:
+        return f"{self.name:.40} {self.repeat}{self.form}{self.item}"
+
+
+def check_counts(header: Header) -> None:
+    """Raise HeaderError "bad-card" if TFIELDS or ZNAXIS of an HDU is larger than the standard allows."""
+    for key in ("TFIELDS", "ZNAXIS"):
+        card_count(header, key, largest=MOST_COLUMNS, default=0)
+
+
+def read_columns(header: Header) -> list[Column]:
+    """The columns of a binary table.
+
+    Raises HeaderError "bad-card" if a format cannot be read, if two columns have one name, or if the columns do not need
+    exactly the NAXIS1 bytes of a row.
+    """
+    columns: list[Column] = []
+    names: set[str] = set()
+    for number in range(1, card_count(header, "TFIELDS", largest=MOST_COLUMNS) + 1):
+        name = (card_text(header, f"TTYPE{number}") or f"column {number}").upper()
+        text = card_text(header, f"TFORM{number}")
+        form = None if text is None else _FORM.fullmatch(text.upper())
+        if form is None or (form[2] in "PQ") != bool(form[3]):
+            raise bad_card(f"TFORM{number} to be a binary format", f"{text!r:.40}")
+        if name in names:
+            raise bad_card("each column once", f"{name:.40} again as column {number}")
+        names.add(name)
+        columns.append(Column(name, int(form[1] or 1), form[2], form[3]))
+    row_bytes = sum(column.row_bytes for column in columns)
+    card_count(header, "NAXIS1", smallest=row_bytes, largest=row_bytes)
+    return columns
+
+
 def check_compression(header: Header, nx: int, ny: int) -> None:
     """Check how the image of nx x ny pixels in a table with ZIMAGE = T is stored.
 
@@ -40,14 +104,13 @@ def check_compression(header: Header, nx: int, ny: int) -> None:
     """
     codec = card_text(header, "ZCMPTYPE")
     if codec not in ALLOWED_CODECS:
-        wanted = ", ".join(ALLOWED_CODECS)
-        raise HeaderError("codec-not-allowed", f"expected compression by one of {wanted}; got {codec}")
+        message = f"expected compression by one of {', '.join(ALLOWED_CODECS)}; got {codec}"
+        raise HeaderError("codec-not-allowed", message)
     _check_keywords(header)
     _check_tiling(header, nx, ny)
-    bitpix = card_count(header, "ZBITPIX", smallest=-64, largest=64)
     settings = _settings(header)
     if codec == "RICE_1":
-        _check_rice(settings, bitpix)
+        _check_rice(settings, card_count(header, "ZBITPIX", smallest=-64, largest=64))
     _check_columns(header)
     _check_dither(header)
     _check_heap(header)
@@ -67,9 +130,7 @@ def _check_keywords(header: Header) -> None:
     """
     for keyword in header:
         if set("*?") & set(keyword) or keyword.endswith("..."):
-            raise HeaderError(
-                "bad-card", f"expected keywords without '*', '?' and '...'; got {keyword!r:.40}"
-            )
+            raise bad_card("keywords without '*', '?' and '...'", f"{keyword!r:.40}")
 
 
 def _check_tiling(header: Header, nx: int, ny: int) -> None:
@@ -96,10 +157,9 @@ def _settings(header: Header) -> dict[str, object]:
         value = card_value(header, f"ZVAL{number}")
         known = {"BYTEPIX", "BLOCKSIZE", "SCALE", "SMOOTH", "NOISEBIT"}
         if name not in known or name in settings:
-            wanted = f"expected ZNAME{number} of {', '.join(sorted(known))}, each once"
-            raise HeaderError("bad-card", f"{wanted}; got {name!r:.40}")
+            raise bad_card(f"ZNAME{number} of {', '.join(sorted(known))}, each once", f"{name!r:.40}")
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST_INT:
-            raise HeaderError("bad-card", f"expected a number in ZVAL{number} ({name}); got {value!r:.40}")
+            raise bad_card(f"a number in ZVAL{number} ({name})", f"{value!r:.40}")
         settings[name] = value
     return settings
 
@@ -108,13 +168,11 @@ def _check_rice(settings: dict[str, object], bitpix: int) -> None:
     for name, allowed in (("BYTEPIX", _RICE_BYTEPIX), ("BLOCKSIZE", _RICE_BLOCKSIZE)):
         value = settings.get(name, allowed[0])
         if not isinstance(value, int) or value not in allowed:
-            raise HeaderError("bad-card", f"expected {name} of {allowed} for RICE_1; got {value!r:.40}")
+            raise bad_card(f"{name} of {allowed} for RICE_1", f"{value!r:.40}")
     most = abs(bitpix) // 8
     if settings.get("BYTEPIX", 0) > most:  # type: ignore[operator]
-        raise HeaderError(
-            "bad-card",
-            f"expected BYTEPIX of at most {most}, the bytes of a pixel with ZBITPIX = {bitpix}; got {settings['BYTEPIX']}",
-        )
+        wanted = f"BYTEPIX of at most {most}, the bytes of a pixel with ZBITPIX = {bitpix}"
+        raise bad_card(wanted, settings["BYTEPIX"])
 
 
 def _check_columns(header: Header) -> None:
@@ -127,24 +185,21 @@ def _check_columns(header: Header) -> None:
             wanted = f"one number of {', '.join(_NUMBERS_OF.get(column.name, _NUMBERS))}"
             good = column.repeat == 1 and column.form in _NUMBERS_OF.get(column.name, _NUMBERS)
         if not good:
-            raise HeaderError("bad-card", f"expected column {column.name:.40} as {wanted}; got {column}")
+            raise bad_card(f"column {column.name:.40} as {wanted}", column)
         for key in ("TSCAL", "TZERO", "TDIM"):
             if card_value(header, f"{key}{number}") is not None:
-                raise HeaderError(
-                    "bad-card", f"expected no card {key}{number} in a compressed image; got one"
-                )
+                raise bad_card(f"no card {key}{number} in a compressed image", "one")
     names = {column.name for column in columns}
     if COMPRESSED not in names:
-        raise HeaderError("bad-card", f"expected a column {COMPRESSED} in a compressed image; got none")
+        raise bad_card(f"a column {COMPRESSED} in a compressed image", "none")
     if ("ZSCALE" in names) != ("ZZERO" in names):
-        raise HeaderError("bad-card", "expected both columns ZSCALE and ZZERO, or neither; got one of them")
+        raise bad_card("both columns ZSCALE and ZZERO, or neither", "one of them")
 
 
 def _check_dither(header: Header) -> None:
     method = card_text(header, "ZQUANTIZ")
     if card_value(header, "ZQUANTIZ") is not None and method not in (*_DITHERS, *_NO_DITHERS):
-        wanted = ", ".join((*_DITHERS, "NO_DITHER"))
-        raise HeaderError("bad-card", f"expected ZQUANTIZ of {wanted}; got {method!r:.40}")
+        raise bad_card(f"ZQUANTIZ of {', '.join((*_DITHERS, 'NO_DITHER'))}", f"{method!r:.40}")
     smallest, largest = _DITHER_SEEDS
     if method in _DITHERS:
         card_count(header, "ZDITHER0", smallest=smallest, largest=largest)

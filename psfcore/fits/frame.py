@@ -78,22 +78,27 @@ class Frame:
 
 def frame_of(header: Cards) -> Frame:
     """The frame that the cards of an image describe."""
-    units = _arcsec_per_unit(header)
-    matrix = _matrix(header, [1.0 if one is None else one for one in units])
-    columns = [math.hypot(matrix[0][k], matrix[1][k]) for k in (0, 1)] if matrix else [0.0, 0.0]
-    scale = tuple(length if None not in units and length > 0 else None for length in columns)
-    on_detector, roll_known = UNIT, False
-    if matrix is not None and min(columns) > 0:
-        roll = _detector_roll_deg(header)
-        roll_known = roll is not None
-        cosine, sine = math.cos(math.radians(roll or 0.0)), math.sin(math.radians(roll or 0.0))
-        (a, b), (c, d) = ((matrix[0][0] / columns[0], matrix[0][1] / columns[1]),
-                          (matrix[1][0] / columns[0], matrix[1][1] / columns[1]))  # fmt: skip
-        on_detector = (
-            (cosine * a + sine * c, cosine * b + sine * d),
-            (cosine * c - sine * a, cosine * d - sine * b),
-        )  # Eq. (2)
-    return Frame((scale[0], scale[1]), on_detector, roll_known, _interpolated(header))
+    units = [
+        _ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{k}") or "arcsec").lower()) for k in (1, 2)
+    ]  # None: a unit that is no angle
+    matrix = _matrix(header)
+    if matrix is None:
+        return Frame((None, None), UNIT, roll_known=False, interpolated=_interpolated(header))
+    (a, b), (c, d) = (
+        tuple(one * (unit or 1.0) for one in row) for row, unit in zip(matrix, units, strict=True)
+    )
+    x, y = math.hypot(a, c), math.hypot(b, d)
+    scales = None if None in units or x == 0 else x, None if None in units or y == 0 else y
+    if min(x, y) == 0:
+        return Frame(scales, UNIT, roll_known=False, interpolated=_interpolated(header))
+    roll = _detector_roll_deg(header)
+    cosine, sine = math.cos(math.radians(roll or 0.0)), math.sin(math.radians(roll or 0.0))
+    a, b, c, d = a / x, b / y, c / x, d / y
+    on_detector = (
+        (cosine * a + sine * c, cosine * b + sine * d),
+        (cosine * c - sine * a, cosine * d - sine * b),
+    )  # Eq. (2)
+    return Frame(scales, on_detector, roll is not None, _interpolated(header))
 
 
 def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
@@ -101,27 +106,16 @@ def plate_scale_arcsec(header: Cards, axis: int = 1) -> float | None:
     return frame_of(header).scale_arcsec[axis - 1]
 
 
-def _arcsec_per_unit(header: Cards) -> list[float | None]:
-    """The unit of each axis in arcsec; None for a unit that is no angle."""
-    return [_ARCSEC_PER_UNIT.get((optional_text(header, f"CUNIT{k}") or "arcsec").lower()) for k in (1, 2)]
-
-
-def _matrix(header: Cards, factor: list[float]) -> Matrix | None:
-    """M of Eq. (1) in arcsec/px (in the unit of the header if it is no angle); None if there are no such cards.
-
-    factor: the unit of each axis in arcsec.
-    """
-    cd = [[optional_number(header, f"CD{i}_{j}") for j in (1, 2)] for i in (1, 2)]
-    step = [optional_number(header, f"CDELT{i}") for i in (1, 2)]
-    if step == [None, None] and any(value is not None for row in cd for value in row):
-        rows = [[value or 0.0 for value in row] for row in cd]
-    else:
-        if step == [None, None]:
-            return None
-        turn = _turn(header, step[0] or 1.0, step[1] or 1.0)
-        rows = [[(step[i] or 0.0) * turn[i][j] for j in (0, 1)] for i in (0, 1)]
-    (a, b), (c, d) = rows
-    return (factor[0] * a, factor[0] * b), (factor[1] * c, factor[1] * d)
+def _matrix(header: Cards) -> Matrix | None:
+    """M of Eq. (1) in the units of the header; None if there are no such cards."""
+    (a, b), (c, d) = cd = [[optional_number(header, f"CD{i}_{j}") for j in (1, 2)] for i in (1, 2)]
+    x, y = (optional_number(header, f"CDELT{i}") for i in (1, 2))
+    if x is not None or y is not None:
+        (a, b), (c, d) = _turn(header, x or 1.0, y or 1.0)
+        return ((x or 0.0) * a, (x or 0.0) * b), ((y or 0.0) * c, (y or 0.0) * d)
+    if cd == [[None, None], [None, None]]:
+        return None
+    return (a or 0.0, b or 0.0), (c or 0.0, d or 0.0)
 
 
 def _turn(header: Cards, step_x: float, step_y: float) -> Matrix:

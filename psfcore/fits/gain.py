@@ -10,8 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from psfcore.errors import DataError
-from psfcore.fits.cards import Cards
-from psfcore.fits.header import optional_text
+from psfcore.fits.cards import Cards, optional_text
 from psfcore.instruments.model import GainMode, Instrument
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, BinaryIO
@@ -24,9 +25,11 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.fits.blocks import FitsLimits, Source, first_image, open_source, walk
+from psfcore.evaluation.report import summary_of
+from psfcore.fits.blocks import FitsLimits, Hdu, Source, first_image, open_source, skip_data, walk
+from psfcore.fits.cards import optional_number
 from psfcore.fits.compression import may_hold_unwritten_memory
-from psfcore.fits.header import HeaderSummary, optional_number
+from psfcore.fits.header import HeaderSummary, is_plane
 from psfcore.limited import fill_new_memory, run_limited
 from psfcore.whole_files import probe
 
@@ -62,20 +65,44 @@ PIXEL_TROUBLE = (
 )
 
 
-def read_pixels(
-    path: str | Path, summary: HeaderSummary, limits: FitsLimits
-) -> tuple[NDArray[np.float64], fits.Header]:
-    """Pixels [y, x] (float64) and header of the image that `summary` describes.
+@dataclass(frozen=True, eq=False)
+class StoredImage:
+    """Pixels [y, x] (float64) and header of an image, as its file has them.
 
-    A plain image is read as it stands. A tile-compressed image is decoded by astropy in a process of its own, and its header
-    is that of the image. Raises HeaderError, DataError "unreadable-pixels", and OSError if the disk fails.
+    others: the images that follow in the file, without planes of products, if they were asked for.
     """
+
+    summary: HeaderSummary
+    pixels: NDArray[np.float64]
+    header: fits.Header
+    others: tuple[Hdu, ...] = ()
+
+
+def read_pixels(
+    path: str | Path, limits: FitsLimits, *, hdu: int | None = None, others: bool = False
+) -> StoredImage:
+    """Read the first 2-D image of a file, or the image in HDU `hdu`. others: look for further images.
+
+    A plain image is read as it stands, in one pass through the file. A tile-compressed image is decoded by astropy in a
+    process of its own, and its header is that of the image. Raises HeaderError, DataError "unreadable-pixels", and OSError
+    if the disk fails.
+    """
+    further: list[Hdu] = []
     with open_source(Path(path), limits) as source:
-        header = first_image(walk(source, limits), limits, summary.hdu).header
-        if summary.codec is None:
-            return _plain_pixels(source, header, summary), header
-    twice = may_hold_unwritten_memory(header)
-    return _decoded_pixels(path, summary, twice=twice), _image_header(header)
+        hdus = walk(source, limits)
+        image = first_image(hdus, limits, hdu)
+        header, summary = image.header, summary_of(image, gzipped=source.gzipped)
+        plain = None if summary.codec is not None else _plain_pixels(source, header, summary)
+        skip_data(source, image, limits)
+        # What follows an image is not needed to use it, so damage there is no error.
+        with suppress(HeaderError):
+            further += (one for one in hdus if others and one.kind == "image" and not is_plane(one))
+    if plain is not None:
+        return StoredImage(summary, plain, header, tuple(further))
+    decoded = _decoded_pixels(path, summary, twice=may_hold_unwritten_memory(header))
+    # The header of the image is that of the table without the cards of its tiles.
+    header = fits.Header([card for card in header.cards if not TABLE_CARD.fullmatch(card.keyword)])
+    return StoredImage(summary, decoded, header, tuple(further))
 
 
 def _plain_pixels(source: Source, header: fits.Header, summary: HeaderSummary) -> NDArray[np.float64]:
@@ -148,15 +175,6 @@ def _tiles(path: str, number: int) -> NDArray[Any]:
         return np.asarray(hdus[number].data)
 
 
-def _image_header(table: fits.Header) -> fits.Header:
-    """The header of a tile-compressed image without the cards of the table that holds its tiles."""
-    header = fits.Header()
-    for card in table.cards:
-        if not TABLE_CARD.fullmatch(card.keyword):
-            header.append(card, end=True)
-    return header
-
-
 @contextmanager
 def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
     """Raise DataError "unreadable-pixels" for the errors of astropy in the block. part: the name of the part, for the
@@ -166,19 +184,11 @@ def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
     except DataError:
         raise
     except PIXEL_TROUBLE as error:
-        _raise_if_storage(error)
+        if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
+            raise  # the disk caused the error; the content of a file causes others, such as a negative size
         wanted = f"expected readable pixels in {part} of {Path(path).name}"
         message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
         raise DataError("unreadable-pixels", message) from None
-
-
-def _raise_if_storage(error: Exception) -> None:
-    """Raise the error again if the disk caused it.
-
-    Do nothing if the content of the file caused it, such as a negative size.
-    """
-    if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
-        raise error
 
 
 def ascii_text(text: str) -> str:

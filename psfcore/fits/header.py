@@ -6,51 +6,29 @@ of the file must be correct (see `psfcore.fits.blocks`). This module reads no pi
 
 from __future__ import annotations
 
+import math
 import os
 import re
-from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psfcore.errors import DataError, HeaderError
-from psfcore.fits.blocks import FitsLimits, first_image, open_source, skip_data, walk
-from psfcore.fits.cards import (
-    Cards,
-    card_count,
-    card_flag,
-    card_text,
-    lenient_value,
-    optional_number,
-    optional_text,
-    optional_value,
-)
-from psfcore.fits.frame import plate_scale_arcsec
-from psfcore.fits.times import observed_at
+from psfcore.errors import DataError
+from psfcore.fits.blocks import FitsLimits as FitsLimits
+from psfcore.fits.blocks import Hdu, first_image, open_source, skip_data, walk
+from psfcore.fits.cards import Cards, card_count, card_flag, card_text, card_trouble, lenient_value
+from psfcore.fits.cards import optional_number as optional_number
+from psfcore.fits.cards import optional_text as optional_text
+from psfcore.fits.cards import optional_value as optional_value
+from psfcore.fits.frame import frame_of
+from psfcore.fits.frame import plate_scale_arcsec as plate_scale_arcsec
 from psfcore.instruments.files import match_instrument
 
 if TYPE_CHECKING:
-    from astropy.io.fits import Header
+    from astropy.io.fits import Card, Header
 
-# FitsLimits is exported here too: every caller of `read_summary` needs it.
-__all__ = [
-    "FitsLimits",
-    "HeaderSummary",
-    "check_all_headers",
-    "check_not_deconvolved",
-    "content_of",
-    "first_image_header",
-    "known_instrument",
-    "optional_exposure_s",
-    "optional_number",
-    "optional_text",
-    "optional_value",
-    "plate_scale_arcsec",
-    "read_summary",
-    "seen_by",
-    "wavelength_angstrom",
-]
-
+JsonValue = str | int | float | bool | None
 # WAVEUNIT is the name of a unit, or an exponent: -10 means 1e-10 m.
 _ANGSTROM_PER_UNIT = {
     "angstrom": 1.0,
@@ -62,6 +40,9 @@ _ANGSTROM_PER_UNIT = {
     "um": 1e4,
     "m": 1e10,
 }
+_DATE_ONLY = re.compile(r"\d{4}-\d\d-\d\d")
+_OLD_DATE = re.compile(r"(\d\d)/(\d\d)/(\d\d)")  # FITS before 1998: day, month, year - 1900
+_LEAP_SECOND = re.compile(r"(.*T\d\d:\d\d):60(\.\d*)?(Z?)")
 # The content of a file, see `content_of`.
 IMAGE, PRODUCT, PSF, ELSEWHERE = "image", "product", "psf", "deconvolved elsewhere"
 _DECONVOLVED = re.compile(
@@ -118,52 +99,36 @@ def read_summary(
 
     Raises HeaderError if the file has no usable image there.
     """
-    return read_contents(path, limits, hdu=hdu)[0]
-
-
-@dataclass(frozen=True)
-class Neighbour:
-    """An image after the one that is used. name: its EXTNAME, or empty."""
-
-    hdu: int
-    name: str
-    shape: tuple[int, int]
-
-
-def read_contents(
-    path: str | os.PathLike[str], limits: FitsLimits, *, hdu: int | None = None, whole: bool = False
-) -> tuple[HeaderSummary, list[Neighbour]]:
-    """As `read_summary`. whole: also the images that follow in the file. Planes of products are left out."""
-    neighbours: list[Neighbour] = []
-    with open_source(Path(path), limits) as source:
-        hdus = walk(source, limits)
-        image = first_image(hdus, limits, hdu)
-        skip_data(source, image, limits)
-        # What follows an image is not needed to use it, so damage there is no error.
-        with suppress(HeaderError):
-            for other in hdus if whole else ():
-                if other.kind == "image" and lenient_value(other.header, "PLANE") is not True:
-                    name = optional_text(other.header, "EXTNAME") or ""
-                    neighbours.append(Neighbour(other.number, name, _shape(other.header)))
-        return _summary(image.header, image.number, source.gzipped), neighbours
+    return read_first_image(path, limits, hdu=hdu)[0]
 
 
 def first_image_header(path: str | os.PathLike[str], limits: FitsLimits) -> Header:
     """Unchanged header of the first 2-D image of a file. Raises HeaderError if the file has no usable image."""
+    return read_first_image(path, limits)[1].header
+
+
+def read_first_image(
+    path: str | os.PathLike[str], limits: FitsLimits, *, hdu: int | None = None
+) -> tuple[HeaderSummary, Hdu]:
+    """As `read_summary`, and the HDU of the image."""
     with open_source(Path(path), limits) as source:
-        image = first_image(walk(source, limits), limits)
+        image = first_image(walk(source, limits), limits, hdu)
         skip_data(source, image, limits)
-        return image.header
+        return summary_of(image, gzipped=source.gzipped), image
 
 
-def check_all_headers(path: str | os.PathLike[str], limits: FitsLimits) -> None:
-    """Raise HeaderError if any HDU of a file exceeds the limits.
+def all_hdus(path: str | os.PathLike[str], limits: FitsLimits) -> list[Hdu]:
+    """All HDUs of a file. Call this before other code reads more of a file than its first image.
 
-    Call this before reading HDUs other than the first image.
+    Raises HeaderError if a header is unusable or exceeds the limits.
     """
     with open_source(Path(path), limits) as source:
-        for _ in walk(source, limits):
-            pass
+        return list(walk(source, limits))
+
+
+def is_plane(hdu: Hdu) -> bool:
+    """Whether an HDU is a plane of a product, see `psfcore.fits.images`."""
+    return hdu.kind == "image" and lenient_value(hdu.header, "PLANE") is True
 
 
 def content_of(header: Header) -> str:
@@ -185,23 +150,21 @@ def check_not_deconvolved(content: str) -> None:
 
     Codes: "already-deconvolved" for a product and for an image that other software deconvolved, "psf-as-image" for a PSF.
     """
-    if content == ELSEWHERE:
+    again = "(--again, in a request again = true)"
+    done_by = {
+        ELSEWHERE: "the HISTORY of its header says that other software deconvolved it: use the original image",
+        PRODUCT: "the header (PSFID) says that heliopsf made it by deconvolution: use the original image",
+    }
+    if content in done_by:
         raise DataError(
             "already-deconvolved",
-            "expected an image that was not deconvolved before; the HISTORY of its header says that other software "
-            "deconvolved it: use the original image, or allow a second deconvolution (--again, in a request again = true)",
-        )
-    if content == PRODUCT:
-        raise DataError(
-            "already-deconvolved",
-            "expected an image that was not deconvolved before; the header (PSFID) says that heliopsf made it by deconvolution: "
-            "use the original image, or allow a second deconvolution (--again, in a request again = true)",
+            f"expected an image that was not deconvolved before; {done_by[content]}, or allow a second deconvolution {again}",
         )
     if content == PSF:
         raise DataError(
             "psf-as-image",
             "expected an image; the header (PSFSUM) says that the file is a PSF: name it as the PSF, or allow it to be "
-            "deconvolved (--again, in a request again = true)",
+            f"deconvolved {again}",
         )
 
 
@@ -257,6 +220,7 @@ def optional_exposure_s(header: Cards) -> float | None:
 def seen_by(header: Cards) -> dict[str, Any]:
     """The values of a header that describe the observation: the fields of `HeaderSummary` from instrument to
     gain_mode."""
+    scale_x, scale_y = frame_of(header).scale_arcsec
     return {
         "instrument": known_instrument(header),
         "telescop": optional_text(header, "TELESCOP"),
@@ -266,8 +230,8 @@ def seen_by(header: Cards) -> dict[str, Any]:
         "date_obs": observed_at(header),
         "exposure_s": optional_exposure_s(header),
         "unit": optional_text(header, "BUNIT", "PIXLUNIT"),
-        "cdelt1": plate_scale_arcsec(header, 1),
-        "cdelt2": plate_scale_arcsec(header, 2),
+        "cdelt1": scale_x,
+        "cdelt2": scale_y,
         "gain_mode": optional_text(header, "GAINCOMB"),
     }
 
@@ -279,17 +243,20 @@ def _pair(header: Header, stem: str) -> tuple[int, int] | None:
     return None
 
 
-def _shape(header: Header) -> tuple[int, int]:
+def shape_of(header: Header) -> tuple[int, int]:
+    """The shape (ny, nx) that the header of a 2-D image declares. Raises HeaderError "bad-card"."""
     z = "Z" if card_flag(header, "ZIMAGE") else ""
     return card_count(header, f"{z}NAXIS2"), card_count(header, f"{z}NAXIS1")
 
 
-def _summary(header: Header, hdu: int, gzipped: bool) -> HeaderSummary:
+def summary_of(image: Hdu, *, gzipped: bool) -> HeaderSummary:
+    """The summary of an HDU that `first_image` chose. gzipped: whether the file is compressed as a whole."""
+    header = image.header
     compressed = card_flag(header, "ZIMAGE")
     z = "Z" if compressed else ""
     return HeaderSummary(
-        hdu=hdu,
-        shape=_shape(header),
+        hdu=image.number,
+        shape=shape_of(header),
         bitpix=card_count(header, f"{z}BITPIX", smallest=-64, largest=64),
         codec=card_text(header, "ZCMPTYPE") if compressed else None,
         gzipped=gzipped,
@@ -300,4 +267,121 @@ def _summary(header: Header, hdu: int, gzipped: bool) -> HeaderSummary:
         psf_version=optional_text(header, "PSFVERS"),
         content=content_of(header),
         cards={key: value for key in _FIT_CARDS if (value := optional_value(header, key)) is not None},
+    )
+
+
+def observed_at(header: Cards) -> str | None:
+    """The start of the exposure in UTC: DATE-BEG, DATE-OBS or DATE_OBS, with TIME-OBS where the card holds a date alone.
+
+    The text of the card, if it is ISO 8601 in UTC; converted to that form, if TIMESYS is TAI or TT, or if the second is a
+    leap second. None if there is no such card.
+    """
+    text = optional_text(header, "DATE-BEG", "DATE-OBS", "DATE_OBS")
+    if text is None:
+        return None
+    old = _OLD_DATE.fullmatch(text)
+    if old is not None:
+        text = f"19{old[3]}-{old[2]}-{old[1]}"
+    time = optional_text(header, "TIME-OBS", "TIME_OBS")
+    if time is not None and _DATE_ONLY.fullmatch(text):
+        text = f"{text}T{time}"
+    scale = (optional_text(header, "TIMESYS") or "UTC").split()[0].upper()
+    if scale in ("TAI", "TT"):
+        return _in_utc(text, scale.lower())
+    if _LEAP_SECOND.fullmatch(text):
+        at = instant(text)
+        return text if at is None else at.replace(tzinfo=None).isoformat()
+    return text
+
+
+def instant(text: str) -> datetime | None:
+    """The instant of a date. A date without a time zone is in UTC; a leap second is the first of the next minute. None if
+    the date cannot be read."""
+    leap = _LEAP_SECOND.fullmatch(text)
+    try:
+        if leap is not None:
+            minute = instant(f"{leap[1]}:00{leap[3]}")
+            return None if minute is None else minute + timedelta(seconds=60 + float(f"0{leap[2] or '.0'}"))
+        at = datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    return at if at.tzinfo is not None else at.replace(tzinfo=UTC)
+
+
+def _in_utc(text: str, scale: str) -> str:
+    from astropy.time import Time  # slow to import, and few headers need it
+
+    try:
+        return str(Time(text.rstrip("Z"), scale=scale, format="isot").utc.isot)
+    except ValueError:
+        return text
+
+
+@dataclass(frozen=True)
+class ListedHeader:
+    """The header of HDU ``index``: the HDU's name (EXTNAME, or empty), and (keyword, value, comment) of each card."""
+
+    index: int
+    name: str
+    cards: list[tuple[str, JsonValue, str]]
+
+
+def all_cards(path: str | os.PathLike[str], limits: FitsLimits) -> list[ListedHeader]:
+    """All headers of a file, with their cards in the order of the file.
+
+    If a card cannot be read, its value is its text. For a tile-compressed image, the header is the header of the table
+    that contains it. Raises HeaderError if a header is unusable or exceeds the limits.
+    """
+    return [_listed(hdu.header, hdu.number) for hdu in all_hdus(path, limits)]
+
+
+def _listed(header: Header, hdu: int) -> ListedHeader:
+    cards = [_shown(card) for card in header.cards]
+    names = [value for keyword, value, _comment in cards if keyword == "EXTNAME" and isinstance(value, str)]
+    return ListedHeader(hdu, names[0].strip() if names else "PRIMARY" if hdu == 0 else "", cards)
+
+
+def _shown(card: Card) -> tuple[str, JsonValue, str]:
+    try:
+        return card.keyword, _json(card.value), str(card.comment)
+    except card_trouble():
+        # card.image is not used here: astropy would repair the card and warn, and Python keeps the text of every
+        # warning.
+        text = str(card._image)[8:].removeprefix("=")
+        return str(card.keyword), text.strip(), ""
+
+
+def _json(value: object) -> JsonValue:
+    """A card's value as JSON; null for a card without a value.
+
+    Complex numbers and infinity, which JSON lacks, become text.
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if value is None or isinstance(value, (str, bool, int, float)):
+        return value
+    from astropy.io.fits.card import Undefined
+
+    return None if isinstance(value, Undefined) else str(value)
+
+
+        return text
+
+
+def utc_time(given: datetime | str, name: str) -> datetime:
+    """A time with a zone. A time without a zone is in UTC; a date means the start of that day.
+
+    name: name of the field, for the message. Raises DataError "bad-time".
+    """
+    try:
+        at = given if isinstance(given, datetime) else datetime.fromisoformat(given)
+    except (TypeError, ValueError) as error:
+        raise bad_time(given, name) from error
+    return at if at.tzinfo else at.replace(tzinfo=UTC)
+
+
+def bad_time(given: object, name: str) -> DataError:
+    """The error for something that is not a time."""
+    return DataError(
+        "bad-time", f"{name}: expected a time such as 2024-03-01T12:00:00Z, got {ascii(given)[:60]}"
     )

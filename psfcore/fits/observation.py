@@ -2,6 +2,14 @@
 
 A deconvolution, a transit, a flare, a measurement of arms and the comparison of a product all read through this module, so a
 file has one mask, one unit and one saturation level everywhere.
+
+A telescope or its pipeline fills a lost block of telemetry with a number that no exposure gives: the value of the card BLANK
+(which FITS knows for integers only), -32768, -999 and others. Pixels with the value of BLANK are lost. Another such value is
+lost if it is far below all other pixels:
+
+    next - value > FAR (median - next),   next: the smallest other value           Eq. (1)
+
+The darkest pixels of an image of light scatter around a value near 0, so none of them is that far from the others.
 """
 
 from __future__ import annotations
@@ -13,28 +21,32 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.cards import Cards, optional_number, optional_text
 from psfcore.fits.gain import saturation_for
-from psfcore.fits.hdus import read_pixels
+from psfcore.fits.hdus import StoredImage, read_pixels
 from psfcore.fits.header import (
-    IMAGE,
-    FitsLimits,
-    HeaderSummary,
-    Neighbour,
     check_not_deconvolved,
     content_of,
     known_instrument,
     optional_exposure_s,
-    read_contents,
-    read_summary,
+    shape_of,
 )
-from psfcore.fits.lost import check_exposure, count_of_lost, lost_pixels
 from psfcore.fits.saturation import with_saturation
 from psfcore.fits.units import check_linear, unit_of
+from psfcore.fits.viewing.planes import IMAGE
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import load_instrument
 
 # Names of images that describe another image: its mask, its errors, the quality of its pixels.
 _PLANES = ("MASK", "UNCERT", "UNCERTAINTY", "DQF", "DQ", "ERR", "ERROR", "QUALITY", "VARIANCE")
+FAR = 3.0
+_FILLED_WITH = (-32768.0, -32767.0, -2147483648.0, -2147483647.0, -9999.0, -999.0, -99999.0, -1e30, -1e31)
+# Cards that name the kind of a frame, and the words of frames without the light of the Sun.
+_KIND_CARDS = ("IMG_TYPE", "IMGTYPE", "IMAGETYP", "EC_IMTYP", "FRAMETYP", "OBS_TYPE")
+# Cards with the value that says that the Earth, the Moon or the pointing hid the Sun (SDO; SWAP).
+_HIDDEN = {"ACS_ECLP": "YES", "ACS_SUNP": "NO", "ECLIPSE": "1"}
+_NO_SUN = ("dark", "bias", "led", "flat", "calib", "offset", "pinhole")
 _FULL_SCALES = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 15, 16))
 
 
@@ -48,30 +60,35 @@ def read_observation(
     2-D image. Raises HeaderError for an unusable header; DataError "unreadable-pixels", and the errors of
     `observation_of`.
     """
-    summary, neighbours = read_contents(path, limits, hdu=hdu, whole=True)
-    pixels, header = read_pixels(path, summary, limits)
-    ours = {one.name.upper(): one for one in neighbours if one.shape == summary.shape}
-    if summary.content == IMAGE and "MASK" in ours:  # as CCDData writes it
-        excluded, _ = read_pixels(path, read_summary(path, limits, hdu=ours["MASK"].hdu), limits)
-        pixels[excluded != 0] = np.nan
-    image = observation_of(pixels, header, saturation_dn=saturation_dn, stored_as_integer=summary.bitpix > 0)
+    stored = read_pixels(path, limits, hdu=hdu, others=True)
+    summary, pixels = stored.summary, stored.pixels
+    masks = [
+        one.number
+        for one in stored.others
+        if one.name.upper() == "MASK" and shape_of(one.header) == summary.shape
+    ]
+    if summary.content == IMAGE and masks:  # as CCDData writes it
+        pixels[read_pixels(path, limits, hdu=masks[-1]).pixels != 0] = np.nan
+    image = observation_of(
+        pixels, stored.header, saturation_dn=saturation_dn, stored_as_integer=summary.bitpix > 0
+    )
     if hdu is not None or summary.content != IMAGE:
         return image
-    return image.warned(_unused_images(summary, neighbours))
+    return image.warned(_unused_images(stored))
 
 
-def _unused_images(summary: HeaderSummary, neighbours: list[Neighbour]) -> dict[str, str]:
+def _unused_images(stored: StoredImage) -> dict[str, str]:
     """The warning about images of a file that are not used."""
     others = [
-        f"{one.hdu} ({one.name})" if one.name else str(one.hdu)
-        for one in neighbours
+        f"{one.number} ({one.name})" if one.name else str(one.number)
+        for one in stored.others
         if one.name.upper() not in _PLANES
     ]
     if not others:
         return {}
     return {
-        "several-images": f"the file has {len(others) + 1} images; HDU {summary.hdu} is used. --hdu (hdu in a request) takes "
-        f"another one: {', '.join(others[:5])}{', ...' if len(others) > 5 else ''}"
+        "several-images": f"the file has {len(others) + 1} images; HDU {stored.summary.hdu} is used. --hdu (hdu in a request) "
+        f"takes another one: {', '.join(others[:5])}{', ...' if len(others) > 5 else ''}"
     }
 
 
@@ -82,8 +99,36 @@ def check_exposure_of_sun(header: Header) -> None:
     are not proportional to the light.
     """
     check_not_deconvolved(content_of(header))
-    check_exposure(header)
+    for key in (*_KIND_CARDS, *_HIDDEN):
+        number = optional_number(header, key)
+        kind = optional_text(header, key) if number is None else f"{number:g}"
+        if kind is None:
+            continue
+        words = kind.lower().replace("_", " ").split()
+        if kind.upper() == _HIDDEN.get(key) or (key in _KIND_CARDS and any(one in words for one in _NO_SUN)):
+            raise DataError(
+                "not-an-exposure",
+                f"expected an exposure of the Sun; the header says {key} = {kind!r:.40}: use another image, or allow it to be "
+                "deconvolved (--again, in a request again = true)",
+            )
     check_linear(header)
+
+
+def _lost_pixels(pixels: NDArray[np.float64], header: Cards) -> NDArray[np.bool_] | None:
+    """True for the pixels [y, x] that hold the value of a lost pixel; None if there are none."""
+    smallest = float(pixels.min())
+    if not np.isfinite(smallest):
+        smallest = float(np.min(pixels, where=np.isfinite(pixels), initial=np.inf))
+    blank = optional_number(header, "BLANK")
+    if blank is not None and smallest == blank < 0:
+        return pixels == smallest
+    if smallest not in _FILLED_WITH:
+        return None
+    others = pixels[np.isfinite(pixels) & (pixels != smallest)]
+    if others.size == 0:
+        return None
+    following, middle = float(others.min()), float(np.median(others))
+    return pixels == smallest if following - smallest > FAR * (middle - following) else None  # Eq. (1)
 
 
 def observation_of(
@@ -98,14 +143,15 @@ def observation_of(
     stored_as_integer: whether the pixels are the numbers of an A/D converter, without a calibration. Raises DataError
     "not-2d", "too-small", "no-exposure", "saturation-unit", "all-nan", "all-saturated", "no-signal".
     """
-    lost = lost_pixels(pixels, header)
+    lost = _lost_pixels(pixels, header)
     if lost is not None:
         pixels = np.where(lost, np.nan, pixels)
     mask = np.where(np.isfinite(pixels), np.uint8(0), np.uint8(MaskBit.NONFINITE))
     warnings = {}
     if lost is not None:
         mask[lost] |= int(MaskBit.LOST)
-        count, stated = int(np.count_nonzero(lost)), count_of_lost(header)
+        count = int(np.count_nonzero(lost))
+        stated = int(max(optional_number(header, key) or 0 for key in ("NMISSING", "MISSVALS")))
         warnings["lost"] = (
             f"{count} pixels were lost on the way to the ground; they are not used, and QUALITY marks them"
             + (f" (the header counts {stated})" if stated not in (0, count) else "")

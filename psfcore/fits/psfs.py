@@ -13,26 +13,13 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from psfcore.errors import DataError
-from psfcore.fits.columns import read_columns
-from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels, write_hdus
-from psfcore.fits.header import (
-    FitsLimits,
-    check_all_headers,
-    optional_number,
-    optional_text,
-    origin_of,
-    plate_scale_arcsec,
-    read_summary,
-    wavelength_angstrom,
-)
-from psfcore.psf import (
-    FittedShape,
-    Psf,
-    cumulative_curve,
-    encircled_energy,
-    radial_profile,
-)
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.cards import optional_number, optional_text
+from psfcore.fits.compression import read_columns
+from psfcore.fits.frame import plate_scale_arcsec
+from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels, readable_pixels, write_hdus
+from psfcore.fits.header import all_hdus, origin_of, wavelength_angstrom
+from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy, radial_profile
 
 _STATED = re.compile(r"psf_id: ([0-9a-f]{64})")
 
@@ -84,19 +71,25 @@ def _psf_header(psf: Psf) -> fits.Header:
 def _profile_hdu(psf: Psf) -> fits.BinTableHDU:
     """Table of mean weight and encircled energy by radius, for the total PSF and for each component."""
     radius, weight = radial_profile(psf.kernel)
-    columns = [
-        fits.Column(name="radius_px", format="D", unit="pixel", array=radius),
-        fits.Column(name="mean_weight", format="D", array=weight),
-        fits.Column(name="encircled", format="D", array=encircled_energy(psf.kernel, radius)),
-        fits.Column(name="cumulative_pct", format="D", unit="%", array=cumulative_curve(psf.kernel, radius)),
-    ]
+    columns = {
+        "radius_px": radius,
+        "mean_weight": weight,
+        "encircled": encircled_energy(psf.kernel, radius),
+        "cumulative_pct": cumulative_curve(psf.kernel, radius),
+    }
+    units = {"radius_px": "pixel", "cumulative_pct": "%"}
     for name, kernel in psf.components.items():
         if kernel.shape == psf.kernel.shape:
             label = ascii_text(name).lower()
-            profile, within = radial_profile(kernel)[1], encircled_energy(kernel, radius)
-            columns.append(fits.Column(name=f"{label}_mean_weight", format="D", array=profile))
-            columns.append(fits.Column(name=f"{label}_encircled", format="D", array=within))
-    return fits.BinTableHDU.from_columns(columns, name="PROFILE")
+            columns[f"{label}_mean_weight"] = radial_profile(kernel)[1]
+            columns[f"{label}_encircled"] = encircled_energy(kernel, radius)
+    return fits.BinTableHDU.from_columns(
+        [
+            fits.Column(name=name, format="D", unit=units.get(name), array=column)
+            for name, column in columns.items()
+        ],
+        name="PROFILE",
+    )
 
 
 def _fitted_hdu(fitted: FittedShape) -> fits.BinTableHDU:
@@ -140,8 +133,8 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     convolution does not need them.
     Raises HeaderError; DataError "unreadable-pixels" and the errors of `Psf` ("psf-not-centred", "psf-sum", ...).
     """
-    summary = read_summary(path, limits)
-    kernel, header = read_pixels(path, summary, limits)
+    stored = read_pixels(path, limits)
+    kernel, header = stored.pixels, stored.header
     own = "PSFNAME" in header
     components, provenance, fitted = (
         _read_extras(path, limits, kernel.shape) if own and parts else ({}, {}, None)
@@ -169,7 +162,7 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
     Also None if the file was changed after `write_psf` wrote it (CHECKSUM and DATASUM of every HDU are checked), or if
     it was derived from the file of another PSF. Raises HeaderError.
     """
-    check_all_headers(path, limits)
+    all_hdus(path, limits)
     try:
         with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
             lines = [str(line) for line in hdus[0].header.get("HISTORY", [])]
@@ -194,24 +187,22 @@ def _read_extras(
     provenance: dict[str, Any] = {}
     # Any file can have a card PSFNAME. Therefore the size limits are checked for all HDUs. HDUs that write_psf never
     # writes are ignored: compressed components, and components of another shape.
-    check_all_headers(path, limits)
-    try:
-        with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
-            provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
-            for hdu in hdus[1:]:
-                if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
-                    components[hdu.name] = np.array(hdu.data, dtype=np.float64)
-                elif not _is_plain_table(hdu):
-                    continue
-                elif hdu.name == "INSTRUMENT":
-                    text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
-                    provenance["instrument_toml"] = text.decode("utf-8")
-                elif hdu.name == "FIT":
-                    fitted = _read_fitted(hdu)
-    except PIXEL_TROUBLE as error:
-        wanted = f"expected readable extensions in {Path(path).name}"
-        message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
-        raise DataError("unreadable-pixels", message) from None
+    all_hdus(path, limits)
+    with (
+        readable_pixels(path, "the extensions"),
+        fits.open(path, memmap=False, disable_image_compression=True) as hdus,
+    ):
+        provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
+        for hdu in hdus[1:]:
+            if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
+                components[hdu.name] = np.array(hdu.data, dtype=np.float64)
+            elif not _is_plain_table(hdu):
+                continue
+            elif hdu.name == "INSTRUMENT":
+                text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
+                provenance["instrument_toml"] = text.decode("utf-8")
+            elif hdu.name == "FIT":
+                fitted = _read_fitted(hdu)
     return components, provenance, fitted
 
 

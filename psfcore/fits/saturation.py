@@ -49,12 +49,6 @@ _LEVEL_CARDS = ("SATURATE", "DSATVAL", "SAT_THR")
 _SETTING = "set the level with saturation_dn (--saturation)"
 
 
-def card_levels(header: Header) -> dict[str, float]:
-    """The saturation levels that cards give, in the unit of the image, by the name of the card."""
-    levels = {key: optional_number(header, key) for key in _LEVEL_CARDS}
-    return {key: level for key, level in levels.items() if level is not None and level > 0}
-
-
 def with_saturation(
     image: Image, *, requested_dn: float | None = None, instrument_dn: float | None = None
 ) -> Image:
@@ -132,15 +126,14 @@ def _brightest_below(
 
 def _levels(image: Image, requested_dn: float | None, instrument_dn: float | None) -> Mapping[str, float]:
     """All known levels in the unit of the image, by their sources."""
-    levels = card_levels(image.header)
-    in_dn = {REQUEST: requested_dn}
-    if requested_dn is None:
-        in_dn = {INSTRUMENT: instrument_dn, "NSATPIX": _aia_level_dn(image.header)}
+    cards = {key: optional_number(image.header, key) for key in _LEVEL_CARDS}
+    levels = {key: level for key, level in cards.items() if level is not None and level > 0}
     unit = parse_unit(image.unit)
     if requested_dn is not None:
         scale = per_dn(unit, image.exposure_s, "because the saturation level is in DN")
-    else:
-        scale = unit.dn_per_unit(image.exposure_s) or 0.0
+        return levels | ({REQUEST: requested_dn / scale} if scale > 0 else {})
+    scale = unit.dn_per_unit(image.exposure_s) or 0.0
+    in_dn = {INSTRUMENT: instrument_dn, "NSATPIX": _aia_level_dn(image.header)}
     if scale > 0:
         levels |= {source: level / scale for source, level in in_dn.items() if level is not None}
     return levels

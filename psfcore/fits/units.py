@@ -74,16 +74,11 @@ def check_linear(header: Cards) -> None:
     """Raise DataError "bad-unit" if the unit says that pixels are a logarithm, a root or a magnitude of the light."""
     text = unit_of(header).text or ""
     if any(mark in text.lower().replace(" ", "") for mark in _NOT_LINEAR):
-        raise not_linear(text)
-
-
-def not_linear(text: str) -> DataError:
-    """The error for a unit that is not proportional to the light."""
-    return DataError(
-        "bad-unit",
-        f"expected pixels that are proportional to the light, such as DN or DN/s; got the unit {text:.40}: convert the pixels "
-        "first",
-    )
+        raise DataError(
+            "bad-unit",
+            f"expected pixels that are proportional to the light, such as DN or DN/s; got the unit {text:.40}: convert the "
+            "pixels first",
+        )
 
 
 def per_dn(unit: PixelUnit, exposure_s: float | None, purpose: str) -> float:

@@ -14,11 +14,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from psfcore.build import known_diffraction
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.gap.evidence.ideal import ideal_observer
 from psfcore.gap.library.registry import LIBRARY
-from psfcore.known_diffraction import known_diffraction
 from psfcore.transit.folder import read_transit
 from psfcore.transit.transit import Transit
 from psfcore.whole_files import write_whole

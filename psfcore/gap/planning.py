@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.gap.diagnose import linear_model_of
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.linear_model import LinearModel
@@ -29,9 +29,8 @@ from psfcore.instruments.files import instrument_names
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Progress
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
-from psfcore.simulate.from_files import LARGEST_DIFFRACTION_PX, diffraction_kernel
+from psfcore.simulate.inputs import LARGEST_DIFFRACTION_PX, diffraction_kernel, read_plan
 from psfcore.simulate.plan import Plan
-from psfcore.simulate.read_plan import read_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.sky import true_sky
 from psfcore.simulate.transit import observed_transit

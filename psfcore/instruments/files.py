@@ -11,11 +11,10 @@ from functools import cache
 from pathlib import Path
 
 from psfcore.errors import DataError
-from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
 
-WAVELENGTH_TOLERANCE = (
-    0.01  # two wavelengths count as the same channel if their ratio differs from 1 by at most this
-)
+# Two wavelengths count as the same channel, and two plate scales as the same, if their ratio differs from 1 by at most this.
+WAVELENGTH_TOLERANCE = 0.01
+PLATE_SCALE_TOLERANCE = 0.01
 # The numbers in the table [match] may differ from those of an image by this ratio.
 _TOLERANCES = {"WAVELNTH": WAVELENGTH_TOLERANCE, "CDELT1": PLATE_SCALE_TOLERANCE}
 _FOLDER = Path(__file__).parent

@@ -1,20 +1,19 @@
 """The error for an image whose PSF is not known. It names the PSFs that could fit, and the steps that the user can take
-next ("ways").
+next ("ways"). For telescopes that heliopsf recognises, but for which it has no instrument file, it gives the reason.
 
-This module imports no numerical library, so that the web process can import it.
+docs/instruments.md lists the sources. This module imports no numerical library, so that the web process can import it.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from psfcore.errors import DataError
-from psfcore.instruments.files import instrument_names
+from psfcore.instruments.files import PLATE_SCALE_TOLERANCE, WAVELENGTH_TOLERANCE, instrument_names
 from psfcore.instruments.model import load_instrument
-from psfcore.instruments.without_file import Telescope, telescope_without_file
-from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
 
 WAYS = (
     {
@@ -35,6 +34,125 @@ WAYS = (
     },
 )
 _NAMES = {"telescope": "telescope", "channel": "channel", "plate_scale": "pixel scale"}
+
+
+Way = Literal["name", "upload", "fit"]  # the steps that `WAYS` describes
+
+_NO_SOURCE = (
+    "no public source that we could read gives the pitch and the wire width of its meshes, or the parameters of its "
+    "diffuse scatter"
+)
+_ASK = "ask the authors for it as a FITS image, and upload it"
+
+
+@dataclass(frozen=True)
+class Telescope:
+    """A telescope without an instrument file.
+
+    cards: an image is of this telescope if its header agrees with one of these tables. A table holds fields of the header
+    summary (`psfcore.fits.header.HeaderSummary`), and the text with which each of them begins, in any case.
+    angstrom: the wavelengths of the images that the entry describes; empty: all wavelengths. reason: why there is no
+    file. ways: sentences about the steps with which a publication or a file helps; the recommended step comes first.
+    """
+
+    name: str
+    cards: tuple[Mapping[str, str], ...]
+    reason: str
+    ways: Mapping[Way, str]
+    angstrom: tuple[float, ...] = ()
+
+    def took(self, header: Mapping[str, Any]) -> bool:
+        """Whether the image with this header summary is of this telescope."""
+        wavelength = header["wavelnth"] or 0.0
+        if self.angstrom and all(abs(wavelength / one - 1) > WAVELENGTH_TOLERANCE for one in self.angstrom):
+            return False
+        return any(
+            all((header[key] or "").strip().upper().startswith(text.upper()) for key, text in table.items())
+            for table in self.cards
+        )
+
+
+TELESCOPES = (
+    Telescope(
+        name="TRACE",
+        cards=({"instrume": "TRACE"}, {"telescop": "TRACE"}),
+        reason=_NO_SOURCE,
+        ways={
+            "fit": "DeForest et al. (2009, ApJ 690, 1264) derived a PSF at 171 angstrom from the transit of Venus of 2004; "
+            "heliopsf can fit the scatter to the same images",
+            "upload": "Gburek et al. (2006, Solar Physics 239, 531) and DeForest et al. (2009) derived a PSF at 171 angstrom: "
+            + _ASK,
+        },
+    ),
+    Telescope(
+        name="STEREO/EUVI",
+        cards=({"detector": "EUVI"},),
+        reason=_NO_SOURCE,
+        ways={
+            "upload": "The SolarSoft package euvdeconpak has the PSFs of Shearer et al. (2012, ApJ 749, L8) as FITS images, "
+            "for example psf_171_A_2048.fts for STEREO-A at 171 angstrom: upload the PSF of the spacecraft and channel of "
+            "the image",
+            "fit": "Shearer et al. (2012) used the transit of the Moon of 2007 for EUVI on STEREO-B",
+        },
+    ),
+    Telescope(
+        name="PROBA2/SWAP",
+        cards=({"instrume": "SWAP"},),
+        reason=_NO_SOURCE,
+        ways={"upload": "Seaton et al. (2013, arXiv:1309.1345) derived a PSF from images of SWAP: " + _ASK},
+    ),
+    Telescope(
+        name="GOES/SUVI",
+        # NOAA's level 2 files have both cards. Level 1b files have no DETECTOR, and the satellite as TELESCOP.
+        cards=({"instrume": "GOES-R Series Solar Ultraviolet Imager"}, {"detector": "SUVI"}),
+        reason=_NO_SOURCE,
+        ways={"fit": "We found no published PSF of SUVI, so we recommend this step"},
+    ),
+    Telescope(
+        name="Hinode/XRT",
+        # The X-ray telescope of Swift also has INSTRUME = 'XRT'.
+        cards=({"telescop": "HINODE", "instrume": "XRT"},),
+        reason="an instrument file describes pupils and meshes, but not mirrors that reflect X-rays at grazing incidence",
+        ways={
+            "upload": "SolarSoft has PSFs of XRT as FITS images in hinode/xrt/idl/util: XRT20170324_151721.0.PSF560.fits at "
+            "560 eV and XRT20170324_161721.0.PSF1000.fits at 1 keV; upload the PSF whose energy suits the filters of the "
+            "image",
+            "fit": "In images of the transit of Venus of 2012, the PSF at 560 eV removes 5 % of the light in the disc of Venus; "
+            "heliopsf can fit the remaining scatter to these images",
+        },
+    ),
+    Telescope(
+        name="EUI/FSI",
+        cards=({"detector": "FSI"}, {"telescop": "SOLO/EUI/FSI"}),
+        reason="its meshes are those of HRI_EUV (Hofmeister et al.), but no public source that we could read gives its "
+        "entrance pupil or the parameters of its diffuse scatter",
+        ways={
+            "upload": "If you know the entrance pupil of FSI, write an instrument file with the meshes of hri_euv.toml",
+            "fit": "Mercury is too small for the pixels of FSI (Hofmeister et al.): use images with a larger occulter",
+        },
+    ),
+    Telescope(
+        name="EUI/HRI_LYA",
+        cards=({"detector": "HRI_LYA"}, {"telescop": "SOLO/EUI/HRI_LYA"}),
+        reason="limitations of the instrument prevented the analysis that Hofmeister et al. made for HRI_EUV",
+        ways={},
+    ),
+    Telescope(
+        name="SDO/AIA",
+        cards=({"telescop": "SDO/AIA"},),
+        reason="the sources of the AIA files describe the seven EUV channels alone",
+        ways={
+            "fit": "AIA observed the transit of Venus of 2012, for example at 1600 angstrom; heliopsf can fit the scatter to "
+            "such images"
+        },
+        angstrom=(1600.0, 1700.0, 4500.0),
+    ),
+)
+
+
+def telescope_without_file(header: Mapping[str, Any]) -> Telescope | None:
+    """The telescope without an instrument file that took the image with this header summary, or None."""
+    return next((one for one in TELESCOPES if one.took(header)), None)
 
 
 def channel_of(instrument: str | None, wavelength_angstrom: float | None) -> str | None:
@@ -116,55 +234,37 @@ def _ways(telescope: Telescope | None) -> list[dict[str, str]]:
 def _instrument(name: str, header: Mapping[str, Any]) -> dict[str, Any]:
     known = load_instrument(name)
     scale = known.detector.plate_scale_arcsec
-    channel = channel_of(name, None)
-    same = same_as_image(name, channel, scale, header)
+    same, told = agreement(name, channel_of(name, None), scale, header)
     return {
         "name": name,
         "wavelength_angstrom": known.wavelength_angstrom,
         "plate_scale_arcsec": scale,
         "same": same,
-        "told": agreement_with_image(same, channel, scale, header),
+        "told": told,
     }
 
 
-def same_as_image(
+def agreement(
     instrument: str | None, channel: str | None, plate_scale_arcsec: float | None, header: Mapping[str, Any]
-) -> list[str]:
-    """The properties that a PSF and an image have in common, of "telescope", "channel" and "plate_scale"."""
-    words = _words_of(header)
-    wanted = channel_of(None, header["wavelnth"])
-    image_scale = header["cdelt1"]
-    same = []
+) -> tuple[list[str], str]:
+    """The properties that a PSF and an image have in common, of "telescope", "channel" and "plate_scale"; and a text that
+    compares both, for example "same telescope, but another channel"."""
+    of_image, image_scale = channel_of(None, header["wavelnth"]), header["cdelt1"]
+    words = set().union(*(_words(header[key]) for key in ("telescop", "instrume", "detector")))
+    same, other = [], []
     if words & _words(instrument):
         same.append("telescope")
-    if channel is not None and channel == wanted:
+    if channel is not None and channel == of_image:
         same.append("channel")
+    elif of_image and channel:
+        other.append(f"another channel ({channel}, not {of_image} Å)")
     if image_scale and plate_scale_arcsec:
-        ratio = abs(image_scale) / plate_scale_arcsec
-        if abs(ratio - 1) <= PLATE_SCALE_TOLERANCE:
+        if abs(abs(image_scale) / plate_scale_arcsec - 1) <= PLATE_SCALE_TOLERANCE:
             same.append("plate_scale")
-    return same
-
-
-def agreement_with_image(
-    same: Sequence[str], channel: str | None, plate_scale_arcsec: float | None, header: Mapping[str, Any]
-) -> str:
-    """A text that compares a PSF with an image, for example "same telescope, but another channel".
-
-    same: the result of `same_as_image`.
-    """
-    wanted, image_scale = channel_of(None, header["wavelnth"]), header["cdelt1"]
-    other = []
-    if wanted and channel and channel != wanted:
-        other.append(f"another channel ({channel}, not {wanted} Å)")
-    if image_scale and plate_scale_arcsec and "plate_scale" not in same:
-        other.append(f"another pixel scale ({plate_scale_arcsec:g}, not {abs(image_scale):g} arcsec)")
+        else:
+            other.append(f"another pixel scale ({plate_scale_arcsec:g}, not {abs(image_scale):g} arcsec)")
     parts = [f"same {' and '.join(_NAMES[one] for one in same)}"] if same else []
-    return ", but ".join([*parts, *([" and ".join(other)] if other else [])])
-
-
-def _words_of(header: Mapping[str, Any]) -> set[str]:
-    return set().union(*(_words(header[key]) for key in ("telescop", "instrume", "detector")))
+    return same, ", but ".join([*parts, *([" and ".join(other)] if other else [])])
 
 
 def _words(text: str | None) -> set[str]:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from psfcore.errors import DataError
 from psfcore.instruments.model import Instrument, Mesh
 
+REACH_GRID_PX = 2048  # light is counted over this grid: the full reach
 LARGEST_SIZE_PX = 4096
 PERIOD_PX = 4096  # size of the transform: light wraps around at 4096 px, not at the 2048 px that are kept
 MOST_MASK_SAMPLES = 32  # a mask that needs more samples per pixel is replaced by an analytic pattern
@@ -53,7 +54,9 @@ def workload(instrument: Instrument, size: int) -> Workload:
     pixel_mm = instrument.detector.pixel_pitch_um * _MM_PER_UM
     samples = 2 * instrument.aperture.diameter_mm * pixel_mm / (shortest_mm * instrument.focal_length_mm)
     corner_px = (size // 2 + 1.5) * math.sqrt(2)
-    meshes = [mesh for mesh in instrument.meshes if _distance_mm(instrument, mesh) is not None]
+    # The error of a missing table of distances is raised when the PSF is built.
+    known = ("entrance",) if instrument.distances is None else ("entrance", "filter_wheel")
+    meshes = [mesh for mesh in instrument.meshes if mesh.place in known]
     mask = samples <= MOST_MASK_SAMPLES and (instrument.mount is not None or bool(instrument.meshes))
     mask_cells = 2 * math.ceil(max(size, PERIOD_PX) * samples / 4) + 2 if mask else 0
     mount = instrument.mount
@@ -94,12 +97,6 @@ def check_workload(instrument: Instrument, label: str) -> None:
         wanted = f"meshes: expected at most {MOST_CELLS} cells along an axis of a rotated mesh"
         advice = "use fewer windows, a smaller pitch_um or a longer distance"
         raise DataError("bad-instrument-file", f"{label}: {wanted}; got {max(largest.cells):.3g}: {advice}")
-
-
-def _distance_mm(instrument: Instrument, mesh: Mesh) -> float | None:
-    if mesh.place != "entrance" and instrument.distances is None:
-        return None  # the error of a missing table is raised when the PSF is built
-    return instrument.mesh_distance_mm(mesh)
 
 
 def _cells(instrument: Instrument, mesh: Mesh, wavelength_mm: float, corner_px: float) -> int:

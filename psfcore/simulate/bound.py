@@ -51,7 +51,6 @@ from psfcore.simulate.scatter_truth import (
     kernel_slopes,
 )
 from psfcore.simulate.sky import TrueSky, on_field
-from psfcore.simulate.transit import SimulatedTransit
 from psfcore.simulate.transit_files import read_sky
 
 Plane = NDArray[np.float64]
@@ -111,21 +110,19 @@ class PhotonBound:
         }
 
 
-def photon_bound(simulated: SimulatedTransit, *, threads: int = 1) -> PhotonBound:
-    """The bound of a simulated transit. Raises DataError "no-bound" if the dark pixels do not determine a parameter."""
-    return bound_of_sky(simulated.sky, threads=threads)
-
-
 def bound_of_folder(folder: str | Path, *, threads: int = 1) -> PhotonBound:
     """The bound of a folder that psfcore.simulate.transit_files.write wrote.
 
-    Raises the errors of photon_bound and of read_sky.
+    Raises the errors of bound_of_sky and of read_sky.
     """
     return bound_of_sky(read_sky(folder, threads=threads), threads=threads)
 
 
 def bound_of_sky(sky: TrueSky, *, threads: int = 1) -> PhotonBound:
-    """The bound of any transit of `sky`; the noise realisation does not matter. Raises the errors of photon_bound."""
+    """The bound of any transit of `sky`; the noise realisation does not matter.
+
+    Raises DataError "no-bound" if the dark pixels do not determine a parameter.
+    """
     slopes = kernel_slopes(sky.scatter)
     sizes = (*[REACH_GRID_PX] * _LAW, sky.kernel.shape[0])  # the stretch is needed only near the discs
     total_slopes = {

@@ -86,10 +86,7 @@ class Behind:
     def window(self, margin_px: int = 0) -> tuple[slice, slice]:
         """The slices of the patch in a plane that is margin_px larger than the field on each side."""
         (top, left), (ny, nx) = self.first, self.shape
-        return (
-            slice(top + margin_px, top + margin_px + ny),
-            slice(left + margin_px, left + margin_px + nx),
-        )
+        return (slice(top + margin_px, top + margin_px + ny), slice(left + margin_px, left + margin_px + nx))
 
     def hidden(self, place: Place) -> Plane:
         """The light that a disc at `place` hides in each detector pixel of the patch, DN/s."""

@@ -84,27 +84,19 @@ def imitated(instrument: Instrument) -> Imitated:
         return HRI_EUV
     channel = round(instrument.wavelength_angstrom)
     is_aia = instrument.name.startswith("aia_") and channel in _TELESCOPES_OF_AIA
+    texts = {key: text for key, text in instrument.match.items() if isinstance(text, str)}
+    if is_aia:
+        number = _TELESCOPES_OF_AIA[channel]
+        texts = {"TELESCOP": "SDO/AIA", "INSTRUME": f"AIA_{number}", "WAVEUNIT": "angstrom"}
     return Imitated(
         name=instrument.name,
-        texts=_texts_of_aia(channel) if is_aia else _matched_texts(instrument),
+        texts=texts,
         wavelength_angstrom=channel,
         plate_scale_arcsec=instrument.detector.plate_scale_arcsec,
         date_key="DATE-OBS" if is_aia else "DATE-BEG",
         exposure_key="EXPTIME" if is_aia else "XPOSURE",
         has_gain_modes=not is_aia,
     )
-
-
-def _texts_of_aia(channel: int) -> dict[str, str]:
-    return {
-        "TELESCOP": "SDO/AIA",
-        "INSTRUME": f"AIA_{_TELESCOPES_OF_AIA[channel]}",
-        "WAVEUNIT": "angstrom",
-    }
-
-
-def _matched_texts(instrument: Instrument) -> dict[str, str]:
-    return {key: text for key, text in instrument.match.items() if isinstance(text, str)}
 
 
 def commented(values: dict[str, CardValue]) -> dict[str, tuple[CardValue, str]]:

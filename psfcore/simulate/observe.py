@@ -1,10 +1,4 @@
-"""A simulated observation: a known scene, convolved with a PSF, with photon noise and read noise added.
-
-| symbol | name | unit |
-|---|---|---|
-| gain | photon_gain_dn: DN per detected photon | DN |
-| read | read_noise_dn: rms of the read noise | DN |
-"""
+"""A simulated observation: a known scene, convolved with a PSF, with photon noise and read noise added."""
 
 from __future__ import annotations
 
@@ -17,6 +11,7 @@ from numpy.typing import NDArray
 from psfcore.convolution.convolver import Convolver
 from psfcore.fits.images import write_image
 from psfcore.image import Image
+from psfcore.noise import Noise
 from psfcore.psf import Psf
 from psfcore.simulate.scene import solar_scene
 
@@ -42,17 +37,15 @@ def observe(
 
     The scene is assumed dark outside its array. If photon_gain_dn and read_noise_dn are 0, the image is noise-free.
     """
-    rng = np.random.default_rng(seed)
     field = (scene.shape[0], scene.shape[1])
-    seen_dn = Convolver(psf.kernel, field, dtype=np.float64, threads=threads).apply(scene) * exposure_s
-    seen_dn = np.maximum(seen_dn, 0.0)  # rounding in the transforms makes some dark pixels slightly negative
-    if photon_gain_dn > 0:
-        seen_dn = rng.poisson(seen_dn / photon_gain_dn) * photon_gain_dn
-    noise_dn = rng.normal(0.0, read_noise_dn, field) if read_noise_dn > 0 else 0.0
-    return np.asarray((seen_dn + noise_dn) / exposure_s, dtype=np.float64)
+    seen = Convolver(psf.kernel, field, dtype=np.float64, threads=threads).apply(scene)
+    if photon_gain_dn == read_noise_dn == 0:
+        return np.maximum(seen, 0.0)  # rounding in the transforms makes some dark pixels slightly negative
+    noise = Noise(photon_gain_dn, read_noise_dn)
+    return noise.observe(np.asarray(seen), exposure_s, np.random.default_rng(seed))
 
 
-def demo_image(path: str | Path, psf: Psf, *, size: int = 1024, seed: int = 1, threads: int = 1) -> None:
+def demo_image(path: str | Path, psf: Psf, *, size: int = 1024, seed: int = 1) -> None:
     """Write a simulated image of (size, size) px with the header of an HRI_EUV level 2 file, marked as simulated."""
     scene = solar_scene((size, size), seed)
     pixels = observe(
@@ -62,11 +55,9 @@ def demo_image(path: str | Path, psf: Psf, *, size: int = 1024, seed: int = 1, t
         photon_gain_dn=DEMO_PHOTON_GAIN_DN,
         read_noise_dn=DEMO_READ_NOISE_DN,
         seed=seed,
-        threads=threads,
     )
     mask = np.zeros(pixels.shape, dtype=np.uint8)
-    header = _demo_header(size, psf)
-    image = Image(pixels=pixels, mask=mask, header=header, unit="DN/s", exposure_s=DEMO_EXPOSURE_S)
+    image = Image(pixels, mask, _demo_header(size, psf), "DN/s", DEMO_EXPOSURE_S)
     history = [f"simulated scene, seed {seed}, convolved with PSF {psf.name} {psf.version}"]
     write_image(path, image, cards={}, history=history)
 

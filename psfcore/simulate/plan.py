@@ -158,8 +158,12 @@ def default_plan(images: int = 30, size_px: int = 512, **changes: Any) -> Plan:
         for phase, count in zip(_PHASES, counts, strict=True)
         for shot in _shots(phase, count, size_px, radius_px)
     ]
-    drawn = {"oversampling": 2 if size_px <= LARGEST_FINE_SIZE_PX else 1}
-    return Plan(size_px, tuple(shots), **(drawn | changes))
+    return Plan(size_px, tuple(shots), **({"oversampling": drawn_oversampling(size_px)} | changes))
+
+
+def drawn_oversampling(size_px: int) -> int:
+    """The oversampling of a field of this size: 2, or 1 if the field is larger than 1024 px."""
+    return 2 if size_px <= LARGEST_FINE_SIZE_PX else 1
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX
 from psfcore.simulate.disc import Behind, behind, binned
 from psfcore.simulate.plan import Plan
-from psfcore.simulate.pointings import drawn_scene
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
+from psfcore.simulate.scene import drawn_scene
 
 Plane = NDArray[np.float64]
 Kernel = NDArray[np.float64]

@@ -42,13 +42,12 @@ class Truth:
     places: tuple[Place, ...]
     seed: int
     scene_seed: int
-    effects: tuple[Any, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The content of truth.json, except for the plan."""
         law = self.scatter
         return {
-            "effects": list(self.effects),
+            "effects": [],
             "psf": {
                 "b": law.b_px,
                 "c": law.c,
@@ -82,20 +81,6 @@ class SimulatedTransit:
         """The plan of the transit."""
         return self.sky.plan
 
-    @property
-    def noise_free(self) -> tuple[Plane, ...]:
-        """The noise-free images, DN/s, float64; computed at first use and kept."""
-        return self.sky.noise_free
-
-    @property
-    def scenes(self) -> Mapping[int, Plane]:
-        """The scene of each pointing without the occulter, DN/s, plan.margin_px larger than the field on each side."""
-        return self.sky.scenes
-
-    def true_scene(self, index: int) -> Plane:
-        """The scene of image `index` on the field, without the light that the occulter hides: [y, x] in DN/s, float64."""
-        return self.sky.true_scene(index)
-
 
 def simulate(
     plan: Plan,
@@ -103,7 +88,6 @@ def simulate(
     diffraction: Kernel,
     seed: int,
     *,
-    scene_seed: int | None = None,
     scenes: Mapping[int, Plane] | None = None,
     imitated: Imitated = HRI_EUV,
     threads: int = 1,
@@ -111,12 +95,11 @@ def simulate(
     """A transit of `plan`. Its PSF is `scatter` convolved with `diffraction`. Equal arguments give equal results.
 
     diffraction: weights [y, x], centre at [n // 2, n // 2], sum 1. seed: random seed of the scenes, the ephemeris errors
-    and the noise. scene_seed: the seed of the scenes, if it differs from `seed`. scenes: for each pointing, a scene
-    to use instead of a synthetic scene, as drawn_scene and scene_from_image of psfcore.simulate.pointings return it.
+    and the noise. scenes: for each pointing, a scene to use instead of a synthetic scene, as drawn_scene and
+    scene_from_image of psfcore.simulate.scene return it.
     imitated: the instrument whose keywords the headers get. Raises DataError "bad-diffraction", "bad-scene".
     """
-    of_scenes = seed if scene_seed is None else scene_seed
-    sky = true_sky(plan, scatter, diffraction, of_scenes, scenes=scenes, threads=threads)
+    sky = true_sky(plan, scatter, diffraction, seed, scenes=scenes, threads=threads)
     return observed_transit(sky, seed, imitated)
 
 

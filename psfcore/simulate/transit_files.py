@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.images import Cards, CardValue, read_plane, write_plane
 from psfcore.simulate.headers import commented
 from psfcore.simulate.plan import HIGH, plan_from_json
@@ -47,7 +47,7 @@ def write(simulated: SimulatedTransit, folder: str | Path) -> None:
         cards = _frame_cards(simulated, index, "DN/s")
         write_plane(folder / "noise_free" / frame.file, noise_free, cards=cards)
     of_instrument = simulated.imitated.values()
-    for pointing, scene in simulated.scenes.items():
+    for pointing, scene in simulated.sky.scenes.items():
         about: dict[str, CardValue] = {"BUNIT": "DN/s", "FOV": pointing, "MARGIN": simulated.plan.margin_px}
         write_plane(folder / "scenes" / f"fov{pointing}.fits", scene, cards=commented(of_instrument | about))
     diffraction = simulated.sky.diffraction

@@ -1,1 +1,1 @@
-"""Tables of a PSF: `make` writes them, `lookup` answers questions from them, `layout` describes them."""
+"""Tables of a PSF: `make` writes them, `lookup` describes them and answers questions from them."""

@@ -1,6 +1,6 @@
 """Makes the tables of a PSF, from which `lookup` answers questions without reading the pixels.
 
-`psfcore.tables.layout` describes the tables, E(R) and 1 - E(R). The radii are the same for every PSF, up to its reach:
+`psfcore.tables.lookup` describes the tables, E(R) and 1 - E(R). The radii are the same for every PSF, up to its reach:
 
 - up to EXACT_TO_PX: every distance that a pixel can have, so that the staircase E is exact;
 - up to WHOLE_TO_PX: every whole number of pixels;
@@ -29,7 +29,8 @@ from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.psf import Psf, encircled_energy, radial_profile, squared_radii
 from psfcore.scatter.shapes import DIFFERENCE, shape_named
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
-from psfcore.tables.layout import EXACT_TO_PX, SCHEMA, STEP, TOTAL, WHOLE_TO_PX
+from psfcore.tables.layout import SCHEMA
+from psfcore.tables.lookup import EXACT_TO_PX, SCHEMA, STEP, TOTAL, WHOLE_TO_PX
 
 DIGITS = 10  # significant digits of a number in the tables
 
@@ -39,7 +40,7 @@ Numbers = list[float]
 
 
 def tables_of(psf: Psf, *, threads: int = 1) -> dict[str, Any]:
-    """The tables of a PSF as JSON values, with the fields of `psfcore.tables.layout`."""
+    """The tables of a PSF as JSON values, with the fields of `psfcore.tables.lookup`."""
     kernels = {TOTAL: psf.kernel, **psf.components}
     radii = table_radii(psf.reach_px)
     test_radii = _test_radii(radii)

@@ -15,10 +15,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from psfcore.errors import DataError, together
-from psfcore.fits.header import FitsLimits, HeaderSummary, plate_scale_arcsec, read_summary
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.frame import plate_scale_arcsec
+from psfcore.fits.header import HeaderSummary, instant, read_summary
 from psfcore.fits.images import read_plane
 from psfcore.fits.observation import read_observation
-from psfcore.fits.times import instant
 from psfcore.noise import Noise
 from psfcore.psf import CENTRE_TOLERANCE
 from psfcore.transit.manifest import MANIFEST_NAME, ImageEntry, TransitManifest, read_manifest

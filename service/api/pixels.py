@@ -15,11 +15,11 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, StreamingResponse
+from psfcore.fits.viewing.all_cards import all_cards
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
-from psfcore.fits.viewing.all_cards import all_cards
-from psfcore.fits.viewing.planes import Decoded, Plane
+from psfcore.fits.viewing.planes import Decoded, Plane, decode_plane
 from service.http import downloads as files
 from service.http.callers import Reading
 from service.http.problems import RESPONSES, Problem, as_problems
@@ -156,8 +156,6 @@ async def prepare_image(state: State, digest: str) -> None:
 
 
 def _decoded(state: State, digest: str, name: str) -> Plane:
-    from psfcore.fits.viewing.decode import decode_plane  # loads the numerical libraries
-
     def decode(target: BinaryIO) -> Decoded:
         check_disk(state)
         # The checksum of the whole file is verified, because browsers keep the pixels for a long time.

@@ -15,7 +15,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import BaseModel, Field
 
-from psfcore.fits.cutout import Cutout, cutout
+from psfcore.fits.stored_psf import Cutout, cutout
 from psfcore.tables import lookup as psf_lookup
 from service.http import downloads as files
 from service.http.callers import Caller, Reading

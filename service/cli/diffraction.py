@@ -176,8 +176,8 @@ def design(
     instrument: str, pitches: str, wires: str, json_file: Path | None, plot: Path | None, overwrite: bool
 ) -> None:
     """Tabulate the diffracted light for combinations of pitch and wire width of the entrance mesh."""
-    from psfcore.diffraction.design_plot import design_png
     from psfcore.diffraction.design_study import design_study
+    from psfcore.diffraction.plots import design_png
     from psfcore.instruments.model import load_instrument
 
     with user_errors():

@@ -25,7 +25,7 @@ from service.client.outputs import check_output_folder, check_outputs, written
 from workers.contract.requests import Deconvolve
 
 if TYPE_CHECKING:
-    from psfcore.fits.header import FitsLimits
+    from psfcore.fits.blocks import FitsLimits
     from workers.settings import Settings
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -272,6 +272,6 @@ def read_settings(data: Path | None = None) -> Settings:
 
 def limits() -> FitsLimits:
     """The limits on FITS files that a command reads, from HELIOPSF_MAX_PIXELS."""
-    from psfcore.fits.header import FitsLimits
+    from psfcore.fits.blocks import FitsLimits
 
     return FitsLimits(max_pixels=read_settings().max_pixels)

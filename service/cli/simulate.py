@@ -124,8 +124,8 @@ def transit(
 ) -> None:
     """Write a simulated transit, with its true PSF and scenes, to a folder."""
     from psfcore.instruments.model import load_instrument
-    from psfcore.simulate.from_files import LARGEST_DIFFRACTION_PX, diffraction_kernel, scenes_from_files
     from psfcore.simulate.headers import imitated
+    from psfcore.simulate.inputs import LARGEST_DIFFRACTION_PX, diffraction_kernel, scenes_from_files
     from psfcore.simulate.plan import default_plan
     from psfcore.simulate.scatter_truth import ScatterTruth
     from psfcore.simulate.transit import simulate as simulated

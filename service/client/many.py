@@ -21,7 +21,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.fits.header import FitsLimits, check_all_headers, first_image_header, optional_text
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.cards import optional_text
+from psfcore.fits.header import all_hdus, first_image_header
 from service.client.errors import ServiceError, WaitInterrupted
 from service.client.operations import Operations, deconvolution
 from service.client.outputs import check_output_folder, check_outputs
@@ -205,7 +207,7 @@ def _products_in(folder: Path) -> _Found:
     limits = FitsLimits(max_pixels=LARGEST_PX)
     for path in sorted(folder.glob("*.fits")):
         try:
-            check_all_headers(path, limits)
+            all_hdus(path, limits)
             header = first_image_header(path, limits)
         except (HeaderError, OSError):
             continue  # not a complete FITS file, so not a product that can be used in place of a new one

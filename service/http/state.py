@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import anyio
 from fastapi import Depends, Request
 
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.viewing.planes import Planes
 from service.client.address import is_loopback
 from service.http.problems import as_problems

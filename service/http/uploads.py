@@ -15,7 +15,7 @@ from fastapi import Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from psfcore.fits.header import HeaderSummary, read_summary
-from psfcore.fits.weights import check_is_psf
+from psfcore.fits.stored_psf import check_is_psf
 from psfcore.transit.archive import START_BYTES, ArchiveContents, archive_kind, could_be_archive, list_archive
 from service.http.callers import Caller
 from service.http.forms import FORM, FormPart, chunks_of, media_type_of, pieces_of

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 
 from psfcore.errors import DataError
-from psfcore.fits.header import plate_scale_arcsec
+from psfcore.fits.frame import plate_scale_arcsec
 from service.http.callers import Reading
 from service.http.paging import following, position
 from service.http.state import Shared

@@ -19,7 +19,8 @@ import numpy as np
 from psfcore import build, limited
 from psfcore.diffraction import combined, fraunhofer
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.header import read_summary
 from psfcore.fits.images import write_image
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
@@ -42,6 +43,7 @@ def read_an_image(content: bytes, folder: Path) -> str:
     path.write_bytes(content)
     summary = read_summary(path, LIMITS)
     json.dumps(dataclasses.asdict(summary), allow_nan=False)
+    assert 0 < summary.shape[0] * summary.shape[1] <= LIMITS.max_pixels
     images = []
     for filling in (0x11, 0x77):
         limited.FILLING = filling

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 from functools import cache
 from itertools import product
@@ -43,10 +44,13 @@ def compressed_image(seed: int) -> bytes:
 
 
 def plain_image(seed: int) -> bytes:
-    """An image, or a PSF as heliopsf writes it, with one to four faults in any header."""
+    """An image, or a PSF as heliopsf writes it, with one to four faults in any header; sometimes as gzip, or bytes of no file."""
     rng = np.random.default_rng([2, seed])
-    bases = _plain_bases()
-    return _damaged(bases[int(rng.integers(len(bases)))], rng, first_card=lambda _: 0)
+    bases, kind = _plain_bases(), rng.random()
+    if kind < 0.05:
+        return (b"", b"SIMPLE  =", b"\x1f\x8b\x08")[int(rng.integers(3))] + rng.bytes(int(rng.integers(6000)))
+    content = _damaged(bases[int(rng.integers(len(bases)))], rng, first_card=lambda _: 0)
+    return gzip.compress(content) if kind < 0.2 else content
 
 
 def _damaged(base: bytes, rng: np.random.Generator, *, first_card) -> bytes:  # type: ignore[no-untyped-def]

@@ -22,11 +22,11 @@ from matplotlib.figure import Figure
 
 import heliopsf
 from heliopsf.psfs import LIMITS
+from psfcore.build import known_diffraction
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.fits.observation import read_observation
 from psfcore.gap import diagnose
-from psfcore.known_diffraction import known_diffraction
 from psfcore.scatter import fit as fit_module
 from psfcore.scatter.published_equations import free_fit
 from psfcore.simulate.transit_files import write

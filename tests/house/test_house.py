@@ -87,9 +87,8 @@ def test_what_people_import_stands_on_the_core_the_client_the_folder_of_the_cach
 # table of contents is checked at upload as headers are. None of these loads numerics.
 LIGHT = (
     "psfcore.fits.header",
-    "psfcore.fits.cutout",
+    "psfcore.fits.stored_psf",
     "psfcore.fits.viewing",  # its modules of pixels are loaded by the first request for pixels
-    "psfcore.fits.weights",
     "psfcore.instruments.files",
     "psfcore.tables.lookup",
     "psfcore.errors",
@@ -132,8 +131,7 @@ def test_the_web_process_carries_no_numerics_and_no_task() -> None:
         "workers.run.runner",
         "psfcore.convolution.convolver",
         "psfcore.fits.hdus",
-        "psfcore.fits.viewing.decode",  # loaded by the first request for pixels
-        "psfcore.fits.viewing.windows",
+        "psfcore.fits.viewing.windows",  # loaded by the first request for pixels
         "psfcore.fits.images",
         "psfcore.fits.psfs",
         "service.local",

@@ -16,7 +16,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.build import build_psf
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import load_instrument
 from psfcore.psf import Psf, crop_centred

@@ -18,7 +18,7 @@ from psfcore.build import build_psf, component_names
 from psfcore.diffraction import combined
 from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.instruments.model import (
     Aperture,

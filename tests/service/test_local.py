@@ -17,10 +17,10 @@ from astropy.io import fits
 from fastapi.testclient import TestClient
 
 import heliopsf
-from psfcore.fits.cutout import cutout
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.fits.psfs import write_psf as write_built
+from psfcore.fits.stored_psf import cutout
 from psfcore.instruments import files
 from psfcore.psf_sampling import rebinned
 from psfcore.transit.archive import pack

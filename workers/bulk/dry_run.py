@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.header import read_summary
 from workers.bulk.intake import check_places, check_uploaded, pinned
 from workers.bulk.matching import found_files
 from workers.bulk.targets import target_of

@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits, first_image_header, optional_text, read_summary
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.cards import optional_text
+from psfcore.fits.header import first_image_header, read_summary
 from psfcore.image import Image
 from workers.bulk.targets import target_of
 from workers.catalogue.bulk_tables import BulkRow

@@ -10,7 +10,7 @@ from typing import Any
 from urllib.parse import quote, unquote_to_bytes
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from workers.catalogue.bulk_tables import MOST_LETTERS
 from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, Listed
 from workers.contract.bulk import BulkWork, Condition

@@ -19,7 +19,9 @@ from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits, first_image_header, optional_value
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.cards import optional_value
+from psfcore.fits.header import first_image_header
 from workers.contract.bulk import Condition
 
 ANY_FOLDERS = "**"

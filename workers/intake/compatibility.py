@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from psfcore.fits.binning import binning_factor
 from psfcore.fits.cards import Cards
-from psfcore.fits.channel import check_channel
+from psfcore.fits.channel import binning_factor, check_channel
+from psfcore.fits.frame import plate_scale_arcsec
 from psfcore.fits.gain import no_noise_figures, noise_figures_for
-from psfcore.fits.header import origin_of, plate_scale_arcsec, wavelength_angstrom
+from psfcore.fits.header import origin_of, wavelength_angstrom
 from psfcore.instruments.model import load_instrument
 from psfcore.noise_figures import NoiseFigures
 from workers.catalogue.tables import PsfRow

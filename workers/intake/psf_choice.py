@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from psfcore.instruments.model import load_instrument
-from psfcore.instruments.unknown import agreement_with_image, same_as_image, unknown_instrument
+from psfcore.instruments.unknown import agreement, unknown_instrument
 from psfcore.instruments.unknown import channel_of as channel_of_image
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import NOW
@@ -293,7 +293,7 @@ def _candidates(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> 
     for row in catalogue.psfs.page(PsfFilter(), owner, limit=MOST_SEARCHED):
         scale = row.details.get("plate_scale_arcsec")
         channel = None if row.channel is None else without_variant(row.channel)
-        same = same_as_image(row.instrument, channel, scale, header)
+        same, told = agreement(row.instrument, channel, scale, header)
         other_channel = image_channel is not None and channel is not None and channel != image_channel
         usable = row.kind in (TOTAL, UPLOADED) and row.status != PsfStatus.DEPRECATED
         if not usable or other_channel or not {"telescope", "plate_scale"} & set(same):
@@ -306,7 +306,7 @@ def _candidates(catalogue: Catalogue, header: Mapping[str, Any], owner: str) -> 
             "instrument": row.instrument,
             "channel": row.channel,
             "same": same,
-            "told": agreement_with_image(same, channel, scale, header),
+            "told": told,
         }
         found += 1
         if found == MOST_NAMED:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from psfcore.comparison import Comparison, compare
 from psfcore.errors import DataError
-from psfcore.fits.images import read_plane
-from psfcore.fits.product.planes import read_planes
+from psfcore.fits.images import read_plane, read_planes
 from psfcore.fits.psfs import read_psf
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow

@@ -13,8 +13,10 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FILTER_CARDS, optional_text, plate_scale_arcsec
-from psfcore.plate_scale import PLATE_SCALE_TOLERANCE
+from psfcore.fits.cards import optional_text
+from psfcore.fits.frame import plate_scale_arcsec
+from psfcore.fits.header import FILTER_CARDS
+from psfcore.instruments.files import PLATE_SCALE_TOLERANCE
 from workers.versions.series import word
 
 SEPARATOR = "-"  # a word of a header card never contains it

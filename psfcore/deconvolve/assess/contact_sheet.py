@@ -31,7 +31,7 @@ from psfcore.drawing.plots import (
     write_png,
 )
 from psfcore.errors import DataError
-from psfcore.fits.header import optional_text
+from psfcore.fits.cards import optional_text
 from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.psf_sampling import psf_for_image

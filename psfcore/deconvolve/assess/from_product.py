@@ -17,9 +17,10 @@ from psfcore.deconvolve.assess.changes import Changes, Range, Structure
 from psfcore.deconvolve.assess.contact_sheet import THUMBNAIL_PX, Treated
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.drawing.plots import binned
-from psfcore.fits.header import FitsLimits, optional_text
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.cards import optional_text
+from psfcore.fits.images import read_planes
 from psfcore.fits.observation import read_observation
-from psfcore.fits.product.planes import read_planes
 
 DATE_KEYS = ("DATE-BEG", "DATE-OBS", "T_OBS")
 

@@ -1,27 +1,39 @@
-"""Keeps decoded planes of FITS files for some time, so that a plane is decoded only once for many requests of a viewer.
+"""Decodes planes of FITS files for a viewer, and keeps them for some time for the many requests of a viewer.
+
+A plane is decoded in a process of its own. Its values are those of the file after BSCALE, BZERO and BLANK are applied. No
+pixel is divided by the exposure time or masked.
 
 A decoded plane is stored in a file without a name in the folder of temporary files. The plane is not kept as an array
 in memory, because many slow clients may read different planes at the same time. The system's page cache keeps the
 pixels in memory as long as there is room. The disk space becomes free when the plane is no longer kept and nobody reads
-it. This module loads no numerical library; only the decoding needs one.
+it. This module loads no numerical library; only the decoding process needs one.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 from weakref import WeakValueDictionary
+
+from psfcore.errors import DataError
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.cards import optional_text
+from psfcore.fits.header import all_hdus, is_plane, read_summary
+from psfcore.limited import run_limited
 
 IMAGE = "image"
 PIXEL_BYTES = 4
 MOST_BYTES, MOST_PLANES = 2**27, 8
+
+_LONGEST_UNIT = 68  # characters of a card's value
 
 Key = tuple[str, str]  # SHA-256 of the file, and name of the plane
 
@@ -65,7 +77,8 @@ class Planes:
         self._temporary = temporary
         self._kept: OrderedDict[Key, Plane] = OrderedDict()
         self._lock = threading.Lock()
-        self._turns: WeakValueDictionary[Key, _Turn] = WeakValueDictionary()
+        # The right to decode a plane.
+        self._turns: WeakValueDictionary[Key, threading.Lock] = WeakValueDictionary()
 
     def kept(self, key: Key) -> Plane | None:
         """The plane, if it is still kept."""
@@ -81,32 +94,56 @@ class Planes:
         If several threads request the same plane at the same time, one of them decodes it and the others wait.
         """
         with self._lock:
-            turn = self._turns.setdefault(key, _Turn())
-        with turn.lock:
+            turn = self._turns.setdefault(key, threading.Lock())
+        with turn:
             plane = self.kept(key)
             if plane is None:
-                plane = self._made(decode)
+                with self._temporary() as path:
+                    with path.open("wb") as target:
+                        decoded = decode(target)
+                    plane = Plane(path, decoded)
                 self._keep(key, plane)
             return plane
-
-    def _made(self, decode: Callable[[BinaryIO], Decoded]) -> Plane:
-        with self._temporary() as path:
-            with path.open("wb") as target:
-                decoded = decode(target)
-            return Plane(path, decoded)
 
     def _keep(self, key: Key, plane: Plane) -> None:
         with self._lock:
             self._kept[key] = plane
-            while len(self._kept) > MOST_PLANES or self._bytes() > MOST_BYTES:
+            while (
+                len(self._kept) > MOST_PLANES or sum(one.length for one in self._kept.values()) > MOST_BYTES
+            ):
                 self._kept.popitem(last=False)
 
-    def _bytes(self) -> int:
-        return sum(plane.length for plane in self._kept.values())
+
+def decode_plane(path: str | Path, name: str, limits: FitsLimits, target: BinaryIO) -> Decoded:
+    """Write the pixels of a plane to ``target`` as little-endian float32, in the order of the FITS file (row 0 first).
+
+    NaN stays NaN. name: IMAGE for the first 2-D image of the file, or the name of a plane of a product, for example
+    "quality". Returns the shape and the unit of the plane. Raises HeaderError for an unusable header; DataError
+    "unreadable-pixels" or "no-such-plane".
+    """
+    hdu = None if name == IMAGE else _number_of_plane(path, name.upper(), limits)
+    shape = read_summary(path, limits, hdu=hdu).shape
+    answer = run_limited(write_pixels, path, target, pixels=math.prod(shape), hdu=hdu, limits=asdict(limits))
+    return Decoded(shape, answer["unit"])
 
 
-class _Turn:
-    """The right to decode one plane."""
+def write_pixels(target: BinaryIO, *, path: str, hdu: int | None, limits: dict[str, int]) -> dict[str, Any]:
+    """Write the pixels of an image to ``target`` as little-endian float32; returns its unit. Call it in a limited process."""
+    from psfcore.fits.hdus import ascii_text, read_pixels  # loads the numerical libraries
 
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
+    stored = read_pixels(path, FitsLimits(**limits), hdu=hdu)
+    target.write(stored.pixels.astype("<f4").data)
+    unit = optional_text(stored.header, "BUNIT")
+    return {"unit": None if unit is None else ascii_text(unit)[:_LONGEST_UNIT]}
+
+
+def _number_of_plane(path: str | Path, name: str, limits: FitsLimits) -> int:
+    """The HDU of a plane of a product. Raises DataError "no-such-plane"."""
+    planes = {hdu.name: hdu.number for hdu in all_hdus(path, limits)[1:] if is_plane(hdu)}
+    if name not in planes:
+        there = ", ".join([IMAGE, *map(str.lower, planes)])
+        advice = ": submit the deconvolution with error_draws" if name == "ERROR" else ""
+        raise DataError(
+            "no-such-plane", f"expected a plane of this file ({there}); got {name.lower()}{advice}"
+        )
+    return planes[name]

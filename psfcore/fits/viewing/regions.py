@@ -25,8 +25,9 @@ from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
+from psfcore.fits.blocks import FitsLimits, first_image
 from psfcore.fits.hdus import readable_pixels
-from psfcore.fits.header import FitsLimits, check_all_headers, read_summary
+from psfcore.fits.header import all_hdus, shape_of
 from psfcore.limited import run_limited
 
 Frame = Literal["pixel", "helioprojective"]
@@ -78,8 +79,8 @@ def write_cutout(path: str | Path, region: Region, limits: FitsLimits, target: B
     Raises HeaderError for an unusable header, and DataError "region-outside" if the region contains no pixel of the image,
     "no-helioprojective" if the header gives no helioprojective coordinates, and "unreadable-pixels".
     """
-    check_all_headers(path, limits)
-    pixels = math.prod(read_summary(path, limits).shape)
+    image = first_image(iter(all_hdus(path, limits)), limits)
+    pixels = math.prod(shape_of(image.header))
     run_limited(cut_out, path, target, pixels=pixels, frame=region.frame, edge=region.edge.tolist())
 
 

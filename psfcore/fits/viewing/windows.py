@@ -73,22 +73,16 @@ def pixels(plane: Plane, window: Window, *, bits: bool) -> Iterator[bytes]:
 
     bits: whether the plane holds bits, see above. Raises EOFError if the plane cannot be read.
     """
-    for block in _blocks(plane, window, bits):
-        yield np.ascontiguousarray(block, dtype="<f4").tobytes()
-
-
-def _blocks(plane: Plane, window: Window, bits: bool) -> Iterator[NDArray[Any]]:
     at_once = max(1, _BLOCK_BYTES // (plane.shape[1] * PIXEL_BYTES))
     step, end = window.step, window.y + window.height
-    if step == 1:
-        yield from _read(plane, window, window.y, end, at_once)
-        return
     reduced = _union if bits else _mean
     # For a small step, one read gives several rows of the answer. For a large step, one row of the answer needs several
     # reads.
     rows = max(1, at_once // step) * step
     for first in range(window.y, end, rows):
-        yield reduced(_read(plane, window, first, min(first + rows, end), at_once), step)
+        pieces = _read(plane, window, first, min(first + rows, end), at_once)
+        for block in pieces if step == 1 else (reduced(pieces, step),):
+            yield np.ascontiguousarray(block, dtype="<f4").tobytes()
 
 
 def _read(plane: Plane, window: Window, first: int, end: int, at_once: int) -> Iterator[NDArray[np.float32]]:

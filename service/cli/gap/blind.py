@@ -95,7 +95,7 @@ def blind(
     from psfcore.blind.case_set import SetPlan, alone_in, make_set
     from psfcore.blind.run_set import run_set
     from psfcore.blind.score import write_score
-    from psfcore.simulate.from_files import image_rate
+    from psfcore.simulate.inputs import image_rate
 
     def say(line: str) -> None:
         click.echo(line, err=True)

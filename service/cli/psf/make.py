@@ -193,7 +193,7 @@ def _mask_of(instrument: str) -> Iterator[Path | None]:
         return
     from astropy.io import fits
 
-    from psfcore.fits.mask_file import read_mask_image
+    from psfcore.fits.images import read_mask_image
     from psfcore.instruments.model import load_instrument
 
     mount = load_instrument(instrument).mount

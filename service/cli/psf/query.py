@@ -78,7 +78,7 @@ def query(
 @writes_files
 def cutout(psf: str, size: int, output: Path, server: str | None, overwrite: bool) -> None:
     """Write the central part of a PSF, not renormalised. If the PSF is a file, the components are written too."""
-    from psfcore.central_part import central_part
+    from psfcore.psf import central_part
 
     with user_errors():
         if is_psf_id(psf):

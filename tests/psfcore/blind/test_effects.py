@@ -22,8 +22,8 @@ from psfcore.blind.effects.registry import EFFECTS, KNOWN, UNKNOWN, effect_named
 from psfcore.errors import DataError
 from psfcore.simulate.disc import binned
 from psfcore.simulate.plan import COMBINED, HIGH, Plan, default_plan
-from psfcore.simulate.pointings import drawn_scene
 from psfcore.simulate.scatter_truth import ScatterTruth, anisotropic_kernel
+from psfcore.simulate.scene import drawn_scene
 
 LAW = ScatterTruth(5.0, 2.5, 0.4)
 GLASS = Glass(SYNTHETIC, 64)

@@ -17,7 +17,7 @@ from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE, Case, case_scenes,
 from psfcore.blind.effects.registry import EFFECTS, KNOWN
 from psfcore.blind.make_case import Made, make
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.gap import ideal_observer
 from psfcore.transit.folder import read_transit
 from tests.psfcore.gap.small_transits import effect

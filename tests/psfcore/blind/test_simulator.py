@@ -15,7 +15,7 @@ from psfcore.blind.score import score
 from psfcore.blind.scoring import Judged
 from psfcore.blind.simulator import checked_truth, simulator_of, source_sha256
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.gap import ideal_observer
 from psfcore.transit.folder import read_transit
 from tests.psfcore.gap.small_transits import effect

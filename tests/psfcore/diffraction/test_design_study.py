@@ -10,8 +10,8 @@ from pathlib import Path
 import matplotlib.image
 import pytest
 
-from psfcore.diffraction.design_plot import design_png
 from psfcore.diffraction.design_study import DesignStudy, MeshDesign, design_study
+from psfcore.diffraction.plots import design_png
 from psfcore.errors import DataError
 from psfcore.instruments.model import load_instrument
 

@@ -15,10 +15,8 @@ from scipy.special import fresnel as fresnel_integrals
 
 from psfcore.convolution.convolver import ChirpTransform
 from psfcore.diffraction import fresnel as waves
-from psfcore.diffraction.best_focus import BestFocus, best_focus, paraxial_separation_mm
 from psfcore.diffraction.fresnel import (
     Grid,
-    aperture_openings_mm,
     binned_light,
     common_openings_mm,
     conic_sag_mm,
@@ -31,7 +29,14 @@ from psfcore.diffraction.fresnel import (
     propagate,
 )
 from psfcore.diffraction.fresnel_study import FresnelStudy, fresnel_study
-from psfcore.diffraction.light_path import LightPath, focal_mm, light_path, mesh_windows_mm
+from psfcore.diffraction.light_path import (
+    BestFocus,
+    LightPath,
+    best_focus,
+    focal_mm,
+    light_path,
+    paraxial_separation_mm,
+)
 from psfcore.diffraction.plots import fresnel_png
 from psfcore.errors import DataError
 from psfcore.instruments.model import Aperture, Instrument, Mirror, load_instrument
@@ -73,7 +78,7 @@ def slit_field(x_mm: NDArray[np.float64], begin_mm: float, end_mm: float, z_mm: 
 
 
 def through(field: Complex, source: Grid, target: Grid, distance_mm: float) -> Complex:
-    return propagate(field, source, target, wavelength_mm=LAMBDA_MM, distance_mm=distance_mm)
+    return propagate(field, source, target, distance_mm)
 
 
 def test_the_chirp_transform_equals_the_direct_sum() -> None:
@@ -88,11 +93,13 @@ def test_the_chirp_transform_equals_the_direct_sum() -> None:
 
 
 def test_propagation_conserves_the_light_of_any_field() -> None:
-    source = Grid("a", 2000, 0.001)
+    source = Grid("a", 2000, 0.001, LAMBDA_MM)
     rng = np.random.default_rng(0)
     field = rng.normal(size=2000) + 1j * rng.normal(size=2000)
     for out_samples in (2000, 3001):
-        target = Grid("b", out_samples, LAMBDA_MM * 300.0 / 0.001 / out_samples)  # one period of the sum
+        target = Grid(
+            "b", out_samples, LAMBDA_MM * 300.0 / 0.001 / out_samples, LAMBDA_MM
+        )  # one period of the sum
         assert target.light(through(field, source, target, 300.0)) == pytest.approx(
             source.light(field), rel=1e-10
         )
@@ -100,7 +107,7 @@ def test_propagation_conserves_the_light_of_any_field() -> None:
 
 def test_a_gaussian_beam_spreads_by_its_formula() -> None:
     # The sum is periodic in lambda z / step, at least 1.7 mm.
-    source, target = Grid("a", 8000, 0.0005), Grid("b", 1601, 0.0008)
+    source, target = Grid("a", 8000, 0.0005, LAMBDA_MM), Grid("b", 1601, 0.0008, LAMBDA_MM)
     waist = gaussian_beam(source.x_mm, 0.0, 0.2).astype(complex)
     for z_mm in (50.0, 655.9):
         after = through(waist, source, target, z_mm)
@@ -108,8 +115,8 @@ def test_a_gaussian_beam_spreads_by_its_formula() -> None:
 
 
 def test_a_slit_gives_the_fresnel_integrals() -> None:
-    source = grid_for("slit", width_mm=1.3, next_width_mm=6.0, wavelength_mm=LAMBDA_MM, distance_mm=273.0)
-    target = Grid("screen", 2001, 0.001)
+    source = grid_for("slit", LAMBDA_MM, 1.3, 6.0, 273.0)
+    target = Grid("screen", 2001, 0.001, LAMBDA_MM)
     field = open_share(source, np.array([[-0.61, 0.62]])).astype(complex)
     after = through(field, source, target, 273.0)
     np.testing.assert_allclose(after, slit_field(target.x_mm, -0.61, 0.62, 273.0), atol=0.004)
@@ -130,13 +137,13 @@ def test_the_sag_lies_on_its_conic_and_ends_at_the_radius_of_a_sphere() -> None:
 
 def test_a_parabola_focuses_at_half_its_radius() -> None:
     mirror = Mirror(name="m", radius_mm=1518.0, conic=-1.0, diameter_mm=10.0, figure="concave")
-    grid = Grid("mirror", 60_000, 0.0002)
-    field = mirror_transmission(mirror, grid, LAMBDA_MM)
-    axis = Grid("axis", 1, 1.0)
+    grid = Grid("mirror", 60_000, 0.0002, LAMBDA_MM)
+    field = mirror_transmission(mirror, grid)
+    axis = Grid("axis", 1, 1.0, LAMBDA_MM)
     distances = np.arange(758.0, 760.01, 0.05)
     on_axis = [abs(through(field, grid, axis, z)[0]) for z in distances]
     assert distances[np.argmax(on_axis)] == pytest.approx(759.0, abs=0.06)
-    screen = Grid("focus", 1601, 0.0002)
+    screen = Grid("focus", 1601, 0.0002, LAMBDA_MM)
     image = through(field, grid, screen, 759.0)
     u = screen.x_mm / (LAMBDA_MM * 759.0)
     expected = 10.0**2 * np.sinc(10.0 * u) ** 2 / (LAMBDA_MM * 759.0)
@@ -144,35 +151,32 @@ def test_a_parabola_focuses_at_half_its_radius() -> None:
 
 
 def test_a_mesh_is_open_in_its_windows() -> None:
-    grid = Grid("g", 1270, 0.01)  # ten pitches
-    still, moved = (
-        open_share(grid, mesh_openings_mm(pitch_mm=1.27, wire_mm=0.04, phase=phase, width_mm=20.0))
-        for phase in (0.0, 0.5)
-    )
+    grid = Grid("g", 1270, 0.01, LAMBDA_MM)  # ten pitches
+    still, moved = (open_share(grid, mesh_openings_mm(HRI.meshes[0], phase, 20.0)) for phase in (0.0, 0.5))
     assert still.mean() == pytest.approx(1.23 / 1.27, rel=1e-12)
     assert still[635] == pytest.approx(1, abs=1e-9), "at phase 0 a window is on the axis"
     assert moved[635] == pytest.approx(0, abs=1e-9), "at phase 0.5 a wire is"
 
 
-def test_the_open_length_does_not_depend_on_the_samples() -> None:
-    aperture = Aperture(diameter_mm=47.4, obscuration_diameter_mm=9.1)
-    windows = mesh_openings_mm(pitch_mm=1.27, wire_mm=0.04, phase=0.21, width_mm=47.4)
-    both = common_openings_mm(aperture_openings_mm(aperture), windows)
+def test_the_open_length_does_not_depend_on_the_samples(path: LightPath) -> None:
+    ring = replace(path, aperture=Aperture(diameter_mm=47.4, obscuration_diameter_mm=9.1))
+    windows = mesh_openings_mm(HRI.meshes[0], 0.21, 47.4)
+    both = common_openings_mm(ring.aperture_mm, windows)
     for samples in (999, 50_000):
-        grid = Grid("g", samples, 48.0 / samples)
+        grid = Grid("g", samples, 48.0 / samples, LAMBDA_MM)
         length = open_share(grid, both).sum() * grid.step_mm
         assert length == pytest.approx(float(np.diff(both).sum()), rel=1e-12)
-    assert open_share(Grid("g", 9, 1.0), both).max() == 0, "the middle is obscured"
+    assert open_share(Grid("g", 9, 1.0, LAMBDA_MM), both).max() == 0, "the middle is obscured"
 
 
 def test_fraunhofer_is_the_integral_over_the_openings() -> None:
     openings = np.array([[-3.0, -1.0], [0.5, 2.0]])
-    grid = Grid("d", 41, 0.001)
+    grid = Grid("d", 41, 0.001, LAMBDA_MM)
     x = (np.arange(50_000) + 0.5) * 1e-4 - 3.0
     lit = ((x > -3) & (x < -1)) | ((x > 0.5) & (x < 2))
     reach = LAMBDA_MM * 4187.0
     plain = np.exp(-2j * np.pi * np.outer(grid.x_mm, x[lit]) / reach).sum(axis=1) * 1e-4 / np.sqrt(1j * reach)
-    found = fraunhofer_field(openings, grid, wavelength_mm=LAMBDA_MM, focal_length_mm=4187.0)
+    found = fraunhofer_field(openings, grid, 4187.0)
     np.testing.assert_allclose(found, plain, atol=1e-5)
 
 
@@ -209,7 +213,7 @@ def test_a_telescope_of_parabolas_matches_the_closed_form(path: LightPath) -> No
     behind, distance = path.secondary_to_detector_mm - 273.0, 273.0
     wheel, detector = path.wheel_grid(distance), path.detector_grid
     aperture, primary = path.entrance_grids()
-    at_mirror = path.secondary_grid(next_width_mm=wheel.width_mm, distance_mm=behind)
+    at_mirror = path.secondary_grid(wheel.width_mm, behind)
     field = path.field_at_primary(path.entrance_mm, aperture, primary)
     field = path.field_at_secondary(field, primary, at_mirror, separation)
     field = through(field, at_mirror, wheel, behind)
@@ -217,10 +221,10 @@ def test_a_telescope_of_parabolas_matches_the_closed_form(path: LightPath) -> No
     exact = collins(path, separation, behind, wheel.x_mm[sample])
     np.testing.assert_allclose(np.abs(field[sample]), np.abs(exact), atol=0.006 * float(np.abs(exact).max()))
 
-    windows = mesh_windows_mm(path.wheel_mesh, 0.3, wheel.width_mm)
+    windows = mesh_openings_mm(path.wheel_mesh, 0.3, wheel.width_mm)
     after = through(field * open_share(wheel, windows), wheel, detector, distance)
     # An independent grid, finer and narrower than that of the study.
-    fine = Grid("fine", 60_001, 8.0 / 60_001)
+    fine = Grid("fine", 60_001, 8.0 / 60_001, LAMBDA_MM)
     lit = collins(path, separation, behind, fine.x_mm) * open_share(fine, windows)
     points = detector.samples // 2 + np.array([0, 2, 9, 40, 92, 183])
     reach = path.wavelength_mm * distance
@@ -245,9 +249,7 @@ def test_best_focus_is_where_rays_meet(focus: BestFocus) -> None:
 def test_the_ideal_slit_in_focus_matches_fraunhofer(path: LightPath, focus: BestFocus) -> None:
     """The light of the open aperture outside the central pixel is 1 - integral of sinc^2."""
     grid = path.detector_grid
-    field = fraunhofer_field(
-        path.aperture_mm, grid, wavelength_mm=path.wavelength_mm, focal_length_mm=focus.focal_length_mm
-    )
+    field = fraunhofer_field(path.aperture_mm, grid, focus.focal_length_mm)
     line = binned_light(field, grid, 16)
     ideal = 1 - line[line.size // 2] / line.sum()
     assert focus.beyond_central_pixel_focused == pytest.approx(ideal, abs=0.002)

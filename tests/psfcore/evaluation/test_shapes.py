@@ -128,7 +128,7 @@ def test_held_out_discs_of_clean_transits_are_predicted() -> None:
         found = evaluate(made.transit, held_out_kernels(invert(made.transit)))
         print("\n".join(["", f"seed {seed}", *summary_lines(report(found))]))
         for fov in off:
-            planes = made.noise_free
+            planes = made.sky.noise_free
             here = [residual_against_pct(f, planes[f.index]) for f in found.frames if f.pointing == fov]
             print(f"pointing {fov}, discs without noise: mean {np.mean(here):+.2f} %, rms {rms(here):.2f} %")
             assert abs(np.mean(here)) < 1.5 and rms(here) < 2

@@ -8,8 +8,8 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.channel import channel_differences, check_channel
-from psfcore.fits.header import FitsLimits
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import Psf
 from tests.psfcore.conftest import gaussian, make_psf

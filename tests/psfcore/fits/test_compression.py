@@ -16,7 +16,8 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.header import read_summary
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf
 from tests.conftest import REPOSITORY

@@ -14,12 +14,12 @@ from astropy.wcs import WCS
 
 import heliopsf
 from psfcore.errors import DataError
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.channel import check_channel
 from psfcore.fits.doubts import doubts
 from psfcore.fits.frame import UNIT, frame_of
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.header import instant, observed_at, read_summary
 from psfcore.fits.observation import check_exposure_of_sun, observation_of, read_observation
-from psfcore.fits.times import instant, observed_at
 from psfcore.fits.units import parse_unit
 from psfcore.image import MaskBit
 from psfcore.psf import Psf

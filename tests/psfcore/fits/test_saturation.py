@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 from scipy.stats import poisson
 
 from psfcore.fits import observation
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.gain import noise_for
-from psfcore.fits.header import FitsLimits
 from psfcore.fits.observation import read_observation
 from psfcore.fits.saturation import largest_value, with_saturation
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.noise import Noise
-from psfcore.simulate.observe import demo_image
 from tests.conftest import SMALL_INSTRUMENT, write_image
-from tests.psfcore.conftest import gaussian, make_psf
 
 Find = Callable[[str], Path]
 FLARE = "aia/limbflare_20120719/aia.lev1_euv_12s.2012-07-19T073037Z.171.image.fits"
@@ -150,6 +148,7 @@ LEVELS = [
     ({"SAT_THR": 3000.0}, "DN/s", {}, 3000.0, "SAT_THR"),
     ({}, "DN/s", {"instrument_dn": 4000.0}, 2000.0, "instrument file"),
     ({}, "DN / s", {"requested_dn": 4000.0, "instrument_dn": 100.0}, 2000.0, "request"),
+    ({"SATURATE": 3000.0}, "DN / s", {"requested_dn": 4000.0}, 2000.0, "request"),
     ({"TELESCOP": "SDO/AIA", "NSATPIX": 0}, None, {}, 15000.0, "NSATPIX"),
     ({"TELESCOP": "OTHER", "NSATPIX": 0}, None, {}, None, None),
     ({}, "DN", {}, None, None),
@@ -163,12 +162,6 @@ def test_the_level_and_its_source() -> None:
         assert image.saturation is not None
         assert (image.saturation.level, image.saturation.found) == (level, source), (cards, given)
         np.testing.assert_array_equal(saturated(image), pixels >= (np.inf if level is None else level))
-
-
-def test_the_demo_is_not_saturated(tmp_path: Path, limits: FitsLimits) -> None:
-    demo_image(tmp_path / "a.fits", make_psf(gaussian(32, 1.0), plate_scale_arcsec=0.492), size=128, seed=3)
-    image = read_observation(tmp_path / "a.fits", limits)
-    assert image.saturation is not None and image.saturation == type(image.saturation)(None, None, None)
 
 
 # --- the level and the noise of the gain mode ---

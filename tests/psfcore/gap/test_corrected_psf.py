@@ -11,7 +11,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.gap import corrected_psf as corrected_psfs
 from psfcore.gap.corrected_psf import corrected_psf

@@ -77,43 +77,6 @@ def test_the_error_of_an_unknown_instrument_names_the_known_ones() -> None:
         load_instrument("../../etc/passwd")
 
 
-BASIS = 'basis = "assumed"'
-FAULTS = [
-    ("wire_um = 40.0", "wire_um = -4.0", "wire_um"),
-    ("wire_um = 40.0", "wire_um = 1400.0", "wire_um"),
-    ("wire_um = 40.0", "wire_um = 1e-10", "wire_um"),
-    ("focal_length_mm = 4187.0", "focal_length_mm = 1e10", "focal_length_mm"),
-    ("b_px = 6.15", "b_pix = 6.15", "b_p"),
-    ("windows = 37", 'windows = "many"', "windows"),
-    ("total = 0.411", "total = 1.5", "total"),
-    ("wavelength_angstrom = 174.0", "", "wavelength_angstrom"),
-    ("diameter_mm = 47.4", "diameter_mm = 47.4\nobscuration_diameter_mm = 50.0", "aperture"),
-    ("diameter_mm = 47.4", "diameter_mm = 47.4\ninner_mm = 5.0", "aperture.inner_mm"),
-    ('place = "entrance"', 'place = "attic"', "meshes.0.place"),
-    ("windows = 37", "windows = 37\nshare = 1.2", "meshes.0.share"),
-    ('basis = "assumed"', 'basis = "guessed"', "mount.basis"),
-    ("count = 8", "count = 0", "mount.rays.0.count"),
-    ("conic = -1.0", 'conic = "round"', "mirrors.0.conic"),
-    ('basis = "assumed"', 'basis = "assumed"\nhub_diameter_mm = -1.0', "mount.hub_diameter_mm"),
-    (BASIS, BASIS + '\nmask_image = { file = "../secret.png", width_mm = 50.0 }', "mount.mask_image.file"),
-    (BASIS, BASIS + "\npolygons = [{ corners_mm = [[0, 1], [1, 0]] }]", "corners_mm"),
-    ('DETECTOR = "HRI_EUV"', "DETECTOR = 174", "match.DETECTOR: expected a text; got 174"),
-    ('DETECTOR = "HRI_EUV"', 'WAVELNTH = "174"', "match.WAVELNTH: expected a finite number; got '174'"),
-    ('DETECTOR = "HRI_EUV"', 'OBJECT = "Sun"', "match.OBJECT"),
-    ('name = "hri_euv"', "name = ", "TOML"),
-]
-
-
-def test_the_error_of_a_bad_file_is_one_line_that_names_the_key(tmp_path: Path) -> None:
-    text = instrument_path("hri_euv").read_text()
-    for old, new, key in FAULTS:
-        assert old in text
-        (tmp_path / "mine.toml").write_text(text.replace(old, new, 1))
-        with pytest.raises(DataError, match=f"bad-instrument-file: .*{re.escape(key)}") as caught:
-            load_instrument(tmp_path / "mine.toml")
-        assert "\n" not in caught.value.message
-
-
 def with_values(**values: float | str) -> str:
     """The small instrument with other values of its keys."""
     text = SMALL_INSTRUMENT

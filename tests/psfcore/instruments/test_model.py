@@ -83,6 +83,12 @@ FAULTS = [
         "mount.polygons.0.corners_mm.1.1: expected this entry; got none",
     ),
     (("", MOUNT + MASK), "mount.mask_image.file: expected a text of the form"),
+    (("", MOUNT + MASK.replace("a.png\\n", "../secret.png")), "mount.mask_image.file: expected a text of the form"),
+    (("", MOUNT + "hub_diameter_mm = -1.0"), "mount.hub_diameter_mm: expected a number of at least 0; got -1.0"),
+    (("", '[scatter]\nb_px = 6.0\nc = 2.5\ntotal = 1.5\nbasis = "fitted"\n'), "scatter.total: expected a number below 1; got 1.5"),
+    (("4.0", "4.0\nobscuration_diameter_mm = 5.0"), "aperture: expected obscuration_diameter_mm less than diameter_mm"),
+    (("", "[match]\nDETECTOR = 174"), "match.DETECTOR: expected a text; got 174"),
+    (("1.0.0\"", "1.0.0"), "expected TOML; "),
     (
         ("", MODE + "depth = 1"),
         "detector.gain_modes.HIGH.depth: expected one of the keys saturation_dn, photon_gain_dn, read_noise_dn, basis",

@@ -1,4 +1,4 @@
-"""The photon bound agrees with differences of whole simulations and with the scatter of noisy fits."""
+"""The photon bound agrees with differences of whole simulations."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from psfcore.psf import cumulative_curve
 from psfcore.simulate import bound as bound_module
 from psfcore.simulate import scatter_truth
 from psfcore.simulate import sky as sky_module
-from psfcore.simulate.bound import PhotonBound, bound_of_folder, bound_of_sky, photon_bound
+from psfcore.simulate.bound import PhotonBound, bound_of_folder, bound_of_sky
 from psfcore.simulate.disc import fully_dark
 from psfcore.simulate.plan import Plan, default_plan
-from psfcore.simulate.pointings import drawn_scene
 from psfcore.simulate.scatter_truth import (
     ScatterTruth,
     amplitude_slopes,
@@ -28,8 +27,9 @@ from psfcore.simulate.scatter_truth import (
     kernel_slopes,
     total_kernel,
 )
+from psfcore.simulate.scene import drawn_scene
 from psfcore.simulate.sky import TrueSky, true_sky
-from psfcore.simulate.transit import observed_transit, simulate
+from psfcore.simulate.transit import simulate
 from psfcore.simulate.transit_files import write
 from tests.psfcore.conftest import gaussian
 
@@ -128,29 +128,6 @@ def test_the_bound_agrees_with_differences_of_whole_simulations(
     assert bound.images == 6
 
 
-def test_a_fit_scatters_by_the_bound(bound: PhotonBound, sky: TrueSky, slopes: Plane) -> None:
-    """The best linear fit of b, c, total to 120 noisy transits."""
-    weighted = slopes[:3] / dark_variances(sky)
-    fit = np.linalg.solve(weighted @ slopes[:3].T, weighted)
-    expected, size = dark_pixels(sky), sky.plan.size_px
-    discs = [fully_dark(sky.plan.place(n), (0, 0), (size, size)) for n in range(6)]
-    found = []
-    for seed in range(120):
-        frames = observed_transit(sky, seed).transit.frames
-        seen = np.concatenate([frame.pixels[disc] for frame, disc in zip(frames, discs, strict=True)])
-        found.append(fit @ (seen - expected))
-    sigmas = np.array([bound.b_px, bound.c, bound.total])
-    # 120 draws know a width to 6.5 %; whole DN add 1 % to the readout's variance.
-    np.testing.assert_allclose(np.std(found, axis=0), sigmas, rtol=0.2)
-    np.testing.assert_allclose(np.mean(found, axis=0) / sigmas, 0, atol=4 / np.sqrt(120))
-    np.testing.assert_allclose(np.corrcoef(found, rowvar=False)[0, 1], correlation(bound), atol=0.15)
-
-
-def correlation(bound: PhotonBound) -> float:
-    """The correlation of b with c."""
-    return bound.covariance[0][1] / (bound.b_px * bound.c)
-
-
 def test_errors_of_curves_follow_from_their_slopes(bound: PhotonBound) -> None:
     radii = [at.radius_px for at in bound.curve]
     assert radii == [0.5, 2, 5, 10, 20, 50, 100, 200, 300]
@@ -222,7 +199,7 @@ def test_clipped_pixels_around_the_disc_are_not_used(bound: PhotonBound, sky: Tr
 def test_the_bound_of_a_folder_is_that_of_its_transit(tmp_path: Path) -> None:
     simulated = simulate(default_plan(3, 64), dataclasses.replace(SCATTER, stretch=0.1), DIFFRACTION, 2)
     write(simulated, tmp_path)
-    kept, read = photon_bound(simulated), bound_of_folder(tmp_path)
+    kept, read = bound_of_sky(simulated.sky), bound_of_folder(tmp_path)
     for name in ("b_px", "c", "total", "stretch"):
         assert getattr(read, name) == pytest.approx(getattr(kept, name), rel=0.02)
     np.testing.assert_allclose(read.places_px, kept.places_px, rtol=0.1)
@@ -235,4 +212,4 @@ def test_the_bound_of_a_folder_is_that_of_its_transit(tmp_path: Path) -> None:
 def test_without_scatter_there_is_no_bound() -> None:
     simulated = simulate(default_plan(1, 64), dataclasses.replace(SCATTER, total=0.0), DIFFRACTION, 1)
     with pytest.raises(DataError, match="no-bound"):
-        photon_bound(simulated)
+        bound_of_sky(simulated.sky)

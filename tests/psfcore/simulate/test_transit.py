@@ -17,16 +17,19 @@ from scipy.signal import fftconvolve
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.fits.observation import read_observation
+from psfcore.instruments.model import load_instrument
 from psfcore.scatter.power_law import scatter_kernel
 from psfcore.simulate.disc import covered_share, fully_dark
+from psfcore.simulate.headers import HRI_EUV, imitated
 from psfcore.simulate.plan import COMBINED, HIGH, Plan, default_plan, plan_from_json
-from psfcore.simulate.pointings import drawn_scene, scene_from_image
 from psfcore.simulate.scatter_truth import ScatterTruth, anisotropic_kernel, total_kernel
-from psfcore.simulate.scene import solar_scene
+from psfcore.simulate.scene import drawn_scene, scene_from_image, solar_scene
 from psfcore.simulate.sky import TrueSky, true_sky
 from psfcore.simulate.transit import SimulatedTransit, observed_transit, simulate
 from psfcore.simulate.transit_files import read_sky, write
+from psfcore.transit.folder import read_transit
 from psfcore.transit.transit import Place
+from tests.conftest import SMALL_INSTRUMENT
 from tests.psfcore.conftest import LIMITS, gaussian
 
 SCATTER = ScatterTruth(6.15, 2.53, 0.411)
@@ -186,11 +189,11 @@ def test_a_pixel_is_the_sum_of_the_definition(beyond: TrueSky) -> None:
 def test_the_occulter_is_dark_in_the_true_scene_and_lit_by_scatter(small: SimulatedTransit) -> None:
     for index in range(6):
         dark = fully_dark(small.plan.place(index), (0, 0), (96, 96))
-        assert small.true_scene(index)[dark].max() < 1e-9
-        assert small.noise_free[index][dark].min() > 0
+        assert small.sky.true_scene(index)[dark].max() < 1e-9
+        assert small.sky.noise_free[index][dark].min() > 0
         lit = covered_share(small.plan.place(index), (0, 0), (96, 96)) == 0
         pointing = small.plan.shots[index].pointing
-        np.testing.assert_array_equal(small.true_scene(index)[lit], small.scenes[pointing][lit])
+        np.testing.assert_array_equal(small.sky.true_scene(index)[lit], small.sky.scenes[pointing][lit])
 
 
 def test_half_pixels_are_binned_after_the_disc_is_removed() -> None:
@@ -281,9 +284,6 @@ def test_equal_seeds_give_equal_transits(small: SimulatedTransit) -> None:
         assert one.place == same.place
         assert not np.array_equal(one.pixels, differs.pixels)
         assert one.place != differs.place
-    shared = simulate(small.plan, SCATTER, DIFFRACTION, 4, scene_seed=3)
-    np.testing.assert_array_equal(shared.transit.frames[2].pixels, other.transit.frames[2].pixels)
-    assert shared.truth == other.truth
 
 
 # --- scenes -----------------------------------------------------------------------------------------------
@@ -327,7 +327,7 @@ def test_a_scene_from_an_image_is_cut_or_enlarged() -> None:
     small = scene_from_image(np.full((40, 50), 7.0), plan)
     np.testing.assert_allclose(small, 7.0)
     seen = simulate(plan, SCATTER, DIFFRACTION, 1, scenes={1: scene, 2: small, 3: scene})
-    assert seen.scenes[2].max() == pytest.approx(7.0)
+    assert seen.sky.scenes[2].max() == pytest.approx(7.0)
 
 
 def test_scenes_without_light_or_of_another_shape_are_refused() -> None:
@@ -366,7 +366,7 @@ def test_a_folder_contains_the_transit_and_its_truth(tmp_path: Path) -> None:
     diffraction = fits.getdata(tmp_path / "t/diffraction.fits")
     np.testing.assert_allclose(diffraction, DIFFRACTION, rtol=1e-6, atol=1e-30)
     noise_free = fits.getdata(tmp_path / "t/noise_free/002.fits")
-    np.testing.assert_allclose(noise_free, simulated.noise_free[2], rtol=1e-6)
+    np.testing.assert_allclose(noise_free, simulated.sky.noise_free[2], rtol=1e-6)
 
 
 def test_a_sky_is_read_back(tmp_path: Path) -> None:
@@ -378,11 +378,11 @@ def test_a_sky_is_read_back(tmp_path: Path) -> None:
     for index in range(3):
         # Half pixels at the disc's edge are gone: what they hide differs a little, and only there.
         dark = fully_dark(plan.place(index), (0, 0), (64, 64))
-        ratio = sky.expected(index) / simulated.noise_free[index]
+        ratio = sky.expected(index) / simulated.sky.noise_free[index]
         assert ratio[dark].mean() == pytest.approx(1, abs=0.02)
         share = covered_share(plan.place(index), (0, 0), (64, 64))
         np.testing.assert_allclose(
-            sky.true_scene(index)[share == 0], simulated.true_scene(index)[share == 0], rtol=1e-6
+            sky.true_scene(index)[share == 0], simulated.sky.true_scene(index)[share == 0], rtol=1e-6
         )
 
 
@@ -392,3 +392,61 @@ def test_a_folder_without_truth_is_refused(tmp_path: Path) -> None:
     (tmp_path / "truth.json").write_text('{"psf": {"b": 1}}')
     with pytest.raises(DataError, match="not-simulated"):
         read_sky(tmp_path)
+
+
+# --- keywords of the imitated instrument ---
+
+# What level 1 files of AIA's 171 A channel say, as 2013-03-10T12:00:11.
+REAL_AIA_171 = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171, "WAVEUNIT": "angstrom"}
+
+
+def written(folder: Path, instrument: str) -> fits.Header:
+    """The header of the first image of a transit that imitates an instrument."""
+    of_instrument = imitated(load_instrument(instrument))
+    plan = default_plan(3, 64, oversampling=1)
+    write(simulate(plan, ScatterTruth(6.0, 2.5, 0.4), DIFFRACTION, 1, imitated=of_instrument), folder)
+    return fits.getheader(folder / "000.fits")
+
+
+def test_aia_171_has_the_keywords_of_aia(tmp_path: Path) -> None:
+    header = written(tmp_path, "aia_171")
+    assert {key: header[key] for key in REAL_AIA_171} == REAL_AIA_171
+    assert header["CDELT1"] == header["CDELT2"] == pytest.approx(0.599489, abs=1e-6)
+    assert header["EXPTIME"] == 5.0 and "T" in header["DATE-OBS"]
+    assert not {"DETECTOR", "GAINCOMB", "XPOSURE", "DATE-BEG"} & set(header)
+    assert "HRI" not in repr(header) and "SIMULATED" in header["ORIGIN"]
+    assert fits.getheader(tmp_path / "diffraction.fits")["INSTRUME"] == "AIA_3"
+    assert fits.getheader(tmp_path / "scenes/fov1.fits")["INSTRUME"] == "AIA_3"
+    assert json.loads((tmp_path / "transit.json").read_text())["instrument"] == "aia_171"
+    transit = read_transit(tmp_path, LIMITS)
+    assert transit.instrument == "aia_171"
+    assert [frame.exposure_s for frame in transit.frames] == [5.0, 1.8, 5.0]
+    assert transit.plate_scale_arcsec == pytest.approx(0.599489, abs=1e-6)
+
+
+def test_real_aia_files_have_these_keywords(shared: Path) -> None:
+    header = fits.getheader(shared / "data/real/aia/aia_171_cutout_20130310.fits", 1)
+    assert {key: header[key] for key in REAL_AIA_171} == REAL_AIA_171
+    assert "DETECTOR" not in header and "GAINCOMB" not in header
+    assert header["CDELT1"] == pytest.approx(
+        imitated(load_instrument("aia_171")).plate_scale_arcsec, abs=1e-5
+    )
+
+
+def test_hri_euv_has_the_keywords_of_eui(tmp_path: Path) -> None:
+    assert imitated(load_instrument("hri_euv")) == HRI_EUV
+    header = written(tmp_path, "hri_euv")
+    assert (header["TELESCOP"], header["INSTRUME"]) == ("SOLO/EUI/HRI_EUV", "EUI")
+    assert (header["DETECTOR"], header["WAVELNTH"], header["CDELT1"]) == ("HRI_EUV", 174, 0.492)
+    assert header["GAINCOMB"] == "combined" and header["XPOSURE"] == 5.0
+    assert load_instrument("hri_euv").detector.plate_scale_arcsec == HRI_EUV.plate_scale_arcsec
+
+
+def test_another_instrument_has_the_keywords_that_its_file_matches(tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(SMALL_INSTRUMENT)
+    instrument = load_instrument(path)
+    header = written(tmp_path / "t", str(path))
+    assert {key: header[key] for key in instrument.match} == instrument.match
+    assert header["WAVELNTH"] == round(instrument.wavelength_angstrom)
+    assert "HRI_EUV" not in repr(header)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.noise import Noise
 from psfcore.psf import cumulative_curve
 from psfcore.transit.first_guess import ESTIMATORS, first_guess

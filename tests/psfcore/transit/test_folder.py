@@ -12,7 +12,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.noise import Noise
 from psfcore.transit.folder import checked_kernel, read_prepared, read_transit
 from tests.transit_files import (

@@ -13,8 +13,8 @@ import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
 from httpx import Response
+from service.api.files import pixels as of_files
 
-from psfcore.fits.viewing import decode
 from service.http.state import State
 from tests.conftest import write_image
 from tests.service.conftest import refusal, result_of, upload
@@ -27,13 +27,13 @@ from workers.settings import Settings
 def decodings(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """The names of the planes that were decoded."""
     names: list[str] = []
-    really = decode.decode_plane
+    really = of_files.decode_plane
 
     def counted(path: Any, name: str, *given: Any) -> Any:
         names.append(name)
         return really(path, name, *given)
 
-    monkeypatch.setattr(decode, "decode_plane", counted)
+    monkeypatch.setattr(of_files, "decode_plane", counted)
     yield names
 
 

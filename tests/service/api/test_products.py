@@ -16,7 +16,7 @@ from httpx import Response
 from matplotlib.image import imread
 
 from psfcore.drawing.thumbnail import write_thumbnail
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.images import read_plane
 from psfcore.fits.psfs import write_psf
 from service.cli.main import main

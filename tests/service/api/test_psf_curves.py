@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 from fastapi.testclient import TestClient
 from numpy.typing import NDArray
 
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW

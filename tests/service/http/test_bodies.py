@@ -18,7 +18,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from psfcore.fits.header import FitsLimits, HeaderSummary
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.header import HeaderSummary
 from service.app import create_app
 from service.http import uploads
 from tests.conftest import write_image

@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from fastapi.testclient import TestClient
 
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.viewing.regions import Region, write_cutout
 from tests.service.keyed import Keyed
 from tests.service.vo.made import SHAPE, add_product, pixels

@@ -10,7 +10,8 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.header import read_summary
 from psfcore.noise_figures import NoiseFigures
 from tests.conftest import write_image, write_psf
 from workers.catalogue.tables import ImageRow, PsfRow

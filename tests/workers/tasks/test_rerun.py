@@ -12,7 +12,7 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.images import read_plane
 from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.fits.header import FitsLimits
-from psfcore.fits.product.planes import read_planes
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.images import read_planes
 from psfcore.fits.psfs import read_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.simulate.scatter_truth import total_kernel

@@ -20,7 +20,7 @@ from typing import Any
 
 from psfcore.built.cache import FITS, PROVENANCE, TOTAL_FITS, TOTAL_PROVENANCE, CachedFile, PsfCache
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.psf import Psf
 from workers.catalogue.catalogue import Catalogue

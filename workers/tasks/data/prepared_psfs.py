@@ -15,7 +15,7 @@ from astropy.io.fits import Header
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Shape, new_engine
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.psf import Psf
 from psfcore.psf_sampling import AS_BUILT, sampling_of, with_scale

@@ -18,9 +18,8 @@ from psfcore.deconvolve.cards import UsedPsf, deconvolution_cards, deconvolution
 from psfcore.deconvolve.result import Deconvolved, OfBox
 from psfcore.drawing.thumbnail import write_thumbnail
 from psfcore.drawing.units import unit_label
-from psfcore.fits.header import optional_text
-from psfcore.fits.images import write_image
-from psfcore.fits.product.cards import described
+from psfcore.fits.cards import optional_text
+from psfcore.fits.images import described, write_image
 from psfcore.image import Image, MaskBit
 from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.identities import product_identity

@@ -20,13 +20,12 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.errors import DataError, HeaderError
-from psfcore.fits.header import FitsLimits
+from psfcore.errors import DataError
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.header import all_cards
 from psfcore.fits.images import write_image
 from psfcore.fits.viewing import planes as kept_planes
-from psfcore.fits.viewing.all_cards import all_cards
-from psfcore.fits.viewing.decode import decode_plane
-from psfcore.fits.viewing.planes import Decoded, Plane, Planes
+from psfcore.fits.viewing.planes import Decoded, Plane, Planes, decode_plane
 from psfcore.fits.viewing.windows import Window, window_of
 from psfcore.fits.viewing.windows import pixels as pixels_of
 from psfcore.image import Image
@@ -57,33 +56,6 @@ def test_plain_pixels(tmp_path: Path) -> None:
         pixels, unit = decoded(path)
         np.testing.assert_array_equal(pixels, stored.astype("f4"))
         assert unit == "DN/s"
-
-
-def test_tile_compressed_pixels(tmp_path: Path) -> None:
-    for codec, tile in product(("RICE_1", "GZIP_1", "GZIP_2"), ((1, 211), (64, 50), (300, 211))):
-        hdu = fits.CompImageHDU(field(), compression_type=codec, tile_shape=tile)
-        fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "x.fits", overwrite=True)
-        pixels, unit = decoded(tmp_path / "x.fits")
-        np.testing.assert_array_equal(pixels, field().astype("f4"))
-        assert unit is None
-
-
-def test_a_plane_of_several_blocks_with_quantised_tiles(tmp_path: Path) -> None:
-    """More rows than one block holds, tiles that do not divide them, and dither, which depends on the number of the tile."""
-    noise = np.random.default_rng(4).normal(50, 3, (1700, 1024)).astype("f4")
-    hdu = fits.CompImageHDU(noise, compression_type="RICE_1", tile_shape=(7, 300), quantize_method=1)
-    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "x.fits")
-    pixels, _ = decoded(tmp_path / "x.fits")
-    np.testing.assert_array_equal(pixels, fits.getdata(tmp_path / "x.fits", 1))
-    assert 0 < np.abs(pixels - noise).max() < 3, "quantised, but of the same scene"
-
-
-def test_blank_and_scaled_pixels(tmp_path: Path) -> None:
-    cards = raw_files.image_cards(32, 16, 16, "BSCALE  = 0.5", "BZERO   = 10.0", "BLANK   = -1")
-    stored = np.arange(-1, 32 * 16 - 1, dtype=">i2").reshape(16, 32)
-    (tmp_path / "x.fits").write_bytes(raw_files.block(*cards, data=stored.tobytes()))
-    expected = np.where(stored == -1, np.nan, 0.5 * stored + 10)
-    np.testing.assert_array_equal(decoded(tmp_path / "x.fits")[0], expected)
 
 
 def write_product(path: Path) -> dict[str, np.ndarray]:
@@ -312,10 +284,3 @@ def test_a_damaged_card_is_listed_and_all_values_are_json(tmp_path: Path) -> Non
     assert values["BAD"] == "1 2 3" and values["NOTNUM"] == "NaN" and values["HUGE"] == "inf"
     assert values["COMPLEX"] == "(1+2j)" and values["UNCLOSED"] == "'abc"
     assert json.loads(json.dumps(listed.cards, allow_nan=False))
-
-
-def test_headers_beyond_the_limits_are_refused(tmp_path: Path) -> None:
-    cards = raw_files.image_cards(4, 2, 8, *["COMMENT x"] * 100)
-    (tmp_path / "x.fits").write_bytes(raw_files.block(*cards, data=bytes(8)))
-    with pytest.raises(HeaderError, match=r"^header-too-long"):
-        all_cards(tmp_path / "x.fits", FitsLimits(max_pixels=100, max_header_bytes=2880))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from astropy.io import fits
 
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf
 from tests.conftest import write_image
 from tests.fitted_psfs import EARLY, LATE, interpolated_on_a_small_grid, write_fitted

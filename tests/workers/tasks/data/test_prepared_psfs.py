@@ -10,7 +10,7 @@ from astropy.io import fits
 from astropy.io.fits import Header
 
 from psfcore.deconvolve.conditions import new_engine
-from psfcore.fits.header import FitsLimits
+from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.psf_sampling import psf_for_image
 from service.local import LocalService

@@ -11,8 +11,8 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import DataError
+from psfcore.simulate.inputs import read_plan
 from psfcore.simulate.plan import DISC, VIEWS, default_plan
-from psfcore.simulate.read_plan import read_plan
 from tests.psfcore.conftest import LIMITS
 from tests.transit_files import write_transit
 

@@ -1,6 +1,6 @@
-"""The plan of a simulated transit, from a file that states when, where and for how long images are taken.
+"""The inputs of a simulated transit from files: its plan, the diffraction PSF, and scenes.
 
-Three kinds of files are read:
+A plan states when, where and for how long images are taken. Three kinds of files are read:
 
 - a plan as JSON, as `Plan.as_json` returns it (`size_px`, `shots`, ...);
 - truth.json of a simulated transit, which contains such a plan;
@@ -11,7 +11,6 @@ Three kinds of files are read:
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -19,12 +18,35 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from psfcore.build import build_psf
 from psfcore.errors import DataError
-from psfcore.fits.header import FitsLimits, HeaderSummary, read_summary
-from psfcore.simulate.plan import CAMERA, DISC, HIGH, LARGEST_FINE_SIZE_PX, VIEWS, Plan, Shot, plan_from_json
+from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.header import HeaderSummary, read_summary
+from psfcore.fits.images import read_plane
+from psfcore.fits.observation import read_observation
+from psfcore.fits.units import parse_unit
+from psfcore.instruments.model import load_instrument
+from psfcore.simulate.plan import (
+    CAMERA,
+    DISC,
+    HIGH,
+    VIEWS,
+    WEST,
+    Plan,
+    Shot,
+    drawn_oversampling,
+    plan_from_json,
+)
+from psfcore.simulate.scene import scene_from_image
 from psfcore.transit.folder import times_s
 from psfcore.transit.manifest import MANIFEST_NAME, MAX_MANIFEST_BYTES, TransitManifest, parse_manifest
 
+Plane = NDArray[np.float64]
+
+LARGEST_DIFFRACTION_PX = 2048
 LARGEST_SIZE_PX = 4096
 MOST_IMAGES = 1000
 _INTERVAL_S = 60.0  # time between two images, if their times are not stated
@@ -122,14 +144,14 @@ def _of_transit(
         for image, (exposure_s, gain_mode, time_s) in zip(manifest.images, taken, strict=True)
     ]
     radii = sorted(image.r for image in manifest.images)
-    plan = Plan(
+    return Plan(
         size_px=size_px,
         shots=tuple(sorted(shots, key=lambda shot: shot.time_s)),
         views=_views(content, len(numbers)),
         radius_px=radii[len(radii) // 2],
         noise=CAMERA if manifest.noise is None else manifest.noise.noise(),
+        oversampling=drawn_oversampling(size_px),
     )
-    return dataclasses.replace(plan, oversampling=2 if size_px <= LARGEST_FINE_SIZE_PX else 1)
 
 
 def _size_of(headers: Sequence[HeaderSummary]) -> int:
@@ -203,3 +225,45 @@ def _views(content: Mapping[str, Any], count: int) -> tuple[str, ...]:
 
 def _bad(message: str) -> DataError:
     return DataError("bad-plan", message)
+
+
+def diffraction_kernel(
+    instrument: str, file: Path | None, size: int, limits: FitsLimits, *, threads: int = 1
+) -> Plane:
+    """Weights [y, x] of the diffraction PSF. If ``file`` is given, they are read from it and not changed.
+
+    Otherwise they are computed for ``instrument`` on (size, size) px and divided by their sum.
+    """
+    if file is not None:
+        return read_plane(file, limits)
+    kernel = build_psf(
+        load_instrument(instrument), size=size, component="DIFFRACTION", threads=threads
+    ).kernel
+    return kernel / kernel.sum()
+
+
+def scenes_from_files(files: Sequence[Path], plan: Plan, limits: FitsLimits) -> dict[int, Plane] | None:
+    """A scene for each pointing; the keys are the pointings' numbers. None if ``files`` is empty.
+
+    A single image serves for all pointings; for the west limb it is mirrored. Otherwise ``files`` contains one image for
+    each pointing. Raises DataError "scene-count", "bad-scene".
+    """
+    if not files:
+        return None
+    if len(files) not in (1, len(plan.views)):
+        message = f"expected one scene image, or {len(plan.views)} (one for each pointing); got {len(files)}"
+        raise DataError("scene-count", message)
+    scenes = {}
+    for pointing in plan.pointings:
+        rate = image_rate(files[(pointing - 1) % len(files)], limits)
+        mirrored = len(files) == 1 and plan.views[pointing - 1] == WEST
+        scenes[pointing] = scene_from_image(rate[:, ::-1] if mirrored else rate, plan)
+    return scenes
+
+
+def image_rate(file: str | Path, limits: FitsLimits) -> Plane:
+    """Pixels [y, x] of an image. They are divided by the exposure time if they are counts and that time is known."""
+    image = read_observation(file, limits)
+    if parse_unit(image.unit).kind == "count" and image.exposure_s is not None:
+        return image.pixels / image.exposure_s
+    return image.pixels

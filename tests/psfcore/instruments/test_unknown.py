@@ -9,8 +9,7 @@ from astropy.io.fits import Header
 
 from psfcore.errors import DataError
 from psfcore.fits.header import seen_by
-from psfcore.instruments.unknown import WAYS, unknown_instrument
-from psfcore.instruments.without_file import TELESCOPES, telescope_without_file
+from psfcore.instruments.unknown import TELESCOPES, WAYS, telescope_without_file, unknown_instrument
 
 SUVI = "GOES-R Series Solar Ultraviolet Imager"
 
