@@ -7,8 +7,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psfcore.fits.times import utc_time
-
 from heliopsf.kept import kept_psf
 from heliopsf.progress import Told, told
 from psfcore.built.cache import sha256_of_file
@@ -16,6 +14,7 @@ from psfcore.built.recipe import Recipe
 from psfcore.errors import module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.header import utc_time
 from psfcore.fits.images import read_mask_image
 from psfcore.instruments.files import instrument_path, turned_text
 from psfcore.instruments.model import load_instrument, read_instrument_text

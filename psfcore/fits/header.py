@@ -365,9 +365,6 @@ def _json(value: object) -> JsonValue:
     return None if isinstance(value, Undefined) else str(value)
 
 
-        return text
-
-
 def utc_time(given: datetime | str, name: str) -> datetime:
     """A time with a zone. A time without a zone is in UTC; a date means the start of that day.
 

@@ -43,7 +43,6 @@ from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE, WAVELENGTH_TOLERANCE
 from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, crop_centred
 from psfcore.scatter import total_psf
-from psfcore.scatter.samples import DIFFRACTION, SCATTER
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER, fit_of
 

@@ -29,7 +29,6 @@ from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.psf import Psf, encircled_energy, radial_profile, squared_radii
 from psfcore.scatter.shapes import DIFFERENCE, shape_named
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
-from psfcore.tables.layout import SCHEMA
 from psfcore.tables.lookup import EXACT_TO_PX, SCHEMA, STEP, TOTAL, WHOLE_TO_PX
 
 DIGITS = 10  # significant digits of a number in the tables

@@ -15,10 +15,10 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, StreamingResponse
-from psfcore.fits.viewing.all_cards import all_cards
 from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
+from psfcore.fits.header import all_cards
 from psfcore.fits.viewing.planes import Decoded, Plane, decode_plane
 from service.http import downloads as files
 from service.http.callers import Reading

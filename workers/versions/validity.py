@@ -11,9 +11,8 @@ import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from psfcore.fits.times import bad_time, utc_time
-
 from psfcore.errors import DataError
+from psfcore.fits.header import bad_time, utc_time
 
 TIME = r"^\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d{1,9})?)?(Z|[+-]\d\d:\d\d)?)?$"
 _TIME = re.compile(TIME, re.ASCII)

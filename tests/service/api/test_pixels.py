@@ -13,8 +13,8 @@ import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
 from httpx import Response
-from service.api.files import pixels as of_files
 
+from service.api import pixels as of_files
 from service.http.state import State
 from tests.conftest import write_image
 from tests.service.conftest import refusal, result_of, upload
