@@ -23,7 +23,7 @@ from service.cli.options import (
 from service.client.errors import WaitInterrupted
 from service.client.http import Client
 from service.client.outputs import check_outputs
-from service.client.versions import Progress
+from service.client.operations import Progress
 
 DATA = "data"
 LOG = "server.log"  # a later demo recognises the folder of an earlier demo by this file

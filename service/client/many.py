@@ -12,7 +12,6 @@ recognised by their cards INPSHA and PRODID, whatever their names.
 from __future__ import annotations
 
 import hashlib
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from typing import Any, TypeVar
 
 from psfcore.errors import DataError, HeaderError
 from psfcore.fits.header import FitsLimits, check_all_headers, first_image_header, optional_text
-from service.client.errors import ServiceError, WaitInterrupted
+from service.client.errors import Patience, ServiceError, WaitInterrupted
 from service.client.operations import Operations, deconvolution
 from service.client.outputs import check_output_folder, check_outputs
 from workers.files.archive import safe_name
@@ -30,7 +29,6 @@ from workers.files.archive import safe_name
 # Errors that concern every image, so that the run stops: key refused, scope missing, quota full.
 FOR_ALL = (401, 403, 507)
 BUSY = (429, 502, 503)  # statuses after which a request is sent again
-PATIENCE_S, LONGEST_WAIT_S = 600.0, 60.0
 LARGEST_PX = 2**26
 
 _Found = dict[tuple[str, str], Path]
@@ -218,12 +216,9 @@ def _products_in(folder: Path) -> _Found:
 def _patiently(ask: Callable[[], _Answer]) -> _Answer:
     """The answer to a request. The request is repeated while the service is busy or the caller's rate limit is used
     up."""
-    give_up_at = time.monotonic() + PATIENCE_S
+    patience = Patience(say=lambda line: None, goes_on="")
     while True:
         try:
             return ask()
         except ServiceError as error:
-            if error.status not in BUSY or time.monotonic() > give_up_at:
-                raise
-            wait_s = 1.0 if error.retry_after_s is None else error.retry_after_s
-            time.sleep(min(wait_s, LONGEST_WAIT_S))
+            patience.wait(error, BUSY)
