@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,6 +14,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from service.cli.fields import options_of
+from service.cli.options import user_errors
 from service.cli.progress import say
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
@@ -25,7 +27,9 @@ if TYPE_CHECKING:
 _KEY = "heliopsf.key"
 DIGITS = 64  # number of digits of a whole id, except ids of jobs and bulk runs
 _ID = re.compile(rf"[0-9a-f]{{{FEWEST_DIGITS},{DIGITS}}}")
+_AN_ID = f"{FEWEST_DIGITS} or more hexadecimal digits"
 Command = TypeVar("Command", bound=Callable[..., Any])
+Row = dict[str, Any]
 
 
 class _Id(click.ParamType):
@@ -37,11 +41,7 @@ class _Id(click.ParamType):
         """The digits in lower case. A text that is not an id never becomes part of an address of the service."""
         digits = str(value).lower()
         if not _ID.fullmatch(digits):
-            self.fail(
-                f"expected an id, or its first {FEWEST_DIGITS} or more hexadecimal digits; got {value!r}",
-                param,
-                ctx,
-            )
+            self.fail(f"expected an id, or its first {_AN_ID}; got {value!r}", param, ctx)
         return digits
 
 
@@ -54,11 +54,7 @@ class _IdOrFile(click.ParamType):
         """The text, if it is the name of a file or can be an id."""
         text = str(value)
         if not (Path(text).is_file() or _ID.fullmatch(text)):
-            self.fail(
-                f"expected a PSF id ({FEWEST_DIGITS} or more hexadecimal digits) or a file; got {text!r}",
-                param,
-                ctx,
-            )
+            self.fail(f"expected a PSF id ({_AN_ID}) or a file; got {text!r}", param, ctx)
         return text
 
     def shell_complete(
@@ -139,6 +135,24 @@ def remote(server: str | None) -> Client:
     return Client(server, key=click.get_current_context().meta.get(_KEY), say=say)
 
 
+def on_service(command: Command) -> Command:
+    """Give a command the options ``--server`` and ``--key``, and the client of the service as the argument ``service``."""
+
+    @SERVER
+    @wraps(command)
+    def connected(server: str | None, **given: Any) -> Any:
+        with user_errors(), remote(server) as service:
+            return command(service=service, **given)
+
+    return connected  # type: ignore[return-value]
+
+
+def print_rows(rows: Iterable[Row], line: Callable[[Row], str], *, if_none: str) -> None:
+    """Print a line for each row of a list. if_none: what to print if there are no rows."""
+    lines = [line(row).rstrip() for row in rows]
+    click.echo("\n".join(lines or [if_none]))
+
+
 @contextmanager
 def connection(
     server: str | None, local: bool, *, gap_effects: str = "", previews: bool = True
@@ -172,11 +186,6 @@ def whole_id(service: Operations, things: str, identity: str) -> str:
         return identity
     found: str = service.get(f"/v1/{things}/{identity}")["id"]
     return found
-
-
-def whole_ids(service: Operations, things: str, identities: Sequence[str]) -> list[str]:
-    """Find the whole id for each of these ids, as `whole_id` does."""
-    return [whole_id(service, things, identity) for identity in identities]
 
 
 @contextmanager

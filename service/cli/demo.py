@@ -22,8 +22,8 @@ from service.cli.options import (
 )
 from service.client.errors import WaitInterrupted
 from service.client.http import Client
-from service.client.outputs import check_outputs
 from service.client.operations import Progress
+from service.client.outputs import check_outputs
 
 DATA = "data"
 LOG = "server.log"  # a later demo recognises the folder of an earlier demo by this file

@@ -64,7 +64,7 @@ class Client(Connection, Operations):
     ) -> dict[str, Any]:
         """Upload a PSF (FITS); returns its description, with its ``id``."""
         series = {"instrument": instrument, "channel": channel, "kind": kind}
-        return self._upload("/v1/psfs", Path(path), name=name, version=version, **series)
+        return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **series})
 
     def image_id(self, path: str | Path, sha256: str) -> str:
         """The id of an image. If the service does not have the image, the image is uploaded. sha256: hash of the
@@ -78,13 +78,18 @@ class Client(Connection, Operations):
         return identity
 
     def _upload(
-        self, address: str, path: Path, *, media_type: str = "application/fits", **query: Any
+        self,
+        address: str,
+        path: Path,
+        query: dict[str, Any] | None = None,
+        *,
+        media_type: str = "application/fits",
     ) -> dict[str, Any]:
         with path.open("rb") as file:
             return self._json(
                 "POST",
                 address,
-                params={"filename": path.name, **query},
+                params={"filename": path.name} | (query or {}),
                 content=iter(lambda: file.read(2**20), b""),
                 headers={"Content-Type": media_type, "Content-Length": str(path.stat().st_size)},
             )

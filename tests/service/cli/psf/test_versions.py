@@ -7,16 +7,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import prov
 import pytest
 from click.testing import CliRunner, Result
 from fastapi.testclient import TestClient
 
-from service.cli import context as cli_context
+from service.cli import connection
 from service.cli.connection import short
 from service.cli.main import main
-from service.cli.psf import versions as cli_psf_versions
 from service.client.http import Client, ServiceError
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from tests.service.vo.made import add_product
+
+Command = Callable[..., str]
 
 
 @pytest.fixture
@@ -33,8 +36,7 @@ def sun(api: TestClient, run_jobs: Callable[[], None], monkeypatch: pytest.Monke
             """The transport is the application's: it goes on."""
 
     client = AtOnce("http://testserver", transport=api._transport)
-    for module in (cli_psf_versions, cli_context):
-        monkeypatch.setattr(module, "remote", lambda server: client)
+    monkeypatch.setattr(connection, "remote", lambda server: client)
     return client
 
 
@@ -183,3 +185,37 @@ def test_a_rerun_that_differs_ends_with_status_1(
 
     monkeypatch.setattr(product_task, "write_image", off)
     assert "differs by at most 0.001" in ask("psf", "rerun", product["id"], "--product", code=1)
+
+
+def test_a_deprecated_psf_that_is_named_is_used_with_a_warning(
+    command: Command, psf_file: Path, tmp_path: Path
+) -> None:
+    line = ("--instrument", "hri_euv", "--channel", "174", "--kind", "total")
+    psf = command("psf", "upload", psf_file, *line).split()[0]
+    command("psf", "certify", psf, "--version", "1.0.0")
+    for number in (1, 2):
+        write_image(tmp_path / f"{number}.fits", seed=number, DETECTOR="HRI_EUV", WAVELNTH=174)
+    how = ("--psf", psf, "--steps", 1, "--other-channel")
+    made = command("deconvolve", tmp_path / "1.fits", "-o", tmp_path / "o.fits", *how)
+    assert "was deprecated" not in made
+    command("psf", "deprecate", psf, "--reason", "wrong mesh")
+    again = command("deconvolve", tmp_path / "1.fits", "-o", tmp_path / "o.fits", "--overwrite", *how)
+    assert f"warning: PSF {psf} " in again and "deprecated (reason: wrong mesh)" in again
+    both = command("deconvolve", tmp_path / "1.fits", tmp_path / "2.fits", "-o", f"{tmp_path}/out/", *how)
+    for number in (1, 2):
+        assert f"warning: {tmp_path}/{number}.fits: PSF {psf} " in both
+    bulk = command("bulk", "submit", "--upload", tmp_path / "1.fits", "--psf", psf, "--other-channel")
+    assert f"warning: PSF {psf} was deprecated" in bulk
+
+
+def test_the_lineage_is_written_in_both_forms_of_prov(
+    api: TestClient, tmp_path: Path, command: Command
+) -> None:
+    ids = add_product(api, tmp_path)
+    for name in ("l.json", "l.provn"):
+        out = command("psf", "lineage", ids["product"][-64:], "--product", "--prov", tmp_path / name)
+        assert out.startswith("product ")
+        assert len(prov.read((tmp_path / name).read_bytes()).get_record(f"product:{ids['product']}")) == 1
+    assert (tmp_path / "l.provn").read_text().startswith("document")
+    again = command("psf", "lineage", ids["psf"], "--prov", tmp_path / "l.json", code=1)
+    assert "--overwrite" in again
