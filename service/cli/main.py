@@ -30,12 +30,12 @@ SECTIONS = {
     "Service and operation": {
         "serve": Lazy("service.cli.serve", "serve", "Start a service."),
         "worker": Lazy("service.cli.serve", "worker", "Start a worker for a service with a broker."),
-        "demo": Lazy("service.cli.demo", "demo", "Process one image with a temporary service."),
-        "doctor": Lazy("service.cli.operator.doctor", "doctor", "Check settings, database, broker and disk."),
-        "database": Lazy("service.cli.operator.database", "database", "Show or upgrade the database's tables."),
-        "store": Lazy("service.cli.operator.store", "store", "Check and clean up stored files; set quotas."),
-        "cache": Lazy("service.cli.operator.cache", "cache", "List and remove built PSFs that are kept."),
-        "key": Lazy("service.cli.operator.key", "key", "Create, list and revoke access keys."),
+        "demo": Lazy("service.cli.serve", "demo", "Process one image with a temporary service."),
+        "doctor": Lazy("service.cli.doctor", "doctor", "Check settings, database, broker and disk."),
+        "database": Lazy("service.cli.operator", "database", "Show or upgrade the database's tables."),
+        "store": Lazy("service.cli.operator", "store", "Check and clean up stored files; set quotas."),
+        "cache": Lazy("service.cli.psf.query", "cache", "List and remove built PSFs that are kept."),
+        "key": Lazy("service.cli.operator", "key", "Create, list and revoke access keys."),
     },
     "Studies": {
         "arms": Lazy("service.cli.diffraction", "arms", "Measure the diffraction arms around a flare."),
