@@ -201,7 +201,7 @@ def usage(data: Path | None) -> None:
 @store.command("quota", short_help="Set the quota of an owner.")
 @click.argument("owner")
 @click.argument("mib", type=click.IntRange(0), required=False)
-@click.option("--default", "as_all", is_flag=True, help="Use the default limit again (HELIOPSF_QUOTAMIB)")
+@click.option("--default", "as_all", is_flag=True, help="Use the default limit again (HELIOPSF_QUOTA_MIB)")
 @DATA
 def quota(owner: str, mib: int | None, as_all: bool, data: Path | None) -> None:
     """Set the quota of an OWNER to MIB; 0: unlimited."""

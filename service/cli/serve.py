@@ -25,7 +25,7 @@ from service.cli.options import (
     user_errors,
 )
 from service.client.errors import WaitInterrupted
-from service.client.operations import Progress
+from service.client.operations import Progress, given
 from service.client.outputs import check_outputs
 from workers.contract.queues import Queue, queues_named
 
@@ -40,12 +40,8 @@ DEMO_LOG = "server.log"  # a later demo recognises the folder of an earlier demo
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on")
 @click.option("--port", default=8765, show_default=True, help="Port to listen on; 0: any free port")
 @DATA
-@click.option(
-    "-v",
-    "--verbose",
-    is_flag=True,
-    help="Also log every request on a terminal; a log that is not on a terminal always contains every request",
-)
+@click.option("-v", "--verbose", is_flag=True,
+              help="Also log every request on a terminal; a log that is not on a terminal always contains every request")  # fmt: skip
 def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
     """Start a service over HTTP, and keep it running until it is interrupted.
 
@@ -89,10 +85,8 @@ def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
 def browser_address(url: str) -> str:
     """The address at which a browser on this machine reaches a service that listens at ``url``."""
     parts = urlsplit(url)
-    everywhere = parts.hostname in (
-        "0.0.0.0",
-        "::",
-    )  # all addresses of the machine; a browser cannot open this one
+    # All addresses of the machine; a browser cannot open this one.
+    everywhere = parts.hostname in ("0.0.0.0", "::")
     return f"http://localhost:{parts.port}" if everywhere else url
 
 
@@ -113,8 +107,7 @@ def worker(
     from workers.files.modes import keep_private
 
     # Celery imports the worker's module, which reads its settings from the environment.
-    update: dict[str, Any] = {"worker_processes": processes, "worker_queues": queues}
-    given = {name: value for name, value in update.items() if value is not None}
+    options = given({"worker_processes": processes, "worker_queues": queues})
     if queues is not None:
         try:
             queues_named(queues)
@@ -123,7 +116,7 @@ def worker(
     settings = read_settings(data)
     if stop_with_parent is None:  # otherwise the server that started this worker has printed the folder
         click.echo(f"heliopsf worker (data in {settings.data_dir.resolve()})", err=True)
-    os.environ |= environment(settings.model_copy(update=given))
+    os.environ |= environment(settings.model_copy(update=options))
     from workers.run.worker import main as run
 
     keep_private()

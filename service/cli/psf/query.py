@@ -33,22 +33,19 @@ if TYPE_CHECKING:
     from psfcore.psf import Psf
 
 _MIB = 2**20
+PSF = click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 @click.command("query")
-@click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
+@PSF
 @click.option("--radius", "radii", multiple=True, type=float, help="Radius, px; can be repeated")
 @click.option(
     "--annulus", nargs=2, type=float, metavar="INNER OUTER", help="Show the light between two radii, px"
 )
 @click.option("--profile", is_flag=True, help="Also show the mean weight by radius")
-@click.option(
-    "--compare",
-    type=ID_OR_FILE,
-    metavar="ID|FILE",
-    help="Compare with this PSF; shows this PSF minus the first",
-)
+@click.option("--compare", type=ID_OR_FILE, metavar="ID|FILE",
+              help="Compare with this PSF; shows this PSF minus the first")  # fmt: skip
 @JSON
 @SERVER_FOR_IDS
 @writes_files
@@ -81,7 +78,7 @@ def query(
 
 
 @click.command("cutout")
-@click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
+@PSF
 @click.option(
     "--size", required=True, type=click.IntRange(1), help="Width and height of the part to write, px"
 )
@@ -102,7 +99,7 @@ def cutout(psf: str, size: int, output: Path, server: str | None, overwrite: boo
 
 
 @click.command("rebin")
-@click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
+@PSF
 @click.option("--factor", required=True, type=click.IntRange(2), help="Pixels per binned pixel, on each axis")
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the binned PSF (FITS)")
 @SERVER_FOR_IDS

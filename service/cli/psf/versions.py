@@ -213,12 +213,8 @@ def best(
 @id_argument()
 @PRODUCT
 @JSON
-@click.option(
-    "--prov",
-    "prov_file",
-    type=OUTPUT,
-    help="Write the lineage as W3C PROV: PROV-N if the name ends in .provn, otherwise PROV-JSON",
-)
+@click.option("--prov", "prov_file", type=OUTPUT,
+              help="Write the lineage as W3C PROV: PROV-N if the name ends in .provn, otherwise PROV-JSON")  # fmt: skip
 @on_service
 @writes_files
 def lineage(
@@ -257,12 +253,8 @@ def rerun(
 
 @click.command("series")
 @click.argument("series", required=False, metavar="[SERIES]")
-@click.option(
-    "--interpolate/--no-interpolate",
-    "interpolated",
-    default=None,
-    help="Allow or forbid interpolation between the certified PSFs of SERIES",
-)
+@click.option("--interpolate/--no-interpolate", "interpolated", default=None,
+              help="Allow or forbid interpolation between the certified PSFs of SERIES")  # fmt: skip
 @REASON
 @on_service
 def series(service: Client, series: str | None, interpolated: bool | None, reason: str) -> None:
@@ -371,12 +363,8 @@ def show(service: Client, name: str) -> None:
 
 @context.command("use", short_help="Set the default context.")
 @click.argument("name", required=False)
-@click.option(
-    "--none",
-    "no_context",
-    is_flag=True,
-    help="Set no default: use the PSFs that are certified at the time of a request",
-)
+@click.option("--none", "no_context", is_flag=True,
+              help="Set no default: use the PSFs that are certified at the time of a request")  # fmt: skip
 @REASON
 @on_service
 def use(service: Client, name: str | None, no_context: bool, reason: str) -> None:
