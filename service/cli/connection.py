@@ -27,41 +27,34 @@ if TYPE_CHECKING:
 _KEY = "heliopsf.key"
 DIGITS = 64  # number of digits of a whole id, except ids of jobs and bulk runs
 _ID = re.compile(rf"[0-9a-f]{{{FEWEST_DIGITS},{DIGITS}}}")
-_AN_ID = f"{FEWEST_DIGITS} or more hexadecimal digits"
+_DIGITS = f"{FEWEST_DIGITS} or more hexadecimal digits"
 Command = TypeVar("Command", bound=Callable[..., Any])
 Row = dict[str, Any]
 
 
 class _Id(click.ParamType):
-    """An id, or its first digits."""
+    """An id, or its first digits. or_file: or the name of a file with a PSF."""
 
     name = "id"
 
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The digits in lower case. A text that is not an id never becomes part of an address of the service."""
-        digits = str(value).lower()
-        if not _ID.fullmatch(digits):
-            self.fail(f"expected an id, or its first {_AN_ID}; got {value!r}", param, ctx)
-        return digits
-
-
-class _IdOrFile(click.ParamType):
-    """The id of a PSF, or the name of a file."""
-
-    name = "id or file"
+    def __init__(self, *, or_file: bool = False) -> None:
+        self.or_file = or_file
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The text, if it is the name of a file or can be an id."""
+        """The digits in lower case, or the name of the file. Other texts never become part of an address of the service."""
         text = str(value)
-        if not (Path(text).is_file() or _ID.fullmatch(text)):
-            self.fail(f"expected a PSF id ({_AN_ID}) or a file; got {text!r}", param, ctx)
-        return text
+        if self.or_file and Path(text).is_file():
+            return text
+        if _ID.fullmatch(text.lower()):
+            return text.lower()
+        expected = f"a PSF id ({_DIGITS}) or a file" if self.or_file else f"an id, or its first {_DIGITS}"
+        self.fail(f"expected {expected}; got {value!r}", param, ctx)
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
         """Let the shell complete the name of a file."""
-        return [CompletionItem(incomplete, type="file")]
+        return [CompletionItem(incomplete, type="file")] if self.or_file else []
 
 
 class _Server(click.Option):
@@ -105,7 +98,7 @@ def psf_option(what: str, *, required: bool = False) -> Callable[[Command], Comm
     return click.option("--psf", type=ID_OR_FILE, metavar="ID|FILE", required=required, help=what)
 
 
-ID, ID_OR_FILE = _Id(), _IdOrFile()
+ID, ID_OR_FILE = _Id(), _Id(or_file=True)
 SERVER = server_option("Address of the service, which this command needs")
 LOCAL = click.option("--local", is_flag=True, help="Run in this process, without a service")
 SERVER_FOR_IDS = server_option("Address of the service, which is needed only if a PSF is given by its id")

@@ -38,7 +38,6 @@ class Client(Connection, Operations):
     # Uploads -----------------------------------------------------------------------------------
 
     def upload_image(self, path: str | Path) -> dict[str, Any]:
-        """Upload a FITS image; returns its description, with its ``id``."""
         return self._upload("/v1/images", Path(path))
 
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
@@ -62,13 +61,10 @@ class Client(Connection, Operations):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        """Upload a PSF (FITS); returns its description, with its ``id``."""
         series = {"instrument": instrument, "channel": channel, "kind": kind}
         return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **series})
 
     def image_id(self, path: str | Path, sha256: str) -> str:
-        """The id of an image. If the service does not have the image, the image is uploaded. sha256: hash of the
-        file."""
         try:
             identity: str = self.get(f"/v1/images/{sha256}")["id"]
         except ServiceError as error:
@@ -113,7 +109,6 @@ class Client(Connection, Operations):
         return self._job("/v1/estimates", kind, queue=queue, parameters=parameters)
 
     def result_id(self, kind: str, **parameters: Any) -> str:
-        """The id that the result of a job with these parameters has or would have. No job is started."""
         identity: str = self._job("/v1/jobs/identity", kind, parameters=parameters)["result_id"]
         return identity
 
@@ -257,7 +252,6 @@ class Client(Connection, Operations):
         return self._all("/v1/psfs", filters)
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        """The answer of the service to a query about a PSF."""
         parameters = {
             name: ",".join(f"{number!r}" for number in value) if isinstance(value, list) else value
             for name, value in query.items()
@@ -265,7 +259,6 @@ class Client(Connection, Operations):
         return self._json("GET", f"/v1/psfs/{psf_id}/{question}", params=parameters)
 
     def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
-        """Download the central (size, size) px of a PSF."""
         self.download(f"/v1/psfs/{psf_id}/cutout?size={size}", output, overwrite=overwrite)
 
     def psf_status(self, psf_id: str) -> dict[str, Any]:
