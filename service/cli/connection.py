@@ -177,8 +177,7 @@ def whole_id(service: Operations, things: str, identity: str) -> str:
     """
     if len(identity) == DIGITS:
         return identity
-    found: str = service.get(f"/v1/{things}/{identity}")["id"]
-    return found
+    return str(service.get(f"/v1/{things}/{identity}")["id"])
 
 
 @contextmanager
@@ -199,5 +198,4 @@ def named_psf(service: Operations, psf: str | None) -> str | None:
         return None
     if is_psf_id(psf):
         return whole_id(service, "psfs", psf)
-    uploaded: str = service.upload_psf(psf)["id"]
-    return uploaded
+    return str(service.upload_psf(psf)["id"])

@@ -41,6 +41,17 @@ PINS = Path(__file__).parents[2] / "constraints.txt"
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 EXTRAS = ("service", "fit", "plot")  # the commands need all packages of these extras
 LITTLE_ROOM_BYTES = 5 * 2**30
+# The finding and the advice for a database at another revision; "": the advice is that of the schema.
+OTHER_REVISIONS: dict[str, tuple[State, str]] = {
+    "empty": ("warning", "the first `heliopsf serve` makes them"),
+    "older": (
+        "warning",
+        "copy the database, then run `heliopsf database upgrade` (or start `heliopsf serve`, which also upgrades it)",
+    ),
+    "newer": ("broken", "run the version of heliopsf that upgraded it"),
+    "unversioned": ("broken", ""),
+    "obsolete": ("broken", ""),
+}
 
 
 @dataclass(frozen=True)
@@ -81,8 +92,8 @@ def examine(settings: Settings) -> dict[str, Finding]:
             try:
                 findings[name] = check(settings, catalogue)
             except SQLAlchemyError as error:
-                said = checks.database_said(error)
-                findings[name] = Finding("broken", f"the database did not answer: {said}")
+                fault = checks.database_said(error)
+                findings[name] = Finding("broken", f"the database did not answer: {fault}")
     return findings
 
 
@@ -216,26 +227,18 @@ def broker(settings: Settings) -> Finding:
 def schema(_settings: Settings, catalogue: Catalogue) -> Finding:
     """Is the database at the revision that this version needs, and complete?"""
     status = catalogue.schema.status()
-    said = sentence(status)
-    match status.state:
-        case "empty":
-            return Finding("warning", said, "the first `heliopsf serve` makes them")
-        case "newer":
-            return Finding("broken", said, "run the version of heliopsf that upgraded it")
-        case "unversioned" | "obsolete":
-            return Finding("broken", said, status.refusal or "")
-        case "older":
-            advice = "copy the database, then run `heliopsf database upgrade` (or start `heliopsf serve`, which also upgrades it)"
-            return Finding("warning", said, advice)
-        case "current":
-            faults = catalogue.schema.faults()
+    revision = sentence(status)
+    if status.state != "current":
+        state, advice = OTHER_REVISIONS[status.state]
+        return Finding(state, revision, advice or status.refusal or "")
+    faults = catalogue.schema.faults()
     if faults.columns:
-        found = f"{said}, but columns are missing: {', '.join(faults.columns)}"
+        found = f"{revision}, but columns are missing: {', '.join(faults.columns)}"
         return Finding("broken", found, "the tables were changed by hand: restore a copy of the database")
     if faults.tables or faults.indexes:
-        found = f"{said}, but these are missing: {', '.join((*faults.tables, *faults.indexes))}"
+        found = f"{revision}, but these are missing: {', '.join((*faults.tables, *faults.indexes))}"
         return Finding("warning", found, "run `heliopsf database upgrade` to restore them")
-    return Finding("ok", f"{said}: tables, columns and indexes are complete")
+    return Finding("ok", f"{revision}: tables, columns and indexes are complete")
 
 
 def clock(_settings: Settings, catalogue: Catalogue) -> Finding:

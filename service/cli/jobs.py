@@ -20,7 +20,7 @@ from service.cli.options import (
     write_json,
     writes_files,
 )
-from service.cli.progress import duration, told
+from service.cli.progress import duration, step_text
 from service.client.errors import ServiceError
 from workers.contract.phases import Phase
 
@@ -205,7 +205,7 @@ def _state(row: Row) -> str:
         return ""
     now = row["progress"]
     left = "" if now["time_left_s"] is None else f", {duration(now['time_left_s'])} left"
-    return f"{told(now['stage'], now['step'], now['steps'])}{left}"
+    return f"{step_text(now['stage'], now['step'], now['steps'])}{left}"
 
 
 def _value(value: Any) -> str:

@@ -217,10 +217,10 @@ def write_json(path: Path | None, content: dict[str, Any], *, overwrite: bool = 
 
 def fits_files(paths: Sequence[Path]) -> list[Path]:
     """The named files, each once. A folder is replaced by the FITS files in it, sorted by name."""
-    found: list[Path] = []
+    files: list[Path] = []
     for path in paths:
-        found += sorted(one for one in path.iterdir() if _is_fits(one)) if path.is_dir() else [path]
-    return list(dict.fromkeys(found))
+        files += sorted(one for one in path.iterdir() if _is_fits(one)) if path.is_dir() else [path]
+    return list(dict.fromkeys(files))
 
 
 def _is_fits(path: Path) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0
 PATIENCE_S = 600.0  # a client gives up after this time without an answer
@@ -14,6 +14,8 @@ PASSING: tuple[int | None, ...] = (
     502,
     503,
 )  # statuses after which a request is tried again; None: no answer
+
+Answer = TypeVar("Answer")
 
 
 class ServiceError(Exception):
@@ -100,6 +102,17 @@ class Patience:
         if self._lost:
             self._say(news)
         self._lost = False
+
+    def repeat(self, ask: Callable[[], Answer], passing: Collection[int | None] = PASSING) -> Answer:
+        """The answer to a request, which is repeated while the service does not answer."""
+        while True:
+            try:
+                answer = ask()
+            except ServiceError as error:
+                self.wait(error, passing)
+            else:
+                self.answered()
+                return answer
 
     def wait(self, error: ServiceError, passing: Collection[int | None] = PASSING) -> None:
         """Wait before the next try. Raises the error if its status is not in ``passing``, or if the patience is at its end."""

@@ -66,12 +66,11 @@ class Client(Connection, Operations):
 
     def image_id(self, path: str | Path, sha256: str) -> str:
         try:
-            identity: str = self.get(f"/v1/images/{sha256}")["id"]
+            return str(self.get(f"/v1/images/{sha256}")["id"])
         except ServiceError as error:
             if error.code != "no-such-image":
                 raise
-            identity = self.upload_image(path)["id"]
-        return identity
+            return str(self.upload_image(path)["id"])
 
     def _upload(
         self,
@@ -109,8 +108,7 @@ class Client(Connection, Operations):
         return self._job("/v1/estimates", kind, queue=queue, parameters=parameters)
 
     def result_id(self, kind: str, **parameters: Any) -> str:
-        identity: str = self._job("/v1/jobs/identity", kind, parameters=parameters)["result_id"]
-        return identity
+        return str(self._job("/v1/jobs/identity", kind, parameters=parameters)["result_id"])
 
     def _job(self, address: str, kind: str, **body: Any) -> dict[str, Any]:
         return self._json("POST", address, json={"kind": kind, **body})
@@ -136,7 +134,7 @@ class Client(Connection, Operations):
         Raises ``ServiceError`` if the job failed or was cancelled, ``TimeoutError`` after ``timeout_s``, and
         ``WaitInterrupted`` on Control-C. After ``TimeoutError`` or ``WaitInterrupted``, the job continues.
         """
-        started, in_queue_said = time.monotonic(), False
+        started, in_queue_said, job_id = time.monotonic(), False, job["id"]
         try:
             while job["phase"] in ("QUEUED", "EXECUTING"):
                 waited_s = time.monotonic() - started
@@ -146,25 +144,13 @@ class Client(Connection, Operations):
                     self.say(f"job {job['id'][:SHOWN_DIGITS]} waits in the queue {job['queue']}")
                     in_queue_said = True
                 time.sleep(0.1)
-                job = self._job_patiently(job["id"])
+                job = Patience(self.say, GOES_ON).repeat(lambda: self.job(job_id))
                 now = job["progress"]
                 if progress is not None and now["stage"]:
                     progress(now["stage"], now["step"], max(now["steps"], 1))
         except KeyboardInterrupt as stop:
             raise WaitInterrupted("job", job["id"], self.server) from stop
         return self._ended(job)
-
-    def _job_patiently(self, job_id: str) -> dict[str, Any]:
-        """The description of a job. While the service does not answer, the request is repeated."""
-        patience = Patience(self.say, GOES_ON)
-        while True:
-            try:
-                job = self.job(job_id)
-            except ServiceError as error:
-                patience.wait(error)
-            else:
-                patience.answered()
-                return job
 
     def rerun(
         self, of: Literal["psf", "product"], identity: str, *, progress: Progress | None = None
