@@ -27,14 +27,9 @@ from service.client.outputs import written
 
 INSTRUMENT = click.option("--instrument", default="hri_euv", show_default=True, metavar="NAME|FILE",
                           help="A known instrument, or an instrument file (TOML)")  # fmt: skip
-ARM_NUMBERS = [
-    "angles_deg",
-    "angles_sigma_deg",
-    "spacing_px",
-    "spacing_sigma_px",
-    "centre_xy",
-    "reduced_chi2",
-]
+ARM_NUMBERS = (
+    "angles_deg", "angles_sigma_deg", "spacing_px", "spacing_sigma_px", "centre_xy", "reduced_chi2",
+)  # fmt: skip
 
 
 @click.command()

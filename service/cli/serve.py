@@ -148,13 +148,9 @@ def run_demo(image: Path | None, output: Path, progress: Progress) -> list[str]:
     output.mkdir(exist_ok=True)
     with (output / DEMO_LOG).open("w") as log:
         # -P: nothing is imported from the working folder
-        command = [
-            sys.executable,
-            *["-P", "-m", "service.cli", "serve", "--port", "0", "--data"],
-            str(output / DEMO_DATA),
-        ]
+        python = [sys.executable, "-P", "-m", "service.cli"]
         server = subprocess.Popen(
-            command,
+            [*python, "serve", "--port", "0", "--data", str(output / DEMO_DATA)],
             # The demo uses its own service, even if the environment names another service.
             env={key: value for key, value in os.environ.items() if not key.startswith("HELIOPSF_")},
             stdout=subprocess.PIPE,
@@ -162,7 +158,11 @@ def run_demo(image: Path | None, output: Path, progress: Progress) -> list[str]:
             text=True,
         )
         try:
-            with Client(_address(server, output)) as service:
+            assert server.stdout is not None
+            line = server.stdout.readline()  # the server prints its address when it starts to listen
+            if " serves " not in line:
+                raise OSError(f"the server of the demo did not start; read {output / DEMO_LOG}")
+            with Client(line.split(" serves ")[1].split()[0]) as service:
                 service.wait_until_up()
                 if image is None:
                     image = _simulated(service, output, progress)
@@ -210,15 +210,6 @@ def _command() -> str:
 def _results_for(image: Path, output: Path) -> tuple[Path, Path]:
     """The product and the picture of an image."""
     return output / f"{image.stem}-deconvolved.fits", output / f"{image.stem}-preview.png"
-
-
-def _address(server: subprocess.Popen[str], output: Path) -> str:
-    """The address of the server, which the server prints when it starts to listen."""
-    assert server.stdout is not None
-    line = server.stdout.readline()
-    if " serves " not in line:
-        raise OSError(f"the server of the demo did not start; read {output / DEMO_LOG}")
-    return line.split(" serves ")[1].split()[0]
 
 
 def _simulated(service: Client, output: Path, progress: Progress) -> Path:

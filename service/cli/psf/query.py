@@ -16,15 +16,7 @@ import click
 
 from psfcore.built.cache import PROVENANCE, CachedPsf, PsfCache
 from psfcore.tables import lookup
-from service.cli.connection import (
-    ID_OR_FILE,
-    SERVER_FOR_IDS,
-    is_psf_id,
-    psf_file,
-    remote,
-    short,
-    whole_id,
-)
+from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_file, remote, short, whole_id
 from service.cli.options import JSON, OUTPUT, limits, user_errors, write_json, writes_files
 from service.client.outputs import written
 from workers.cache_folder import psf_cache

@@ -10,16 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
-from service.cli.connection import (
-    CONTEXT,
-    ID,
-    Row,
-    id_argument,
-    on_service,
-    print_rows,
-    short,
-    whole_id,
-)
+from service.cli.connection import CONTEXT, ID, Row, id_argument, on_service, print_rows, short, whole_id
 from service.cli.options import (
     FILE,
     JSON,
