@@ -27,9 +27,8 @@ from psfcore.fits.stored_psf import check_is_psf, cutout
 from psfcore.tables import lookup
 from psfcore.transit.archive import ArchiveLimits, FolderTransit, list_archive, transit_in
 from service.client.errors import ServiceError
-from service.client.operations import Operations
+from service.client.operations import Operations, Progress
 from service.client.outputs import written
-from service.client.versions import Progress
 from service.views.jobs import JobView
 from service.views.products import ProductView
 from service.views.psfs import PsfView

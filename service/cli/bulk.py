@@ -15,26 +15,19 @@ import click
 from service.cli.connection import (
     CONTEXT,
     ID,
-    SERVER,
+    Row,
     id_argument,
     named_psf,
+    on_service,
+    print_rows,
     psf_option,
-    remote,
     short,
     whole_id,
-    whole_ids,
 )
 from service.cli.fields import options_of
-from service.cli.options import (
-    OUTPUT,
-    fits_files,
-    percent,
-    progress_bar,
-    user_errors,
-    writes_files,
-)
+from service.cli.jobs import MOST, moment
+from service.cli.options import OUTPUT, fits_files, percent, progress_bar, writes_files
 from service.cli.progress import duration
-from service.cli.results.job import MOST, moment
 from service.client.errors import ServiceError
 from service.client.operations import treatment
 from service.client.outputs import written
@@ -77,14 +70,8 @@ def bulk() -> None:
 @CONTEXT
 @click.option("--upload", "uploads", multiple=True, type=click.Path(exists=True, path_type=Path),
               help="FITS file, or folder of FITS files, to upload and deconvolve; can be repeated")  # fmt: skip
-@click.option(
-    "--image",
-    "images",
-    multiple=True,
-    type=ID,
-    metavar="ID",
-    help="Id of an uploaded image; can be repeated",
-)
+@click.option("--image", "images", multiple=True, type=ID, metavar="ID",
+              help="Id of an uploaded image; can be repeated")  # fmt: skip
 @click.option("--where", "conditions", multiple=True, type=_Condition(), metavar="KEYWORD=VALUE",
               help="Use only files whose header meets this condition; several conditions must all be met")  # fmt: skip
 @click.option("--output", help="Write products to this folder on the machine of the service")
@@ -101,21 +88,16 @@ def bulk() -> None:
     "--dry-run", is_flag=True, help="Estimate the run and list inputs that it would refuse; start nothing"
 )
 @WAIT
-@SERVER
+@on_service
 def submit(
+    service: Client,
     patterns: tuple[str, ...],
     psf: str | None,
-    context: str | None,
     uploads: tuple[Path, ...],
     images: tuple[str, ...],
     conditions: tuple[tuple[str, str, Any], ...],
-    output: str | None,
-    only: bool,
-    layout: str | None,
-    name: str,
     dry_run: bool,
     wait: bool,
-    server: str | None,
     **parameters: Any,
 ) -> None:
     """Start a bulk run: deconvolve the files on the machine of the service that match PATTERNS.
@@ -127,133 +109,101 @@ def submit(
     --dry-run examines the headers of a sample of the images and starts nothing; it ends with status 1 if the run would
     refuse an examined image.
     """
-    if (psf is None) == (context is None):
+    request = {name: parameters.pop(name) for name in ("context", "output", "only", "layout", "name")}
+    if (psf is None) == (request["context"] is None):
         raise click.UsageError("expected either --psf or --context")
-    if layout is not None and output is None:
+    if request["layout"] is not None and request["output"] is None:
         raise click.UsageError("--layout names the files of the folder --output: give --output, too")
     if dry_run and (uploads or wait):
         raise click.UsageError(
             "--dry-run uploads and starts nothing: use it with PATTERNS or --image, without --upload and --wait"
         )
-    with user_errors(), remote(server) as service:
-        sent, refused = _uploaded(service, fits_files(uploads))
-        if refused and not (sent or images or patterns):
-            raise click.ClickException("no file could be uploaded, so no bulk run was started")
-        psf_id = named_psf(service, psf)
-        if psf_id is not None and service.psf(psf_id)["status"] == PsfStatus.DEPRECATED:
-            click.echo(
-                f"warning: PSF {short(psf_id)} was deprecated; every product has this warning", err=True
-            )
-        asked: dict[str, Any] = {
-            "images": [*whole_ids(service, "images", images), *sent],
-            "files": [{"glob": pattern, "where": _where(conditions)} for pattern in patterns],
-            "psf_id": psf_id,
-            "context": context,
-            "output": output,
-            "only": only,
-            "layout": layout,
-            "name": name,
-            **treatment(**parameters),
-        }
-        if dry_run:
-            estimate = service.estimate_bulk(**asked)
-            click.echo("\n".join(_estimated(estimate)))
-            sys.exit(1 if estimate["refused_images"] else 0)
-        made = service.submit_bulk(**asked)
-        click.echo(f"bulk {short(made['id'])}")
-        if wait:
-            with progress_bar() as report:
-                made = service.wait_for_bulk(made["id"], progress=report)
-        click.echo("\n".join(_said(made)))
+    uploaded, refused = _upload(service, fits_files(uploads))
+    if refused and not (uploaded or images or patterns):
+        raise click.ClickException("no file could be uploaded, so no bulk run was started")
+    psf_id = named_psf(service, psf)
+    if psf_id is not None and service.psf(psf_id)["status"] == PsfStatus.DEPRECATED:
+        click.echo(f"warning: PSF {short(psf_id)} was deprecated; every product has this warning", err=True)
+    request |= {
+        "images": [*(whole_id(service, "images", image) for image in images), *uploaded],
+        "files": [{"glob": pattern, "where": _where(conditions)} for pattern in patterns],
+        "psf_id": psf_id,
+        **treatment(**parameters),
+    }
+    if dry_run:
+        estimate = service.estimate_bulk(**request)
+        _print_estimate(estimate)
+        sys.exit(1 if estimate["refused_images"] else 0)
+    run = service.submit_bulk(**request)
+    click.echo(f"bulk {short(run['id'])}")
+    if wait:
+        run = _wait(service, run["id"])
+    _end(run, wait and not refused)
     if refused:
         were = "file was" if refused == 1 else "files were"
         raise click.ClickException(f"{refused} {were} not uploaded; the reasons are listed above")
-    if wait:
-        _end_with_status(made)
 
 
 @bulk.command("list", short_help="List your bulk runs.")
 @MOST
-@SERVER
-def list_bulks(most: int, server: str | None) -> None:
+@on_service
+def list_bulks(service: Client, most: int) -> None:
     """List your bulk runs, newest first."""
-    with user_errors(), remote(server) as service:
-        rows = list(islice(service.bulks(), most))
-    if not rows:
-        click.echo("no bulk run yet; `heliopsf bulk submit` starts one")
-    for row in rows:
-        click.echo(
+
+    def line(row: Row) -> str:
+        return (
             f"{short(row['id'])}  {row['phase']:<9}  {moment(row['created_at'])}  {row['done']} of {_total(row, row['total'])} done, "
-            f"{row['failed']} failed  {row['name']}".rstrip()
+            f"{row['failed']} failed  {row['name']}"
         )
+
+    print_rows(
+        islice(service.bulks(), most), line, if_none="no bulk run yet; `heliopsf bulk submit` starts one"
+    )
 
 
 @bulk.command("status", short_help="Show progress, speed and time left.")
 @BULK_ID
 @WAIT
-@SERVER
-def status(bulk_id: str, wait: bool, server: str | None) -> None:
+@on_service
+def status(service: Client, bulk_id: str, wait: bool) -> None:
     """Show the progress, speed and time left of a bulk run. `bulk list` lists your bulk runs."""
-    with user_errors(), remote(server) as service:
-        if wait:
-            with progress_bar() as report:
-                service.wait_for_bulk(bulk_id, progress=report)
-        found = service.bulk(bulk_id)
-        click.echo("\n".join(_said(found)))
     if wait:
-        _end_with_status(found)
+        _wait(service, bulk_id)
+    _end(service.bulk(bulk_id), wait)
 
 
-@bulk.command("retry", short_help="Try failed images again.")
-@BULK_ID
-@SERVER
-def retry(bulk_id: str, server: str | None) -> None:
-    """Try the failed images of a bulk run again."""
-    with user_errors(), remote(server) as service:
-        click.echo("\n".join(_said(service.retry_bulk(bulk_id))))
+def _add_action(action: str, short_help: str, text: str) -> None:
+    @bulk.command(action, short_help=short_help, help=text)
+    @BULK_ID
+    @on_service
+    def act(service: Client, bulk_id: str) -> None:
+        _print_run(getattr(service, f"{action}_bulk")(bulk_id))
 
 
-@bulk.command("pause", short_help="Pause a bulk run.")
-@BULK_ID
-@SERVER
-def pause(bulk_id: str, server: str | None) -> None:
-    """Pause a bulk run: start no more images, but finish the images in progress."""
-    with user_errors(), remote(server) as service:
-        click.echo("\n".join(_said(service.pause_bulk(bulk_id))))
-
-
-@bulk.command("resume", short_help="Resume a paused or failed bulk run.")
-@BULK_ID
-@SERVER
-def resume(bulk_id: str, server: str | None) -> None:
-    """Resume a paused or failed bulk run."""
-    with user_errors(), remote(server) as service:
-        click.echo("\n".join(_said(service.resume_bulk(bulk_id))))
-
-
-@bulk.command("cancel", short_help="End a bulk run permanently.")
-@BULK_ID
-@SERVER
-def cancel(bulk_id: str, server: str | None) -> None:
-    """End a bulk run permanently. Products that are done are kept."""
-    with user_errors(), remote(server) as service:
-        click.echo("\n".join(_said(service.cancel_bulk(bulk_id))))
+for _action in (
+    ("retry", "Try failed images again.", "Try the failed images of a bulk run again."),
+    ("pause", "Pause a bulk run.",
+     "Pause a bulk run: start no more images, but finish the images in progress."),
+    ("resume", "Resume a paused or failed bulk run.", "Resume a paused or failed bulk run."),
+    ("cancel", "End a bulk run permanently.",
+     "End a bulk run permanently. Products that are done are kept."),
+):  # fmt: skip
+    _add_action(*_action)
 
 
 @bulk.command("delete", short_help="Delete bulk runs.")
 @id_argument("bulk_ids", several=True)
-@SERVER
-def delete(bulk_ids: tuple[str, ...], server: str | None) -> None:
+@on_service
+def delete(service: Client, bulk_ids: tuple[str, ...]) -> None:
     """Delete bulk runs from the service, so that they no longer count in your quota. Their products are kept.
 
     The manifest of a run is deleted with the run. To keep the manifest, save it first with `bulk report -o FILE`.
     Before you delete a run that is LISTING or RUNNING, cancel it.
     """
-    with user_errors(), remote(server) as service:
-        for bulk_id in bulk_ids:
-            whole = whole_id(service, "bulk", bulk_id)
-            service.delete_bulk(whole)
-            click.echo(f"bulk run {short(whole)} is deleted")
+    for bulk_id in bulk_ids:
+        whole = whole_id(service, "bulk", bulk_id)
+        service.delete_bulk(whole)
+        click.echo(f"bulk run {short(whole)} is deleted")
 
 
 @bulk.command("report", short_help="Show artefact scores and failures.")
@@ -263,110 +213,102 @@ def delete(bulk_ids: tuple[str, ...], server: str | None) -> None:
 @click.option(
     "--most", default=20, show_default=True, type=click.IntRange(0, 10_000), help="Number of images to show"
 )
-@SERVER
+@on_service
 @writes_files
 def report(
-    bulk_id: str,
-    output: Path | None,
-    failures: Path | None,
-    most: int,
-    server: str | None,
-    overwrite: bool,
+    service: Client, bulk_id: str, output: Path | None, failures: Path | None, most: int, overwrite: bool
 ) -> None:
     """Show the results of a bulk run: first the images, sorted by artefact score, then the failures."""
-    with user_errors(), remote(server) as service:
-        click.echo("\n".join(_said(service.bulk(bulk_id))))
-        for row in service.bulk_results(bulk_id, order="worst", limit=most) if most else ():
-            click.echo(_line(row))
-        failed = list(service.bulk_failures(bulk_id))
-        for row in failed[:most]:
-            click.echo(f"failed: {row['source']}: {row['error']['message']}")
-        if len(failed) > most:
-            click.echo(
-                f"... and {len(failed) - most} more {'failure' if len(failed) == most + 1 else 'failures'}"
-            )
-        if output is not None:
-            is_table = output.suffix.lower() == ".csv"
-            kind = "csv" if is_table else "ndjson"
-            service.write_bulk_manifest(bulk_id, output, format=kind, overwrite=overwrite)
-            click.echo(str(output))
-        if failures is not None:
-            with written(failures, overwrite=overwrite) as partial:
-                partial.write_text("".join(f"{json.dumps(row)}\n" for row in failed), "utf-8")
-            click.echo(str(failures))
+    _print_run(service.bulk(bulk_id))
+    for row in service.bulk_results(bulk_id, order="worst", limit=most) if most else ():
+        click.echo(_line(row))
+    failed = list(service.bulk_failures(bulk_id))
+    for row in failed[:most]:
+        click.echo(f"failed: {row['source']}: {row['error']['message']}")
+    if len(failed) > most:
+        click.echo(
+            f"... and {len(failed) - most} more {'failure' if len(failed) == most + 1 else 'failures'}"
+        )
+    if output is not None:
+        form = "csv" if output.suffix.lower() == ".csv" else "ndjson"
+        service.write_bulk_manifest(bulk_id, output, format=form, overwrite=overwrite)
+        click.echo(str(output))
+    if failures is not None:
+        with written(failures, overwrite=overwrite) as partial:
+            partial.write_text("".join(f"{json.dumps(row)}\n" for row in failed), "utf-8")
+        click.echo(str(failures))
 
 
-COMMANDS = (bulk,)
-
-
-def _uploaded(service: Client, files: Sequence[Path]) -> tuple[list[str], int]:
+def _upload(service: Client, files: Sequence[Path]) -> tuple[list[str], int]:
     """Upload files; returns the ids of the images, and how many files were refused. Each refused file is named on standard error."""
-    sent: list[str] = []
-    refused = 0
+    uploaded: list[str] = []
     for file in files:
         try:
-            sent.append(service.upload_image(file)["id"])
+            uploaded.append(service.upload_image(file)["id"])
         except (ServiceError, OSError) as error:
             if isinstance(error, ServiceError) and (
                 error.status not in OF_ONE_FILE or error.code in OF_ALL_FILES
             ):
                 raise
-            refused += 1
             click.echo(f"not uploaded: {file}: {error}", err=True)
-    return sent, refused
+    return uploaded, len(files) - len(uploaded)
 
 
-def _estimated(found: dict[str, Any]) -> list[str]:
-    """What a dry run found, in lines."""
-    workers = found["workers"]
-    lines = [
-        f"{found['images']} images, about {duration(found['seconds'])} with {workers} worker "
-        f"{'process' if workers == 1 else 'processes'}, at most {found['memory_mib']} MiB of memory for one image",
-        f"products: about {found['output_bytes'] / 2**20:.1f} MiB, without their pictures",
-        f"examined: {found['examined']} of {found['images']} images; {found['refused_images']} would be refused"
-        + (f", {found['existing']} products exist already" if found["existing"] else ""),
-    ]
-    if found["example_output"]:
-        lines.append(f"for example: {found['example_output']}")
-    if not found["complete"]:
-        lines.append(
-            "the time of a dry run was not enough to find and examine all of them: the run may be larger"
-        )
-    lines += [f"refused: {one['source']}: {one['error']['message']}" for one in found["refused"]]
-    if found["refused_images"] > len(found["refused"]):
-        lines.append(f"... and {found['refused_images'] - len(found['refused'])} more")
-    return lines
+def _wait(service: Client, bulk_id: str) -> Row:
+    """Wait until a run ends; returns its description."""
+    with progress_bar() as report:
+        return service.wait_for_bulk(bulk_id, progress=report)
 
 
-def _said(found: dict[str, Any]) -> list[str]:
-    images = found["images"]
-    lines = [
-        f"{found['phase']}: {images['done']} of {_total(found, images['total'])} done"
-        + (f" ({images['reused']} existed already)" if images["reused"] else "")
-        + f", {images['failed']} failed, {images['at_work']} in progress, {images['waiting']} waiting"
-    ]
-    if images["to_look_at"]:
-        lines.append(f"{images['to_look_at']} to look at: `heliopsf bulk report {short(found['id'])}`")
-    if found["images_an_hour"]:
-        lines.append(f"{found['images_an_hour']:.0f} images per hour{_left(found['time_left_s'])}")
-    if found["error"]:
-        lines.append(f"stopped: {found['error']['message']}")
-    return lines
-
-
-def _total(found: dict[str, Any], total: int) -> str:
-    """The number of images of a run, as far as it is known."""
-    return str(total) if found["listed"] else f"at least {total}"
-
-
-def _end_with_status(found: dict[str, Any]) -> None:
-    """Exit with status 1 if the run is not completed or if an image failed."""
-    if found["phase"] != "COMPLETED" or found["images"]["failed"]:
+def _end(run: Row, wait: bool) -> None:
+    """Print the state of a run. wait: exit with status 1 if the run is not completed or if an image failed."""
+    _print_run(run)
+    if wait and (run["phase"] != "COMPLETED" or run["images"]["failed"]):
         sys.exit(1)
 
 
-def _left(seconds: float | None) -> str:
-    return "" if seconds is None else f", {duration(seconds)} left"
+def _print_estimate(estimate: Row) -> None:
+    """Print the result of a dry run."""
+    workers, more = estimate["workers"], estimate["refused_images"] - len(estimate["refused"])
+    lines = [
+        f"{estimate['images']} images, about {duration(estimate['seconds'])} with {workers} worker "
+        f"{'process' if workers == 1 else 'processes'}, at most {estimate['memory_mib']} MiB of memory for one image",
+        f"products: about {estimate['output_bytes'] / 2**20:.1f} MiB, without their pictures",
+        f"examined: {estimate['examined']} of {estimate['images']} images; {estimate['refused_images']} would be refused"
+        + (f", {estimate['existing']} products exist already" if estimate["existing"] else ""),
+    ]
+    if estimate["example_output"]:
+        lines.append(f"for example: {estimate['example_output']}")
+    if not estimate["complete"]:
+        lines.append(
+            "the time of a dry run was not enough to find and examine all of them: the run may be larger"
+        )
+    lines += [f"refused: {one['source']}: {one['error']['message']}" for one in estimate["refused"]]
+    if more > 0:
+        lines.append(f"... and {more} more")
+    click.echo("\n".join(lines))
+
+
+def _print_run(run: Row) -> None:
+    """Print the state of a run."""
+    images = run["images"]
+    existed = f" ({images['reused']} existed already)" if images["reused"] else ""
+    click.echo(
+        f"{run['phase']}: {images['done']} of {_total(run, images['total'])} done{existed}, {images['failed']} failed, "
+        f"{images['at_work']} in progress, {images['waiting']} waiting"
+    )
+    if images["to_look_at"]:
+        click.echo(f"{images['to_look_at']} to look at: `heliopsf bulk report {short(run['id'])}`")
+    if run["images_an_hour"]:
+        left = "" if run["time_left_s"] is None else f", {duration(run['time_left_s'])} left"
+        click.echo(f"{run['images_an_hour']:.0f} images per hour{left}")
+    if run["error"]:
+        click.echo(f"stopped: {run['error']['message']}")
+
+
+def _total(run: Row, total: int) -> str:
+    """The number of images of a run, as far as it is known."""
+    return str(total) if run["listed"] else f"at least {total}"
 
 
 def _line(row: dict[str, Any]) -> str:
@@ -384,25 +326,18 @@ def _where(conditions: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
     enough."""
     where: dict[str, Any] = {}
     for key, sign, value in conditions:
-        if sign == "=":
-            before = where.get(key)
-            where[key] = value if before is None else [*_as_list(before, key), value]
-            continue
-        where.setdefault(key, {})
-        if not isinstance(where[key], dict):
+        before = where.get(key)
+        if before is not None and isinstance(before, dict) == (sign == "="):
             raise click.UsageError(
                 f"--where {key}: use either values (=) or comparisons for one keyword, not both"
             )
-        where[key][sign] = value
+        if sign != "=":
+            where[key] = (before or {}) | {sign: value}
+        elif before is None:
+            where[key] = value
+        else:
+            where[key] = [*(before if isinstance(before, list) else [before]), value]
     return where
-
-
-def _as_list(before: Any, key: str) -> list[Any]:
-    if isinstance(before, dict):
-        raise click.UsageError(
-            f"--where {key}: use either values (=) or comparisons for one keyword, not both"
-        )
-    return before if isinstance(before, list) else [before]
 
 
 def _value(text: str) -> bool | int | float | str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from psfcore.built.cache import sha256_of_file
 from psfcore.errors import DataError
 from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
 from service.cli.fields import options_of
@@ -66,7 +66,9 @@ def changes(
     """
     from psfcore.deconvolve.assess.contact_sheet import contact_sheet_png, table, treat_many
 
-    files = [str(path) for path in _named(images)]
+    files = [str(path) for path in fits_files(images)]
+    if not files:
+        raise click.UsageError("expected FITS files; the folders that you named contain none")
     table_file, sheet_file = output / TABLE, output / SHEET
     with user_errors():
         check_output_folder(output)
@@ -81,7 +83,7 @@ def changes(
             _one_by_one(service, parameters, products),
             progress=lambda done, of: report("images", done, of),
         )
-        inputs = {row.name: _sha256(Path(row.name)) for row in treated}
+        inputs = {row.name: sha256_of_file(Path(row.name)) for row in treated}
         content = table(treated, failures) | {
             "method": {"name": parameters["method"], "steps": parameters["steps"]},
             "products": products,
@@ -95,9 +97,6 @@ def changes(
     click.echo(f"{table_file}, {sheet_file}")
     if not treated:
         raise click.ClickException("no image could be deconvolved; the reasons are listed above")
-
-
-COMMANDS = (changes,)
 
 
 def _one_by_one(
@@ -118,22 +117,11 @@ def _one_by_one(
                 raise DataError(error.code, str(error)) from error
             say_warnings(product)
             version = product["details"]["software_version"]
-            products[name] = {
-                "id": product["id"],
-                "psf_id": product["psf_id"],
-                "software_version": version,
-            }
+            products[name] = {"id": product["id"], "psf_id": product["psf_id"], "software_version": version}
             service.release(product)
             return changes_in_product(name, name, file, product["details"], limits())
 
     return one
-
-
-def _named(images: tuple[Path, ...]) -> list[Path]:
-    found = fits_files(images)
-    if not found:
-        raise click.UsageError("expected FITS files; the folders that you named contain none")
-    return found
 
 
 def _lines(content: dict[str, Any]) -> list[str]:
@@ -153,8 +141,3 @@ def _lines(content: dict[str, Any]) -> list[str]:
         f"{counted(summary['images'], 'image')}, {summary['to_look_at']} to look at, {summary['failures']} not deconvolved"
     )
     return lines
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,6 +14,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from service.cli.fields import options_of
+from service.cli.options import user_errors
 from service.cli.progress import say
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
@@ -24,47 +26,34 @@ if TYPE_CHECKING:
 _KEY = "heliopsf.key"
 DIGITS = 64  # number of digits of a whole id, except ids of jobs and bulk runs
 _ID = re.compile(rf"[0-9a-f]{{{FEWEST_DIGITS},{DIGITS}}}")
+_DIGITS = f"{FEWEST_DIGITS} or more hexadecimal digits"
 Command = TypeVar("Command", bound=Callable[..., Any])
+Row = dict[str, Any]
 
 
 class _Id(click.ParamType):
-    """An id, or its first digits."""
+    """An id, or its first digits. or_file: or the name of a file with a PSF."""
 
     name = "id"
 
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The digits in lower case. A text that is not an id never becomes part of an address of the service."""
-        digits = str(value).lower()
-        if not _ID.fullmatch(digits):
-            self.fail(
-                f"expected an id, or its first {FEWEST_DIGITS} or more hexadecimal digits; got {value!r}",
-                param,
-                ctx,
-            )
-        return digits
-
-
-class _IdOrFile(click.ParamType):
-    """The id of a PSF, or the name of a file."""
-
-    name = "id or file"
+    def __init__(self, *, or_file: bool = False) -> None:
+        self.or_file = or_file
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The text, if it is the name of a file or can be an id."""
+        """The digits in lower case, or the name of the file. Other texts never become part of an address of the service."""
         text = str(value)
-        if not (Path(text).is_file() or _ID.fullmatch(text)):
-            self.fail(
-                f"expected a PSF id ({FEWEST_DIGITS} or more hexadecimal digits) or a file; got {text!r}",
-                param,
-                ctx,
-            )
-        return text
+        if self.or_file and Path(text).is_file():
+            return text
+        if _ID.fullmatch(text.lower()):
+            return text.lower()
+        expected = f"a PSF id ({_DIGITS}) or a file" if self.or_file else f"an id, or its first {_DIGITS}"
+        self.fail(f"expected {expected}; got {value!r}", param, ctx)
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
         """Let the shell complete the name of a file."""
-        return [CompletionItem(incomplete, type="file")]
+        return [CompletionItem(incomplete, type="file")] if self.or_file else []
 
 
 class _Server(click.Option):
@@ -108,7 +97,7 @@ def psf_option(what: str, *, required: bool = False) -> Callable[[Command], Comm
     return click.option("--psf", type=ID_OR_FILE, metavar="ID|FILE", required=required, help=what)
 
 
-ID, ID_OR_FILE = _Id(), _IdOrFile()
+ID, ID_OR_FILE = _Id(), _Id(or_file=True)
 SERVER = server_option("Address of the service, which this command needs")
 LOCAL = click.option("--local", is_flag=True, help="Run in this process, without a service")
 SERVER_FOR_IDS = server_option("Address of the service, which is needed only if a PSF is given by its id")
@@ -136,6 +125,24 @@ def remote(server: str | None) -> Client:
     from service.client.http import Client
 
     return Client(server, key=click.get_current_context().meta.get(_KEY), say=say)
+
+
+def on_service(command: Command) -> Command:
+    """Give a command the options ``--server`` and ``--key``, and the client of the service as the argument ``service``."""
+
+    @SERVER
+    @wraps(command)
+    def connected(server: str | None, **given: Any) -> Any:
+        with user_errors(), remote(server) as service:
+            return command(service=service, **given)
+
+    return connected  # type: ignore[return-value]
+
+
+def print_rows(rows: Iterable[Row], line: Callable[[Row], str], *, if_none: str) -> None:
+    """Print a line for each row of a list. if_none: what to print if there are no rows."""
+    lines = [line(row).rstrip() for row in rows]
+    click.echo("\n".join(lines or [if_none]))
 
 
 @contextmanager
@@ -169,13 +176,7 @@ def whole_id(service: Operations, things: str, identity: str) -> str:
     """
     if len(identity) == DIGITS:
         return identity
-    found: str = service.get(f"/v1/{things}/{identity}")["id"]
-    return found
-
-
-def whole_ids(service: Operations, things: str, identities: Sequence[str]) -> list[str]:
-    """Find the whole id for each of these ids, as `whole_id` does."""
-    return [whole_id(service, things, identity) for identity in identities]
+    return str(service.get(f"/v1/{things}/{identity}")["id"])
 
 
 @contextmanager
@@ -196,5 +197,4 @@ def named_psf(service: Operations, psf: str | None) -> str | None:
         return None
     if is_psf_id(psf):
         return whole_id(service, "psfs", psf)
-    uploaded: str = service.upload_psf(psf)["id"]
-    return uploaded
+    return str(service.upload_psf(psf)["id"])

@@ -25,13 +25,11 @@ from service.cli.options import (
 )
 from service.client.outputs import written
 
-INSTRUMENT = click.option(
-    "--instrument",
-    default="hri_euv",
-    show_default=True,
-    metavar="NAME|FILE",
-    help="A known instrument, or an instrument file (TOML)",
-)
+INSTRUMENT = click.option("--instrument", default="hri_euv", show_default=True, metavar="NAME|FILE",
+                          help="A known instrument, or an instrument file (TOML)")  # fmt: skip
+ARM_NUMBERS = (
+    "angles_deg", "angles_sigma_deg", "spacing_px", "spacing_sigma_px", "centre_xy", "reduced_chi2",
+)  # fmt: skip
 
 
 @click.command()
@@ -42,18 +40,10 @@ INSTRUMENT = click.option(
     "--distances",
     help="Distances from filter wheel to detector, mm, such as 50,273,550 [default: the seven distances of the paper]",
 )
-@click.option(
-    "--phases",
-    default=16,
-    show_default=True,
-    type=click.IntRange(1, 256),
-    help="Number of mesh positions to average",
-)
-@click.option(
-    "--windows",
-    type=click.IntRange(1),
-    help="Number of terms of the analytic series [default: from the instrument file]",
-)
+@click.option("--phases", default=16, show_default=True, type=click.IntRange(1, 256),
+              help="Number of mesh positions to average")  # fmt: skip
+@click.option("--windows", type=click.IntRange(1),
+              help="Number of terms of the analytic series [default: from the instrument file]")  # fmt: skip
 @writes_files
 def fresnel(
     instrument: str,
@@ -70,10 +60,9 @@ def fresnel(
     from psfcore.instruments.model import load_instrument
 
     with user_errors(), progress_bar() as report:
-        wanted = DISTANCES_MM if distances is None else _numbers("--distances", distances)
         study = fresnel_study(
             load_instrument(instrument),
-            distances_mm=wanted,
+            distances_mm=DISTANCES_MM if distances is None else _numbers("--distances", distances),
             phases=phases,
             windows=windows,
             progress=lambda done, of: report("distances", done, of),
@@ -98,14 +87,8 @@ def fresnel(
 @click.argument("image", type=FILE)
 @click.option("--background", type=FILE, help=f"{BACKGROUND}, to subtract")
 @CENTRE
-@click.option(
-    "--arms",
-    "n_arms",
-    default=2,
-    show_default=True,
-    type=click.IntRange(1, 8),
-    help="Number of arms (lines of peaks) to fit",
-)
+@click.option("--arms", "n_arms", default=2, show_default=True, type=click.IntRange(1, 8),
+              help="Number of arms (lines of peaks) to fit")  # fmt: skip
 @SATURATION
 @JSON
 @PLOT
@@ -130,37 +113,25 @@ def arms(
 
     with user_errors():
         flare = read_observation(image, limits(), saturation_dn=saturation_dn)
-        saturated, reference = ~flare.valid, None
+        reference = None
         if background is not None:
             before = read_observation(background, limits(), saturation_dn=saturation_dn)
             reference = np.where(before.valid, before.pixels, np.nan)
-        found = measure_arms(
-            flare.pixels,
-            centre,
-            reference=reference,
-            saturated=saturated,
-            n_arms=n_arms,
+        measured = measure_arms(
+            flare.pixels, centre, reference=reference, saturated=~flare.valid, n_arms=n_arms
         )
         if plot is not None:
             with written(plot, overwrite=overwrite) as picture:
-                arms_png(flare.pixels, found, picture, unit=unit_label(flare))
-    for angle, sigma in zip(found.angles_deg, found.angles_sigma_deg, strict=True):
+                arms_png(flare.pixels, measured, picture, unit=unit_label(flare))
+    for angle, sigma in zip(measured.angles_deg, measured.angles_sigma_deg, strict=True):
         click.echo(f"arm at {angle:8.3f} ± {sigma:.3f} degrees from +x towards +y")
-    click.echo(f"spacing  {found.spacing_px:8.4f} ± {found.spacing_sigma_px:.4f} px")
-    write_json(
-        json_file,
-        {
-            "angles_deg": found.angles_deg,
-            "angles_sigma_deg": found.angles_sigma_deg,
-            "spacing_px": found.spacing_px,
-            "spacing_sigma_px": found.spacing_sigma_px,
-            "centre_xy": found.centre_xy,
-            "reduced_chi2": found.reduced_chi2,
-            "peaks": [dataclasses.asdict(peak) for peak in found.peaks],
-            "stopped_because": found.stopped_because,
-        },
-        overwrite=overwrite,
-    )
+    click.echo(f"spacing  {measured.spacing_px:8.4f} ± {measured.spacing_sigma_px:.4f} px")
+    numbers = {name: getattr(measured, name) for name in ARM_NUMBERS}
+    numbers |= {
+        "peaks": [dataclasses.asdict(peak) for peak in measured.peaks],
+        "stopped_because": measured.stopped_because,
+    }
+    write_json(json_file, numbers, overwrite=overwrite)
 
 
 @click.command()
@@ -194,9 +165,6 @@ def design(
         texts = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in values)
         click.echo("  ".join(f"{text:>{len(name)}}" for text, name in zip(texts, names, strict=True)))
     write_json(json_file, dataclasses.asdict(study), overwrite=overwrite)
-
-
-COMMANDS = (fresnel, arms, design)
 
 
 def _numbers(option: str, text: str) -> tuple[float, ...]:

@@ -65,11 +65,11 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """The command that the arguments call. If there is none, the ``UsageError`` names the command that the user may mean."""
-        wanted = args[0]
-        if wanted not in self.rows and not wanted.startswith("-"):
-            close = get_close_matches(wanted, self.rows, n=1)
+        name = args[0]
+        if name not in self.rows and not name.startswith("-"):
+            close = get_close_matches(name, self.rows, n=1)
             hint = f" Did you mean `{close[0]}`?" if close else ""
-            ctx.fail(f"there is no command '{wanted}'.{hint}")
+            ctx.fail(f"there is no command '{name}'.{hint}")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:

@@ -1,4 +1,4 @@
-"""The ``heliopsf`` command: lists all commands, and the file of each command."""
+"""The commands ``heliopsf`` and ``heliopsf psf``: they list all commands, and the file of each command."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ SECTIONS = {
     "Images": {
         "deconvolve": Lazy("service.cli.deconvolve", "deconvolve", "Deconvolve images."),
         "changes": Lazy("service.cli.changes", "changes", "Deconvolve images and show what changed."),
-        "product": Lazy("service.cli.results.product", "product", "List, download and delete products."),
+        "product": Lazy("service.cli.jobs", "product", "List, download and delete products."),
     },
     "PSFs": {
-        "psf": Lazy("service.cli.psf.group", "psf", "Build, fit, inspect, certify and list PSFs."),
-        "context": Lazy("service.cli.context", "context", "Pin sets of PSFs that never change."),
+        "psf": Lazy("service.cli.main", "psf", "Build, fit, inspect, certify and list PSFs."),
+        "context": Lazy("service.cli.psf.versions", "context", "Pin sets of PSFs that never change."),
     },
     "Transits": {
         "report": Lazy("service.cli.report", "report", "Fit a PSF to a transit, or test a PSF on it."),
@@ -25,23 +25,50 @@ SECTIONS = {
         "bulk": Lazy("service.cli.bulk", "bulk", "Deconvolve many images on a service."),
     },
     "Jobs": {
-        "job": Lazy("service.cli.results.job", "job", "List, show, wait for and cancel jobs."),
+        "job": Lazy("service.cli.jobs", "job", "List, show, wait for and cancel jobs."),
     },
     "Service and operation": {
         "serve": Lazy("service.cli.serve", "serve", "Start a service."),
         "worker": Lazy("service.cli.serve", "worker", "Start a worker for a service with a broker."),
-        "demo": Lazy("service.cli.demo", "demo", "Process one image with a temporary service."),
-        "doctor": Lazy("service.cli.operator.doctor", "doctor", "Check settings, database, broker and disk."),
-        "database": Lazy("service.cli.operator.database", "database", "Show or upgrade the database's tables."),
-        "store": Lazy("service.cli.operator.store", "store", "Check and clean up stored files; set quotas."),
-        "cache": Lazy("service.cli.operator.cache", "cache", "List and remove built PSFs that are kept."),
-        "key": Lazy("service.cli.operator.key", "key", "Create, list and revoke access keys."),
+        "demo": Lazy("service.cli.serve", "demo", "Process one image with a temporary service."),
+        "doctor": Lazy("service.cli.doctor", "doctor", "Check settings, database, broker and disk."),
+        "database": Lazy("service.cli.operator", "database", "Show or upgrade the database's tables."),
+        "store": Lazy("service.cli.operator", "store", "Check and clean up stored files; set quotas."),
+        "cache": Lazy("service.cli.psf.query", "cache", "List and remove built PSFs that are kept."),
+        "key": Lazy("service.cli.operator", "key", "Create, list and revoke access keys."),
     },
     "Studies": {
         "arms": Lazy("service.cli.diffraction", "arms", "Measure the diffraction arms around a flare."),
         "flare": Lazy("service.cli.flare", "flare", "Test a PSF on the stray light of a flare."),
         "fresnel": Lazy("service.cli.diffraction", "fresnel", "Test the diffraction by Fresnel propagation."),
         "design": Lazy("service.cli.diffraction", "design", "Tabulate diffraction for mesh designs."),
+    },
+}  # fmt: skip
+PSF_SECTIONS = {
+    "Make": {
+        "build": Lazy("service.cli.psf.make", "build", "Compute the PSF of an instrument."),
+        "fit": Lazy("service.cli.psf.make", "fit", "Fit the scattered light of a transit."),
+        "crossval": Lazy("service.cli.psf.make", "crossval", "Estimate the uncertainty of a fit."),
+        "instruments": Lazy("service.cli.psf.versions", "instruments", "List instruments that can be built."),
+    },
+    "Read": {
+        "show": Lazy("service.cli.psf.make", "show", "Show what a PSF file contains."),
+        "query": Lazy("service.cli.psf.query", "query", "Show the light beyond given radii."),
+        "cutout": Lazy("service.cli.psf.query", "cutout", "Write the central part of a PSF."),
+        "rebin": Lazy("service.cli.psf.query", "rebin", "Write the PSF for binned images."),
+    },
+    "Versions on a service": {
+        "list": Lazy("service.cli.psf.versions", "list_psfs", "List PSFs."),
+        "download": Lazy("service.cli.psf.versions", "download", "Download a PSF."),
+        "upload": Lazy("service.cli.psf.versions", "upload_psf", "Upload a PSF."),
+        "certify": Lazy("service.cli.psf.versions", "certify", "Certify a PSF for a range of times."),
+        "series": Lazy("service.cli.psf.versions", "series", "List series, and allow interpolation in time."),
+        "interpolate": Lazy("service.cli.psf.versions", "interpolate", "Interpolate between two PSFs in time."),
+        "deprecate": Lazy("service.cli.psf.versions", "deprecate", "Deprecate a certified PSF."),
+        "delete": Lazy("service.cli.psf.versions", "delete_psf", "Delete a draft that nothing uses."),
+        "best": Lazy("service.cli.psf.versions", "best", "Find the PSF for an image."),
+        "lineage": Lazy("service.cli.psf.versions", "lineage", "Show what a PSF or product was made from."),
+        "rerun": Lazy("service.cli.psf.versions", "rerun", "Make a PSF or product again and compare."),
     },
 }  # fmt: skip
 
@@ -55,3 +82,8 @@ def main() -> None:
     With --local these commands run in this process and need no service. The help of a command says whether it needs a
     service: heliopsf COMMAND -h
     """
+
+
+@click.group(cls=LazyGroup, sections=PSF_SECTIONS)
+def psf() -> None:
+    """Build, fit, inspect, certify and list PSFs."""

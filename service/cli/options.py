@@ -32,26 +32,21 @@ FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
 
-def _not_stdout(
-    self: click.Path, value: Any, param: click.Parameter | None, ctx: click.Context | None
-) -> None:
-    """Refuse "-", which means standard output in many programs. Commands write their messages to standard output; the
-    messages would damage a file that is written there too."""
-    if str(value) == "-":
-        self.fail(
-            "expected a name; got '-': results are not written to standard output. './-' is a file of this name",
-            param,
-            ctx,
-        )
+class _Output(click.Path):
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path. "-" is refused: it means standard output in many programs, but commands write messages there."""
+        if str(value) == "-":
+            message = "expected a name; got '-': results are not written to standard output. './-' is a file of this name"
+            self.fail(message, param, ctx)
+        return super().convert(value, param, ctx)
 
 
-class OutputFile(click.Path):
+class OutputFile(_Output):
     """The type of an option that names a file to write. ``writes_files`` checks the files of these options."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path. "-" is refused."""
-        _not_stdout(self, value, param, ctx)
-        return super().convert(value, param, ctx)
+
+class OutputFolder(_Output):
+    """The type of an option that names a folder to write to."""
 
 
 class OutputPlace(OutputFile):
@@ -88,15 +83,6 @@ class Place:
 
     def __str__(self) -> str:
         return str(self.path)
-
-
-class OutputFolder(click.Path):
-    """The type of an option that names a folder to write to."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path. "-" is refused."""
-        _not_stdout(self, value, param, ctx)
-        return super().convert(value, param, ctx)
 
 
 OUTPUT = OutputFile(dir_okay=False, path_type=Path)
@@ -231,10 +217,10 @@ def write_json(path: Path | None, content: dict[str, Any], *, overwrite: bool = 
 
 def fits_files(paths: Sequence[Path]) -> list[Path]:
     """The named files, each once. A folder is replaced by the FITS files in it, sorted by name."""
-    found: list[Path] = []
+    files: list[Path] = []
     for path in paths:
-        found += sorted(one for one in path.iterdir() if _is_fits(one)) if path.is_dir() else [path]
-    return list(dict.fromkeys(found))
+        files += sorted(one for one in path.iterdir() if _is_fits(one)) if path.is_dir() else [path]
+    return list(dict.fromkeys(files))
 
 
 def _is_fits(path: Path) -> bool:

@@ -50,7 +50,7 @@ def duration(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
-def told(stage: str, step: int, steps: int) -> str:
+def step_text(stage: str, step: int, steps: int) -> str:
     """The stage and its step as text. If the number of steps is unknown, the text contains only the stage.
 
     A task reports an unknown number of steps as 1.
@@ -87,7 +87,7 @@ class _Teller:
             elif now_s - self.told_s >= LINE_EVERY_S:
                 self.told_s = now_s
                 elapsed = duration(now_s - self.started_s)
-                sys.stderr.write(f"{told(stage, step, steps)} after {elapsed}{left}\n")
+                sys.stderr.write(f"{step_text(stage, step, steps)} after {elapsed}{left}\n")
                 sys.stderr.flush()
 
     def line(self, text: str) -> None:

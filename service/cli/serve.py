@@ -1,29 +1,47 @@
-"""The commands ``serve`` and ``worker``."""
+"""The commands ``serve``, ``worker`` and ``demo``."""
 
 from __future__ import annotations
 
 import os
+import shlex
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import click
 
-from service.cli.options import DATA, read_settings
+from service.cli.options import (
+    DATA,
+    FILE,
+    OUTPUT_FOLDER,
+    check_fresh_folder,
+    percent,
+    progress_bar,
+    read_settings,
+    user_errors,
+)
+from service.client.errors import WaitInterrupted
+from service.client.operations import Progress, given
+from service.client.outputs import check_outputs
 from workers.contract.queues import Queue, queues_named
+
+if TYPE_CHECKING:
+    from service.client.http import Client
+
+DEMO_DATA = "data"
+DEMO_LOG = "server.log"  # a later demo recognises the folder of an earlier demo by this file
 
 
 @click.command()
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on")
 @click.option("--port", default=8765, show_default=True, help="Port to listen on; 0: any free port")
 @DATA
-@click.option(
-    "-v",
-    "--verbose",
-    is_flag=True,
-    help="Also log every request on a terminal; a log that is not on a terminal always contains every request",
-)
+@click.option("-v", "--verbose", is_flag=True,
+              help="Also log every request on a terminal; a log that is not on a terminal always contains every request")  # fmt: skip
 def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
     """Start a service over HTTP, and keep it running until it is interrupted.
 
@@ -67,10 +85,8 @@ def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
 def browser_address(url: str) -> str:
     """The address at which a browser on this machine reaches a service that listens at ``url``."""
     parts = urlsplit(url)
-    everywhere = parts.hostname in (
-        "0.0.0.0",
-        "::",
-    )  # all addresses of the machine; a browser cannot open this one
+    # All addresses of the machine; a browser cannot open this one.
+    everywhere = parts.hostname in ("0.0.0.0", "::")
     return f"http://localhost:{parts.port}" if everywhere else url
 
 
@@ -91,8 +107,7 @@ def worker(
     from workers.files.modes import keep_private
 
     # Celery imports the worker's module, which reads its settings from the environment.
-    update: dict[str, Any] = {"worker_processes": processes, "worker_queues": queues}
-    given = {name: value for name, value in update.items() if value is not None}
+    options = given({"worker_processes": processes, "worker_queues": queues})
     if queues is not None:
         try:
             queues_named(queues)
@@ -101,8 +116,110 @@ def worker(
     settings = read_settings(data)
     if stop_with_parent is None:  # otherwise the server that started this worker has printed the folder
         click.echo(f"heliopsf worker (data in {settings.data_dir.resolve()})", err=True)
-    os.environ |= environment(settings.model_copy(update=given))
+    os.environ |= environment(settings.model_copy(update=options))
     from workers.run.worker import main as run
 
     keep_private()
     run(stop_with_parent)
+
+
+@click.command()
+@click.option("--image", type=FILE, help="Your own image (FITS) [default: a simulated image]")
+@click.option("-o", "--output", default="heliopsf-demo", show_default=True, type=OUTPUT_FOLDER,
+              help="Folder for the results")  # fmt: skip
+def demo(image: Path | None, output: Path) -> None:
+    """Start a service, upload an image, deconvolve it, download the product, and stop the service.
+
+    A second demo replaces the files of the first one. The folder must be new, empty, or the folder of an earlier demo.
+    """
+    check_fresh_folder(output, overwrite=(output / DEMO_LOG).is_file())
+    with user_errors(), progress_bar() as report:
+        lines = run_demo(image, output, report)
+    click.echo("\n".join(lines))
+
+
+def run_demo(image: Path | None, output: Path, progress: Progress) -> list[str]:
+    """Start a service on a free port, upload and deconvolve an image, download the product, stop the service. Returns lines to print."""
+    from service.client.http import Client
+
+    if image is not None:
+        product_file, picture = _results_for(image, output)
+        check_outputs((product_file, picture), inputs=(image,), overwrite=True)
+    output.mkdir(exist_ok=True)
+    with (output / DEMO_LOG).open("w") as log:
+        # -P: nothing is imported from the working folder
+        python = [sys.executable, "-P", "-m", "service.cli"]
+        server = subprocess.Popen(
+            [*python, "serve", "--port", "0", "--data", str(output / DEMO_DATA)],
+            # The demo uses its own service, even if the environment names another service.
+            env={key: value for key, value in os.environ.items() if not key.startswith("HELIOPSF_")},
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+        )
+        try:
+            assert server.stdout is not None
+            line = server.stdout.readline()  # the server prints its address when it starts to listen
+            if " serves " not in line:
+                raise OSError(f"the server of the demo did not start; read {output / DEMO_LOG}")
+            with Client(line.split(" serves ")[1].split()[0]) as service:
+                service.wait_until_up()
+                if image is None:
+                    image = _simulated(service, output, progress)
+                product_file, picture = _results_for(image, output)
+                product = service.deconvolve(
+                    image, product_file, preview=picture, progress=progress, overwrite=True
+                )
+        except WaitInterrupted as stop:
+            raise KeyboardInterrupt from stop  # the job does not continue, because the demo stops its service
+        finally:
+            server.terminate()
+            server.wait(60)
+    return demo_lines(output, image, product_file, picture, product)
+
+
+def demo_lines(
+    output: Path, image: Path, product_file: Path, picture: Path, product: dict[str, Any]
+) -> list[str]:
+    """What the demo prints at its end: its files, what changed, and how to look at the product in a browser."""
+    change = product["details"]
+    return [
+        f"image    {image}",
+        f"product  {product_file}",
+        f"picture  {picture}",
+        f"PSF      {product['psf_version']} (id {product['psf_id'][:12]}, in the product's header)",
+        f"change   brightest 1 % of pixels {percent(change['bright_change_pct'])}, "
+        f"flux of the frame {percent(change['flux_change_pct'], 3)}",
+        "",
+        "To look at the product in a browser, start the service of the demo again:",
+        f"    {_command()} serve --data {shlex.quote(str(output / DEMO_DATA))}",
+        f"and open its address with this path: /products/{product['id']}",
+    ]
+
+
+def _command() -> str:
+    """How to call heliopsf: by its name if the shell finds this name, otherwise by its path in the folder of Python,
+    as after ``make demo``."""
+    beside = Path(sys.executable).with_name("heliopsf")
+    if shutil.which("heliopsf") or not beside.exists():
+        return "heliopsf"
+    here = Path.cwd()
+    return shlex.quote(str(beside.relative_to(here) if beside.is_relative_to(here) else beside))
+
+
+def _results_for(image: Path, output: Path) -> tuple[Path, Path]:
+    """The product and the picture of an image."""
+    return output / f"{image.stem}-deconvolved.fits", output / f"{image.stem}-preview.png"
+
+
+def _simulated(service: Client, output: Path, progress: Progress) -> Path:
+    """A simulated image, convolved with the PSF that the service builds."""
+    # The simulation is imported here, because a demo with the user's own image does not need it.
+    from psfcore.fits.header import FitsLimits
+    from psfcore.fits.psfs import read_psf
+    from psfcore.simulate.observe import demo_image
+
+    psf_file, image = output / "psf.fits", output / "simulated.fits"
+    service.build_psf("hri_euv", psf_file, preview=output / "psf.png", progress=progress, overwrite=True)
+    demo_image(image, read_psf(psf_file, FitsLimits(max_pixels=2048 * 2048)))
+    return image

@@ -54,19 +54,19 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _split(url: str, said: str) -> SplitResult:
+def _split(url: str, text: str) -> SplitResult:
     """The parts of a URL. Raises ``ServiceError`` if it has no host or no valid port."""
     try:
         parts = urlsplit(url)
         valid = bool(parts.hostname) and (parts.port is None or parts.port > 0)
     except ValueError as error:  # a port that is no number, or an IPv6 address without its brackets
-        raise _bad(said) from error
-    if not valid or any(sign.isspace() or not sign.isprintable() for sign in said):
-        raise _bad(said)
+        raise _bad(text) from error
+    if not valid or any(sign.isspace() or not sign.isprintable() for sign in text):
+        raise _bad(text)
     return parts
 
 
-def _bad(said: str) -> ServiceError:
+def _bad(text: str) -> ServiceError:
     return ServiceError(
-        f"expected the address of a service, such as {EXAMPLE}; got {said!r}", code="bad-address"
+        f"expected the address of a service, such as {EXAMPLE}; got {text!r}", code="bad-address"
     )

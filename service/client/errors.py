@@ -1,9 +1,21 @@
-"""The errors that a client raises."""
+"""The errors that a client raises, and how long it repeats a request that got no answer."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import time
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, TypeVar
+
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0
+PATIENCE_S = 600.0  # a client gives up after this time without an answer
+PASSING: tuple[int | None, ...] = (
+    None,
+    429,
+    502,
+    503,
+)  # statuses after which a request is tried again; None: no answer
+
+Answer = TypeVar("Answer")
 
 
 class ServiceError(Exception):
@@ -72,3 +84,42 @@ class WaitInterrupted(KeyboardInterrupt):
         )
         super().__init__(f"the wait was interrupted; {named} at {server}")
         self.what, self.identity, self.server, self.others = what, identity, server, others
+
+
+class Patience:
+    """How long a client repeats a request that got no answer: at growing intervals, for up to 10 minutes.
+
+    say: gets a message when the answers stop, and when they begin again. goes_on: what happens in the meantime.
+    """
+
+    def __init__(self, say: Callable[[str], None], goes_on: str) -> None:
+        self._say, self._goes_on, self._lost = say, goes_on, False
+        self.answered()
+
+    def answered(self, news: str = "the service answers again") -> None:
+        """Begin to count anew. news: the message if answers were missing before."""
+        self._since, self._wait_s = time.monotonic(), FIRST_WAIT_S
+        if self._lost:
+            self._say(news)
+        self._lost = False
+
+    def repeat(self, ask: Callable[[], Answer], passing: Collection[int | None] = PASSING) -> Answer:
+        """The answer to a request, which is repeated while the service does not answer."""
+        while True:
+            try:
+                answer = ask()
+            except ServiceError as error:
+                self.wait(error, passing)
+            else:
+                self.answered()
+                return answer
+
+    def wait(self, error: ServiceError, passing: Collection[int | None] = PASSING) -> None:
+        """Wait before the next try. Raises the error if its status is not in ``passing``, or if the patience is at its end."""
+        if error.status not in passing or time.monotonic() - self._since > PATIENCE_S:
+            raise error
+        if not self._lost and (error.status != 429 or error.code == "too-many-streams"):
+            self._say(f"{error}. {self._goes_on} for {PATIENCE_S / 60:.0f} min")
+            self._lost = True
+        time.sleep(min(error.retry_after_s or self._wait_s, LONGEST_WAIT_S))
+        self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)

@@ -2,104 +2,43 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import os
-import re
+import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
-from typing import Any
-
-import httpx
+from typing import TYPE_CHECKING, Any, Literal
 
 from psfcore.errors import DataError
 from psfcore.transit.archive import pack
 from service.client import resumable
-from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS, how_to_start, service_address
-from service.client.bulk import FIRST_WAIT_S, LONGEST_WAIT_S, PASSING, PATIENCE_S, BulkClient, still_waiting
-from service.client.errors import ServiceError, WaitInterrupted
-from service.client.keys import KeysClient
-from service.client.operations import Operations
-from service.client.outputs import written
-from service.client.versions import Progress, VersionedPsfs
-from service.client.viewing import Viewing
+from service.client.address import SHOWN_DIGITS
+from service.client.connection import GOES_ON, Connection
+from service.client.errors import Patience, ServiceError, WaitInterrupted
+from service.client.operations import Operations, Progress, given
 
-_STANDARD_FIELDS = ("type", "title", "status", "detail", "instance")  # of a problem document, RFC 9457
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
 QUEUED_S = 10.0  # time in the queue after which a client that waits for a job says so
 
 
-def _silent(_line: str) -> None:
-    """Say nothing."""
+class Client(Connection, Operations):
+    """A heliopsf service, over HTTP.
 
-
-class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
-    """A heliopsf service, over HTTP."""
+    Every method raises ``ServiceError`` if its request fails; the ``code`` of the error states the reason, such as
+    "no-psf-fits", "path-not-allowed" or "scope-missing". Times are in ISO 8601; a time without a zone is UTC.
+    """
 
     server: str
     jobs_at_once = 4
 
-    def __init__(
-        self,
-        server: str | None = None,
-        *,
-        key: str | None = None,
-        transport: httpx.BaseTransport | None = None,
-        say: Callable[[str], None] = _silent,
-    ) -> None:
-        """server: address of the service; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY. say: a
-        function that is called with a sentence during a wait, if the job stays in the queue or the service does not
-        answer.
-
-        A service of this machine needs no scheme: ``localhost:8765``. Raises ``ServiceError`` "bad-address", and "bad-key" if
-        the key cannot be sent.
-        """
-        self.server = service_address(server or os.environ.get("HELIOPSF_SERVER") or DEFAULT_SERVER)
-        key = (key or os.environ.get("HELIOPSF_KEY", "")).strip()
-        if not (key.isascii() and key.isprintable()) or " " in key:
-            # The key is checked here. Otherwise the HTTP library would print the key in its error about a bad header.
-            raise ServiceError(
-                "expected a key of the form hpsf_ID_SECRET; got another text: set HELIOPSF_KEY to the whole key",
-                code="bad-key",
-            )
-        headers = {"Authorization": f"Bearer {key}"} if key else {}
-        self.say = say
-        self._http = httpx.Client(base_url=self.server, timeout=60, transport=transport, headers=headers)
-
-    def __enter__(self) -> Client:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._http.close()
-
-    def health(self) -> dict[str, Any]:
-        """The answer of ``/healthz``."""
-        return self._json("GET", "/healthz")
-
-    def wait_until_up(self, timeout_s: float = 60.0) -> None:
-        """Wait until the service answers. Raises ``ServiceError`` after ``timeout_s``."""
-        deadline = time.monotonic() + timeout_s
-        while True:
-            try:
-                self.health()
-                return
-            except ServiceError:
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(0.1)
+    # Uploads -----------------------------------------------------------------------------------
 
     def upload_image(self, path: str | Path) -> dict[str, Any]:
-        """Upload a FITS image; returns its description, with its ``id``."""
-        return self._upload("/v1/images", Path(path), {})
+        return self._upload("/v1/images", Path(path))
 
     def upload_transit(self, path: str | Path) -> dict[str, Any]:
         """Upload a transit: a folder, or an archive of a folder. Returns the description of the transit, with its ``id``.
@@ -107,9 +46,9 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         A file of 64 MiB or more is sent in parts. If the connection is cut, the upload continues where it was; if this
         process ends before, the next upload of the same file continues it, for a day.
         """
-        with as_archive(Path(path)) as archive:
+        with _as_archive(Path(path)) as archive:
             if archive.stat().st_size < resumable.FROM_BYTES:
-                return self._upload("/v1/transits", archive, {}, media_type="application/octet-stream")
+                return self._upload("/v1/transits", archive, media_type="application/octet-stream")
             return self.get(resumable.upload(self._answer, archive, "transit", archive.name, self.say))
 
     def upload_psf(
@@ -122,9 +61,35 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         channel: str | None = None,
         kind: str | None = None,
     ) -> dict[str, Any]:
-        """Upload a PSF (FITS); returns its description, with its ``id``."""
         series = {"instrument": instrument, "channel": channel, "kind": kind}
         return self._upload("/v1/psfs", Path(path), {"name": name, "version": version, **series})
+
+    def image_id(self, path: str | Path, sha256: str) -> str:
+        try:
+            return str(self.get(f"/v1/images/{sha256}")["id"])
+        except ServiceError as error:
+            if error.code != "no-such-image":
+                raise
+            return str(self.upload_image(path)["id"])
+
+    def _upload(
+        self,
+        address: str,
+        path: Path,
+        query: dict[str, Any] | None = None,
+        *,
+        media_type: str = "application/fits",
+    ) -> dict[str, Any]:
+        with path.open("rb") as file:
+            return self._json(
+                "POST",
+                address,
+                params={"filename": path.name} | (query or {}),
+                content=iter(lambda: file.read(2**20), b""),
+                headers={"Content-Type": media_type, "Content-Length": str(path.stat().st_size)},
+            )
+
+    # Jobs --------------------------------------------------------------------------------------
 
     def submit(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
         """Submit a job; returns its description. If an identical job was submitted before, returns the description of
@@ -132,8 +97,7 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
 
         queue: "bulk" runs the job after all jobs of other queues; default: the queue of its kind.
         """
-        body = {"kind": kind, "queue": queue, "parameters": parameters}
-        return self._json("POST", "/v1/jobs", json=body)
+        return self._job("/v1/jobs", kind, queue=queue, parameters=parameters)
 
     def estimate(self, kind: str, *, queue: str | None = None, **parameters: Any) -> dict[str, Any]:
         """Estimate a job without starting it. The arguments and the errors are the same as for ``submit``.
@@ -141,32 +105,17 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         "estimate" has the expected ``seconds`` and ``memory_mib``, "psf" says which PSF a deconvolution would use and why, and
         "existing" is the address of the result if there is one already.
         """
-        body = {"kind": kind, "queue": queue, "parameters": parameters}
-        return self._json("POST", "/v1/estimates", json=body)
+        return self._job("/v1/estimates", kind, queue=queue, parameters=parameters)
 
     def result_id(self, kind: str, **parameters: Any) -> str:
-        """The id that the result of a job with these parameters has or would have. No job is started."""
-        body = {"kind": kind, "parameters": parameters}
-        identity: str = self._json("POST", "/v1/jobs/identity", json=body)["result_id"]
-        return identity
+        return str(self._job("/v1/jobs/identity", kind, parameters=parameters)["result_id"])
 
-    def image_id(self, path: str | Path, sha256: str) -> str:
-        """The id of an image. If the service does not have the image, the image is uploaded. sha256: hash of the
-        file."""
-        try:
-            identity: str = self.get(f"/v1/images/{sha256}")["id"]
-        except ServiceError as error:
-            if error.code != "no-such-image":
-                raise
-            identity = self.upload_image(path)["id"]
-        return identity
-
-    def release(self, product: dict[str, Any]) -> None:
-        """Do nothing: the service keeps its products."""
+    def _job(self, address: str, kind: str, **body: Any) -> dict[str, Any]:
+        return self._json("POST", address, json={"kind": kind, **body})
 
     def job(self, job_id: str) -> dict[str, Any]:
         """The current description of a job."""
-        return self._json("GET", f"/v1/jobs/{job_id}")
+        return self.get(f"/v1/jobs/{job_id}")
 
     def jobs(self, **filters: str) -> Iterator[dict[str, Any]]:
         """Your jobs, newest first; ``phase`` selects the jobs in one phase."""
@@ -185,65 +134,35 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         Raises ``ServiceError`` if the job failed or was cancelled, ``TimeoutError`` after ``timeout_s``, and
         ``WaitInterrupted`` on Control-C. After ``TimeoutError`` or ``WaitInterrupted``, the job continues.
         """
+        started, in_queue_said, job_id = time.monotonic(), False, job["id"]
         try:
-            return self._ended(self._followed(job, progress, timeout_s))
+            while job["phase"] in ("QUEUED", "EXECUTING"):
+                waited_s = time.monotonic() - started
+                if timeout_s is not None and waited_s > timeout_s:
+                    raise TimeoutError(f"job {job['id']} is {job['phase']} after {timeout_s:g} s")
+                if job["phase"] == "QUEUED" and waited_s > QUEUED_S and not in_queue_said:
+                    self.say(f"job {job['id'][:SHOWN_DIGITS]} waits in the queue {job['queue']}")
+                    in_queue_said = True
+                time.sleep(0.1)
+                job = Patience(self.say, GOES_ON).repeat(lambda: self.job(job_id))
+                now = job["progress"]
+                if progress is not None and now["stage"]:
+                    progress(now["stage"], now["step"], max(now["steps"], 1))
         except KeyboardInterrupt as stop:
             raise WaitInterrupted("job", job["id"], self.server) from stop
+        return self._ended(job)
 
-    def _followed(
-        self, job: dict[str, Any], progress: Progress | None, timeout_s: float | None
+    def rerun(
+        self, of: Literal["psf", "product"], identity: str, *, progress: Progress | None = None
     ) -> dict[str, Any]:
-        """The description of a job when it has ended."""
-        started, told = time.monotonic(), False
-        while job["phase"] in ("QUEUED", "EXECUTING"):
-            waited_s = time.monotonic() - started
-            if timeout_s is not None and waited_s > timeout_s:
-                raise TimeoutError(f"job {job['id']} is {job['phase']} after {timeout_s:g} s")
-            if job["phase"] == "QUEUED" and waited_s > QUEUED_S and not told:
-                self.say(f"job {job['id'][:SHOWN_DIGITS]} waits in the queue {job['queue']}")
-                told = True
-            time.sleep(0.1)
-            job = self._job_patiently(job["id"])
-            now = job["progress"]
-            if progress is not None and now["stage"]:
-                progress(now["stage"], now["step"], max(now["steps"], 1))
-        return job
+        """Make a PSF or a product again; returns the report on the differences."""
+        return self.run("rerun", {"of": of, "id": identity}, progress)
 
-    def _job_patiently(self, job_id: str) -> dict[str, Any]:
-        """The description of a job. While the service does not answer, the request is repeated at growing intervals."""
-        deadline, wait_s = time.monotonic() + PATIENCE_S, FIRST_WAIT_S
-        lost = False
-        while True:
-            try:
-                job = self.job(job_id)
-            except ServiceError as error:
-                if error.status not in PASSING or time.monotonic() > deadline:
-                    raise
-                if not lost and error.status != 429:
-                    self.say(still_waiting(error))
-                    lost = True
-                time.sleep(min(error.retry_after_s or wait_s, LONGEST_WAIT_S))
-                wait_s = min(2 * wait_s, LONGEST_WAIT_S)
-            else:
-                if lost:
-                    self.say("the service answers again")
-                return job
-
-    def get(self, address: str) -> dict[str, Any]:
-        """The description at an address of the service."""
-        return self._json("GET", address)
+    # Images and products -----------------------------------------------------------------------
 
     def product(self, product_id: str) -> dict[str, Any]:
         """The description of a product."""
-        return self._json("GET", f"/v1/products/{product_id}")
-
-    def psf(self, psf_id: str) -> dict[str, Any]:
-        """The description of a PSF version."""
-        return self._json("GET", f"/v1/psfs/{psf_id}")
-
-    def psfs(self, **filters: str) -> Iterator[dict[str, Any]]:
-        """All PSF versions, newest first."""
-        return self._all("/v1/psfs", filters)
+        return self.get(f"/v1/products/{product_id}")
 
     def products(self, **filters: str) -> Iterator[dict[str, Any]]:
         """All products, newest first."""
@@ -253,24 +172,72 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         """Delete a product. The same request makes it again."""
         self._answer("DELETE", f"/v1/products/{product_id}")
 
-    def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
-        """Download a file of the service. The file appears at ``path`` only when it is complete.
+    def release(self, product: dict[str, Any]) -> None:
+        """Do nothing: the service keeps its products."""
 
-        Raises ``ServiceError`` "download-damaged" if its SHA-256 is not the one that the service recorded.
+    def pixels(
+        self,
+        of: Literal["image", "product"],
+        identity: str,
+        plane: Literal["image", "error", "quality"] = "image",
+        *,
+        x: int = 0,
+        y: int = 0,
+        width: int | None = None,
+        height: int | None = None,
+        step: int = 1,
+    ) -> NDArray[np.float32]:
+        """The pixels [y, x] of an uploaded image or of a plane of a product, in the unit of the file; NaN: no value.
+
+        x, y, width, height: the window, px, counted from 0; default: the whole plane. step: n gives one number for each block of
+        n x n px: the mean of its finite pixels, for "quality" the bitwise OR. Raises ``ServiceError`` "window-outside"
+        and "no-such-plane".
         """
-        with (
-            written(path, overwrite=overwrite) as partial,
-            self._streamed(address) as response,
-            partial.open("wb") as file,
-        ):
-            digest = hashlib.sha256()
-            for chunk in response.iter_bytes():
-                digest.update(chunk)
-                file.write(chunk)
-            _check_digest(response, digest.digest())
+        import numpy as np  # only a caller of this method needs it
+
+        query = {"plane": plane, "x": x, "y": y, "width": width, "height": height, "step": step}
+        answer = self._answer("GET", f"/v1/{of}s/{identity}/pixels", params=query)
+        ny, nx = map(int, answer.headers["x-pixels-shape"].split(","))
+        return np.frombuffer(answer.content, dtype="<f4").astype(np.float32).reshape(ny, nx)
+
+    def image_header(self, image_id: str) -> list[dict[str, Any]]:
+        """The header of each HDU of an uploaded image: ``index``, ``name``, and ``cards`` as [keyword, value, comment]."""
+        return self._header(f"/v1/images/{image_id}")
+
+    def product_header(self, product_id: str) -> list[dict[str, Any]]:
+        """The header of each HDU of a product, as ``image_header`` gives them."""
+        return self._header(f"/v1/products/{product_id}")
+
+    def _header(self, address: str) -> list[dict[str, Any]]:
+        hdus: list[dict[str, Any]] = self._answer("GET", f"{address}/header").json()
+        return hdus
+
+    def thumbnail(self, product_id: str, output: str | Path, *, overwrite: bool = False) -> None:
+        """Write the small picture of a product (PNG, at most 192 px). Raises ``ServiceError`` "no-thumbnail"."""
+        self.download(f"/v1/products/{product_id}/thumbnail", output, overwrite=overwrite)
+
+    def lineage(self, of: Literal["psf", "product"], identity: str) -> dict[str, Any]:
+        """The images, transits and PSFs from which a PSF or a product was made, back to the uploads."""
+        return self.get(f"/v1/{of}s/{identity}/lineage")
+
+    def provenance(
+        self, of: Literal["psf", "product"], identity: str, output: str | Path, *, overwrite: bool = False
+    ) -> None:
+        """Write the lineage of a PSF or a product as W3C PROV: PROV-N if the name of the file ends in .provn, otherwise PROV-JSON."""
+        form = "provn" if Path(output).suffix == ".provn" else "json"
+        self.download(f"/v1/{of}s/{identity}/provenance?format={form}", output, overwrite=overwrite)
+
+    # PSFs and their versions -------------------------------------------------------------------
+
+    def psf(self, psf_id: str) -> dict[str, Any]:
+        """The description of a PSF version."""
+        return self.get(f"/v1/psfs/{psf_id}")
+
+    def psfs(self, **filters: str) -> Iterator[dict[str, Any]]:
+        """All PSF versions, newest first."""
+        return self._all("/v1/psfs", filters)
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        """The answer of the service to a query about a PSF."""
         parameters = {
             name: ",".join(f"{number!r}" for number in value) if isinstance(value, list) else value
             for name, value in query.items()
@@ -278,60 +245,259 @@ class Client(VersionedPsfs, BulkClient, KeysClient, Viewing, Operations):
         return self._json("GET", f"/v1/psfs/{psf_id}/{question}", params=parameters)
 
     def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
-        """Download the central (size, size) px of a PSF."""
         self.download(f"/v1/psfs/{psf_id}/cutout?size={size}", output, overwrite=overwrite)
 
-    def _upload(
-        self, address: str, path: Path, query: dict[str, str | None], *, media_type: str = "application/fits"
+    def psf_status(self, psf_id: str) -> dict[str, Any]:
+        """The status of a PSF, the status changes that are allowed, a free version of its series, and its history."""
+        return self.get(f"/v1/psfs/{psf_id}/status")
+
+    def certify_psf(
+        self,
+        psf_id: str,
+        version: str | None = None,
+        *,
+        valid_from: str | None = None,
+        valid_to: str | None = None,
+        supersedes: Sequence[str] = (),
+        reason: str = "",
+        **series: str | None,
     ) -> dict[str, Any]:
-        known = {key: value for key, value in query.items() if value is not None}
-        with path.open("rb") as file:
-            return self._json(
-                "POST",
-                address,
-                params={"filename": path.name, **known},
-                content=iter(lambda: file.read(2**20), b""),
-                headers={"Content-Type": media_type, "Content-Length": str(path.stat().st_size)},
-            )
+        """Certify a draft under a version, or change the time range of a certified PSF. Returns its new status.
 
-    def _all(self, address: str, filters: dict[str, str]) -> Iterator[dict[str, Any]]:
-        page = self._json("GET", address, params={"limit": "200", **filters})
-        while True:
-            yield from page["items"]
-            if page["next"] is None:
-                return
-            page = self._json("GET", page["next"])
+        supersedes: certified PSFs to deprecate in the same step. series: ``instrument``, ``channel`` and ``kind`` of an
+        uploaded PSF, if its file does not contain them.
+        """
+        change = {"version": version, "valid_from": valid_from, "valid_to": valid_to, **series}
+        return self._set_status(psf_id, "certified", supersedes=list(supersedes), reason=reason, **change)
 
-    @contextmanager
-    def _streamed(self, address: str, **options: Any) -> Iterator[httpx.Response]:
+    def deprecate_psf(self, psf_id: str, successor: str | None = None, *, reason: str = "") -> dict[str, Any]:
+        """Deprecate a certified PSF, or name the successor of a deprecated PSF. Returns its new status."""
+        return self._set_status(psf_id, "deprecated", successor=successor, reason=reason)
+
+    def _set_status(self, psf_id: str, status: str, **change: Any) -> dict[str, Any]:
+        return self._json("POST", f"/v1/psfs/{psf_id}/status", json={"status": status, **change})
+
+    def delete_psf(self, psf_id: str) -> dict[str, Any]:
+        """Delete a draft that nothing uses. Returns its last description."""
+        return self._json("DELETE", f"/v1/psfs/{psf_id}")
+
+    def best_psf(self, **filters: str | None) -> dict[str, Any]:
+        """The one PSF that fits ``instrument``, ``channel``, ``kind``, ``version``, ``valid_at``, ``context``, ...
+
+        The description of the PSF is under the key "psf". Raises ``ServiceError`` "no-psf-fits" or "several-psfs-fit".
+        """
+        return self._json("GET", "/v1/psfs/best", params=filters)
+
+    def psf_for_image(self, image_id: str, **where: str | None) -> dict[str, Any]:
+        """The PSF that fits the header of an uploaded image; ``context`` and ``kind`` as for ``best_psf``."""
+        return self._json("GET", f"/v1/images/{image_id}/psf", params=where)
+
+    def affected(self, psf_id: str | None = None, *, superseded: bool = False) -> Iterator[dict[str, Any]]:
+        """Products made with a PSF. Without ``psf_id``: products made with any deprecated PSF.
+
+        superseded: list only products whose PSF has a successor.
+        """
+        if psf_id is not None:
+            return self._all(f"/v1/psfs/{psf_id}/affected", {})
+        return self._all("/v1/affected", {"superseded": superseded})
+
+    def series(self) -> Iterator[dict[str, Any]]:
+        """The series of which a PSF was certified: name, and whether its PSFs may be interpolated."""
+        return self._all("/v1/series", {})
+
+    def interpolate_series(
+        self, series: str, interpolated: bool = True, *, reason: str = ""
+    ) -> dict[str, Any]:
+        """Say whether the PSFs of a series (instrument/channel/kind) may be interpolated in time. Returns the series."""
+        body = {"interpolated": interpolated, "reason": reason}
+        return self._json("PUT", f"/v1/series/{series}", json=body)
+
+    def interpolate_psf(
+        self,
+        before: str,
+        after: str,
+        time: str,
+        *,
+        before_time: str | None = None,
+        after_time: str | None = None,
+        progress: Progress | None = None,
+    ) -> dict[str, Any]:
+        """Interpolate between two fitted PSFs in time; returns the new PSF.
+
+        before, after: their ids. before_time, after_time: the last time at which the earlier PSF holds, and the first
+        time at which the later PSF holds; default: the end and the start of the ranges for which they are certified.
+        """
+        times = {
+            "before_time": before_time or self.psf(before)["valid_to"],
+            "after_time": after_time or self.psf(after)["valid_from"],
+        }
+        parameters = {"before_psf_id": before, "after_psf_id": after, "time": time, **given(times)}
+        return self.run("psf-interpolate", parameters, progress)
+
+    def contexts(self) -> Iterator[dict[str, Any]]:
+        """All contexts, newest first, without their pins."""
+        return self._all("/v1/contexts", {})
+
+    def context(self, id_or_name: str) -> dict[str, Any]:
+        """A context with its pins."""
+        return self.get(f"/v1/contexts/{id_or_name}")
+
+    def create_context(
+        self, name: str, pins: Sequence[dict[str, Any]] | None = None, *, reason: str = ""
+    ) -> dict[str, Any]:
+        """Make a context. pins: ``{"psf_id", "valid_from", "valid_to"}`` for each PSF; default: all certified PSFs."""
+        body = {"name": name, "reason": reason, "pins": None if pins is None else list(pins)}
+        return self._json("POST", "/v1/contexts", json=body)
+
+    def default_context(self) -> dict[str, Any]:
+        """The default context, from which the PSF is chosen if a request names no context, and the history of its changes."""
+        return self.get("/v1/contexts/default")
+
+    def use_context(self, id_or_name: str | None, *, reason: str = "") -> dict[str, Any]:
+        """Make a context the default; None: use the PSFs that are certified at the time of each request."""
+        body = {"context": id_or_name, "reason": reason}
+        return self._json("PUT", "/v1/contexts/default", json=body)
+
+    # Bulk runs ---------------------------------------------------------------------------------
+
+    def submit_bulk(self, **request: Any) -> dict[str, Any]:
+        """Start a bulk run and return its description. If a bulk run of an identical request is open, return the description of that run.
+
+        request: the arguments below, by their names. images: ids of uploaded images. files: patterns of paths on the machine of the service, or {"glob": pattern,
+        "where": conditions on the header}. output: folder on that machine for the products. only: write the products only to
+        this folder. layout: names of the products in this folder, for example ``{telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits``.
+        fields: ``name``, either ``psf_id`` or ``context`` (id or name), and the fields of
+        ``workers.contract.requests.Treatment``, such as ``method={"name": ..., "steps": ...}`` or ``saturation_dn``.
+        """
+        return self._json("POST", "/v1/bulk", json=_bulk_request(**request))
+
+    def estimate_bulk(self, *, sample: int | None = None, **request: Any) -> dict[str, Any]:
+        """Estimate a bulk run without starting it. The other arguments and the errors are those of ``submit_bulk``.
+
+        sample: largest number of images whose headers are examined; default: 200. "images" is the number of images that
+        were found, "seconds" the expected time of the run with the workers of now, "output_bytes" the expected size of the
+        products; "refused" has the examined images that the run would refuse, with the reasons.
+        """
+        body = _bulk_request(**request)
+        return self._json("POST", "/v1/bulk/estimate", json=body, params={"sample": sample})
+
+    def bulk(self, bulk_id: str) -> dict[str, Any]:
+        """The current description of a bulk run."""
+        return self.get(f"/v1/bulk/{bulk_id}")
+
+    def bulks(self, **filters: str) -> Iterator[dict[str, Any]]:
+        """All bulk runs, newest first."""
+        return self._all("/v1/bulk", filters)
+
+    def pause_bulk(self, bulk_id: str) -> dict[str, Any]:
+        """Pause a bulk run: it starts no more images."""
+        return self._json("POST", f"/v1/bulk/{bulk_id}/pause")
+
+    def resume_bulk(self, bulk_id: str) -> dict[str, Any]:
+        """Resume a paused or failed bulk run."""
+        return self._json("POST", f"/v1/bulk/{bulk_id}/resume")
+
+    def cancel_bulk(self, bulk_id: str) -> dict[str, Any]:
+        """End a bulk run permanently. Products that are done are kept."""
+        return self._json("POST", f"/v1/bulk/{bulk_id}/cancel")
+
+    def retry_bulk(self, bulk_id: str) -> dict[str, Any]:
+        """Try the failed images again. Raises ``ServiceError`` "equal-bulk-open" if another bulk run of the same request is open."""
+        return self._json("POST", f"/v1/bulk/{bulk_id}/retry")
+
+    def delete_bulk(self, bulk_id: str) -> None:
+        """Delete a bulk run that is not LISTING or RUNNING; its products are kept. Raises ``ServiceError`` "wrong-phase"."""
+        self._answer("DELETE", f"/v1/bulk/{bulk_id}")
+
+    def bulk_failures(self, bulk_id: str) -> Iterator[dict[str, Any]]:
+        """The failed images, with reasons."""
+        return self._all(f"/v1/bulk/{bulk_id}/failures", {})
+
+    def bulk_results(
+        self, bulk_id: str, *, order: str = "bulk", limit: int | None = None
+    ) -> Iterator[dict[str, Any]]:
+        """The images that are done, with checksums and changes. ``order="worst"`` puts the highest artefact score first."""
+        query = given({"order": order, "limit": limit})
+        with self._streamed(f"/v1/bulk/{bulk_id}/results", params=query) as answer:
+            for line in answer.iter_lines():
+                yield json.loads(line)
+
+    def write_bulk_manifest(
+        self, bulk_id: str, path: str | Path, *, format: str = "ndjson", overwrite: bool = False
+    ) -> None:
+        """Write the manifest of all products, as JSON lines ("ndjson") or as a table ("csv")."""
+        self.download(f"/v1/bulk/{bulk_id}/results?format={format}", path, overwrite=overwrite)
+
+    def wait_for_bulk(self, bulk_id: str, *, progress: Progress | None = None) -> dict[str, Any]:
+        """Wait until a bulk run ends, is paused or has failed; returns its description.
+
+        Raises ``WaitInterrupted`` on Control-C; the bulk run then continues.
+        """
         try:
-            with self._http.stream("GET", address, **options) as response:
-                if response.is_error:
-                    response.read()
-                    raise _refused(response)
-                yield response
-        except httpx.TransportError as error:
-            raise self._unreachable(error) from error
+            for bulk in self.follow(f"/v1/bulk/{bulk_id}"):
+                images = bulk["images"]
+                ended, total = images["done"] + images["failed"], images["total"]
+                if progress is not None and not bulk["listed"]:
+                    # The number of steps is unknown.
+                    progress(f"{ended} of at least {total} images", 0, 1)
+                elif progress is not None and total:
+                    progress("images", ended, total)
+                if bulk["phase"] not in ("LISTING", "RUNNING"):
+                    break
+        except KeyboardInterrupt as stop:
+            raise WaitInterrupted("bulk", bulk_id, self.server) from stop
+        return bulk
 
-    def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
-        body: dict[str, Any] = self._answer(method, address, **options).json()
-        return body
+    # Keys, for a service that requires keys ----------------------------------------------------
 
-    def _answer(self, method: str, address: str, **options: Any) -> httpx.Response:
-        try:
-            response = self._http.request(method, address, **options)
-        except httpx.TransportError as error:
-            raise self._unreachable(error) from error
-        if response.is_error:
-            raise _refused(response)
-        return response
+    def make_key(
+        self,
+        scopes: Sequence[str],
+        *,
+        label: str = "",
+        lasts_days: float | None = None,
+        owner: str | None = None,
+    ) -> dict[str, Any]:
+        """Make a key; returns its description. Only this answer contains the whole key, under "key".
 
-    def _unreachable(self, error: httpx.TransportError) -> ServiceError:
-        return ServiceError(f"no answer from {self.server} ({error}); {how_to_start(self.server)}")
+        scopes: "read", "submit", "certify", "bulk", "admin"; not more than your own key allows. lasts_days: lifetime, days;
+        default: as long as your own key. owner: another owner than your own needs the scope admin.
+        """
+        body = {"scopes": list(scopes), "label": label, "lasts_days": lasts_days, "owner": owner}
+        return self._json("POST", "/v1/keys", json=body)
+
+    def keys(self, owner: str | None = None) -> Iterator[dict[str, Any]]:
+        """Your keys without their secrets, newest first. owner: another owner, or "*" for all; needs the scope admin."""
+        return self._all("/v1/keys", {"owner": owner})
+
+    def revoke_key(self, key_id: str, *, and_made: bool = False) -> dict[str, Any]:
+        """Revoke a key; returns its description. and_made: also revoke all keys that were made with it."""
+        return self._json("DELETE", f"/v1/keys/{key_id}", params={"and_made": and_made})
+
+
+def _bulk_request(
+    *,
+    images: Sequence[str] = (),
+    files: Sequence[str | Mapping[str, Any]] = (),
+    output: str | None = None,
+    only: bool = False,
+    layout: str | None = None,
+    **fields: Any,
+) -> dict[str, Any]:
+    """The body of a request for a bulk run, from the arguments of ``Client.submit_bulk``."""
+    fields = given(fields)
+    own: dict[str, Any] = {name: fields.pop(name) for name in ("name", "psf_id", "context") if name in fields}
+    return {
+        **own,
+        "images": list(images),
+        "files": [{"glob": one} if isinstance(one, str) else dict(one) for one in files],
+        "parameters": fields,
+        "output": None if output is None else {"folder": output, "only": only, "layout": layout},
+    }
 
 
 @contextmanager
-def as_archive(path: Path) -> Iterator[Path]:
+def _as_archive(path: Path) -> Iterator[Path]:
     """The archive at ``path``. If ``path`` is a folder, a temporary archive of this folder."""
     if not path.is_dir():
         yield path
@@ -343,30 +509,3 @@ def as_archive(path: Path) -> Iterator[Path]:
         except DataError as error:
             raise ServiceError(error.message, code=error.code) from error
         yield archive
-
-
-def _check_digest(response: httpx.Response, received: bytes) -> None:
-    """Compare the SHA-256 of the received bytes with the header Repr-Digest (RFC 9530), if the answer has one."""
-    declared = response.headers.get("repr-digest", "")
-    found = re.search(r"\bsha-256=:([A-Za-z0-9+/=]+):", declared)
-    if found is not None and found[1] != base64.b64encode(received).decode():
-        raise ServiceError(
-            f"expected a file with the SHA-256 {base64.b64decode(found[1]).hex()}; received one with {received.hex()}: try "
-            "again; if this does not help, the file in the store is damaged: tell the operator",
-            code="download-damaged",
-        )
-
-
-def _refused(response: httpx.Response) -> ServiceError:
-    if response.headers.get("content-type", "").startswith("application/problem+json"):
-        problem = response.json()
-        code = str(problem["type"]).removeprefix("urn:heliopsf:")
-        after = response.headers.get("retry-after", "")
-        return ServiceError(
-            problem["detail"],
-            status=response.status_code,
-            code=code,
-            retry_after_s=float(after) if after.isdecimal() else None,
-            fields={name: value for name, value in problem.items() if name not in _STANDARD_FIELDS},
-        )
-    return ServiceError(f"the service answered {response.status_code}", status=response.status_code)

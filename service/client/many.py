@@ -12,7 +12,6 @@ recognised by their cards INPSHA and PRODID, whatever their names.
 from __future__ import annotations
 
 import hashlib
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,8 +22,8 @@ from typing import Any, TypeVar
 from psfcore.errors import DataError, HeaderError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_text
-from psfcore.fits.header import all_hdus, first_image_header
-from service.client.errors import ServiceError, WaitInterrupted
+from psfcore.fits.header import FitsLimits, all_hdus, first_image_header, optional_text
+from service.client.errors import Answer, Patience, ServiceError, WaitInterrupted
 from service.client.operations import Operations, deconvolution
 from service.client.outputs import check_output_folder, check_outputs
 from workers.files.archive import safe_name
@@ -32,12 +31,10 @@ from workers.files.archive import safe_name
 # Errors that concern every image, so that the run stops: key refused, scope missing, quota full.
 FOR_ALL = (401, 403, 507)
 BUSY = (429, 502, 503)  # statuses after which a request is sent again
-PATIENCE_S, LONGEST_WAIT_S = 600.0, 60.0
 LARGEST_PX = 2**26
 
-_Found = dict[tuple[str, str], Path]
-_Answer = TypeVar("_Answer")
-_Step = TypeVar("_Step", bound="_Begun | Outcome")
+_Products = dict[tuple[str, str], Path]
+_Step = TypeVar("_Step", bound="_Pending | Outcome")
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,7 @@ def deconvolve_many(
 
 
 @dataclass
-class _Begun:
+class _Pending:
     """An image whose outcome is not yet known. key: identity of its product, and SHA-256 of the image.
 
     job: None if an earlier image in flight has the same product.
@@ -94,60 +91,58 @@ class _Begun:
     image: Path
     key: tuple[str, str]
     output: Path
-    wanted: dict[str, Any]
+    request: dict[str, Any]
     job: dict[str, Any] | None
 
 
+@dataclass
 class _Run:
     """The images whose outcome is not yet known, in their order; the first image is finished first."""
 
-    def __init__(
-        self,
-        service: Operations,
-        images: Sequence[str | Path],
-        folder: Path,
-        overwrite: bool,
-        parameters: dict[str, Any],
-    ) -> None:
-        self._service, self._images, self._folder = service, images, folder
-        self._overwrite, self._parameters = overwrite, parameters
-        self._found = _products_in(folder)
-        self._begun: deque[_Begun | Outcome] = deque()
+    service: Operations
+    images: Sequence[str | Path]
+    folder: Path
+    overwrite: bool
+    parameters: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        self._products = _products_in(self.folder)
+        self._pending: deque[_Pending | Outcome] = deque()
 
     def outcomes(self) -> Iterator[Outcome]:
         """The outcome for each image. Raises the same errors as ``deconvolve_many``."""
         try:
-            for image in map(Path, self._images):
+            for image in map(Path, self.images):
                 try:
-                    self._begun.append(_told(image, partial(self._begin, image)))
+                    self._pending.append(_outcome(image, partial(self._begin, image)))
                 except ServiceError as error:
                     if error.status in FOR_ALL:
                         yield from self._finished(leave=0)
                     raise
-                yield from self._finished(leave=self._service.jobs_at_once - 1)
+                yield from self._finished(leave=self.service.jobs_at_once - 1)
             yield from self._finished(leave=0)
         except KeyboardInterrupt as stop:
             jobs = [one["id"] for one in self._in_flight()]
-            if self._service.server is None or not jobs:
+            if self.service.server is None or not jobs:
                 raise
-            raise WaitInterrupted("job", jobs[0], self._service.server, tuple(jobs[1:])) from stop
+            raise WaitInterrupted("job", jobs[0], self.service.server, tuple(jobs[1:])) from stop
 
     def _in_flight(self) -> list[dict[str, Any]]:
-        return [one.job for one in self._begun if isinstance(one, _Begun) and one.job is not None]
+        return [one.job for one in self._pending if isinstance(one, _Pending) and one.job is not None]
 
     def _finished(self, leave: int) -> Iterator[Outcome]:
         """Finish images, oldest first, until at most ``leave`` jobs are in flight and the oldest unfinished image has
         a job in flight."""
-        while self._begun:
-            first = self._begun[0]
-            if isinstance(first, _Begun):
+        while self._pending:
+            first = self._pending[0]
+            if isinstance(first, _Pending):
                 if first.job is not None and len(self._in_flight()) <= leave:
                     return
-                first = _told(first.image, partial(self._finish, first))
-            self._begun.popleft()  # only now: an interruption before this line must name its job
+                first = _outcome(first.image, partial(self._finish, first))
+            self._pending.popleft()  # only now: an interruption before this line must name its job
             yield first
 
-    def _begin(self, image: Path) -> _Begun | Outcome:
+    def _begin(self, image: Path) -> _Pending | Outcome:
         """Upload an image and submit its job.
 
         No job is submitted if the folder already contains the product, or if the job of an earlier image makes the
@@ -155,37 +150,37 @@ class _Run:
         """
         with image.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-        image_id = _patiently(lambda: self._service.image_id(image, sha256))
-        wanted = deconvolution(image_id, **self._parameters)
-        product_id = _patiently(lambda: self._service.result_id("deconvolve", **wanted))
+        image_id = _patiently(lambda: self.service.image_id(image, sha256))
+        request = deconvolution(image_id, **self.parameters)
+        product_id = _patiently(lambda: self.service.result_id("deconvolve", **request))
         key = (product_id, sha256)
-        if key in self._found:
-            return Outcome(image, self._found[key], existed=True)
-        begun = _Begun(image, key, self._folder / safe_name(image.name, product_id), wanted, None)
-        if not any(isinstance(one, _Begun) and one.key == key for one in self._begun):
-            begun.job = self._submitted(begun)
-        return begun
+        if key in self._products:
+            return Outcome(image, self._products[key], existed=True)
+        pending = _Pending(image, key, self.folder / safe_name(image.name, product_id), request, None)
+        if not any(isinstance(one, _Pending) and one.key == key for one in self._pending):
+            pending.job = self._submit(pending)
+        return pending
 
-    def _submitted(self, begun: _Begun) -> dict[str, Any]:
-        inputs = self._images if begun.output.exists() else ()
-        check_outputs((begun.output,), inputs=inputs, overwrite=self._overwrite)
-        return _patiently(lambda: self._service.submit("deconvolve", **begun.wanted))
+    def _submit(self, pending: _Pending) -> dict[str, Any]:
+        inputs = self.images if pending.output.exists() else ()
+        check_outputs((pending.output,), inputs=inputs, overwrite=self.overwrite)
+        return _patiently(lambda: self.service.submit("deconvolve", **pending.request))
 
-    def _finish(self, begun: _Begun) -> Outcome:
+    def _finish(self, pending: _Pending) -> Outcome:
         """Wait for the job of an image, and download its product."""
-        if begun.key in self._found:
-            return Outcome(begun.image, self._found[begun.key], existed=True)
-        if begun.job is None:  # the earlier image failed
-            begun.job = self._submitted(begun)
-        product = self._service.get(self._service.wait(begun.job)["result"])
-        self._service.download(product["file"], begun.output, overwrite=self._overwrite)
-        self._service.release(product)
-        self._found[begun.key] = begun.output
+        if pending.key in self._products:
+            return Outcome(pending.image, self._products[pending.key], existed=True)
+        if pending.job is None:  # the earlier image failed
+            pending.job = self._submit(pending)
+        product = self.service.get(self.service.wait(pending.job)["result"])
+        self.service.download(product["file"], pending.output, overwrite=self.overwrite)
+        self.service.release(product)
+        self._products[pending.key] = pending.output
         warnings = tuple(one["message"] for one in product["details"]["warnings"])
-        return Outcome(begun.image, begun.output, warnings=warnings)
+        return Outcome(pending.image, pending.output, warnings=warnings)
 
 
-def _told(image: Path, step: Callable[[], _Step]) -> _Step | Outcome:
+def _outcome(image: Path, step: Callable[[], _Step]) -> _Step | Outcome:
     """The answer of a step, or the outcome of the image if the step failed. Raises ``ServiceError`` if the error
     concerns every image."""
     try:
@@ -200,10 +195,10 @@ def _told(image: Path, step: Callable[[], _Step]) -> _Step | Outcome:
         return Outcome(image, failure=error.strerror or str(error))
 
 
-def _products_in(folder: Path) -> _Found:
+def _products_in(folder: Path) -> _Products:
     """Find the files of the complete products in a folder. Return a dictionary from (product id, SHA-256 of the input
     image) to the file."""
-    found: _Found = {}
+    products: _Products = {}
     limits = FitsLimits(max_pixels=LARGEST_PX)
     for path in sorted(folder.glob("*.fits")):
         try:
@@ -213,19 +208,11 @@ def _products_in(folder: Path) -> _Found:
             continue  # not a complete FITS file, so not a product that can be used in place of a new one
         product_id, sha256 = optional_text(header, "PRODID"), optional_text(header, "INPSHA")
         if product_id is not None and sha256 is not None:
-            found[product_id, sha256] = path
-    return found
+            products[product_id, sha256] = path
+    return products
 
 
-def _patiently(ask: Callable[[], _Answer]) -> _Answer:
+def _patiently(ask: Callable[[], Answer]) -> Answer:
     """The answer to a request. The request is repeated while the service is busy or the caller's rate limit is used
     up."""
-    give_up_at = time.monotonic() + PATIENCE_S
-    while True:
-        try:
-            return ask()
-        except ServiceError as error:
-            if error.status not in BUSY or time.monotonic() > give_up_at:
-                raise
-            wait_s = 1.0 if error.retry_after_s is None else error.retry_after_s
-            time.sleep(min(wait_s, LONGEST_WAIT_S))
+    return Patience(say=lambda line: None, goes_on="").repeat(ask, BUSY)

@@ -9,14 +9,15 @@ the new file is complete.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from service.client.errors import ServiceError
-from service.client.outputs import check_outputs
-from service.client.versions import Progress
+from service.client.outputs import Name, check_outputs
 from workers.contract.requests import Deconvolve
+
+Progress = Callable[[str, int, int], None]  # called with the stage, the step, and the number of steps
 
 
 class Operations(ABC):
@@ -117,12 +118,9 @@ class Operations(ABC):
         """
         check_outputs((output, preview, changes), inputs=(image,), overwrite=overwrite)
         image_id = self.upload_image(image)["id"]
-        wanted = deconvolution(image_id, changes_picture=changes is not None, **parameters)
-        job = self.submit("deconvolve", **wanted)
-        product = self.get(self.wait(job, progress=progress)["result"])
-        self._fetch(product, output, preview, overwrite)
-        if changes is not None:
-            self.download(product["changes"], changes, overwrite=overwrite)
+        request = deconvolution(image_id, changes_picture=changes is not None, **parameters)
+        product = self.run("deconvolve", request, progress)
+        self._fetch(product, {"file": output, "preview": preview, "changes": changes}, overwrite)
         return product
 
     def build_psf(
@@ -145,16 +143,15 @@ class Operations(ABC):
         """
         is_file = isinstance(instrument, Path) or instrument.endswith(".toml")
         check_outputs((output, preview), inputs=(instrument if is_file else None, mask), overwrite=overwrite)
-        wanted: dict[str, Any] = {"size": size, "component": component}
+        request: dict[str, Any] = {"size": size, "component": component}
         if is_file:
-            wanted["instrument_file"] = Path(instrument).read_text("utf-8")
+            request["instrument_file"] = Path(instrument).read_text("utf-8")
         else:
-            wanted["instrument"] = instrument
+            request["instrument"] = instrument
         if mask is not None:
-            wanted["mask_id"] = self.upload_image(mask)["id"]
-        job = self.submit("psf-build", **wanted)
-        psf = self.get(self.wait(job, progress=progress)["result"])
-        self._fetch(psf, output, preview, overwrite)
+            request["mask_id"] = self.upload_image(mask)["id"]
+        psf = self.run("psf-build", request, progress)
+        self._fetch(psf, {"file": output, "preview": preview}, overwrite)
         return psf
 
     def fit_psf(
@@ -164,22 +161,15 @@ class Operations(ABC):
         *,
         report: str | Path | None = None,
         preview: str | Path | None = None,
-        progress: Progress | None = None,
-        noise: tuple[float, float] | None = None,
-        overwrite: bool = False,
-        **parameters: Any,
+        **options: Any,
     ) -> dict[str, Any]:
         """Upload a transit (folder or archive), fit its scatter kernel and download the PSF; returns its description.
 
-        report, preview: where to write the report (JSON) and the plot (PNG). noise: as for ``deconvolve``. parameters: for example
-        ``shape="stretched"``, ``as_published=True``.
+        report, preview: where to write the report (JSON) and the plot (PNG). options: ``progress``, ``overwrite`` and ``noise`` as for
+        ``deconvolve``, and the fields of ``workers.contract.requests.PsfFit``, such as ``shape="stretched"`` or ``as_published=True``.
         """
-        check_outputs((output, report, preview), inputs=(transit,), overwrite=overwrite)
-        psf = self._on_transit("psf-fit", transit, progress, noise, parameters)
-        self._fetch(psf, output, preview, overwrite)
-        if report is not None:
-            self.download(psf["report"], report, overwrite=overwrite)
-        return psf
+        files = {"file": output, "report": report, "preview": preview}
+        return self._on_transit("psf-fit", transit, files, **options)
 
     def cross_validate(
         self,
@@ -187,19 +177,13 @@ class Operations(ABC):
         report: str | Path | None = None,
         *,
         preview: str | Path | None = None,
-        progress: Progress | None = None,
-        noise: tuple[float, float] | None = None,
-        overwrite: bool = False,
-        **parameters: Any,
+        **options: Any,
     ) -> dict[str, Any]:
         """Upload a transit, cross-validate its fit and download the report (JSON); returns its description.
 
-        parameters: as for ``fit_psf``, and ``scheme="exact"``, ``runs=10``.
+        options: as for ``fit_psf``, and ``scheme="exact"``, ``runs=10``.
         """
-        check_outputs((report, preview), inputs=(transit,), overwrite=overwrite)
-        found = self._on_transit("cross-validate", transit, progress, noise, parameters)
-        self._fetch(found, report, preview, overwrite)
-        return found
+        return self._on_transit("cross-validate", transit, {"file": report, "preview": preview}, **options)
 
     def report(
         self,
@@ -208,22 +192,16 @@ class Operations(ABC):
         *,
         page: str | Path | None = None,
         preview: str | Path | None = None,
-        progress: Progress | None = None,
-        noise: tuple[float, float] | None = None,
-        overwrite: bool = False,
-        **parameters: Any,
+        **options: Any,
     ) -> dict[str, Any]:
         """Upload a transit, make a report on its PSF and download the report; returns the description of the report.
 
-        report, page, preview: where to write the report as JSON, as HTML, and its plot (PNG). noise: as for
-        ``deconvolve``. parameters: ``psf_id`` of a PSF to test (default: fit a PSF), ``seed``, ``dark_offsets``, ``shapes``.
+        report, page, preview: where to write the report as JSON, as HTML, and its plot (PNG). options: ``progress``,
+        ``overwrite`` and ``noise`` as for ``deconvolve``, ``psf_id`` of a PSF to test (default: fit a PSF), ``seed``,
+        ``dark_offsets``, ``shapes``.
         """
-        check_outputs((report, page, preview), inputs=(transit,), overwrite=overwrite)
-        found = self._on_transit("report", transit, progress, noise, parameters)
-        self._fetch(found, report, preview, overwrite)
-        if page is not None:
-            self.download(found["html"], page, overwrite=overwrite)
-        return found
+        files = {"file": report, "preview": preview, "html": page}
+        return self._on_transit("report", transit, files, **options)
 
     def diagnose_gap(
         self,
@@ -232,36 +210,46 @@ class Operations(ABC):
         *,
         page: str | Path | None = None,
         preview: str | Path | None = None,
+        **options: Any,
+    ) -> dict[str, Any]:
+        """Upload a transit, diagnose the gap between it and the fitted model, and download the report; returns its description.
+
+        report, page, preview: as for ``report``. options: ``progress``, ``overwrite`` and ``noise`` as for ``deconvolve``,
+        ``psf_id`` of a fitted PSF to start from, ``seed``, ``coverage`` of the answer set, ``correct`` (whether to make the
+        corrected PSF). If an effect was found, ``details.corrected_psf_id`` is the id of the corrected PSF.
+        """
+        files = {"file": report, "preview": preview, "html": page}
+        return self._on_transit("gap-diagnose", transit, files, **options)
+
+    def _on_transit(
+        self,
+        kind: str,
+        transit: Name,
+        files: dict[str, Name | None],
+        *,
         progress: Progress | None = None,
         noise: tuple[float, float] | None = None,
         overwrite: bool = False,
         **parameters: Any,
     ) -> dict[str, Any]:
-        """Upload a transit, diagnose the gap between it and the fitted model, and download the report; returns its description.
-
-        report, page, preview, noise: as for ``report``. parameters: ``psf_id`` of a fitted PSF to start from, ``seed``,
-        ``coverage`` of the answer set, ``correct`` (whether to make the corrected PSF). If an effect was found,
-        ``details.corrected_psf_id`` is the id of the corrected PSF.
-        """
-        check_outputs((report, page, preview), inputs=(transit,), overwrite=overwrite)
-        found = self._on_transit("gap-diagnose", transit, progress, noise, parameters)
-        self._fetch(found, report, preview, overwrite)
-        if page is not None:
-            self.download(found["html"], page, overwrite=overwrite)
-        return found
-
-    def _on_transit(
-        self,
-        kind: str,
-        transit: str | Path,
-        progress: Progress | None,
-        noise: tuple[float, float] | None,
-        parameters: dict[str, Any],
-    ) -> dict[str, Any]:
-        """Upload a transit and run a job of this kind on it; returns the description of the result."""
+        """Run a job of this kind on a transit, and download files of its result; returns the description of the result."""
+        check_outputs(files.values(), inputs=(transit,), overwrite=overwrite)
         transit_id = self.upload_transit(transit)["id"]
-        job = self.submit(kind, transit_id=transit_id, **_given(parameters), **_noise(noise))
+        request = {"transit_id": transit_id, **given(parameters), **_noise(noise)}
+        result = self.run(kind, request, progress)
+        self._fetch(result, files, overwrite)
+        return result
+
+    def run(self, kind: str, parameters: dict[str, Any], progress: Progress | None) -> dict[str, Any]:
+        """Run a job; returns the description of its result."""
+        job = self.submit(kind, **parameters)
         return self.get(self.wait(job, progress=progress)["result"])
+
+    def _fetch(self, result: dict[str, Any], files: dict[str, Name | None], overwrite: bool) -> None:
+        """Download files of a result. files: the file to write, by the name of the address in the description."""
+        for name, path in files.items():
+            if path is not None:
+                self.download(result[name], path, overwrite=overwrite)
 
     def psf_curve(self, psf_id: str, radii: Sequence[float] | None = None) -> dict[str, Any]:
         """Light beyond radii (px) in percent, by component, with errors; without ``radii``, at all radii of the table."""
@@ -294,14 +282,6 @@ class Operations(ABC):
             self.wait(self.submit("psf-tables", psf_id=psf_id))
         return self.ask(psf_ids[0], question, **query)
 
-    def _fetch(
-        self, result: dict[str, Any], output: str | Path | None, preview: str | Path | None, overwrite: bool
-    ) -> None:
-        if output is not None:
-            self.download(result["file"], output, overwrite=overwrite)
-        if preview is not None:
-            self.download(result["preview"], preview, overwrite=overwrite)
-
     @staticmethod
     def _ended(job: dict[str, Any]) -> dict[str, Any]:
         """The job, if it is completed. Raises ``ServiceError`` if it failed, was cancelled or was never started."""
@@ -323,13 +303,13 @@ def treatment(
     *, method: str = "richardson-lucy", noise: tuple[float, float] | None = None, **parameters: Any
 ) -> dict[str, Any]:
     """The fields of a request to deconvolve, from the arguments of ``Operations.deconvolve``."""
-    given = _given(parameters)
-    fields = {name: value for name, value in given.items() if name in Deconvolve.model_fields}
-    of_method = {name: value for name, value in given.items() if name not in fields}
+    parameters = given(parameters)
+    fields = {name: value for name, value in parameters.items() if name in Deconvolve.model_fields}
+    of_method = {name: value for name, value in parameters.items() if name not in fields}
     return {"method": {"name": method, **of_method}, **fields, **_noise(noise)}
 
 
-def _given(parameters: dict[str, Any]) -> dict[str, Any]:
+def given(parameters: dict[str, Any]) -> dict[str, Any]:
     """The parameters that are not None. The service has defaults for the others."""
     return {name: value for name, value in parameters.items() if value is not None}
 

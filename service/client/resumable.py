@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from service.client.bulk import FIRST_WAIT_S, LONGEST_WAIT_S, PASSING, PATIENCE_S
-from service.client.errors import ServiceError
+from service.client.errors import PASSING, Patience, ServiceError
 
 if TYPE_CHECKING:
     import httpx
@@ -36,44 +34,23 @@ def upload(ask: Ask, path: Path, kind: str, filename: str, say: Callable[[str], 
     metadata = {"kind": kind, "filename": filename, "sha256": sha256}
     text = ",".join(f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in metadata.items())
     headers = TUS | {"Upload-Length": str(length), "Upload-Metadata": text}
-    heard_at, wait_s, cut = time.monotonic(), FIRST_WAIT_S, False
+    patience = Patience(say, "Trying to continue the upload")
     while True:
+        passing = PASSING
         try:
             begun = ask("POST", "/v1/uploads", headers=headers)
             if "content-location" in begun.headers:
                 return str(begun.headers["content-location"])
-            if cut:
-                say(f"the upload continues at {int(begun.headers['upload-offset']) / length:.0%}")
-            cut, heard_at, wait_s = False, time.monotonic(), FIRST_WAIT_S
-            return _sent(ask, path, begun.headers["location"], int(begun.headers["upload-offset"]))
-        except _Cut as error:
-            if error.progress:
-                heard_at, wait_s = time.monotonic(), FIRST_WAIT_S
-            _wait_or_raise(error.reason, heard_at)
-            reason = error.reason
+            offset = int(begun.headers["upload-offset"])
+            patience.answered(f"the upload continues at {offset / length:.0%}")
+            passing = AGAIN
+            return _send_parts(ask, path, begun.headers["location"], offset, patience)
         except ServiceError as error:
-            if error.status not in PASSING:
-                raise
-            _wait_or_raise(error, heard_at)
-            reason = error
-        if not cut:
-            say(f"{reason}. Trying to continue the upload for {PATIENCE_S / 60:.0f} min")
-        cut = True
-        time.sleep(min(reason.retry_after_s or wait_s, LONGEST_WAIT_S))
-        wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+            patience.wait(error, passing)
 
 
-class _Cut(Exception):
-    """A part was not received. progress: whether parts before it were received."""
-
-    def __init__(self, reason: ServiceError, *, progress: bool) -> None:
-        super().__init__(str(reason))
-        self.reason, self.progress = reason, progress
-
-
-def _sent(ask: Ask, path: Path, address: str, offset: int) -> str:
-    """Send all parts from an offset on; returns the address of the file. Raises ``_Cut`` and ``ServiceError``."""
-    begun_at = offset
+def _send_parts(ask: Ask, path: Path, address: str, offset: int, patience: Patience) -> str:
+    """Send all parts from an offset on; returns the address of the file."""
     with path.open("rb") as file:
         file.seek(offset)
         while True:
@@ -84,17 +61,8 @@ def _sent(ask: Ask, path: Path, address: str, offset: int) -> str:
                 "Upload-Offset": str(offset),
                 "Upload-Checksum": f"sha256 {checksum}",
             }
-            try:
-                answer: Any = ask("PATCH", address, content=part, headers=headers)
-            except ServiceError as error:
-                if error.status not in AGAIN:
-                    raise
-                raise _Cut(error, progress=offset > begun_at) from error
+            answer = ask("PATCH", address, content=part, headers=headers)
             if "content-location" in answer.headers:
                 return str(answer.headers["content-location"])
+            patience.answered()
             offset += len(part)
-
-
-def _wait_or_raise(error: ServiceError, heard_at: float) -> None:
-    if time.monotonic() - heard_at > PATIENCE_S:
-        raise error

@@ -13,7 +13,8 @@ from collections.abc import Iterator
 
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Metric, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
+from prometheus_client.core import CounterMetricFamily, InfoMetricFamily
+from prometheus_client.core import GaugeMetricFamily as Gauge
 from prometheus_client.registry import Collector
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -54,35 +55,27 @@ class _Catalogued(Collector):
     def collect(self) -> Iterator[Metric]:
         """The metrics of database, storage and streams. If the database does not answer, its metrics are left out,
         except ``heliopsf_database_up``, which is 0."""
+        state = self._state
+        free_bytes, streams = checks.free_bytes(state.settings.data_dir), state.streams.total()
         yield InfoMetricFamily("heliopsf", "The service", {"version": software_version()})
-        room = GaugeMetricFamily("heliopsf_storage_free_bytes", "Free space where files are stored")
-        room.add_metric([], checks.free_bytes(self._state.settings.data_dir))
-        yield room
-        streams = GaugeMetricFamily("heliopsf_event_streams", "Streams of events that this process sends now")
-        streams.add_metric([], self._state.streams.total())
-        yield streams
-        up = GaugeMetricFamily("heliopsf_database_up", "1 if the database answers, else 0")
+        yield Gauge("heliopsf_storage_free_bytes", "Free space where files are stored", free_bytes)
+        yield Gauge("heliopsf_event_streams", "Streams of events that this process sends now", streams)
         try:
-            found = [*self._jobs(), *self._stages(), *self._waiting(), *self._files()]
+            families = [*self._jobs(), *self._stages(), *self._waiting(), *self._files()]
         except SQLAlchemyError:
-            up.add_metric([], 0)
-            yield up
-            return
-        up.add_metric([], 1)
-        yield up
-        yield from found
+            families = None
+        yield Gauge("heliopsf_database_up", "1 if the database answers, else 0", families is not None)
+        yield from families or ()
 
     def _jobs(self) -> Iterator[Metric]:
         tallies = {(tally.kind, tally.phase): tally for tally in self._state.catalogue.census.tally()}
         kinds = sorted({*KINDS, *(kind for kind, _ in tallies)})
-        jobs = GaugeMetricFamily("heliopsf_jobs", "Jobs", labels=["kind", "phase"])
-        attempts = GaugeMetricFamily(
-            "heliopsf_job_attempts", "Number of times that jobs were started", labels=["kind"]
-        )
-        retries = GaugeMetricFamily(
+        jobs = Gauge("heliopsf_jobs", "Jobs", labels=["kind", "phase"])
+        attempts = Gauge("heliopsf_job_attempts", "Number of times that jobs were started", labels=["kind"])
+        retries = Gauge(
             "heliopsf_job_retries", "Number of times that jobs were started again", labels=["kind"]
         )
-        seconds = GaugeMetricFamily(
+        seconds = Gauge(
             "heliopsf_job_run_seconds",
             "Sum over COMPLETED jobs of the time from the last start to the end",
             labels=["kind"],
@@ -99,48 +92,37 @@ class _Catalogued(Collector):
         yield from (jobs, attempts, retries, seconds)
 
     def _stages(self) -> Iterator[Metric]:
+        labels = ["kind", "stage"]
         seconds = CounterMetricFamily(
-            "heliopsf_job_stage_seconds",
-            "Time that ended attempts spent in a stage",
-            labels=["kind", "stage"],
+            "heliopsf_job_stage_seconds", "Time that ended attempts spent in a stage", labels=labels
         )
         steps = CounterMetricFamily(
-            "heliopsf_job_stage_steps",
-            "Steps that ended attempts reported in a stage",
-            labels=["kind", "stage"],
+            "heliopsf_job_stage_steps", "Steps that ended attempts reported in a stage", labels=labels
         )
-        for (kind, stage), spent in self._state.catalogue.stage_times.all().items():
-            seconds.add_metric([kind, stage], spent.seconds)
-            steps.add_metric([kind, stage], spent.steps)
+        for key, spent in self._state.catalogue.stage_times.all().items():
+            seconds.add_metric(key, spent.seconds)
+            steps.add_metric(key, spent.steps)
         yield from (seconds, steps)
 
     def _waiting(self) -> Iterator[Metric]:
         catalogue, lease_s = self._state.catalogue, self._state.settings.lease_s
-        age = GaugeMetricFamily(
+        age = Gauge(
             "heliopsf_oldest_queued_seconds", "Waiting time of the oldest queued job", labels=["queue"]
         )
         for queue in Queue:
             oldest = catalogue.census.oldest_queued_at(queue)
             age.add_metric([queue], 0.0 if oldest is None else max(0.0, time.time() - oldest))
-        yield age
-        silent = GaugeMetricFamily(
-            "heliopsf_jobs_silent", "Jobs whose worker did not report within its lease"
-        )
-        silent.add_metric([], catalogue.census.count_silent(lease_s))
-        yield silent
-        images = GaugeMetricFamily(
-            "heliopsf_bulk_images", "Images of bulk runs that have not ended", labels=["state"]
-        )
+        images = Gauge("heliopsf_bulk_images", "Images of bulk runs that have not ended", labels=["state"])
         for state, count in catalogue.bulks.progress.open_images().items():
             images.add_metric([state], count)
-        yield images
-        workers = GaugeMetricFamily("heliopsf_workers", "Worker processes that report")
-        workers.add_metric([], len(catalogue.census.workers(lease_s)))
-        yield workers
+        silent, workers = catalogue.census.count_silent(lease_s), catalogue.census.workers(lease_s)
+        yield from (age, images)
+        yield Gauge("heliopsf_jobs_silent", "Jobs whose worker did not report within its lease", silent)
+        yield Gauge("heliopsf_workers", "Worker processes that report", len(workers))
 
     def _files(self) -> Iterator[Metric]:
-        files = GaugeMetricFamily("heliopsf_files", "Stored files", labels=["kind", "origin"])
-        size = GaugeMetricFamily("heliopsf_file_bytes", "Bytes of stored files", labels=["kind", "origin"])
+        files = Gauge("heliopsf_files", "Stored files", labels=["kind", "origin"])
+        size = Gauge("heliopsf_file_bytes", "Bytes of stored files", labels=["kind", "origin"])
         for tally in self._state.catalogue.census.tally_files():
             files.add_metric([tally.kind, tally.origin], tally.files)
             size.add_metric([tally.kind, tally.origin], tally.bytes)

@@ -1,41 +1,43 @@
-"""The commands ``psf query``, ``psf cutout`` and ``psf rebin``, for a PSF in a file or on a service.
+"""Commands about PSFs in files or on a service (``psf query``, ``cutout``, ``rebin``), and the built PSFs that are kept (``cache``).
 
 For a file the tables are computed in this process; for an id the service reads its stored tables. Both give the same answers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from psfcore.built.cache import PROVENANCE, CachedPsf, PsfCache
 from psfcore.tables import lookup
-from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_file, remote, whole_id
+from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_file, remote, short, whole_id
 from service.cli.options import JSON, OUTPUT, limits, user_errors, write_json, writes_files
 from service.client.outputs import written
+from workers.cache_folder import psf_cache
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf
 
+_MIB = 2**20
+PSF = click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 @click.command("query")
-@click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
+@PSF
 @click.option("--radius", "radii", multiple=True, type=float, help="Radius, px; can be repeated")
 @click.option(
     "--annulus", nargs=2, type=float, metavar="INNER OUTER", help="Show the light between two radii, px"
 )
 @click.option("--profile", is_flag=True, help="Also show the mean weight by radius")
-@click.option(
-    "--compare",
-    type=ID_OR_FILE,
-    metavar="ID|FILE",
-    help="Compare with this PSF; shows this PSF minus the first",
-)
+@click.option("--compare", type=ID_OR_FILE, metavar="ID|FILE",
+              help="Compare with this PSF; shows this PSF minus the first")  # fmt: skip
 @JSON
 @SERVER_FOR_IDS
 @writes_files
@@ -53,23 +55,22 @@ def query(
     answers: dict[str, Any] = {}
     with user_errors(), _asking(server, psf, compare) as ask:
         if radii or not (annulus or profile or compare):
-            reach = ask(psf, "encircled", radius=0.0)["reach_px"]
-            wanted = list(radii) or [r for r in SHOWN_RADII_PX if r <= reach]
-            answers["curve"] = ask(psf, "curve", radii=wanted)
+            reach_px = ask("encircled", radius=0.0)["reach_px"]
+            shown = list(radii) or [r for r in SHOWN_RADII_PX if r <= reach_px]
+            answers["curve"] = ask("curve", radii=shown)
         if annulus is not None:
-            answers["annulus"] = ask(psf, "annulus", inner=annulus[0], outer=annulus[1])
+            answers["annulus"] = ask("annulus", inner=annulus[0], outer=annulus[1])
         if profile:
-            answers["profile"] = ask(psf, "profile")
+            answers["profile"] = ask("profile")
         if compare is not None:
-            answers["compare"] = ask(psf, f"compare/{compare}")
-    for name, lines in _LINES.items():
-        if name in answers:
-            click.echo("\n".join(lines(answers[name])))
+            answers["compare"] = ask("compare")
+    for name, answer in answers.items():
+        click.echo("\n".join(_LINES[name](answer)))
     write_json(json_file, answers, overwrite=overwrite)
 
 
 @click.command("cutout")
-@click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
+@PSF
 @click.option(
     "--size", required=True, type=click.IntRange(1), help="Width and height of the part to write, px"
 )
@@ -90,7 +91,7 @@ def cutout(psf: str, size: int, output: Path, server: str | None, overwrite: boo
 
 
 @click.command("rebin")
-@click.argument("psf", type=ID_OR_FILE, metavar="ID|FILE")
+@PSF
 @click.option("--factor", required=True, type=click.IntRange(2), help="Pixels per binned pixel, on each axis")
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the binned PSF (FITS)")
 @SERVER_FOR_IDS
@@ -106,45 +107,77 @@ def rebin(psf: str, factor: int, output: Path, server: str | None, overwrite: bo
     click.echo(f"{output}: {binned.name} {binned.version}, {nx} x {ny} px of {factor} x {factor}")
 
 
-COMMANDS = (query, cutout, rebin)
+@click.group(short_help="List and remove built PSFs that are kept.")
+def cache() -> None:
+    """List and remove the built PSFs that are kept in your cache folder. No service is needed.
+
+    Commands with --local and the Python functions build a PSF once and keep it there. HELIOPSF_CACHE_DIR names another
+    folder, HELIOPSF_CACHE_MIB the largest size (default: 2048; 0: keep nothing). A service keeps its PSFs in its own data folder.
+    """
+
+
+@cache.command("list", short_help="List the PSFs that are kept.")
+def list_cached() -> None:
+    """List the PSFs that are kept, the last used first: id, size, last use, instrument."""
+    with user_errors():
+        folder = psf_cache()
+        psfs = folder.psfs()
+        for psf in psfs:
+            used = datetime.fromtimestamp(psf.used_at, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+            click.echo(f"{short(psf.identity)}  {psf.bytes / _MIB:8.1f} MiB  {used}  {_named(folder, psf)}")
+    total = sum(psf.bytes for psf in psfs) / _MIB
+    click.echo(f"{len(psfs)} PSFs, {total:.1f} of {folder.max_bytes // _MIB} MiB, in {folder.folder}")
+
+
+@cache.command("clear", short_help="Remove all PSFs that are kept.")
+def clear() -> None:
+    """Remove all PSFs that are kept. A PSF is built again when it is needed."""
+    with user_errors():
+        folder = psf_cache()
+        count, removed = len(folder.psfs()), folder.clear()
+    click.echo(f"removed {count} PSFs, {removed / _MIB:.1f} MiB, from {folder.folder}")
+
+
+def _named(folder: PsfCache, psf: CachedPsf) -> str:
+    """The instrument, the size and the component of a PSF, from its provenance."""
+    file = folder.find(psf.identity, PROVENANCE)
+    if file is None:
+        return "(incomplete)"
+    parameters: dict[str, Any] = json.loads(file.path.read_bytes())["parameters"]
+    parts = [parameters.get("instrument", "your instrument file"), f"{parameters['size']} px"]
+    return ", ".join([*parts, *filter(None, [parameters.get("component")])])
 
 
 @contextmanager
-def _asking(server: str | None, *psfs: str | None) -> Iterator[Callable[..., dict[str, Any]]]:
-    """A function that answers queries about the named PSFs: the service answers for ids; for files the tables are computed here."""
-    ids = [psf for psf in psfs if psf is not None and is_psf_id(psf)]
-    files = [psf for psf in psfs if psf is not None and not is_psf_id(psf)]
-    if ids and files:
+def _asking(server: str | None, psf: str, other: str | None) -> Iterator[Callable[..., dict[str, Any]]]:
+    """A function that answers questions about a PSF, and compares it with another one: the service answers for ids; for
+    files the tables are computed here."""
+    psfs = [psf] if other is None else [psf, other]
+    if len({is_psf_id(one) for one in psfs}) > 1:
         raise click.UsageError(
             "expected two PSF ids or two files; got an id and a file. Upload the file first: heliopsf psf upload FILE"
         )
-    if not ids:
-        tables = {file: _tables(file) for file in files}
+    if not is_psf_id(psf):
+        from psfcore.tables.make import tables_of
 
-        def ask_files(psf: str, question: str, **wanted: Any) -> dict[str, Any]:
-            name, _, other = question.partition("/")
-            if other:
-                return lookup.compare(tables[psf], tables[other])
-            return lookup.QUESTIONS[name](tables[psf], **wanted)
+        tables = [tables_of(_read(file)) for file in psfs]
+
+        def ask_files(question: str, **query: Any) -> dict[str, Any]:
+            if question == "compare":
+                return lookup.compare(*tables)
+            return lookup.QUESTIONS[question](tables[0], **query)
 
         yield ask_files
         return
     with remote(server) as service:
-        whole = {psf: whole_id(service, "psfs", psf) for psf in ids}
+        ids = [whole_id(service, "psfs", one) for one in psfs]
 
-        def ask_service(psf: str, question: str, **wanted: Any) -> dict[str, Any]:
-            name, _, other = question.partition("/")
-            if other:
-                return service.compare_psfs(whole[psf], whole[other])
-            return service.answer([whole[psf]], name, wanted)
+        def ask_service(question: str, **query: Any) -> dict[str, Any]:
+            if question == "compare":
+                return service.compare_psfs(*ids)
+            return service.answer(ids[:1], question, query)
 
         yield ask_service
-
-
-def _tables(file: str) -> dict[str, Any]:
-    from psfcore.tables.make import tables_of
-
-    return tables_of(_read(file))
 
 
 def _read(file: str) -> Psf:
@@ -162,28 +195,23 @@ def _write(output: Path, psf: Psf, overwrite: bool) -> None:
 
 
 def _curve_lines(answer: dict[str, Any]) -> list[str]:
-    curves, sigma = answer["light_beyond_pct"], answer["sigma_points"]
-    lines = [
-        f"{answer['name']} {answer['version']}, sum {answer['sum_on_array']:.6f} on {answer['shape'][1]} x "
-        f"{answer['shape'][0]} px, central pixel {answer['central_weight']:.4f}",
+    shape, sigma = answer["shape"], answer["sigma_points"]
+    return [
+        f"{answer['name']} {answer['version']}, sum {answer['sum_on_array']:.6f} on {shape[1]} x {shape[0]} px, "
+        f"central pixel {answer['central_weight']:.4f}",
         "light beyond R, or outside the array, in percent:",
-        f"{'R (px)':>10}" + "".join(f"{name:>{_width(name, sigma)}}" for name in curves),
+        *_table(
+            [f"{radius:g}" for radius in answer["radii_px"]],
+            {
+                name: [
+                    _with_sigma(*pair)
+                    for pair in zip(curve, sigma.get(name, [None] * len(curve)), strict=True)
+                ]
+                for name, curve in answer["light_beyond_pct"].items()
+            },
+        ),
+        f"({answer['resolution']})",
     ]
-    for n, radius in enumerate(answer["radii_px"]):
-        values = (_with_sigma(curves[name][n], sigma.get(name, [None] * (n + 1))[n]) for name in curves)
-        lines.append(
-            f"{radius:>10g}"
-            + "".join(f"{v:>{_width(k, sigma)}}" for k, v in zip(curves, values, strict=True))
-        )
-    return [*lines, f"({answer['resolution']})"]
-
-
-def _width(name: str, sigma: dict[str, Any]) -> int:
-    return 22 if name in sigma else 15
-
-
-def _with_sigma(value: float, sigma: float | None) -> str:
-    return f"{value:.3f}" if sigma is None else f"{value:.3f} ± {sigma:.3f}"
 
 
 def _annulus_lines(answer: dict[str, Any]) -> list[str]:
@@ -195,30 +223,38 @@ def _annulus_lines(answer: dict[str, Any]) -> list[str]:
 
 
 def _profile_lines(answer: dict[str, Any]) -> list[str]:
-    weights = answer["mean_weight"]
-    lines = ["mean weight of a pixel:", f"{'R (px)':>10}" + "".join(f"{name:>15}" for name in weights)]
-    for n, radius in enumerate(answer["radius_px"]):
-        if radius <= 20 or radius % 10 == 0:
-            lines.append(f"{radius:>10g}" + "".join(f"{row[n]:>15.4e}" for row in weights.values()))
-    return lines
+    radii = answer["radius_px"]
+    shown = [n for n, radius in enumerate(radii) if radius <= 20 or radius % 10 == 0]
+    columns = {name: [f"{row[n]:.4e}" for n in shown] for name, row in answer["mean_weight"].items()}
+    return ["mean weight of a pixel:", *_table([f"{radii[n]:g}" for n in shown], columns)]
 
 
 def _compare_lines(answer: dict[str, Any]) -> list[str]:
-    one, other = answer["one"], answer["other"]
-    lines = [
+    one, other, radii = answer["one"], answer["other"], answer["radii_px"]
+    shown = [n for n, radius in enumerate(radii) if radius in (0.0, *SHOWN_RADII_PX)]
+    columns = {
+        name: [f"{points:+.3f}" for points in (*(row[n] for n in shown), answer["largest_points"][name])]
+        for name, row in answer["difference_points"].items()
+    }
+    return [
         f"{other['name']} {other['version']} minus {one['name']} {one['version']}: sum {answer['difference_of_sums']:+.6f}, "
-        f"central pixel {answer['difference_of_central_weights']:+.5f}; light beyond R in percentage points:"
+        f"central pixel {answer['difference_of_central_weights']:+.5f}; light beyond R in percentage points:",
+        *_table([*(f"{radii[n]:g}" for n in shown), "largest"], columns),
     ]
-    points = answer["difference_points"]
-    lines.append(f"{'R (px)':>10}" + "".join(f"{name:>15}" for name in points))
-    shown = [n for n, r in enumerate(answer["radii_px"]) if r in (0.0, *SHOWN_RADII_PX)]
-    for n in shown:
-        radius = answer["radii_px"][n]
-        lines.append(f"{radius:>10g}" + "".join(f"{row[n]:>+15.3f}" for row in points.values()))
-    lines.append(
-        f"{'largest':>10}" + "".join(f"{most:>+15.3f}" for most in answer["largest_points"].values())
-    )
-    return lines
+
+
+def _table(radii: Sequence[str], columns: dict[str, list[str]]) -> list[str]:
+    """Lines with a radius and the texts of all columns; the first line has the names of the columns."""
+    widths = [22 if any("±" in text for text in texts) else 15 for texts in columns.values()]
+    rows = [("R (px)", *columns), *zip(radii, *columns.values(), strict=True)]
+    return [
+        f"{radius:>10}" + "".join(f"{text:>{width}}" for text, width in zip(texts, widths, strict=True))
+        for radius, *texts in rows
+    ]
+
+
+def _with_sigma(value: float, sigma: float | None) -> str:
+    return f"{value:.3f}" if sigma is None else f"{value:.3f} ± {sigma:.3f}"
 
 
 _LINES = {

@@ -16,7 +16,7 @@ import httpx
 import pytest
 
 from psfcore.transit.archive import pack
-from service.client import resumable
+from service.client import errors, resumable
 from service.client.errors import ServiceError
 from tests.service.api.live import Live, running
 from tests.transit_files import write_transit
@@ -136,7 +136,7 @@ class Broken:
 
 def test_the_client_continues_after_cuts(live: Live, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resumable, "PART_BYTES", 20_000)
-    monkeypatch.setattr(resumable, "FIRST_WAIT_S", 0.3)
+    monkeypatch.setattr(errors, "FIRST_WAIT_S", 0.3)
     said: list[str] = []
     broken = Broken(live, ["", "before", "after", ""])
     found = resumable.upload(broken, archive, "transit", "mercury.tar", said.append)
@@ -155,7 +155,7 @@ def test_another_process_continues_the_upload(
 ) -> None:
     monkeypatch.setattr(resumable, "PART_BYTES", 20_000)
     with monkeypatch.context() as patched:
-        patched.setattr(resumable, "PATIENCE_S", -1.0)
+        patched.setattr(errors, "PATIENCE_S", -1.0)
         with pytest.raises(ServiceError, match="no answer"):
             resumable.upload(Broken(live, ["", "", "before"]), archive, "transit", "m.tar", print)
     second = Broken(live, [])

@@ -17,7 +17,10 @@ from service.client import http
 def command(
     api: TestClient, run_jobs: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., str]:
-    """Run a command; returns what it writes. Jobs run as soon as a client waits for them."""
+    """Run a command; returns what it writes. Jobs run as soon as a client waits for them.
+
+    `service.client.http.Client` is then a client of the application in this process.
+    """
 
     class AtOnce(http.Client):
         def __init__(self, server: str | None = None, *, key: str | None = None, **options: Any) -> None:
@@ -39,3 +42,9 @@ def command(
         return done.output
 
     return run
+
+
+@pytest.fixture
+def client(command: Callable[..., str]) -> http.Client:
+    """A client of the application in this process, as the commands have one."""
+    return http.Client()

@@ -11,7 +11,7 @@ import pytest
 from astropy.io import fits
 from click.testing import CliRunner, Result
 
-from service.cli import bulk as cli_bulk
+from service.cli import connection
 from service.cli.main import main
 from tests.conftest import write_image, write_psf
 
@@ -114,7 +114,7 @@ def test_a_bulk_run_with_failures_ends_with_status_1(monkeypatch: pytest.MonkeyP
     service = MagicMock()
     service.__enter__.return_value = service
     service.psf.return_value = {"status": "draft"}
-    monkeypatch.setattr(cli_bulk, "remote", lambda server: service)
+    monkeypatch.setattr(connection, "remote", lambda server: service)
     for phase, failed, status in (("COMPLETED", 0, 0), ("COMPLETED", 1, 1), ("ERROR", 0, 1)):
         bulk = {
             "id": "b" * 32,

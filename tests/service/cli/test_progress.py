@@ -93,4 +93,4 @@ def test_a_stage_and_its_step_as_text(subtests: pytest.Subtests) -> None:
         ("compiling kernels (only once)", 0, 0, "compiling kernels (only once)"),
     ):
         with subtests.test(str((stage, step, steps, text))):
-            assert progress.told(stage, step, steps) == text
+            assert progress.step_text(stage, step, steps) == text

@@ -12,7 +12,7 @@ import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
-from service.client import bulk, http
+from service.client import errors, http
 from service.client.address import service_address
 from service.client.errors import ServiceError, WaitInterrupted
 from service.client.http import Client
@@ -131,14 +131,14 @@ def test_a_lost_service_is_told_once_and_rejoined(slept: list[float]) -> None:
     assert "no answer from http://testserver" in said[0] and "continue when the service runs again" in said[0]
     assert sum(slept) > 60, "longer than a restart takes"
     waits = [one for one in slept if one > 0.1]
-    assert waits == sorted(waits) and waits[1] == 2 * waits[0] and max(waits) == bulk.LONGEST_WAIT_S
+    assert waits == sorted(waits) and waits[1] == 2 * waits[0] and max(waits) == errors.LONGEST_WAIT_S
 
 
 def test_a_service_that_stays_away_is_given_up(slept: list[float]) -> None:
     said: list[str] = []
     with pytest.raises(ServiceError, match="no answer"):
         client_of([nothing], said).wait(job("EXECUTING"))
-    assert len(said) == 1 and bulk.PATIENCE_S < sum(slept) < 2 * bulk.PATIENCE_S
+    assert len(said) == 1 and errors.PATIENCE_S < sum(slept) < 2 * errors.PATIENCE_S
 
 
 def test_a_refusal_is_not_repeated(slept: list[float]) -> None:

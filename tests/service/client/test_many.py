@@ -12,7 +12,7 @@ import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
-from service.client import many
+from service.client import errors
 from service.client.errors import ServiceError, WaitInterrupted
 from service.client.http import Client
 from service.client.many import Outcome, deconvolve_many
@@ -292,7 +292,7 @@ def test_a_busy_service_is_asked_again(
     told: Told, five: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waited: list[float] = []
-    monkeypatch.setattr(many.time, "sleep", waited.append)
+    monkeypatch.setattr(errors.time, "sleep", waited.append)
     submit = told.submit
     answers = [ServiceError("later", status=429, retry_after_s=7.0), ServiceError("later", status=503)]
 

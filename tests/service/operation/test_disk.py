@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
 from psfcore.fits import hdus
-from service.cli.operator import doctor
+from service.cli import doctor
 from tests.conftest import write_image
 from tests.service.conftest import job_after, refusal, result_of, upload, work_through_bulks
 from workers import checks
@@ -205,12 +205,12 @@ def test_a_damaged_database_is_told_of(
     api: TestClient, settings: Settings, spoil: Callable[[Path], None]
 ) -> None:
     file = database_file(settings)
-    database = {finding.what: finding for finding in doctor.examine(settings)}["database"]
+    database = doctor.examine(settings)["database"]
     assert database.state == "ok"
     spoil(file)
     answer = api.get("/readyz")
     assert answer.status_code == 503 and "damaged" in answer.json()["parts"]["database"]
-    database = {finding.what: finding for finding in doctor.examine(settings)}["database"]
+    database = doctor.examine(settings)["database"]
     assert database.state == "broken" and "damaged" in database.found and "restore a copy" in database.advice
 
 

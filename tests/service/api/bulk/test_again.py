@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 from fastapi.testclient import TestClient
 
-from service.cli import bulk as cli_bulk
+from service.cli import connection
 from service.cli.main import main
 from service.client.http import Client
 from tests.conftest import write_image
@@ -65,7 +65,7 @@ def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
             """The transport is the application's: it goes on."""
 
     client = Here("http://testserver", transport=api._transport)
-    monkeypatch.setattr(cli_bulk, "remote", lambda server: client)
+    monkeypatch.setattr(connection, "remote", lambda server: client)
     answer = CliRunner().invoke(main, ["bulk", "retry", first["id"]])
     assert answer.exit_code == 1
     (line,) = answer.output.splitlines()

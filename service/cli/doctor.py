@@ -11,7 +11,8 @@ import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
@@ -25,8 +26,9 @@ from packaging.utils import canonicalize_name
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
-from service.cli.operator.database import sentence
+from service.cli.operator import sentence
 from service.cli.options import DATA, read_settings
+from service.cli.progress import duration
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import open_store
@@ -35,18 +37,27 @@ from workers.settings import Settings, software_version
 
 State = Literal["ok", "warning", "broken"]
 SIGNS: dict[State, str] = {"ok": "green", "warning": "yellow", "broken": "red"}
-PINS = Path(__file__).parents[3] / "constraints.txt"
+PINS = Path(__file__).parents[2] / "constraints.txt"
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 EXTRAS = ("service", "fit", "plot")  # the commands need all packages of these extras
 LITTLE_ROOM_BYTES = 5 * 2**30
+# The finding and the advice for a database at another revision; "": the advice is that of the schema.
+OTHER_REVISIONS: dict[str, tuple[State, str]] = {
+    "empty": ("warning", "the first `heliopsf serve` makes them"),
+    "older": (
+        "warning",
+        "copy the database, then run `heliopsf database upgrade` (or start `heliopsf serve`, which also upgrades it)",
+    ),
+    "newer": ("broken", "run the version of heliopsf that upgraded it"),
+    "unversioned": ("broken", ""),
+    "obsolete": ("broken", ""),
+}
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check. what: the subject of the check. found: the observation. advice: what to do; may be
-    empty."""
+    """The result of a check. found: the observation. advice: what to do; may be empty."""
 
-    what: str
     state: State
     found: str
     advice: str = ""
@@ -58,48 +69,46 @@ class Finding:
 def doctor(data: Path | None, as_json: bool) -> None:
     """Check versions, settings, disk, database, broker and workers, and say what to do. If something is broken, the exit status is 1."""
     findings = examine(read_settings(data))
-    broken = any(finding.state == "broken" for finding in findings)
+    broken = any(finding.state == "broken" for finding in findings.values())
     if as_json:
-        click.echo(json.dumps({"ok": not broken, "findings": [asdict(one) for one in findings]}, indent=1))
+        rows = [{"what": what, **asdict(finding)} for what, finding in findings.items()]
+        click.echo(json.dumps({"ok": not broken, "findings": rows}, indent=1))
     else:
-        for line in table(findings, shutil.get_terminal_size((110, 24)).columns):
-            click.echo(line)
+        click.echo("\n".join(table(findings, shutil.get_terminal_size((110, 24)).columns)))
     sys.exit(1 if broken else 0)
 
 
-def examine(settings: Settings) -> list[Finding]:
-    """All findings, in the order in which problems should be corrected."""
-    findings = [versions(), threads(settings), storage(settings)]
-    findings += [object_store(settings)] if settings.store_url else []
-    findings.append(broker(settings))
-    with _catalogue(settings) as (catalogue, finding):
-        findings.append(finding)
-        if catalogue is not None:
-            looks: list[Callable[[Settings, Catalogue], Finding]] = [schema, clock, workers, stuck_jobs]
-            for look in looks:
-                try:
-                    findings.append(look(settings, catalogue))
-                except SQLAlchemyError as error:
-                    name = look.__name__.replace("_", " ")
-                    findings.append(
-                        Finding(name, "broken", f"the database did not answer: {checks.database_said(error)}")
-                    )
+def examine(settings: Settings) -> dict[str, Finding]:
+    """The finding about each subject, in the order in which problems should be corrected."""
+    findings = {"versions": versions(), "threads": threads(settings), "storage": storage(settings)}
+    if settings.store_url:
+        findings["object store"] = object_store(settings)
+    findings["broker"] = broker(settings)
+    with _catalogue(settings) as (catalogue, findings["database"]):
+        if catalogue is None:
+            return findings
+        for check in (schema, clock, workers, stuck_jobs):
+            name = check.__name__.replace("_", " ")
+            try:
+                findings[name] = check(settings, catalogue)
+            except SQLAlchemyError as error:
+                fault = checks.database_said(error)
+                findings[name] = Finding("broken", f"the database did not answer: {fault}")
     return findings
 
 
-def table(findings: list[Finding], width: int) -> Iterator[str]:
+def table(findings: dict[str, Finding], width: int) -> Iterator[str]:
     """The findings as lines: subject, state and what was found. The next line gives the advice."""
-    names = max(len(finding.what) for finding in findings)
+    names = max(map(len, findings))
     indent = " " * (names + 11)
-    for finding in findings:
-        start = f"{finding.what:<{names}}  {finding.state:<7}  "
+    for what, finding in findings.items():
         texts = [finding.found, *([f"-> {finding.advice}"] if finding.advice else [])]
         lines = [line for text in texts for line in textwrap.wrap(text, max(40, width - len(indent)))]
-        first = start.replace(finding.state, click.style(finding.state, fg=SIGNS[finding.state]), 1)
-        yield first + lines[0]
+        state = click.style(finding.state, fg=SIGNS[finding.state]) + " " * (7 - len(finding.state))
+        yield f"{what:<{names}}  {state}  {lines[0]}"
         yield from (indent + line for line in lines[1:])
-    count = {state: sum(finding.state == state for finding in findings) for state in SIGNS}
-    yield ", ".join(f"{number} {state}" for state, number in count.items() if number)
+    count = Counter(finding.state for finding in findings.values())
+    yield ", ".join(f"{count[state]} {state}" for state in SIGNS if count[state])
 
 
 # The checks ----------------------------------------------------------------------------------
@@ -125,28 +134,25 @@ def versions(pins: Path = PINS) -> Finding:
             other.append(f"{requirement.name} {found}, tested with {pin}")
     about = f"heliopsf {software_version()}, Python {sys.version.split()[0]}"
     if wrong:
-        return Finding("versions", "broken", f"{about}; {'; '.join(wrong)}", "install heliopsf again")
+        return Finding("broken", f"{about}; {'; '.join(wrong)}", "install heliopsf again")
     if other:
         advice = "install with `-c constraints.txt` to get the tested versions"
-        return Finding("versions", "warning", f"{about}; {'; '.join(other)}", advice)
-    as_what = (
-        "with tested versions"
-        if tested
-        else "with required versions (there is no constraints.txt with tested versions here)"
-    )
-    return Finding("versions", "ok", f"{about}; {count} libraries {as_what}")
+        return Finding("warning", f"{about}; {'; '.join(other)}", advice)
+    kind = "tested" if tested else "required"
+    note = "" if tested else " (there is no constraints.txt with tested versions here)"
+    return Finding("ok", f"{about}; {count} libraries with {kind} versions{note}")
 
 
 def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
     """Do workers and libraries together start more threads than there are cores?"""
     here = cores()
     may_use = min(here, _quota(cpu_quota) or here)
-    wanted = settings.worker_processes * settings.threads
-    plural = "es" if settings.worker_processes > 1 else ""
-    found = f"{here} cores, {settings.worker_processes} worker process{plural} of {settings.threads} threads"
+    processes = settings.worker_processes
+    share = max(1, int(may_use // processes))
+    found = f"{here} cores, {processes} worker process{'es' if processes > 1 else ''} of {settings.threads} threads"
     if may_use < here:
         found += f"; the container may use {may_use:g} of the cores"
-    more = []
+    advice = []
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         value = os.environ.get(name)
         if value is None:
@@ -156,15 +162,14 @@ def threads(settings: Settings, cpu_quota: Path = CPU_QUOTA) -> Finding:
             continue
         first = value.split(",")[0].strip()
         if not first.isdecimal() or int(first) < 1:
-            more.append(f"set {name} to a number of threads")
-        elif int(first) * settings.worker_processes > may_use:
-            more.append(f"set {name} to {max(1, int(may_use // settings.worker_processes))} or less")
-    if wanted > may_use:
-        fit = max(1, int(may_use // settings.worker_processes))
-        more.append(
-            f"more threads than cores slow each other down: set HELIOPSF_WORKER_THREADS={fit}, or start fewer processes"
+            advice.append(f"set {name} to a number of threads")
+        elif int(first) * processes > may_use:
+            advice.append(f"set {name} to {share} or less")
+    if processes * settings.threads > may_use:
+        advice.append(
+            f"more threads than cores slow each other down: set HELIOPSF_WORKER_THREADS={share}, or start fewer processes"
         )
-    return Finding("threads", "warning" if more else "ok", found, "; ".join(more))
+    return Finding("warning" if advice else "ok", found, "; ".join(advice))
 
 
 def storage(settings: Settings) -> Finding:
@@ -173,24 +178,22 @@ def storage(settings: Settings) -> Finding:
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not there.is_dir() or (there != folder and not os.access(there, os.W_OK | os.X_OK)):
         found = f"{folder} does not exist and cannot be made"
-        return Finding(
-            "storage", "broken", found, "set HELIOPSF_DATA_DIR to a folder that this user can write to"
-        )
+        return Finding("broken", found, "set HELIOPSF_DATA_DIR to a folder that this user can write to")
     if there == folder:
         try:
             checks.storage(folder, settings.min_free_mib)
         except checks.Unusable as fault:
             found = f"{folder}: {fault}"
-            return Finding("storage", "broken", found, "give this user write access, or free disk space")
+            return Finding("broken", found, "give this user write access, or free disk space")
     free = checks.free_bytes(there)
     found = f"{folder}{'' if there == folder else ' (not made yet)'}, {_gib(free)} free"
     largest = max(settings.max_upload_bytes, settings.max_transit_bytes)
     if free < settings.max_upload_bytes:
-        return Finding("storage", "broken", f"{found}: no room for one upload", "free disk space")
+        return Finding("broken", f"{found}: no room for one upload", "free disk space")
     if free < max(LITTLE_ROOM_BYTES, largest):
         advice = f"free disk space: one transit may take {_gib(settings.max_transit_bytes)}"
-        return Finding("storage", "warning", found, advice)
-    return Finding("storage", "ok", found)
+        return Finding("warning", found, advice)
+    return Finding("ok", found)
 
 
 def object_store(settings: Settings) -> Finding:
@@ -199,17 +202,17 @@ def object_store(settings: Settings) -> Finding:
         checks.object_store(open_store(settings))
     except checks.Unusable as fault:
         advice = "check HELIOPSF_STORE_URL and the AWS_* variables (endpoint, region, credentials)"
-        return Finding("object store", "broken", f"{settings.store_url}: {fault}", advice)
+        return Finding("broken", f"{settings.store_url}: {fault}", advice)
     except ImportError:
         advice = "install heliopsf with the extra s3: pip install 'heliopsf[s3]'"
-        return Finding("object store", "broken", "the library for S3 is not installed", advice)
-    return Finding("object store", "ok", str(settings.store_url))
+        return Finding("broken", "the library for S3 is not installed", advice)
+    return Finding("ok", str(settings.store_url))
 
 
 def broker(settings: Settings) -> Finding:
     """Does the broker answer?"""
     if settings.embedded:
-        return Finding("broker", "ok", "embedded: a folder inside the data folder")
+        return Finding("ok", "embedded: a folder inside the data folder")
     where = address(settings.broker_url)
     try:
         checks.broker(settings)
@@ -217,35 +220,25 @@ def broker(settings: Settings) -> Finding:
         advice = (
             "start it, or correct HELIOPSF_BROKER_URL; jobs wait in the database until the broker answers"
         )
-        return Finding("broker", "broken", f"{where}: {fault}", advice)
-    return Finding("broker", "ok", f"{where} answers")
+        return Finding("broken", f"{where}: {fault}", advice)
+    return Finding("ok", f"{where} answers")
 
 
 def schema(_settings: Settings, catalogue: Catalogue) -> Finding:
     """Is the database at the revision that this version needs, and complete?"""
     status = catalogue.schema.status()
-    said = sentence(status)
-    match status.state:
-        case "empty":
-            return Finding("schema", "warning", said, "the first `heliopsf serve` makes them")
-        case "newer":
-            return Finding("schema", "broken", said, "run the version of heliopsf that upgraded it")
-        case "unversioned" | "obsolete":
-            return Finding("schema", "broken", said, status.refusal or "")
-        case "older":
-            advice = "copy the database, then run `heliopsf database upgrade` (or start `heliopsf serve`, which also upgrades it)"
-            return Finding("schema", "warning", said, advice)
-        case "current":
-            faults = catalogue.schema.faults()
+    revision = sentence(status)
+    if status.state != "current":
+        state, advice = OTHER_REVISIONS[status.state]
+        return Finding(state, revision, advice or status.refusal or "")
+    faults = catalogue.schema.faults()
     if faults.columns:
-        found = f"{said}, but columns are missing: {', '.join(faults.columns)}"
-        return Finding(
-            "schema", "broken", found, "the tables were changed by hand: restore a copy of the database"
-        )
+        found = f"{revision}, but columns are missing: {', '.join(faults.columns)}"
+        return Finding("broken", found, "the tables were changed by hand: restore a copy of the database")
     if faults.tables or faults.indexes:
-        found = f"{said}, but these are missing: {', '.join((*faults.tables, *faults.indexes))}"
-        return Finding("schema", "warning", found, "run `heliopsf database upgrade` to restore them")
-    return Finding("schema", "ok", f"{said}: tables, columns and indexes are complete")
+        found = f"{revision}, but these are missing: {', '.join((*faults.tables, *faults.indexes))}"
+        return Finding("warning", found, "run `heliopsf database upgrade` to restore them")
+    return Finding("ok", f"{revision}: tables, columns and indexes are complete")
 
 
 def clock(_settings: Settings, catalogue: Catalogue) -> Finding:
@@ -257,50 +250,44 @@ def clock(_settings: Settings, catalogue: Catalogue) -> Finding:
     found = f"the database's clock is {abs(apart):.2f} s {'ahead' if apart > 0 else 'behind'}"
     if abs(apart) > 1.0 + (after - before):
         advice = "set both clocks by NTP: creation times and the expiry of keys use the clock of this machine"
-        return Finding("clock", "warning", found, advice)
-    return Finding("clock", "ok", f"within {max(0.01, abs(apart)):.2f} s of the database's clock")
+        return Finding("warning", found, advice)
+    return Finding("ok", f"within {max(0.01, abs(apart)):.2f} s of the database's clock")
 
 
 def workers(settings: Settings, catalogue: Catalogue) -> Finding:
     """Are there workers, and do they run this version?"""
     if "workers" in catalogue.schema.faults().tables:
-        return Finding("workers", "warning", "no worker was ever started", _start(settings))
+        return Finding("warning", "no worker was ever started", _start(settings))
     there = catalogue.census.workers(settings.lease_s)
     waiting = catalogue.census.oldest_queued_at()
     if not there:
         found = f"no worker has reported for {settings.lease_s:g} s"
         if waiting is not None:
-            found += f"; a job has waited for {_span(time.time() - waiting)}"
+            found += f"; a job has waited for {duration(time.time() - waiting)}"
         state: State = "broken" if waiting is not None and not settings.embedded else "warning"
-        return Finding("workers", state, found, _start(settings))
+        return Finding(state, found, _start(settings))
     others = sorted({row.version for row in there} - {software_version()})
-    found = (
-        f"{len(there)} process{'es' if len(there) > 1 else ''}: {', '.join(row.name for row in there[:5])}"
-    )
-    found += ", ..." if len(there) > 5 else ""
+    names = ", ".join(row.name for row in there[:5]) + (", ..." if len(there) > 5 else "")
+    found = f"{len(there)} process{'es' if len(there) > 1 else ''}: {names}"
     if others:
         advice = f"restart them with version {software_version()}"
-        return Finding("workers", "warning", f"{found}; some run version {', '.join(others)}", advice)
-    return Finding("workers", "ok", found)
+        return Finding("warning", f"{found}; some run version {', '.join(others)}", advice)
+    return Finding("ok", found)
 
 
 def stuck_jobs(settings: Settings, catalogue: Catalogue) -> Finding:
     """Are there jobs that a running service would have handled by now?"""
     if "jobs" in catalogue.schema.faults().tables:
-        return Finding("stuck jobs", "ok", "no jobs yet")
+        return Finding("ok", "no jobs yet")
     silent = catalogue.census.count_silent(settings.lease_s + 5 * settings.reconcile_s)
     left = catalogue.census.count_unsubmitted(max(30.0, 5 * settings.reconcile_s))
     if not silent and not left:
-        return Finding("stuck jobs", "ok", "none")
+        return Finding("ok", "none")
     found = (
         f"{silent} in progress whose worker does not report, {left} queued but not submitted to the broker"
     )
-    return Finding(
-        "stuck jobs",
-        "warning" if settings.embedded else "broken",
-        found,
-        "start `heliopsf serve`, which queues them again; if it is running, read its log",
-    )
+    advice = "start `heliopsf serve`, which queues them again; if it is running, read its log"
+    return Finding("warning" if settings.embedded else "broken", found, advice)
 
 
 # Texts -------------------------------------------------------------------------------------
@@ -325,19 +312,15 @@ def _catalogue(settings: Settings) -> Iterator[tuple[Catalogue | None, Finding]]
     """The catalogue (None if the database does not answer), and the finding about the database."""
     where, own = _database(settings)
     if own and not Path(where).exists():  # opening the database would create the file
-        yield None, Finding("database", "warning", f"{where} does not exist yet", "`heliopsf serve` makes it")
+        yield None, Finding("warning", f"{where} does not exist yet", "`heliopsf serve` makes it")
         return
     advice = "correct the permissions of the file" if own else "start it, or correct HELIOPSF_DATABASE_URL"
     try:
         catalogue = Catalogue(settings.catalogue_url)
     except (ArgumentError, ImportError, ValueError) as error:
         found = f"{where} cannot be used ({type(error).__name__})"
-        yield (
-            None,
-            Finding(
-                "database", "broken", found, "set HELIOPSF_DATABASE_URL to postgresql://..., or unset it"
-            ),
-        )
+        advice = "set HELIOPSF_DATABASE_URL to postgresql://..., or unset it"
+        yield None, Finding("broken", found, advice)
         return
     try:
         started = time.perf_counter()
@@ -347,9 +330,9 @@ def _catalogue(settings: Settings) -> Iterator[tuple[Catalogue | None, Finding]]
     except SQLAlchemyError as error:
         if checks.damaged(error):
             advice = "stop the service, and restore a copy of the database"
-        yield None, Finding("database", "broken", f"{where}: {checks.database_said(error)}", advice)
+        yield None, Finding("broken", f"{where}: {checks.database_said(error)}", advice)
     else:
-        yield catalogue, Finding("database", "ok", f"{where} answers in {took_ms:.0f} ms")
+        yield catalogue, Finding("ok", f"{where} answers in {took_ms:.0f} ms")
     finally:
         catalogue.close()
 
@@ -395,13 +378,3 @@ def _quota(file: Path) -> float | None:
 
 def _gib(size: int) -> str:
     return f"{size / 2**30:.1f} GiB"
-
-
-def _span(seconds: float) -> str:
-    for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * length:
-            return f"{seconds / length:.0f} {unit}"
-    return f"{seconds:.0f} s"
-
-
-COMMANDS = (doctor,)

@@ -11,8 +11,8 @@ import pytest
 from click.testing import CliRunner, Result
 from sqlalchemy import create_engine, text
 
+from service.cli import doctor as cli_doctor
 from service.cli.main import main
-from service.cli.operator import doctor as cli_doctor
 from tests.whole.stack import free_port
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
@@ -233,11 +233,11 @@ def test_versions_are_compared_with_what_was_tested_and_what_is_needed(
 
 
 def test_the_table_says_what_state_found_and_what_to_do() -> None:
-    found = [
-        cli_doctor.Finding("one", "ok", "well"),
-        cli_doctor.Finding("another", "broken", "a long story " * 20, "mend it"),
-    ]
-    lines = list(cli_doctor.table(found, 80))
+    findings = {
+        "one": cli_doctor.Finding("ok", "well"),
+        "another": cli_doctor.Finding("broken", "a long story " * 20, "mend it"),
+    }
+    lines = list(cli_doctor.table(findings, 80))
     assert lines[0].split()[::2] == ["one", "well"] and "another" in lines[1] and "broken" in lines[1]
     assert lines[-2].strip() == "-> mend it" and lines[-1] == "1 ok, 1 broken"
     assert max(map(len, lines[2:])) <= 80

@@ -1,1 +1,0 @@
-"""The commands for operators: `cache`, `database`, `doctor`, `key` and `store`."""

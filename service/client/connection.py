@@ -1,0 +1,244 @@
+"""The connection of a client to a service: requests, lists, downloads and streams of events."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import re
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+
+from service.client.address import DEFAULT_SERVER, how_to_start, service_address
+from service.client.errors import FIRST_WAIT_S, Patience, ServiceError
+from service.client.operations import given
+from service.client.outputs import written
+
+# Longest silence before a stream counts as broken; a stream sends a line at least every 15 s.
+QUIET_S = 60.0
+GOES_ON = "Submitted jobs are kept and continue when the service runs again; trying again"
+_STANDARD_FIELDS = ("type", "title", "status", "detail", "instance")  # of a problem document, RFC 9457
+
+
+class Connection:
+    """The connection to a service. Every method raises ``ServiceError`` if a request fails; its ``code`` is the reason.
+
+    server: address of the service.
+    """
+
+    server: str
+
+    def __init__(
+        self,
+        server: str | None = None,
+        *,
+        key: str | None = None,
+        transport: httpx.BaseTransport | None = None,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        """server: address of the service; default: HELIOPSF_SERVER. key: access key; default: HELIOPSF_KEY. say: a
+        function that is called with a sentence during a wait, if the job stays in the queue or the service does not
+        answer.
+
+        A service of this machine needs no scheme: ``localhost:8765``. Raises ``ServiceError`` "bad-address", and "bad-key" if
+        the key cannot be sent.
+        """
+        self.server = service_address(server or os.environ.get("HELIOPSF_SERVER") or DEFAULT_SERVER)
+        key = (key or os.environ.get("HELIOPSF_KEY", "")).strip()
+        if not (key.isascii() and key.isprintable()) or " " in key:
+            # The key is checked here. Otherwise the HTTP library would print the key in its error about a bad header.
+            raise ServiceError(
+                "expected a key of the form hpsf_ID_SECRET; got another text: set HELIOPSF_KEY to the whole key",
+                code="bad-key",
+            )
+        self.say = say
+        self._http = httpx.Client(
+            base_url=self.server,
+            timeout=60,
+            transport=transport,
+            headers={"Authorization": f"Bearer {key}"} if key else {},
+            event_hooks={"response": [_raise_if_refused]},
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._http.close()
+
+    def health(self) -> dict[str, Any]:
+        """The answer of ``/healthz``."""
+        return self.get("/healthz")
+
+    def wait_until_up(self, timeout_s: float = 60.0) -> None:
+        """Wait until the service answers. Raises ``ServiceError`` after ``timeout_s``."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                self.health()
+                return
+            except ServiceError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.1)
+
+    def get(self, address: str) -> dict[str, Any]:
+        """The description at an address of the service."""
+        return self._json("GET", address)
+
+    def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
+        """Download a file of the service. The file appears at ``path`` only when it is complete.
+
+        Raises ``ServiceError`` "download-damaged" if its SHA-256 is not the one that the service recorded.
+        """
+        with (
+            written(path, overwrite=overwrite) as partial,
+            self._streamed(address) as response,
+            partial.open("wb") as file,
+        ):
+            digest = hashlib.sha256()
+            for chunk in response.iter_bytes():
+                digest.update(chunk)
+                file.write(chunk)
+            _check_digest(response, digest.digest())
+
+    def follow(self, address: str) -> Iterator[dict[str, Any]]:
+        """Yield the description of a job or bulk run (address ``/v1/jobs/...``, ``/v1/bulk/...``) now and after each change.
+
+        The iteration ends when the job or bulk run ends or is deleted. If the service does not answer, for example
+        during a restart, the client tries again for up to 10 minutes and then raises ``ServiceError``.
+        """
+        with closing(self._events(f"{address}/events")) as events:
+            for event in events:
+                if event["event"] == "gone":
+                    return
+                yield json.loads(event["data"])
+                if event["event"] == "end":
+                    return
+
+    def events(
+        self, *, jobs: Sequence[str] = (), bulks: Sequence[str] = ()
+    ) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield the state of your jobs and bulk runs: ("job", description), ("bulk", description), ("gone", {"kind",
+        "id"}).
+
+        The iteration first yields the jobs and bulk runs that have not ended or that ended in the last seconds, and
+        those whose ids are in ``jobs`` and ``bulks``. Then the iteration yields each job or bulk run again when its
+        state changes. The iteration does not end by itself. If the service does not answer, the client tries again
+        for up to 10 minutes and then raises ``ServiceError``.
+        """
+        with closing(self._events("/v1/events", params={"job": list(jobs), "bulk": list(bulks)})) as events:
+            for event in events:
+                yield event["event"], json.loads(event["data"])
+
+    def _events(self, address: str, **options: Any) -> Generator[dict[str, str], None, None]:
+        """The events of a stream. If the connection is lost, the stream is opened again. The iteration ends if the
+        service answers 204 (no more events)."""
+        last_id: str | None = None
+        patience = Patience(self.say, GOES_ON)
+        while True:
+            headers = {} if last_id is None else {"Last-Event-ID": last_id}
+            try:
+                with self._streamed(address, headers=headers, timeout=QUIET_S, **options) as answer:
+                    for event in _events_in(answer.iter_lines()):
+                        patience.answered()
+                        last_id = event.get("id", last_id)
+                        if "data" in event:
+                            yield event
+                    if answer.status_code == 204:
+                        return
+            except ServiceError as error:
+                patience.wait(error)
+            else:
+                time.sleep(FIRST_WAIT_S)
+
+    def _all(self, address: str, filters: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        """All items of a list."""
+        page = self._json("GET", address, params={"limit": "200", **filters})
+        while True:
+            yield from page["items"]
+            if page["next"] is None:
+                return
+            page = self.get(page["next"])
+
+    def _json(self, method: str, address: str, **options: Any) -> dict[str, Any]:
+        """The description that a request answers."""
+        body: dict[str, Any] = self._answer(method, address, **options).json()
+        return body
+
+    def _answer(
+        self, method: str, address: str, *, params: dict[str, Any] | None = None, **options: Any
+    ) -> httpx.Response:
+        """The answer to a request. A parameter whose value is None is not sent."""
+        with self._reached():
+            return self._http.request(method, address, params=given(params or {}) or None, **options)
+
+    @contextmanager
+    def _streamed(self, address: str, **options: Any) -> Iterator[httpx.Response]:
+        """The answer at an address, read while it arrives."""
+        with self._reached(), self._http.stream("GET", address, **options) as response:
+            yield response
+
+    @contextmanager
+    def _reached(self) -> Iterator[None]:
+        try:
+            yield
+        except httpx.TransportError as error:
+            raise ServiceError(
+                f"no answer from {self.server} ({error}); {how_to_start(self.server)}"
+            ) from error
+
+
+def _events_in(lines: Iterator[str]) -> Iterator[dict[str, str]]:
+    """The events of a stream. A blank line ends an event. An event that only states its id has no data."""
+    event: dict[str, str] = {}
+    for line in lines:
+        if line:
+            field, _, value = line.partition(":")
+            event[field] = value.removeprefix(" ")
+        elif event:
+            yield event
+            event = {}
+
+
+def _check_digest(response: httpx.Response, received: bytes) -> None:
+    """Compare the SHA-256 of the received bytes with the header Repr-Digest (RFC 9530), if the answer has one."""
+    declared = response.headers.get("repr-digest", "")
+    digest = re.search(r"\bsha-256=:([A-Za-z0-9+/=]+):", declared)
+    if digest is not None and digest[1] != base64.b64encode(received).decode():
+        raise ServiceError(
+            f"expected a file with the SHA-256 {base64.b64decode(digest[1]).hex()}; received one with {received.hex()}: try "
+            "again; if this does not help, the file in the store is damaged: tell the operator",
+            code="download-damaged",
+        )
+
+
+def _raise_if_refused(response: httpx.Response) -> None:
+    if not response.is_error:
+        return
+    status = response.status_code
+    if not response.headers.get("content-type", "").startswith("application/problem+json"):
+        raise ServiceError(f"the service answered {status}", status=status)
+    response.read()
+    problem = response.json()
+    after = response.headers.get("retry-after", "")
+    raise ServiceError(
+        problem["detail"],
+        status=status,
+        code=str(problem["type"]).removeprefix("urn:heliopsf:"),
+        retry_after_s=float(after) if after.isdecimal() else None,
+        fields={name: value for name, value in problem.items() if name not in _STANDARD_FIELDS},
+    )
