@@ -18,8 +18,7 @@ from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, first_image_header, optional_text, read_summary
 from psfcore.image import Image
 from workers.bulk.targets import target_of
-from workers.catalogue.bulk_tables import BulkRow
-from workers.catalogue.bulks import Taken
+from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.bulk import BulkWork
 from workers.contract.identities import product_identity
@@ -84,7 +83,7 @@ class Ready:
     target: Path | None
 
 
-def read_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Ready | Outcome:
+def read_one(context: Context, bulk: BulkRow, request: BulkWork, taken: BulkItemRow) -> Ready | Outcome:
     """Read an image of a bulk run and choose its PSF. If its product exists already, return this product.
 
     If another job is making the product now, wait for that job and use its product. Raises DataError for an image
@@ -94,7 +93,7 @@ def read_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -
         wanted = _resolved(context, bulk, request, source)
         identity = product_identity(wanted)
         target = _target(context, request, source, wanted, identity)
-        if target is not None and taken.attempt > 1 and target.parent.is_dir():
+        if target is not None and taken.attempts > 1 and target.parent.is_dir():
             # A killed worker may have left partial copies.
             beneath.remove_partials(target, _output_roots(context))
         before = done_before(context, wanted, request, target)
@@ -166,7 +165,7 @@ def _rest() -> None:
 
 
 @contextmanager
-def _source(context: Context, taken: Taken) -> Iterator[_Source]:
+def _source(context: Context, taken: BulkItemRow) -> Iterator[_Source]:
     if taken.uploaded:
         row = row_of(context.catalogue, ImageRow, taken.source, context.owner)
         yield _Source(None, None, row.id, row.summary, row.filename or "image")

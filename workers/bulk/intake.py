@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from psfcore.errors import DataError
+from workers.catalogue.bulk_progress import BATCH
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import PsfRow
+from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.bulk import BulkPhase, BulkRequest
 from workers.contract.identities import canonical_hash
 from workers.files import archive as archive_files
@@ -57,9 +58,12 @@ def pinned(request: BulkRequest, catalogue: Catalogue, owner: str) -> tuple[str 
 
 def check_uploaded(images: Sequence[str], catalogue: Catalogue, owner: str) -> None:
     """Raise DataError "no-such-image" if one of the ids is not an uploaded image of the owner."""
-    missing = catalogue.bulks.progress.first_not_uploaded(images, owner)
-    if missing is not None:
-        raise no_such("image", missing)
+    for at in range(0, len(images), BATCH):
+        batch = images[at : at + BATCH]
+        there = catalogue.ids_among(ImageRow, batch, owner)
+        missing = next((one for one in batch if one not in there), None)
+        if missing is not None:
+            raise no_such("image", missing)
 
 
 def check_places(request: BulkRequest, settings: Settings) -> None:

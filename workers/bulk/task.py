@@ -22,8 +22,7 @@ from typing import Any, TypeVar
 
 from workers.bulk.image import Outcome, Ready, compute_one, done_before, read_one, write_one
 from workers.bulk.listing import list_files, work_of
-from workers.catalogue.bulk_tables import BulkRow
-from workers.catalogue.bulks import Taken
+from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.jobs import Lease
 from workers.contract.bulk import AT_WORK, BulkPhase, BulkWork
 from workers.contract.phases import Fault, JobError
@@ -58,7 +57,7 @@ def bulk_turn(context: Context, parameters: Mapping[str, Any]) -> str:
 class _Reading:
     """An image that the reading thread takes and then reads."""
 
-    taken: Future[Taken | None]
+    taken: Future[BulkItemRow | None]
     ready: Future[tuple[Ready | Outcome, float] | None]
 
 
@@ -66,7 +65,7 @@ class _Reading:
 class _Writing:
     """An image whose product the writing thread writes."""
 
-    taken: Taken
+    taken: BulkItemRow
     written: Future[None]
 
 
@@ -218,7 +217,7 @@ class _Turn:
         if self._stop.is_set():
             raise _Stopped
 
-    def _do(self, taken: Taken, reading: Future[tuple[Ready | Outcome, float] | None]) -> None:
+    def _do(self, taken: BulkItemRow, reading: Future[tuple[Ready | Outcome, float] | None]) -> None:
         """Deconvolve one image, and let the writing thread write it and record its result.
 
         If the whole turn must stop, the image is released for another turn.
@@ -234,7 +233,7 @@ class _Turn:
             read = _awaited(reading, lambda: progress.report("reading", 0, 1))
             assert read is not None
             ready, times["read"] = read
-            alone = taken.attempt > 1 or context.settings.max_attempts == 1
+            alone = taken.attempts > 1 or context.settings.max_attempts == 1
             if alone:
                 self._finish_writing()
             elif time.monotonic() < self._ends_at:
