@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from typing import Annotated, Any
 
@@ -15,9 +14,8 @@ from service.http.paging import Cursor, Limit, Page, following, no_cursor, page,
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_room, check_rows
 from service.http.state import Shared
-from workers.bulk import turns as bulk_turns
-from workers.bulk.dry_run import BUDGET_S, MOST_REFUSED, DryRun, dry_run
-from workers.bulk.intake import begin
+from workers.bulk.dry_run import BulkEstimate, dry_run
+from workers.bulk.runs import begin, cancel_turns
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.contract.bulk import BulkPhase, BulkRequest, ItemState
 from workers.contract.phases import JobError
@@ -157,42 +155,6 @@ class Failed(BaseModel):
         )
 
 
-class Refused(BaseModel):
-    """An image that a bulk run would refuse."""
-
-    source: str = Field(description="id of the upload, or path of the file")
-    error: JobError
-
-
-class BulkEstimate(BaseModel):
-    """What a bulk run would do. Only a sample of the images is examined; the figures of the run are scaled up from it."""
-
-    images: int = Field(description="images that were found")
-    complete: bool = Field(
-        description=f"false: {BUDGET_S:g} s were not enough to list all files and to examine the sample, so the run is larger or "
-        "the sample smaller"
-    )
-    examined: int = Field(description="images of the sample whose headers were read")
-    refused_images: int = Field(description="examined images that the run would refuse")
-    refused: list[Refused] = Field(description=f"the first {MOST_REFUSED} of them, with the reasons")
-    existing: int = Field(
-        description="examined uploads whose product exists already; for files this is not known before the run"
-    )
-    output_bytes: int = Field(description="expected size of all products, without their pictures")
-    seconds: float = Field(description="expected time of the run with the workers of now")
-    workers: int = Field(description="worker processes now; 1 if there are none")
-    memory_mib: int = Field(description="memory that the largest examined image needs")
-    example_output: str | None = Field(
-        description="path of the product of an examined image in the output folder; null: there is no output folder, or the "
-        "path has the id of the product, which is not known before the run"
-    )
-
-    @classmethod
-    def of(cls, found: DryRun) -> BulkEstimate:
-        """The description of a dry run."""
-        return cls.model_validate(dataclasses.asdict(found))
-
-
 @router.post("/estimate", summary="Estimate a bulk run without starting it")
 def estimate_bulk(
     body: BulkRequest,
@@ -208,7 +170,7 @@ def estimate_bulk(
     refuse images whose pixels cannot be used.
     """
     try:
-        return BulkEstimate.of(dry_run(body, state.catalogue, caller.owner, state.settings, sample=sample))
+        return dry_run(body, state.catalogue, caller.owner, state.settings, sample=sample)
     except DataError as error:
         raise problem(error) from error
 
@@ -305,7 +267,7 @@ def cancel_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
     """End the run. Workers stop at the next step of their images. Finished products are kept."""
     row = find(state, caller, bulk_id)
     _done(state.catalogue.bulks.cancel(row.id), row, "LISTING, RUNNING, PAUSED or ERROR")
-    bulk_turns.cancel_turns(state.catalogue, row.id)
+    cancel_turns(state.catalogue, row.id)
     return BulkView.of(find(state, caller, bulk_id), state)
 
 
@@ -338,7 +300,7 @@ def delete_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> Response:
     if not state.catalogue.bulks.delete(row.id):
         there = find(state, caller, bulk_id)  # if another request deleted it meanwhile, the answer is 404
         _done(False, there, "PAUSED, ERROR, COMPLETED or CANCELLED", ": cancel it first")
-    bulk_turns.cancel_turns(state.catalogue, row.id)
+    cancel_turns(state.catalogue, row.id)
     return Response(status_code=204)
 
 

@@ -16,7 +16,7 @@ from service.pages import archive_runs
 from tests.conftest import write_image
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.contract.layout import FIELDS

@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 from service.pages import assets
 from tests.conftest import write_image
 from tests.service.conftest import upload
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store
 from workers.run.runner import Runner

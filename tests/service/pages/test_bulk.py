@@ -15,7 +15,7 @@ from service.pages import bulk as bulk_pages
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store

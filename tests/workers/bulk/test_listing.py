@@ -19,8 +19,8 @@ from tests.service.conftest import upload
 from tests.workers.databases import rows
 from tests.workers.jobs import claimed
 from workers.bulk import listing, task
-from workers.bulk.matching import Place
-from workers.bulk.turns import keep_turns
+from workers.bulk.listing import Place
+from workers.bulk.runs import keep_turns
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
@@ -183,7 +183,7 @@ def test_a_search_that_was_stopped_at_every_step_finds_each_file_once(run: Run) 
     run.start("0/*.fits", "**/*.fits", "*/*.fits")
     bulks, lease, steps = run.catalogue.bulks, _lease(run), 0
     while (begun := bulks.begin_listing(run.id, lease)) is not None:
-        listing.list_files(_context(run), begun, lease, lambda: None, lambda: True)
+        listing.list_files(_context(run, lease), begun, lambda: None, lambda: True)
         steps += 1
         assert steps < 100
     run.catalogue.jobs.hand_back(lease)
@@ -199,7 +199,7 @@ def test_a_worker_that_is_lost_while_it_lists_is_followed_by_another(run: Run) -
     assert (partly["phase"], partly["listed"]) == ("LISTING", False) and 0 < partly["images"]["total"] < ALL
     run.catalogue.jobs.give_up_silent(-1.0, 99)
     run.turns()
-    listing.list_files(_context(run), begun, lost, lambda: None, lambda: False)  # it comes back too late
+    listing.list_files(_context(run, lost), begun, lambda: None, lambda: False)  # it comes back too late
     run.check_all_done_once()
 
 
@@ -320,12 +320,12 @@ def _list_first_folder(run: Run, lease: Lease) -> BulkRow:
     begun = run.catalogue.bulks.begin_listing(run.id, lease)
     assert begun is not None
     steps = iter([False] * (1 + FOLDERS + IN_FOLDER) + [True])
-    listing.list_files(_context(run), begun, lease, lambda: None, lambda: next(steps))
+    listing.list_files(_context(run, lease), begun, lambda: None, lambda: next(steps))
     return begun
 
 
-def _context(run: Run) -> Context:
+def _context(run: Run, lease: Lease) -> Context:
     return Context(
         catalogue=run.catalogue, store=Store(run.settings.data_dir), settings=run.settings, owner="local",
-        job_id="j", report=lambda *_: None,
+        job_id="j", report=lambda *_: None, lease=lease,
     )  # fmt: skip

@@ -22,7 +22,7 @@ from tests.workers.databases import rows
 from tests.workers.jobs import claimed
 from workers.bulk import image as bulk_image
 from workers.bulk import task
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.catalogue import Catalogue
 from workers.files.opened import open_store
@@ -94,12 +94,12 @@ def test_the_next_image_is_read_and_the_last_product_written_while_an_image_is_c
     read_one, compute_one, write_one = task.read_one, task.compute_one, task.write_one
     threads: set[int] = set()
 
-    def reading(context: Any, bulk: Any, request: Any, taken: Any) -> Any:
-        ready = read_one(context, bulk, request, taken)
+    def reading(context: Any, bulk: Any, taken: Any) -> Any:
+        ready = read_one(context, bulk, taken)
         read[taken.position].set()
         return ready
 
-    def compute(context: Any, request: Any, ready: Any) -> Any:
+    def compute(context: Any, ready: Any) -> Any:
         number = number_of(ready)
         computing.set()
         threads.add(threading.get_ident())
@@ -107,14 +107,14 @@ def test_the_next_image_is_read_and_the_last_product_written_while_an_image_is_c
         assert number == 0 or written[number - 1].wait(WAIT_S), (
             f"image {number - 1} was not written meanwhile"
         )
-        made = compute_one(context, request, ready)
+        made = compute_one(context, ready)
         computing.clear()
         return made
 
-    def write(context: Any, request: Any, ready: Any, made: Any) -> Any:
+    def write(context: Any, ready: Any, made: Any) -> Any:
         number = number_of(ready)
         assert number == 3 or computing.wait(WAIT_S), f"image {number} was written before the next one began"
-        outcome = write_one(context, request, ready, made)
+        outcome = write_one(context, ready, made)
         written[number].set()
         return outcome
 
@@ -132,9 +132,9 @@ def test_an_image_in_its_second_attempt_has_no_neighbours(run: Run, monkeypatch:
     at_work: list[list[int]] = []
     compute_one = task.compute_one
 
-    def compute(context: Any, request: Any, ready: Any) -> Any:
+    def compute(context: Any, ready: Any) -> Any:
         at_work.append([row.position for row in run.rows() if row.state == "taken"])
-        return compute_one(context, request, ready)
+        return compute_one(context, ready)
 
     monkeypatch.setattr(task, "compute_one", compute)
     run.turn()
@@ -146,12 +146,12 @@ def test_an_image_that_was_read_ahead_is_given_back(run: Run, monkeypatch: pytes
     begun = threading.Event()
     read_one = task.read_one
 
-    def reading(context: Any, bulk: Any, request: Any, taken: Any) -> Any:
+    def reading(context: Any, bulk: Any, taken: Any) -> Any:
         if taken.position == 1:
             begun.set()
-        return read_one(context, bulk, request, taken)
+        return read_one(context, bulk, taken)
 
-    def compute(context: Any, request: Any, ready: Any) -> Any:
+    def compute(context: Any, ready: Any) -> Any:
         assert begun.wait(WAIT_S)
         run.catalogue.bulks.pause(run.id)
         raise DataError("no-signal", "expected light; got none")
@@ -166,10 +166,10 @@ def test_an_image_that_was_read_ahead_is_given_back(run: Run, monkeypatch: pytes
 def test_an_error_of_writing_belongs_to_its_image(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     write_one = task.write_one
 
-    def write(context: Any, request: Any, ready: Any, made: Any) -> Any:
+    def write(context: Any, ready: Any, made: Any) -> Any:
         if number_of(ready) in (1, 3):
             raise DataError("output-not-written", "expected a folder; got a file")
-        return write_one(context, request, ready, made)
+        return write_one(context, ready, made)
 
     monkeypatch.setattr(task, "write_one", write)
     run.turn()

@@ -19,7 +19,7 @@ from tests.whole.many_rows import plan, statements
 from tests.workers.databases import BOTH, change, database, rows
 from tests.workers.jobs import bulk_row, claimed
 from tests.workers.psf_examples import product
-from workers.bulk import listing, matching
+from workers.bulk import listing
 from workers.catalogue import bulk_progress
 from workers.catalogue import bulks as bulk_rows
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
@@ -384,16 +384,16 @@ def test_files_whose_paths_cannot_be_stored_are_failed_images(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_image(path)
     (root / "loop.fits").symlink_to(root / "loop.fits")
+    bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
     context = Context(
-        catalogue=catalogue, store=Store(tmp_path / "data"), owner="o", job_id="j",
+        catalogue=catalogue, store=Store(tmp_path / "data"), owner="o", job_id="j", lease=lease,
         settings=settings.model_copy(update={"bulk_roots": str(root)}), report=lambda *_: None,
     )  # fmt: skip
-    bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
     request = {"files": [{"glob": f"{root}/**/*.fits", "where": {"NAXIS": 2}}]}
     change(catalogue, update(BulkRow).where(BulkRow.id == bulk_id).values(request=request))
     begun = catalogue.bulks.begin_listing(bulk_id, lease)
     assert begun is not None
-    listing.list_files(context, begun, lease, lambda: None, lambda: False)
+    listing.list_files(context, begun, lambda: None, lambda: False)
     assert row(catalogue, bulk_id).phase == BulkPhase.RUNNING
     (taken,) = all_taken(catalogue, bulk_id, lease)
     assert taken.source == str(root / "a.fits")
@@ -407,7 +407,7 @@ def test_files_whose_paths_cannot_be_stored_are_failed_images(
     assert "1024" in message and str(len(str(long))) in message and message.endswith("5/long.fits")
     sources = [item.source for item in items]
     assert f"{root}/\\xff\\xfe/Sonne\\xf6.fits" in sources
-    assert max(map(len, sources)) == matching.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
+    assert max(map(len, sources)) == listing.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
     check_counts(catalogue, bulk_id)
     assert done(catalogue, taken) and catalogue.bulks.retry(bulk_id) == 1, "no row tells where the others lie"
     assert [one.source for one in all_taken(catalogue, bulk_id, lease)] == [str(root / "loop.fits")]

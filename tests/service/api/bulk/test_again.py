@@ -17,7 +17,7 @@ from service.client.http import Client
 from tests.conftest import write_image
 from tests.service.api.bulk.conftest import FEW, now, started
 from tests.service.conftest import refusal
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.files import archive as archive_files
 from workers.files.store import Store

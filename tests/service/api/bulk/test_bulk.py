@@ -19,7 +19,7 @@ from tests.conftest import write_image, write_psf
 from tests.service.api.bulk.conftest import FEW, failures, now, results, started
 from tests.service.conftest import refusal, upload
 from workers.bulk import image as bulk_image
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.contract.queues import Queue
 from workers.files import beneath
@@ -241,10 +241,10 @@ def test_an_internal_error_stops_one_image_and_one_of_a_turn_the_run(
 ) -> None:
     real = bulk_image.read_one
 
-    def breaks(context: Any, bulk: Any, request: Any, taken: Any) -> Any:
+    def breaks(context: Any, bulk: Any, taken: Any) -> Any:
         if taken.position == 1:
             raise ZeroDivisionError("secret place")
-        return real(context, bulk, request, taken)
+        return real(context, bulk, taken)
 
     bulk = started(api, files=files, psf_id=psf_id)
     with pytest.MonkeyPatch.context() as patched:
