@@ -35,10 +35,10 @@ def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
     idle = catalogue.jobs.nobody_works(settings.resubmit_s) and bool(
         catalogue.census.workers(settings.lease_s)
     )
-    for job in catalogue.jobs.unsubmitted(settings.resubmit_s, limit=AT_ONCE, idle=idle):
-        if not queue.submit(app, job.id, job.queue):
+    for job_id, name in catalogue.jobs.unsubmitted(settings.resubmit_s, limit=AT_ONCE, idle=idle):
+        if not queue.submit(app, job_id, name):
             break
-        submitted.append(job.id)
+        submitted.append(job_id)
     if submitted:
         catalogue.jobs.mark_submitted(*submitted)
     return len(submitted)

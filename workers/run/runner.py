@@ -11,6 +11,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
 
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 
@@ -26,8 +27,7 @@ from workers.contract.queues import Queue
 from workers.files.full_disk import NO_ROOM, STORAGE_FULL, is_disk_full
 from workers.files.store import Store
 from workers.run.attempt import Assistance, Attempt, Cancelled, Progress, TookTooLong
-from workers.run.child import MARGIN, Child, allowed_mib, is_out_of_memory
-from workers.run.stopping import Stopping
+from workers.run.child import MARGIN, Child, Stopping, allowed_mib, is_out_of_memory
 from workers.settings import Settings
 from workers.tasks.context import Context, TurnOver
 from workers.tasks.stage_timer import StageTimer
@@ -36,6 +36,15 @@ log = logging.getLogger(__name__)
 FAILED = "job %s: %s (%s)"  # log line about a failed job: its id, and the message and the code of its error
 
 TRANSIENT = (OperationalError, InterfaceError, ConnectionError, TimeoutError)
+LATE = ("psfcore.build", "psfcore.drawing.plots")  # libraries that tasks load when they need them
+
+
+def load_tasks() -> None:
+    """Import every task and late library, so that the first job of each kind does not wait for them."""
+    for kind in KINDS.values():
+        kind.load_task()
+    for name in LATE:
+        import_module(name)
 
 
 def worker_name() -> str:
@@ -224,15 +233,13 @@ class Runner:
         except Cancelled:
             aborted = self._persist(lambda: self._catalogue.jobs.abort(lease))
             log.info("job %s: %s", job.id, "aborted" if aborted else "lease lost; another worker has the job")
-        except TookTooLong as error:
-            self._fail(lease, error.as_error())
-        except DataError as error:
-            self._fail(lease, JobError(fault=Fault.USER, code=error.code, message=error.message))
         except TRANSIENT as error:
             self._retry(job, lease, error)
+        except (DataError, TookTooLong) as error:
+            self._fail(lease, self._error_of(job, error))
         except Exception as error:
             log.exception("job %s failed", job.id)
-            self._fail(lease, self._unexpected(job, error))
+            self._fail(lease, self._error_of(job, error))
         else:
             completed = self._persist(lambda: self._catalogue.jobs.complete(lease, result_id))
             outcome = (
@@ -285,15 +292,13 @@ class Runner:
             piece()
         except (Cancelled, *TRANSIENT):
             raise
-        except TookTooLong as error:
-            return error.as_error()
-        except DataError as error:
-            return JobError(fault=Fault.USER, code=error.code, message=error.message)
+        except (DataError, TookTooLong) as error:
+            return self._error_of(job, error)
         except Exception as error:
             if is_disk_full(error):
                 raise
             log.exception("job %s: a piece of its work failed", job.id)
-            return self._unexpected(job, error)
+            return self._error_of(job, error)
         return None
 
     @contextmanager
@@ -309,9 +314,12 @@ class Runner:
         """The memory for which the job was admitted, MiB. Without an estimate, it is the operator's limit."""
         return int((job.estimate or {}).get("memory_mib", self._settings.max_job_memory_mib))
 
-    def _unexpected(self, job: JobRow, error: Exception) -> JobError:
-        """The error of a job whose task raised an exception that the user did not cause: a full disk, too little
-        memory, or a fault of the software."""
+    def _error_of(self, job: JobRow, error: Exception) -> JobError:
+        """The error of a job whose task raised this exception."""
+        if isinstance(error, TookTooLong):
+            return error.as_error()
+        if isinstance(error, DataError):
+            return JobError.of(error)
         if is_disk_full(error):
             return JobError(fault=Fault.TRANSIENT, code=STORAGE_FULL, message=NO_ROOM)
         if not is_out_of_memory(error):
