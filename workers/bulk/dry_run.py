@@ -155,10 +155,10 @@ class _DryRun:
     def _found(self) -> Iterator[Listed]:
         for identity in self._uploads:
             yield Listed(identity, uploaded=True)
-        for step in found_files(self._request, self._settings):
+        for _, image in found_files(self._request, self._settings):
             self._check_time()
-            if step.image is not None:
-                yield step.image
+            if image is not None:
+                yield image
 
     def _examine(self, image: Listed) -> None:
         """Add the estimate of one image. Raises DataError if the run would refuse the image."""

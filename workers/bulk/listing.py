@@ -53,14 +53,6 @@ class Place:
         return cls(stored["pattern"], names)
 
 
-@dataclass(frozen=True)
-class Step:
-    """A step of the search, which looks at one folder or entry. image: the image that was found there, or None."""
-
-    place: Place
-    image: Listed | None = None
-
-
 def list_files(context: Context, bulk: BulkRow, added: Callable[[], None], stops: Callable[[], bool]) -> None:
     """Add the files that the patterns of a bulk run match to its images, from the place where an earlier search ended.
 
@@ -116,10 +108,10 @@ def _add_all(context: Context, bulk: BulkRow, added: Callable[[], None], stops: 
         return True
 
     try:
-        for step in found_files(request, context.settings, place, known, bulk.total):
-            place = step.place
-            if step.image is not None:
-                batch.append(step.image)
+        for reached, image in found_files(request, context.settings, place, known, bulk.total):
+            place = reached
+            if image is not None:
+                batch.append(image)
             stop = stops()
             if (stop or len(batch) >= LIST_AT_ONCE or time.monotonic() >= add_at) and not add():
                 return False
@@ -137,9 +129,10 @@ def found_files(
     after: Place | None = None,
     known: frozenset[str] = frozenset(),
     listed: int = 0,
-) -> Iterator[Step]:
+) -> Iterator[tuple[Place, Listed | None]]:
     """Search the files that match the patterns of a request; each file is found once even if several patterns match it.
 
+    Each step of the search looks at one folder or entry: its place comes with the image that was found there, or None.
     A file that cannot be used comes with its error. after: continue a search that ended after this place. known: paths
     that it found, if there are several patterns. listed: number of images that are listed. Raises DataError "bad-path",
     "path-not-allowed", "unreadable-folder", "too-many-images".
@@ -163,7 +156,7 @@ def found_files(
                     "too-many-images",
                     f"expected at most {MOST_IMAGES} images in a bulk run; the patterns match more: split the request",
                 )
-            yield Step(Place(number, looked.place), image)
+            yield Place(number, looked.place), image
 
 
 def _listed_one(

@@ -200,19 +200,19 @@ class Jobs:
 
     def complete(self, lease: Lease, result_id: str) -> bool:
         """EXECUTING -> COMPLETED. Returns False if the lease is lost."""
-        return self._set(
-            _held(lease), phase=Phase.COMPLETED, ended_at=self._database.now, result_id=result_id, lease=None
-        )
+        return self._end(lease, Phase.COMPLETED, result_id=result_id)
 
     def fail(self, lease: Lease, error: JobError) -> bool:
         """EXECUTING -> ERROR. Returns False if the lease is lost."""
-        return self._set(
-            _held(lease),
-            phase=Phase.ERROR,
-            ended_at=self._database.now,
-            error=error.model_dump(mode="json"),
-            lease=None,
-        )
+        return self._end(lease, Phase.ERROR, error=error.model_dump(mode="json"))
+
+    def abort(self, lease: Lease) -> bool:
+        """EXECUTING -> ABORTED, when the worker has stopped a cancelled job. Returns False if the lease is lost."""
+        return self._end(lease, Phase.ABORTED, JobRow.cancel_requested.is_(True))
+
+    def _end(self, lease: Lease, phase: Phase, *conditions: ColumnElement[bool], **values: Any) -> bool:
+        ended = {"phase": phase, "ended_at": self._database.now, "lease": None}
+        return self._set([*_held(lease), *conditions], **ended, **values)
 
     def requeue(self, lease: Lease) -> bool:
         """EXECUTING -> QUEUED after a transient failure. Returns False if the lease is lost.
@@ -221,15 +221,6 @@ class Jobs:
         """
         delay = {"submitted_at": self._database.now, "submissions": JobRow.attempt, "delayed": True}
         return self._set(_held(lease), **self._again(), **delay)
-
-    def abort(self, lease: Lease) -> bool:
-        """EXECUTING -> ABORTED, when the worker has stopped a cancelled job. Returns False if the lease is lost."""
-        return self._set(
-            [*_held(lease), JobRow.cancel_requested.is_(True)],
-            phase=Phase.ABORTED,
-            ended_at=self._database.now,
-            lease=None,
-        )
 
     def cancel(self, job_id: str) -> None:
         """PENDING, QUEUED -> ABORTED. The worker of an executing job is told to stop; an ended job does not change."""

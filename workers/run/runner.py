@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
+from typing import Any
 
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 
@@ -187,15 +188,7 @@ class Runner:
         if assistant is None:
             return
         assistance = Assistance(self._catalogue, job_id, self._stopping)
-        context = Context(
-            catalogue=self._catalogue,
-            store=self._store,
-            settings=self._settings,
-            owner=job.owner,
-            job_id=job.id,
-            report=assistance.report,
-            times=assistance.times,
-        )
+        context = self._context(job, assistance)
         with logs.bound(job=job.id, owner=job.owner):
             try:
                 with self._limited(job):
@@ -207,22 +200,30 @@ class Runner:
                 log.exception("job %s: assisting failed", job_id)
             self._keep_times(job, assistance.times)
 
-    def _attempt(self, job: JobRow, lease: Lease, attempt: Attempt) -> None:
-        context = Context(
+    def _context(self, job: JobRow, work: Attempt | Assistance, **functions: Any) -> Context:
+        """The context of a task or an assistant. functions: what only a task may use."""
+        return Context(
             catalogue=self._catalogue,
             store=self._store,
             settings=self._settings,
             owner=job.owner,
             job_id=job.id,
-            report=attempt.report,
+            report=work.report,
+            times=work.times,
+            previews=self._previews,
+            compile_beside=self._compile_beside,
+            total_psfs=self._total_psfs,
+            **functions,
+        )
+
+    def _attempt(self, job: JobRow, lease: Lease, attempt: Attempt) -> None:
+        context = self._context(
+            job,
+            attempt,
             call_for_help=lambda workers: self._call_for_help(job.id, workers),
             guarded=lambda piece: self._guarded(job, attempt, piece),
             others_wait=lambda: self._stopping.asked or self._catalogue.jobs.others_wait(job.kind),
             lease=lease,
-            times=attempt.times,
-            previews=self._previews,
-            compile_beside=self._compile_beside,
-            total_psfs=self._total_psfs,
         )
         try:
             self._check_room(job)
@@ -265,14 +266,8 @@ class Runner:
         An identical job, or an earlier attempt that could not record its end, may have made it.
         """
         made, find = job.work_key, self._catalogue.get
-        if made is None:
-            return False
-        found = (
-            find(ProductRow, made, job.owner),
-            find(PsfRow, made, job.owner),
-            find(ReportRow, made, job.owner),
-        )
-        return any(row is not None for row in found)
+        tables: tuple[type[Any], ...] = (ProductRow, PsfRow, ReportRow)
+        return made is not None and any(find(table, made, job.owner) is not None for table in tables)
 
     def _keep_times(self, job: JobRow, times: StageTimer) -> None:
         """Add the stage times of an attempt to the sums. The outcome of the attempt is already recorded, so a failure here is only logged."""

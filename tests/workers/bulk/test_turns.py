@@ -279,6 +279,18 @@ def test_a_listing_that_fails_midway_keeps_what_is_done_and_continues_when_resum
     run.check_all_done_once()
 
 
+def test_a_run_that_is_cancelled_while_it_finds_nothing_stops_at_once(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr(listing, "ADD_EVERY_S", 0.0)
+    run.start("**/*.none")
+    looked = at_folder(monkeypatch, run.archive, "1", lambda: run.change("cancel"))
+    run.turn()
+    assert looked == ["archive", "0", "1"] and run.now()["phase"] == "CANCELLED"
+    assert {job.phase for job in run.catalogue.jobs.of_kind("bulk")} <= {"ABORTED", "COMPLETED"}
+
+
 def test_a_listing_that_finds_nothing_lets_other_jobs_go_first(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -296,7 +308,7 @@ def test_a_listing_that_finds_nothing_lets_other_jobs_go_first(
     def slow(*given: Any, **named: Any) -> Iterator[Any]:
         for step in real(*given, **named):
             yield step
-            if step.place.names[0] == "1":
+            if step[0].names[0] == "1":
                 threading.Event().wait(0.2)
 
     monkeypatch.setattr(listing, "found_files", slow)
