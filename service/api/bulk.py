@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from psfcore.errors import DataError
 from service.http.callers import Bulk, Caller, KeyFirst, Reading
@@ -15,11 +14,10 @@ from service.http.paging import Cursor, Limit, Page, following, no_cursor, page,
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_room, check_rows
 from service.http.state import Shared
-from workers.bulk import turns as bulk_turns
-from workers.bulk.dry_run import BUDGET_S, MOST_REFUSED, DryRun, dry_run
-from workers.bulk.intake import begin
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
-from workers.contract.bulk import BulkPhase, BulkRequest, ItemState
+from workers.bulk.dry_run import BulkEstimate, dry_run
+from workers.bulk.runs import begin, cancel_turns
+from workers.catalogue.bulk_tables import BulkRow
+from workers.contract.bulk import STOPPED, BulkPhase, BulkRequest, ItemState
 from workers.contract.phases import JobError
 from workers.rows import no_such
 
@@ -75,41 +73,34 @@ class BulkView(BaseModel):
     @classmethod
     def of(cls, row: BulkRow, state: Shared) -> BulkView:
         """The description of a bulk run, from its row in the catalogue."""
-        pace = state.catalogue.bulks.progress.pace(row)
-        here = f"/v1/bulk/{row.id}"
+        progress = state.catalogue.bulks.progress
+        pace, here = progress.pace(row), f"/v1/bulk/{row.id}"
         left = row.total - row.done - row.failed
-        rate = None if row.phase in (BulkPhase.PAUSED, BulkPhase.ERROR) else pace.images_an_hour
-        return cls(
-            id=row.id,
-            name=row.name,
-            phase=BulkPhase(row.phase),
-            created_at=row.created_at,
-            ended_at=row.ended_at,
-            psf_id=row.psf_id,
-            context_id=row.context_id,
-            request=row.request,
-            listed=row.listed,
-            images=Counts(
-                total=row.total,
-                waiting=max(0, left - pace.taken),
-                at_work=pace.taken,
-                done=row.done,
-                reused=row.reused,
-                failed=row.failed,
-                to_look_at=state.catalogue.bulks.progress.to_look_at(row.id, LOOK_FROM),
-            ),
-            images_an_hour=rate,
-            time_left_s=left * 3600.0 / rate if rate and row.phase == BulkPhase.RUNNING else None,
-            error=JobError.model_validate(row.error) if row.error else None,
-            results=f"{here}/results",
-            failures=f"{here}/failures",
-            events=f"{here}/events",
+        rate = None if row.phase in STOPPED else pace.images_an_hour
+        counts = Counts(
+            total=row.total,
+            waiting=max(0, left - pace.taken),
+            at_work=pace.taken,
+            done=row.done,
+            reused=row.reused,
+            failed=row.failed,
+            to_look_at=progress.to_look_at(row.id, LOOK_FROM),
         )
+        values = {name: getattr(row, name) for name in cls.model_fields if hasattr(row, name)} | {
+            "images": counts,
+            "images_an_hour": rate,
+            "time_left_s": left * 3600.0 / rate if rate and row.phase == BulkPhase.RUNNING else None,
+            "results": f"{here}/results",
+            "failures": f"{here}/failures",
+            "events": f"{here}/events",
+        }
+        return cls.model_validate(values)
 
 
 class BulkLine(BaseModel):
     """A bulk run in a list."""
 
+    model_config = ConfigDict(from_attributes=True)
     id: str
     name: str
     phase: BulkPhase
@@ -120,77 +111,16 @@ class BulkLine(BaseModel):
     done: int
     failed: int
 
-    @classmethod
-    def of(cls, row: BulkRow) -> BulkLine:
-        """The description of a bulk run for a list, from its row in the catalogue."""
-        return cls(
-            id=row.id,
-            name=row.name,
-            phase=BulkPhase(row.phase),
-            created_at=row.created_at,
-            ended_at=row.ended_at,
-            listed=row.listed,
-            total=row.total,
-            done=row.done,
-            failed=row.failed,
-        )
-
 
 class Failed(BaseModel):
     """An image that could not be deconvolved."""
 
+    model_config = ConfigDict(from_attributes=True)
     position: int
     source: str = Field(description="id of the upload, or path of the file")
     attempts: int
     ended_at: float | None
     error: JobError
-
-    @classmethod
-    def of(cls, row: BulkItemRow) -> Failed:
-        """The description of a failed image of a bulk run, from its row in the catalogue."""
-        return cls(
-            position=row.position,
-            source=row.source,
-            attempts=row.attempts,
-            ended_at=row.ended_at,
-            error=JobError.model_validate(row.error),
-        )
-
-
-class Refused(BaseModel):
-    """An image that a bulk run would refuse."""
-
-    source: str = Field(description="id of the upload, or path of the file")
-    error: JobError
-
-
-class BulkEstimate(BaseModel):
-    """What a bulk run would do. Only a sample of the images is examined; the figures of the run are scaled up from it."""
-
-    images: int = Field(description="images that were found")
-    complete: bool = Field(
-        description=f"false: {BUDGET_S:g} s were not enough to list all files and to examine the sample, so the run is larger or "
-        "the sample smaller"
-    )
-    examined: int = Field(description="images of the sample whose headers were read")
-    refused_images: int = Field(description="examined images that the run would refuse")
-    refused: list[Refused] = Field(description=f"the first {MOST_REFUSED} of them, with the reasons")
-    existing: int = Field(
-        description="examined uploads whose product exists already; for files this is not known before the run"
-    )
-    output_bytes: int = Field(description="expected size of all products, without their pictures")
-    seconds: float = Field(description="expected time of the run with the workers of now")
-    workers: int = Field(description="worker processes now; 1 if there are none")
-    memory_mib: int = Field(description="memory that the largest examined image needs")
-    example_output: str | None = Field(
-        description="path of the product of an examined image in the output folder; null: there is no output folder, or the "
-        "path has the id of the product, which is not known before the run"
-    )
-
-    @classmethod
-    def of(cls, found: DryRun) -> BulkEstimate:
-        """The description of a dry run."""
-        return cls.model_validate(dataclasses.asdict(found))
 
 
 @router.post("/estimate", summary="Estimate a bulk run without starting it")
@@ -208,7 +138,7 @@ def estimate_bulk(
     refuse images whose pixels cannot be used.
     """
     try:
-        return BulkEstimate.of(dry_run(body, state.catalogue, caller.owner, state.settings, sample=sample))
+        return dry_run(body, state.catalogue, caller.owner, state.settings, sample=sample)
     except DataError as error:
         raise problem(error) from error
 
@@ -257,7 +187,7 @@ def list_bulks(
     rows = state.catalogue.page(
         BulkRow, owner=caller.owner, limit=limit + 1, after=position(cursor), phase=phase
     )
-    return page(request, rows, limit, BulkLine.of)
+    return page(request, rows, limit, BulkLine.model_validate)
 
 
 @router.get("/{bulk_id}", summary="One bulk run: progress, speed and time left")
@@ -280,7 +210,7 @@ def list_failures(
     after = _after(cursor)
     items = state.catalogue.bulks.progress.items(row.id, ItemState.FAILED, after=after, limit=limit + 1)
     next_page = following(request, str(items[limit - 1].position)) if len(items) > limit else None
-    return Page(items=[Failed.of(item) for item in items[:limit]], next=next_page)
+    return Page(items=[Failed.model_validate(item) for item in items[:limit]], next=next_page)
 
 
 @router.post("/{bulk_id}/pause", summary="Pause a bulk run")
@@ -288,7 +218,7 @@ def pause_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
     """Start no more images. Workers finish the images that they have started."""
     row = find(state, caller, bulk_id)
     _done(state.catalogue.bulks.pause(row.id), row, "LISTING or RUNNING")
-    return BulkView.of(find(state, caller, bulk_id), state)
+    return get_bulk(bulk_id, caller, state)
 
 
 @router.post("/{bulk_id}/resume", summary="Resume a bulk run")
@@ -297,7 +227,7 @@ def resume_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
     row = find(state, caller, bulk_id)
     _done(state.catalogue.bulks.resume(row.id), row, "PAUSED or ERROR")
     state.reconciler.wake()
-    return BulkView.of(find(state, caller, bulk_id), state)
+    return get_bulk(bulk_id, caller, state)
 
 
 @router.post("/{bulk_id}/cancel", summary="Cancel a bulk run")
@@ -305,8 +235,8 @@ def cancel_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
     """End the run. Workers stop at the next step of their images. Finished products are kept."""
     row = find(state, caller, bulk_id)
     _done(state.catalogue.bulks.cancel(row.id), row, "LISTING, RUNNING, PAUSED or ERROR")
-    bulk_turns.cancel_turns(state.catalogue, row.id)
-    return BulkView.of(find(state, caller, bulk_id), state)
+    cancel_turns(state.catalogue, row.id)
+    return get_bulk(bulk_id, caller, state)
 
 
 @router.post("/{bulk_id}/retry", summary="Retry failed images")
@@ -322,7 +252,7 @@ def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
         raise Problem(409, error.code, error.message) from error
     _done(changed is not None, row, "other than CANCELLED")
     state.reconciler.wake()
-    return BulkView.of(find(state, caller, bulk_id), state)
+    return get_bulk(bulk_id, caller, state)
 
 
 @router.delete("/{bulk_id}", status_code=204, summary="Delete a bulk run", response_class=Response)
@@ -338,7 +268,7 @@ def delete_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> Response:
     if not state.catalogue.bulks.delete(row.id):
         there = find(state, caller, bulk_id)  # if another request deleted it meanwhile, the answer is 404
         _done(False, there, "PAUSED, ERROR, COMPLETED or CANCELLED", ": cancel it first")
-    bulk_turns.cancel_turns(state.catalogue, row.id)
+    cancel_turns(state.catalogue, row.id)
     return Response(status_code=204)
 
 

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from psfcore.errors import DataError, HeaderError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_text
-from psfcore.fits.header import FitsLimits, all_hdus, first_image_header, optional_text
+from psfcore.fits.header import all_hdus, first_image_header
 from service.client.errors import Answer, Patience, ServiceError, WaitInterrupted
 from service.client.operations import Operations, deconvolution
 from service.client.outputs import check_output_folder, check_outputs

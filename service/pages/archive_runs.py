@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
 
-from service.api.bulk import BulkEstimate, estimate_bulk, submit_bulk
+from service.api.bulk import estimate_bulk, submit_bulk
 from service.http.callers import Caller
 from service.http.problems import Problem
 from service.http.state import Shared, State
@@ -17,6 +17,7 @@ from service.pages.parts.forms import Sent, fields
 from service.pages.parts.sentences import of_error, of_problem
 from service.pages.rendering import page
 from service.pages.visitors import PageBulk
+from workers.bulk.dry_run import BulkEstimate
 from workers.contract.bulk import BulkRequest
 
 MOST_REFUSED = 20  # refused images that the page shows

@@ -40,6 +40,7 @@ from service.pages.visitors import PageBulk, PageReading
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.bulk_progress import MOST_EXPLAINED
 from workers.catalogue.bulk_tables import BulkItemRow
+from workers.catalogue.tables import ProductRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, BulkRequest, ItemState
 
 PER_PAGE, PER_SHEET = 20, 24
@@ -232,7 +233,7 @@ def _after(cursor: str | None) -> tuple[float, int] | None:
 def _cards(rows: Sequence[BulkItemRow], caller: Caller, state: State) -> list[dict[str, Any]]:
     """The entries of the images on the contact sheet."""
     results, names = [Result.of(row) for row in rows], _names(rows, caller, state)
-    there = state.catalogue.bulks.progress.still_there([one.product_id for one in results], caller.owner)
+    there = state.catalogue.ids_among(ProductRow, [one.product_id for one in results], caller.owner)
     return [
         {
             "result": one,

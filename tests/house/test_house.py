@@ -127,7 +127,6 @@ def test_the_web_process_carries_no_numerics_and_no_task() -> None:
         "scipy",
         "numba",
         "matplotlib",
-        "workers.run.registry",
         "workers.run.runner",
         "psfcore.convolution.convolver",
         "psfcore.fits.hdus",

@@ -18,7 +18,7 @@ from tests.blank_figures import blank_unless_told
 from tests.service.keyed import Keyed, keyed
 from tests.shared_routes import shared_routes
 from tests.tables import copied_tables
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
 from workers.contract.phases import Phase

@@ -9,7 +9,7 @@ from celery import Celery
 from sqlalchemy.exc import SQLAlchemyError
 
 from workers.broker import app as queue
-from workers.bulk import turns as bulk_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 
@@ -30,15 +30,15 @@ def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
         log.warning("job %s: no heartbeat from its worker; queued again", job_id)
     for job_id in catalogue.uws.end_by_terms():
         log.info("job %s: destroyed at the time its client set", job_id)
-    bulk_turns.keep_turns(catalogue, settings)
+    keep_turns(catalogue, settings)
     submitted: list[str] = []
     idle = catalogue.jobs.nobody_works(settings.resubmit_s) and bool(
         catalogue.census.workers(settings.lease_s)
     )
-    for job in catalogue.jobs.unsubmitted(settings.resubmit_s, limit=AT_ONCE, idle=idle):
-        if not queue.submit(app, job.id, job.queue):
+    for job_id, name in catalogue.jobs.unsubmitted(settings.resubmit_s, limit=AT_ONCE, idle=idle):
+        if not queue.submit(app, job_id, name):
             break
-        submitted.append(job.id)
+        submitted.append(job_id)
     if submitted:
         catalogue.jobs.mark_submitted(*submitted)
     return len(submitted)

@@ -12,28 +12,28 @@ import hashlib
 import random
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, Field
+
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
-from psfcore.fits.header import read_summary
-from workers.bulk.intake import check_places, check_uploaded, pinned
-from workers.bulk.matching import found_files
-from workers.bulk.targets import target_of
+from psfcore.fits.header import FitsLimits, read_summary
+from workers.bulk.listing import found_files, no_images
+from workers.bulk.outputs import target_of
+from workers.bulk.runs import new_run, resolved_image
 from workers.catalogue.bulks import Listed
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow
-from workers.contract.bulk import BulkRequest, Output
+from workers.contract.bulk import BulkRequest
 from workers.contract.identities import product_identity
-from workers.contract.phases import Fault, JobError
-from workers.contract.requests import Deconvolve, ResolvedDeconvolve
+from workers.contract.phases import JobError
+from workers.contract.requests import ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files import beneath
 from workers.intake import estimates
-from workers.intake.requests import resolved_deconvolution
-from workers.rows import no_such
+from workers.rows import row_of
 from workers.settings import Settings
 
 BUDGET_S = 20.0  # a dry run stops after this time, and reports what it found
@@ -45,36 +45,35 @@ HEADER_BYTES = 2 * BLOCK_BYTES  # a usual header of an image; the headers of pla
 NO_ID = "0" * 64  # takes the place of the SHA-256 of a file, which is not read
 
 
-@dataclass(frozen=True)
-class Refused:
-    """An image that the run would refuse, and the reason. source: the id of an upload, or the path of a file."""
+class Refused(BaseModel):
+    """An image that a bulk run would refuse."""
 
-    source: str
+    source: str = Field(description="id of the upload, or path of the file")
     error: JobError
 
 
-@dataclass
-class DryRun:
-    """What a bulk run would do. Figures of all images are scaled up from the examined ones.
+class BulkEstimate(BaseModel):
+    """What a bulk run would do. Only a sample of the images is examined; the figures of the run are scaled up from it."""
 
-    images: images that were found. complete: False if the time was not enough to list all files and to examine the
-    sample. examined, refused_images, existing: numbers of examined images, of those that would be refused, and of those
-    whose product exists already (known for uploads only). output_bytes: size of all products, bytes. seconds: time of
-    the run. workers: worker processes now. memory_mib: memory of the largest examined image. example_output: path of the
-    product of an examined image, if it is known before the run; a product's id is not known for a file.
-    """
-
-    images: int = 0
-    complete: bool = True
-    examined: int = 0
-    refused_images: int = 0
-    refused: list[Refused] = field(default_factory=list)
-    existing: int = 0
-    output_bytes: int = 0
-    seconds: float = 0.0
-    workers: int = 1
-    memory_mib: int = 0
-    example_output: str | None = None
+    images: int = Field(description="images that were found")
+    complete: bool = Field(
+        description=f"false: {BUDGET_S:g} s were not enough to list all files and to examine the sample, so the run is larger or "
+        "the sample smaller",
+    )
+    examined: int = Field(description="images of the sample whose headers were read")
+    refused_images: int = Field(description="examined images that the run would refuse")
+    refused: list[Refused] = Field(description=f"the first {MOST_REFUSED} of them, with the reasons")
+    existing: int = Field(
+        description="examined uploads whose product exists already; for files this is not known before the run",
+    )
+    output_bytes: int = Field(description="expected size of all products, without their pictures")
+    seconds: float = Field(description="expected time of the run with the workers of now")
+    workers: int = Field(description="worker processes now; 1 if there are none")
+    memory_mib: int = Field(description="memory that the largest examined image needs")
+    example_output: str | None = Field(
+        description="path of the product of an examined image in the output folder; null: there is no output folder, or the "
+        "path has the id of the product, which is not known before the run",
+    )
 
 
 class _OutOfTime(Exception):
@@ -83,124 +82,114 @@ class _OutOfTime(Exception):
 
 def dry_run(
     request: BulkRequest, catalogue: Catalogue, owner: str, settings: Settings, *, sample: int
-) -> DryRun:
+) -> BulkEstimate:
     """Examine at most ``sample`` images of a bulk run, and estimate the whole run.
 
-    Raises the same ``DataError`` as ``workers.bulk.intake.begin``, and "unreadable-folder", "too-many-images", "no-images".
+    Raises the same ``DataError`` as ``workers.bulk.runs.begin``, and "unreadable-folder", "too-many-images", "no-images".
     """
-    asked = _Asked(request, catalogue, owner, settings)
-    found = DryRun(workers=max(1, len(catalogue.census.workers(settings.lease_s))))
-    chosen: list[Listed] = []
-    chance = random.Random(0)
-    try:
-        for image in asked.images():
-            found.images += 1
-            if len(chosen) < sample:
-                chosen.append(image)
-            elif (place := chance.randrange(found.images)) < sample:
-                chosen[place] = image
-    except _OutOfTime:
-        found.complete = False
-    if not found.images and found.complete:
-        raise DataError(
-            "no-images",
-            "expected files that match the patterns and the header conditions; found no files: check the globs and `where`",
-        )
-    seconds, size_bytes = 0.0, 0
-    for image in chosen:
-        if asked.late:
-            found.complete = False
-            break
-        found.examined += 1
-        try:
-            one = asked.examined(image)
-        except DataError as error:
-            found.refused_images += 1
-            if len(found.refused) < MOST_REFUSED:
-                reason = JobError(fault=Fault.USER, code=error.code, message=error.message)
-                found.refused.append(Refused(image.source, reason))
-            continue
-        found.existing += one.exists
-        found.memory_mib = max(found.memory_mib, one.memory_mib)
-        found.example_output = found.example_output or one.output
-        seconds, size_bytes = seconds + one.seconds, size_bytes + one.bytes
-    scale = found.images / max(1, found.examined)
-    found.seconds = round(scale * seconds / found.workers, 1)
-    found.output_bytes = round(scale * size_bytes)
-    return found
+    return _DryRun(request, catalogue, owner, settings).estimate(sample)
 
 
-@dataclass(frozen=True)
-class _Examined:
-    exists: bool
-    bytes: int
-    seconds: float
-    memory_mib: int
-    output: str | None
-
-
-class _Asked:
-    """A request, whose images are found and examined within ``BUDGET_S``."""
+class _DryRun:
+    """A run whose images are found and examined within ``BUDGET_S``."""
 
     def __init__(self, request: BulkRequest, catalogue: Catalogue, owner: str, settings: Settings) -> None:
-        self._request, self._catalogue, self._owner, self._settings = request, catalogue, owner, settings
+        self._request, self._catalogue, self._settings = request, catalogue, settings
         self._ends_at = time.monotonic() + BUDGET_S
-        self._psf_id, self._context_id = pinned(request, catalogue, owner)
-        self._uploads = list(dict.fromkeys(request.images))
-        check_uploaded(self._uploads, catalogue, owner)
-        check_places(request, settings)
+        self._run, self._uploads = new_run(request, catalogue, owner, settings)
         self._names: dict[Path, str] = {}  # the image that first got this name
+        self._images, self._examined, self._existing, self._complete = 0, 0, 0, True
+        self._refused: list[Refused] = []
+        self._seconds, self._bytes, self._memory_mib = 0.0, 0, 0
+        self._example_output: str | None = None
 
-    @property
-    def late(self) -> bool:
-        """Whether the time is over."""
-        return time.monotonic() > self._ends_at
+    def estimate(self, sample: int) -> BulkEstimate:
+        """Examine at most ``sample`` images, and scale their figures up."""
+        try:
+            for image in self._chosen(sample):
+                self._check_time()
+                self._examined += 1
+                try:
+                    self._examine(image)
+                except DataError as error:
+                    self._refused.append(Refused(source=image.source, error=JobError.of(error)))
+        except _OutOfTime:
+            self._complete = False
+        scale = self._images / max(1, self._examined)
+        workers = max(1, len(self._catalogue.census.workers(self._settings.lease_s)))
+        return BulkEstimate(
+            images=self._images,
+            complete=self._complete,
+            examined=self._examined,
+            refused_images=len(self._refused),
+            refused=self._refused[:MOST_REFUSED],
+            existing=self._existing,
+            output_bytes=round(scale * self._bytes),
+            seconds=round(scale * self._seconds / workers, 1),
+            workers=workers,
+            memory_mib=self._memory_mib,
+            example_output=self._example_output,
+        )
 
-    def images(self) -> Iterator[Listed]:
-        """All images of the run. Raises ``_OutOfTime``, and the errors of listing."""
+    def _check_time(self) -> None:
+        if time.monotonic() > self._ends_at:
+            raise _OutOfTime
+
+    def _chosen(self, sample: int) -> list[Listed]:
+        """Count all images of the run, and choose a random sample of them. Raises the errors of listing."""
+        chosen: list[Listed] = []
+        chance = random.Random(0)
+        try:
+            for image in self._found():
+                self._images += 1
+                if len(chosen) < sample:
+                    chosen.append(image)
+                elif (place := chance.randrange(self._images)) < sample:
+                    chosen[place] = image
+        except _OutOfTime:
+            self._complete = False
+            return chosen
+        if not self._images:
+            raise no_images()
+        return chosen
+
+    def _found(self) -> Iterator[Listed]:
         for identity in self._uploads:
             yield Listed(identity, uploaded=True)
-        for step in found_files(self._request, self._settings):
-            if self.late:
-                raise _OutOfTime
-            if step.image is not None:
-                yield step.image
+        for _, image in found_files(self._request, self._settings):
+            self._check_time()
+            if image is not None:
+                yield image
 
-    def examined(self, image: Listed) -> _Examined:
-        """The estimate of one image. Raises DataError if the run would refuse the image."""
+    def _examine(self, image: Listed) -> None:
+        """Add the estimate of one image. Raises DataError if the run would refuse the image."""
         if image.error is not None:
             raise DataError(image.error.code, image.error.message)
+        catalogue = self._catalogue
         image_id, summary = self._summary(image)
-        wanted = Deconvolve(
-            image_id=image_id,
-            psf_id=self._psf_id,
-            context=self._context_id,
-            **self._request.parameters.model_dump(),
-        )
-        resolved = resolved_deconvolution(wanted, summary, self._catalogue, self._owner)
+        resolved = resolved_image(self._run, image_id, summary, catalogue)
         needs = resolved.model_dump(mode="json") | {"image_shape": summary["shape"]}
-        estimate = estimates.checked("deconvolve", needs, self._catalogue, self._owner, self._settings)
-        exists = image.uploaded and self._exists(resolved)
-        output, target = self._request.output, None
-        if output is not None:
-            target = self._named(image, summary, resolved, output)
-        if output is not None and not image.uploaded and "{product}" in (output.layout or "{product}"):
-            target = None  # the name has the id of the product, which depends on the bytes of the file
-        return _Examined(
-            exists,
-            0 if exists else product_bytes(summary["shape"], resolved.error_draws),
-            0.0 if exists else estimate["seconds"],
-            estimate["memory_mib"],
-            None if target is None else archive_files.shown(target),
+        estimate = estimates.checked("deconvolve", needs, catalogue, self._run.owner, self._settings)
+        exists = image.uploaded and (
+            catalogue.get(ProductRow, product_identity(resolved), self._run.owner) is not None
         )
+        if self._request.output is not None:
+            target = self._target(image, summary, resolved)
+            # The id of a file's product depends on the bytes of the file.
+            if image.uploaded or "{product}" not in (self._request.output.layout or "{product}"):
+                self._example_output = self._example_output or archive_files.shown(target)
+        self._existing += exists
+        self._memory_mib = max(self._memory_mib, estimate["memory_mib"])
+        if not exists:
+            self._seconds += estimate["seconds"]
+            self._bytes += product_bytes(summary["shape"], resolved.error_draws)
 
-    def _named(
-        self, image: Listed, summary: dict[str, Any], resolved: ResolvedDeconvolve, output: Output
-    ) -> Path:
+    def _target(self, image: Listed, summary: dict[str, Any], resolved: ResolvedDeconvolve) -> Path:
         """The path of the product. Raises DataError if the layout gives no name, or the name of another examined image."""
+        assert self._request.output is not None
         identity = product_identity(resolved)
         target = target_of(
-            output,
+            self._request.output,
             self._settings,
             name=summary["filename"] if image.uploaded else Path(image.source).name,
             source=None if image.uploaded else Path(image.source),
@@ -217,21 +206,16 @@ class _Asked:
             )
         return target
 
-    def _exists(self, resolved: ResolvedDeconvolve) -> bool:
-        return self._catalogue.get(ProductRow, product_identity(resolved), self._owner) is not None
-
     def _summary(self, image: Listed) -> tuple[str, dict[str, Any]]:
         if image.uploaded:
-            row = self._catalogue.get(ImageRow, image.source, self._owner)
-            if row is None:  # it was deleted meanwhile
-                raise no_such("image", image.source)
+            row = row_of(self._catalogue, ImageRow, image.source, self._run.owner)
             return row.id, row.summary | {"filename": row.filename or "image"}
         try:
             with beneath.opened(Path(image.source), archive_files.roots(self._settings.bulk_roots)) as file:
-                found = read_summary(beneath.reopened(file), FitsLimits(max_pixels=self._settings.max_pixels))
+                limits = FitsLimits(max_pixels=self._settings.max_pixels)
+                return NO_ID, dataclasses.asdict(read_summary(beneath.reopened(file), limits))
         except OSError as error:
             raise archive_files.unreadable(error) from error
-        return NO_ID, dataclasses.asdict(found)
 
 
 def product_bytes(shape: Sequence[int], error_draws: int) -> int:

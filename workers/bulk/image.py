@@ -14,24 +14,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits
-from psfcore.fits.cards import optional_text
-from psfcore.fits.header import first_image_header, read_summary
+from psfcore.fits.header import read_summary
 from psfcore.image import Image
-from workers.bulk.targets import target_of
-from workers.catalogue.bulk_tables import BulkRow
-from workers.catalogue.bulks import Taken
+from workers.bulk import outputs
+from workers.bulk.runs import resolved_image
+from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.bulk import BulkWork
 from workers.contract.identities import product_identity
-from workers.contract.requests import Deconvolve, ResolvedDeconvolve
+from workers.contract.requests import ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files import beneath
 from workers.files.store import is_disk_full, sha256_of
 from workers.intake import estimates
 from workers.intake.deprecated import details_now
-from workers.intake.requests import resolved_deconvolution
 from workers.rows import row_of
 from workers.tasks import deconvolve as deconvolve_task
 from workers.tasks.context import Context
@@ -61,6 +57,24 @@ class Outcome:
 
 
 @dataclass(frozen=True)
+class Destination:
+    """The product of an image: the id, the request of the run, and the path in the output folder or None."""
+
+    identity: str
+    run: BulkWork
+    target: Path | None
+
+
+@dataclass(frozen=True)
+class Ready:
+    """An image that was read and can be deconvolved."""
+
+    request: ResolvedDeconvolve
+    image: Image
+    destination: Destination
+
+
+@dataclass(frozen=True)
 class _Source:
     """An image of a bulk run: its file and the summary of its header.
 
@@ -74,70 +88,67 @@ class _Source:
     name: str
 
 
-@dataclass(frozen=True)
-class Ready:
-    """An image that was read and can be deconvolved. target: the path of the product in the output folder, or None."""
-
-    wanted: ResolvedDeconvolve
-    identity: str
-    image: Image
-    target: Path | None
-
-
-def read_one(context: Context, bulk: BulkRow, request: BulkWork, taken: Taken) -> Ready | Outcome:
+def read_one(context: Context, bulk: BulkRow, item: BulkItemRow) -> Ready | Outcome:
     """Read an image of a bulk run and choose its PSF. If its product exists already, return this product.
 
     If another job is making the product now, wait for that job and use its product. Raises DataError for an image
     that cannot be deconvolved, and OSError if the disk is full.
     """
-    with _source(context, taken) as source:
-        wanted = _resolved(context, bulk, request, source)
-        identity = product_identity(wanted)
-        target = _target(context, request, source, wanted, identity)
-        if target is not None and taken.attempt > 1 and target.parent.is_dir():
-            # A killed worker may have left partial copies.
-            beneath.remove_partials(target, _output_roots(context))
-        before = done_before(context, wanted, request, target)
-        if before is None and target is not None:
-            assert request.output is not None
-            if request.output.layout is not None:
-                _check_free(target, identity, context.limits)
-            with _write_errors():  # checked before the deconvolution, so that no work is lost if this fails
-                beneath.make_folder(target.parent, _output_roots(context))
-        if before is None and _waited(context, request, identity):
-            before = done_before(context, wanted, request, target)
+    settings, run = context.settings, BulkWork.model_validate(bulk.request)
+    with _source(context, item) as source:
+        request = resolved_image(bulk, source.sha256, source.summary, context.catalogue)
+        identity, target = product_identity(request), None
+        if run.output is not None:
+            target = outputs.target_of(
+                run.output,
+                settings,
+                name=source.name,
+                source=source.path,
+                summary=source.summary,
+                identity=identity,
+                psf_id=request.psf_id,
+            )
+            if item.attempts > 1:
+                outputs.remove_partials(target, settings)
+        destination = Destination(identity, run, target)
+        before = done_before(context, destination)
+        if before is None and run.output is not None and target is not None:
+            outputs.prepare(run.output, target, identity, settings, context.limits)
+        if before is None and run.keeps_products and _waited(context, identity):
+            before = done_before(context, destination)
         if before is not None:
             return before
-        needs = wanted.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
-        estimates.checked("deconvolve", needs, context.catalogue, context.owner, context.settings)
+        needs = request.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
+        estimates.checked("deconvolve", needs, context.catalogue, context.owner, settings)
         # The path is taken only now, because the store's local copy may have been removed during a wait.
         image_file = source.copy or context.store.verified(source.sha256)
-        return Ready(wanted, identity, deconvolve_task.load(context, wanted, image_file), target)
+        return Ready(request, deconvolve_task.load(context, request, image_file), destination)
 
 
-def compute_one(context: Context, request: BulkWork, ready: Ready) -> Made:
+def compute_one(context: Context, ready: Ready) -> Made:
     """Deconvolve an image that was read. Builds the PSF first if it does not exist. Raises DataError."""
-    psf_row = requested_psf(context, ready.wanted)
-    return deconvolve_task.make(context, ready.wanted, psf_row, ready.image, preview=request.keeps_products)
+    psf_row = requested_psf(context, ready.request)
+    preview = ready.destination.run.keeps_products
+    return deconvolve_task.make(context, ready.request, psf_row, ready.image, preview=preview)
 
 
-def write_one(context: Context, request: BulkWork, ready: Ready, made: Made) -> Outcome:
+def write_one(context: Context, ready: Ready, made: Made) -> Outcome:
     """Write a finished deconvolution as a product. Raises DataError "output-not-written", and OSError if the disk is full."""
+    output, target = ready.destination.run.output, ready.destination.target
     with context.store.temporary() as path:
         product.write(made, path)
-        if request.keeps_products:
-            row = product.keep(made, path)
-            return _kept(context, row, ready.target, request, reused=False)
-        assert ready.target is not None
+        if ready.destination.run.keeps_products:
+            return _kept(context, product.keep(made, path), ready.destination, reused=False)
+        assert output is not None and target is not None
         sha256, size_bytes = sha256_of(path), path.stat().st_size
-        _put(context, path, ready.target, sha256, request)
+        outputs.put(output, path, target, sha256, context.settings)
     return Outcome(
-        image_sha256=ready.wanted.image_id,
-        psf_id=ready.wanted.psf_id,
+        image_sha256=ready.request.image_id,
+        psf_id=ready.request.psf_id,
         product_id=made.identity,
         reused=False,
         kept=False,
-        output=str(ready.target),
+        output=str(target),
         sha256=sha256,
         bytes=size_bytes,
         score=made.found.artefacts.score,
@@ -145,15 +156,9 @@ def write_one(context: Context, request: BulkWork, ready: Ready, made: Made) -> 
     )
 
 
-def _waited(context: Context, request: BulkWork, identity: str) -> bool:
-    """Wait while another job makes this product. Returns whether there was such a job.
-
-    If the service keeps no products of the run, this function returns at once, because no other job makes the same
-    file.
-    """
+def _waited(context: Context, identity: str) -> bool:
+    """Wait while another job makes this product. Returns whether there was such a job."""
     waited = False
-    if not request.keeps_products:
-        return False
     while context.catalogue.jobs.at_work_on(context.owner, identity):
         waited = True
         context.report("waiting for an equal job", 0, 1)  # raises an exception if the bulk run must stop
@@ -166,13 +171,13 @@ def _rest() -> None:
 
 
 @contextmanager
-def _source(context: Context, taken: Taken) -> Iterator[_Source]:
-    if taken.uploaded:
-        row = row_of(context.catalogue, ImageRow, taken.source, context.owner)
+def _source(context: Context, item: BulkItemRow) -> Iterator[_Source]:
+    if item.uploaded:
+        row = row_of(context.catalogue, ImageRow, item.source, context.owner)
         yield _Source(None, None, row.id, row.summary, row.filename or "image")
         return
     allowed = archive_files.roots(context.settings.bulk_roots)
-    path = archive_files.check_under(Path(taken.source), allowed)
+    path = archive_files.check_under(Path(item.source), allowed)
     with context.store.temporary() as copy:
         try:
             with beneath.opened(path, allowed) as file:
@@ -185,91 +190,31 @@ def _source(context: Context, taken: Taken) -> Iterator[_Source]:
         yield _Source(copy, path, sha256, summary, path.name)
 
 
-def _resolved(context: Context, bulk: BulkRow, request: BulkWork, source: _Source) -> ResolvedDeconvolve:
-    """The deconvolution with its PSF. The PSF is that of the bulk run, or the PSF that the context of the run pins
-    for the image."""
-    wanted = Deconvolve(
-        image_id=source.sha256,
-        psf_id=bulk.psf_id,
-        context=bulk.context_id,
-        **request.parameters.model_dump(),
-    )
-    return resolved_deconvolution(wanted, source.summary, context.catalogue, context.owner)
-
-
-def _target(
-    context: Context, request: BulkWork, source: _Source, wanted: ResolvedDeconvolve, identity: str
-) -> Path | None:
-    """The path of the product's file in the output folder; None if only the service keeps it."""
-    if request.output is None:
-        return None
-    return target_of(
-        request.output,
-        context.settings,
-        name=source.name,
-        source=source.path,
-        summary=source.summary,
-        identity=identity,
-        psf_id=wanted.psf_id,
-    )
-
-
-def _check_free(target: Path, identity: str, limits: FitsLimits) -> None:
-    """Raise DataError "output-name-taken" if another product has the path that a layout gives to this product."""
-    if not target.is_file():
-        return
-    try:
-        there = optional_text(first_image_header(target, limits), "PRODID")
-    except DataError:  # a file that is no product; it must not be replaced either
-        there = None
-    if there != identity:
-        raise _taken(target)
-
-
-def _taken(target: Path) -> DataError:
-    return DataError(
-        "output-name-taken",
-        f"expected a name of its own for each product; got {archive_files.shown(target)}, where another file is: use a layout with "
-        "further fields, for example {product}, or another folder",
-    )
-
-
-def done_before(
-    context: Context, wanted: ResolvedDeconvolve, request: BulkWork, target: Path | None
-) -> Outcome | None:
+def done_before(context: Context, destination: Destination) -> Outcome | None:
     """The existing product, copied to the output folder if it is not there yet; None if there is no product."""
-    identity = product_identity(wanted)
-    if request.keeps_products:
-        row = context.made(ProductRow, identity)
-        return None if row is None else _kept(context, row, target, request, reused=True)
-    earlier = context.catalogue.bulks.progress.done_before(context.owner, identity, str(target))
+    target = destination.target
+    if destination.run.keeps_products:
+        row = context.made(ProductRow, destination.identity)
+        return None if row is None else _kept(context, row, destination, reused=True)
+    find = context.catalogue.bulks.progress.done_before
+    earlier = find(context.owner, destination.identity, str(target))
     if earlier is None or target is None or not target.is_file() or sha256_of(target) != earlier.sha256:
         return None
-    assert earlier.sha256 is not None and earlier.bytes is not None and earlier.score is not None
-    return Outcome(
-        image_sha256=wanted.image_id,
-        psf_id=wanted.psf_id,
-        product_id=identity,
-        reused=True,
-        kept=False,
-        output=str(target),
-        sha256=earlier.sha256,
-        bytes=earlier.bytes,
-        score=earlier.score,
-        statistics={
-            name: value for name, value in (earlier.statistics or {}).items() if not name.endswith("seconds")
-        },
-    )
+    columns = {name: getattr(earlier, name) for name in Outcome.__annotations__}
+    statistics = {
+        name: value for name, value in (earlier.statistics or {}).items() if not name.endswith("seconds")
+    }
+    return Outcome(**columns | {"reused": True, "kept": False, "statistics": statistics})
 
 
-def _kept(
-    context: Context, row: ProductRow, target: Path | None, request: BulkWork, *, reused: bool
-) -> Outcome:
+def _kept(context: Context, row: ProductRow, destination: Destination, *, reused: bool) -> Outcome:
     """The outcome for a product that the service keeps."""
-    if target is not None and not (
-        target.is_file() and target.stat().st_size == row.bytes and sha256_of(target) == row.file_sha256
-    ):
-        _put(context, context.store.verified(row.file_sha256), target, row.file_sha256, request)
+    output, target = destination.run.output, destination.target
+    if output is not None and target is not None:
+        there = target.is_file() and target.stat().st_size == row.bytes
+        if not there or sha256_of(target) != row.file_sha256:
+            file = context.store.verified(row.file_sha256)
+            outputs.put(output, file, target, row.file_sha256, context.settings)
     return Outcome(
         image_sha256=row.image_id,
         psf_id=row.psf_id,
@@ -303,36 +248,3 @@ def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
         "warnings": [one["code"] for one in details["warnings"]],
         "has_thumbnail": details.get("thumbnail_sha256") is not None,
     }
-
-
-def _put(context: Context, source: Path, target: Path, sha256: str, request: BulkWork) -> None:
-    """Copy a file to its path in the output folder. A file whose name a layout gives is not replaced by another one.
-
-    Raises DataError "output-not-written", "output-name-taken", and OSError if the disk is full.
-    """
-    assert request.output is not None
-    with _write_errors():
-        try:
-            replace = request.output.layout is None
-            beneath.put(source, target, _output_roots(context), replace=replace)
-        except FileExistsError:
-            if sha256_of(target) != sha256:
-                raise _taken(target) from None
-
-
-def _output_roots(context: Context) -> tuple[Path, ...]:
-    return archive_files.roots(context.settings.bulk_output_roots)
-
-
-@contextmanager
-def _write_errors() -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if is_disk_full(error):  # the same error would occur for every image
-            raise
-        reason = archive_files.reason_of(error)
-        raise DataError(
-            "output-not-written",
-            f"expected an output folder that the service can write to; the system says: {reason}",
-        ) from error

@@ -1,4 +1,4 @@
-"""Lists the files that match the patterns of a bulk run, and adds them to the catalogue as its images.
+"""Lists the files that match the patterns and the header conditions of a bulk run, and adds them to its images.
 
 A turn lists files in a thread of its own while it processes the images that are already listed. The transaction that
 adds images also stores how far the search has come, so that the next turn continues the search from there.
@@ -6,19 +6,28 @@ adds images also stores how far the search has come, so that the next turn conti
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote, unquote_to_bytes
 
 from psfcore.errors import DataError
-from workers.bulk.matching import Place, found_files
-from workers.catalogue.bulk_tables import BulkRow
-from workers.catalogue.bulks import Listed
-from workers.catalogue.jobs import Lease
-from workers.catalogue.owners import OverQuota
-from workers.contract.bulk import BulkWork
-from workers.contract.phases import Fault, JobError
-from workers.tasks.context import Context
+from psfcore.fits.header import FitsLimits
+from workers.catalogue.bulk_tables import MOST_LETTERS, BulkRow
+from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, Listed
+from workers.contract.bulk import BulkWork, Condition
+from workers.contract.phases import JobError
+from workers.files import archive as archive_files
+from workers.files import beneath
+from workers.settings import Settings
 
+if TYPE_CHECKING:
+    from workers.tasks.context import Context
+
+MOST_IMAGES = 1_000_000
 LIST_AT_ONCE = 200
 ADD_EVERY_S = (
     0.5  # images are added after this time even if they are fewer, so that the first ones are processed soon
@@ -26,45 +35,57 @@ ADD_EVERY_S = (
 NOT_LISTED = "not all files that the patterns match could be listed"  # a reason for Usage.too_many_rows
 
 
-def work_of(bulk: BulkRow) -> BulkWork:
-    """The request of a bulk run, without the ids of uploaded images."""
-    return BulkWork.model_validate(bulk.request)
+@dataclass(frozen=True)
+class Place:
+    """How far the search for the files of a run has come. pattern: number of the pattern. names: see ``archive.Looked``."""
+
+    pattern: int
+    names: archive_files.Place
+
+    def stored(self) -> dict[str, Any]:
+        """The place as JSON. Names may have bytes that are not UTF-8, which PostgreSQL refuses; they are written as %FF."""
+        return {"pattern": self.pattern, "names": [quote(os.fsencode(name), safe="") for name in self.names]}
+
+    @classmethod
+    def of(cls, stored: dict[str, Any]) -> Place:
+        """The place that was stored."""
+        names = tuple(os.fsdecode(unquote_to_bytes(name)) for name in stored["names"])
+        return cls(stored["pattern"], names)
 
 
-def list_files(
-    context: Context, bulk: BulkRow, lease: Lease, added: Callable[[], None], stops: Callable[[], bool]
-) -> None:
+def list_files(context: Context, bulk: BulkRow, added: Callable[[], None], stops: Callable[[], bool]) -> None:
     """Add the files that the patterns of a bulk run match to its images, from the place where an earlier search ended.
 
-    bulk: the row that ``Bulks.begin_listing`` returned. added: called after images were added. stops: whether the search
-    must end now; another turn then continues it. An error that concerns all files stops the run. Images that were added
-    before it stay.
+    bulk: the row that ``Bulks.begin_listing`` returned for the lease of the context. added: called after images were
+    added. stops: whether the search must end now; another turn then continues it. An error that concerns all files
+    stops the run. Images that were added before it stay.
     """
     bulks = context.catalogue.bulks
+    assert context.lease is not None
     try:
-        if not _add_all(context, bulk, lease, added, stops):
+        if not _add_all(context, bulk, added, stops):
             return
-        there = bulks.get(bulk.id)
-        if there is not None and there.total == 0:
-            raise DataError(
-                "no-images",
-                "expected files that match the patterns and the header conditions; found no files: check the globs and `where`",
-            )
+        now = bulks.get(bulk.id)
+        if now is not None and now.total == 0:
+            raise no_images()
     except DataError as error:
-        bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code=error.code, message=error.message))
+        bulks.stop_with(bulk.id, JobError.of(error))
         return
-    except OverQuota as over:
-        message = f"{over.usage.too_many_rows(NOT_LISTED)}, then resume the run"
-        bulks.stop_with(bulk.id, JobError(fault=Fault.USER, code="quota-exceeded", message=message))
-        return
-    bulks.end_listing(bulk.id, lease)
+    bulks.end_listing(bulk.id, context.lease)
 
 
-def _add_all(
-    context: Context, bulk: BulkRow, lease: Lease, added: Callable[[], None], stops: Callable[[], bool]
-) -> bool:
-    """Search and add images in batches. Returns whether the search came to its end. Raises DataError, OverQuota."""
-    bulks, request = context.catalogue.bulks, work_of(bulk)
+def no_images() -> DataError:
+    """The error of a run whose patterns match no file."""
+    return DataError(
+        "no-images",
+        "expected files that match the patterns and the header conditions; found no files: check the globs and `where`",
+    )
+
+
+def _add_all(context: Context, bulk: BulkRow, added: Callable[[], None], stops: Callable[[], bool]) -> bool:
+    """Search and add images in batches. Returns whether the search came to its end. Raises DataError."""
+    bulks, request, lease = context.catalogue.bulks, BulkWork.model_validate(bulk.request), context.lease
+    assert lease is not None
     place = None if bulk.listed_to is None else Place.of(bulk.listed_to)
     several = place is not None and len(request.files) > 1
     # A path that the catalogue cannot store is not known again: it may then fail twice, once for each pattern.
@@ -74,23 +95,23 @@ def _add_all(
 
     def add() -> bool:
         nonlocal add_at
-        images, add_at = tuple(batch), time.monotonic() + ADD_EVERY_S
-        batch.clear()
+        add_at = time.monotonic() + ADD_EVERY_S
         if place is None:
             return True
         usage = context.catalogue.owners.limited(context.owner, context.settings.quota_mib)
-        if usage is not None and not usage.allows_rows(len(images)):
-            raise OverQuota(usage)
-        if not bulks.add_listed(bulk.id, lease, images, place.stored()):
+        if usage is not None and not usage.allows_rows(len(batch)):
+            raise DataError("quota-exceeded", f"{usage.too_many_rows(NOT_LISTED)}, then resume the run")
+        if not bulks.add_listed(bulk.id, lease, batch, place.stored()):
             return False
+        batch.clear()
         added()
         return True
 
     try:
-        for step in found_files(request, context.settings, place, known, bulk.total):
-            place = step.place
-            if step.image is not None:
-                batch.append(step.image)
+        for reached, image in found_files(request, context.settings, place, known, bulk.total):
+            place = reached
+            if image is not None:
+                batch.append(image)
             stop = stops()
             if (stop or len(batch) >= LIST_AT_ONCE or time.monotonic() >= add_at) and not add():
                 return False
@@ -100,3 +121,71 @@ def _add_all(
         add()
         raise
     return add()
+
+
+def found_files(
+    request: BulkWork,
+    settings: Settings,
+    after: Place | None = None,
+    known: frozenset[str] = frozenset(),
+    listed: int = 0,
+) -> Iterator[tuple[Place, Listed | None]]:
+    """Search the files that match the patterns of a request; each file is found once even if several patterns match it.
+
+    Each step of the search looks at one folder or entry: its place comes with the image that was found there, or None.
+    A file that cannot be used comes with its error. after: continue a search that ended after this place. known: paths
+    that it found, if there are several patterns. listed: number of images that are listed. Raises DataError "bad-path",
+    "path-not-allowed", "unreadable-folder", "too-many-images".
+    """
+    allowed = archive_files.roots(settings.bulk_roots)
+    limits = FitsLimits(max_pixels=settings.max_pixels)
+    seen = set(known)
+    first = 0 if after is None else after.pattern
+    for number, files in enumerate(request.files[first:], first):
+        names = after.names if after is not None and number == first else None
+        for looked in archive_files.find(files.glob, allowed, names):
+            path, image = str(looked.path), None
+            if (looked.matches or looked.error) and path not in seen:
+                image = _listed_one(allowed, limits, looked, files.where)
+            if image is not None:
+                listed += 1
+                if len(request.files) > 1:
+                    seen.add(path)
+            if listed > MOST_IMAGES:
+                raise DataError(
+                    "too-many-images",
+                    f"expected at most {MOST_IMAGES} images in a bulk run; the patterns match more: split the request",
+                )
+            yield Place(number, looked.place), image
+
+
+def _listed_one(
+    allowed: Sequence[Path], limits: FitsLimits, found: archive_files.Looked, where: dict[str, Condition]
+) -> Listed | None:
+    """The found file as an image of the run, with an error if the file cannot be used; None if its header does not match."""
+    failure = found.error
+    if failure is None and where:
+        try:
+            with beneath.opened(found.path, allowed) as file:
+                if not archive_files.matches(beneath.reopened(file), where, limits):
+                    return None
+        except DataError as unusable:
+            failure = unusable
+        except OSError as unreadable:
+            failure = archive_files.unreadable(unreadable)
+    source = archive_files.shown(found.path)
+    failure = _path_error(found.path, source) or failure
+    if len(source) > MOST_LETTERS:
+        source = source[: MOST_LETTERS - 1] + "…"
+    return Listed(source, uploaded=False, error=None if failure is None else JobError.of(failure))
+
+
+def _path_error(path: Path, source: str) -> DataError | None:
+    """The error for a path that the catalogue cannot store; None if the catalogue can store it."""
+    if source != str(path):
+        message = f"expected a path in UTF-8; got a path that ends in {source[-100:]}: rename the file"
+        return DataError(NOT_UTF_8, message)
+    if len(source) > MOST_LETTERS:
+        message = f"expected a path of at most {MOST_LETTERS} characters; got {len(source)}, ending in {source[-100:]}"
+        return DataError(TOO_LONG, message)
+    return None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 from sqlalchemy import exists, func, select, tuple_
 
@@ -43,18 +42,6 @@ class BulkProgress:
 
     def __init__(self, database: Database) -> None:
         self._database = database
-
-    def first_not_uploaded(self, ids: Sequence[str], owner: str) -> str | None:
-        """The first of these ids that is not an uploaded image of the owner; None if all are uploaded images."""
-        rest = iter(ids)
-        with self._database.reading() as session:
-            while batch := list(islice(rest, BATCH)):
-                query = select(ImageRow.id).where(ImageRow.owner == owner, ImageRow.id.in_(batch))
-                there = set(session.scalars(query))
-                for one in batch:
-                    if one not in there:
-                        return one
-        return None
 
     def pace(self, bulk: BulkRow) -> Pace:
         """The speed of a run: the images that workers process now, and the images that ended per hour.
@@ -149,12 +136,6 @@ class BulkProgress:
         query = select(ImageRow.id, ImageRow.filename).where(ImageRow.owner == owner, ImageRow.id.in_(ids))
         with self._database.reading() as session:
             return {one: name for one, name in session.execute(query) if name}
-
-    def still_there(self, product_ids: Sequence[str], owner: str) -> frozenset[str]:
-        """The ids in ``product_ids`` whose products have not been deleted."""
-        query = select(ProductRow.id).where(ProductRow.owner == owner, ProductRow.id.in_(product_ids))
-        with self._database.reading() as session:
-            return frozenset(session.scalars(query))
 
     def done_before(self, owner: str, product_id: str, output: str) -> BulkItemRow | None:
         """A done image, from any bulk run of the owner, whose product ``product_id`` is in the file ``output``.

@@ -35,7 +35,7 @@ class BulkRow(Base):
     lister: Mapped[str | None] = mapped_column(
         String(32)
     )  # token of the lease of the worker that lists files
-    # how far the files are listed (``workers.bulk.matching.Place``); null: the listing has not begun, or it has no files
+    # how far the files are listed (``workers.bulk.listing.Place``); null: the listing has not begun, or it has no files
     listed_to: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
     total: Mapped[int] = mapped_column(default=0)
     done: Mapped[int] = mapped_column(default=0)

@@ -43,9 +43,7 @@ from workers.catalogue.tables import (
     TransitRow,
 )
 from workers.catalogue.uws_jobs import UwsJobs
-from workers.catalogue.waiting.again import Again
-from workers.catalogue.waiting.places import Places
-from workers.catalogue.waiting.turns import Turns
+from workers.catalogue.waiting import Places, Turns
 from workers.contract.bulk import OPEN
 from workers.contract.identities import canonical_hash
 from workers.contract.phases import ENDED, Phase
@@ -69,7 +67,6 @@ class Catalogue:
         self._engine = self._database.engine
         self.schema = Schema(self._database)
         self.jobs = Jobs(self._database)
-        self.again = Again(self._database)
         self.turns = Turns(self._database, self.jobs)
         self.places = Places(self._database)
         self.uws = UwsJobs(self._database, self.jobs)

@@ -37,14 +37,6 @@ class Lease:
     token: str
 
 
-@dataclass(frozen=True)
-class Waiting:
-    """A job to give to the broker."""
-
-    id: str
-    queue: Queue
-
-
 class Jobs:
     """The table of jobs; each method is one transaction."""
 
@@ -208,19 +200,19 @@ class Jobs:
 
     def complete(self, lease: Lease, result_id: str) -> bool:
         """EXECUTING -> COMPLETED. Returns False if the lease is lost."""
-        return self._set(
-            _held(lease), phase=Phase.COMPLETED, ended_at=self._database.now, result_id=result_id, lease=None
-        )
+        return self._end(lease, Phase.COMPLETED, result_id=result_id)
 
     def fail(self, lease: Lease, error: JobError) -> bool:
         """EXECUTING -> ERROR. Returns False if the lease is lost."""
-        return self._set(
-            _held(lease),
-            phase=Phase.ERROR,
-            ended_at=self._database.now,
-            error=error.model_dump(mode="json"),
-            lease=None,
-        )
+        return self._end(lease, Phase.ERROR, error=error.model_dump(mode="json"))
+
+    def abort(self, lease: Lease) -> bool:
+        """EXECUTING -> ABORTED, when the worker has stopped a cancelled job. Returns False if the lease is lost."""
+        return self._end(lease, Phase.ABORTED, JobRow.cancel_requested.is_(True))
+
+    def _end(self, lease: Lease, phase: Phase, *conditions: ColumnElement[bool], **values: Any) -> bool:
+        ended = {"phase": phase, "ended_at": self._database.now, "lease": None}
+        return self._set([*_held(lease), *conditions], **ended, **values)
 
     def requeue(self, lease: Lease) -> bool:
         """EXECUTING -> QUEUED after a transient failure. Returns False if the lease is lost.
@@ -229,15 +221,6 @@ class Jobs:
         """
         delay = {"submitted_at": self._database.now, "submissions": JobRow.attempt, "delayed": True}
         return self._set(_held(lease), **self._again(), **delay)
-
-    def abort(self, lease: Lease) -> bool:
-        """EXECUTING -> ABORTED, when the worker has stopped a cancelled job. Returns False if the lease is lost."""
-        return self._set(
-            [*_held(lease), JobRow.cancel_requested.is_(True)],
-            phase=Phase.ABORTED,
-            ended_at=self._database.now,
-            lease=None,
-        )
 
     def cancel(self, job_id: str) -> None:
         """PENDING, QUEUED -> ABORTED. The worker of an executing job is told to stop; an ended job does not change."""
@@ -302,32 +285,52 @@ class Jobs:
         with self._database.reading() as session:
             return session.scalars(query.limit(1)).first() is None
 
-    def unsubmitted(self, resubmit_s: float, limit: int = 1000, *, idle: bool = False) -> list[Waiting]:
-        """Queued jobs that the broker never received or seems to have lost; sorted by queue, then oldest first.
+    def unsubmitted(
+        self, resubmit_s: float, limit: int = 1000, *, idle: bool = False
+    ) -> list[tuple[str, Queue]]:
+        """Ids and queues of queued jobs that the broker never received or seems to have lost; sorted by queue, then oldest first.
 
         A job seems lost when it has waited for ``resubmit_s`` since its submission. This waiting time doubles with each
         submission, so that the jobs of a long queue are not submitted again and again. idle: there are workers, and they
         do nothing; then the waiting time does not double, because a message that the broker still had would be taken.
         """
-        waits = {number: resubmit_s * 2 ** (number - 1) for number in range(2, 9)}
-        growing_s = case(
-            (JobRow.submissions <= 1, resubmit_s),
-            *((JobRow.submissions == number, wait) for number, wait in waits.items()),
-            else_=resubmit_s * 2**8,
-        )
+        waits = {number: resubmit_s * 2.0 ** max(0, number - 1) for number in range(9)}
+        growing_s = case(waits, value=JobRow.submissions, else_=resubmit_s * 2.0**8)
         wait_s = literal(resubmit_s) if idle else growing_s
         now = self._database.now
         # If a submission lies in the future, the database's clock was set back after it.
         ahead = JobRow.submitted_at > now + resubmit_s
         due = or_(JobRow.submitted_at.is_(None), JobRow.submitted_at < now - wait_s, ahead)
-        query = select(JobRow.id, JobRow.queue).where(JobRow.phase == Phase.QUEUED, due, no_equal_at_work())
-        found: list[Waiting] = []
+        query = select(JobRow.id).where(JobRow.phase == Phase.QUEUED, due, no_equal_at_work())
+        jobs: list[tuple[str, Queue]] = []
         with self._database.reading() as session:
             for queue in Queue:
-                of_queue = query.where(JobRow.queue == queue).order_by(JobRow.created_at)
-                rows = session.execute(of_queue.limit(limit - len(found)))
-                found += [Waiting(job_id, Queue(name)) for job_id, name in rows]
-        return found
+                oldest = query.where(JobRow.queue == queue).order_by(JobRow.created_at)
+                jobs += [(job_id, queue) for job_id in session.scalars(oldest.limit(limit - len(jobs)))]
+        return jobs
+
+    def that_made(self, owner: str, result_id: str) -> JobRow | None:
+        """A completed job with this result; None if there is none, for example because it was deleted."""
+        query = select(JobRow).where(
+            JobRow.owner == owner, JobRow.phase == Phase.COMPLETED, JobRow.result_id == result_id
+        )
+        with self._database.reading() as session:
+            return session.scalars(query.order_by(JobRow.created_at.desc())).first()
+
+    def reopen(self, job_id: str) -> bool:
+        """COMPLETED -> QUEUED. The job then has the state of a job that has not run. Returns False if the job is not
+        COMPLETED."""
+        again = {
+            "phase": Phase.QUEUED,
+            "result_id": None,
+            "ended_at": None,
+            "submitted_at": None,
+            "submissions": 0,
+            "attempt": 0,
+            "cancel_requested": False,
+        }
+        completed = (JobRow.id == job_id, JobRow.phase == Phase.COMPLETED)
+        return bool(self._database.change(update(JobRow).where(*completed).values(**again)))
 
     def of_kind(self, kind: str) -> Sequence[JobRow]:
         """All jobs of a kind, in any phase. Use this only for kinds with few jobs."""

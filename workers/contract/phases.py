@@ -6,6 +6,8 @@ from enum import StrEnum
 
 from pydantic import BaseModel
 
+from psfcore.errors import DataError
+
 
 class Phase(StrEnum):
     """Phases of a job, by their IVOA UWS names.
@@ -46,3 +48,8 @@ class JobError(BaseModel):
     fault: Fault
     code: str
     message: str
+
+    @classmethod
+    def of(cls, error: DataError) -> JobError:
+        """The error of a job whose request or data is wrong."""
+        return cls(fault=Fault.USER, code=error.code, message=error.message)

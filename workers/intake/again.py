@@ -41,7 +41,7 @@ def reopened(job: JobRow, catalogue: Catalogue, store: Store) -> bool:
     if job.phase != Phase.COMPLETED or table is None or job.result_id is None:
         return False
     row = catalogue.get(table, job.result_id, job.owner)
-    return (row is None or not intact(store, row)) and catalogue.again.reopen(job.id)
+    return (row is None or not intact(store, row)) and catalogue.jobs.reopen(job.id)
 
 
 def without_results(jobs: Sequence[JobRow], catalogue: Catalogue) -> frozenset[str]:
@@ -100,11 +100,11 @@ def make_again(row: ProductRow | PsfRow | ReportRow, catalogue: Catalogue, store
         tables = PsfTables(psf_id=row.id)
         key = request_identity("psf-tables")(tables)
         drawing, _ = catalogue.jobs.submit("psf-tables", tables.model_dump(mode="json"), key, row.owner)
-        catalogue.again.reopen(drawing.id)
+        catalogue.jobs.reopen(drawing.id)
         return drawing.id
-    job = catalogue.again.that_made(row.owner, row.id)
+    job = catalogue.jobs.that_made(row.owner, row.id)
     if job is not None and KINDS[job.kind].result in TABLES and job.work_key == row.id:
-        catalogue.again.reopen(job.id)
+        catalogue.jobs.reopen(job.id)
         return job.id
     if isinstance(row, ReportRow):
         raise _unknown(row)

@@ -16,8 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.contract.phases import Fault, JobError, Phase
-from workers.run.child import Child
-from workers.run.stopping import Stopping
+from workers.run.child import Child, Stopping
 from workers.tasks.stage_timer import StageTimer
 
 log = logging.getLogger(__name__)

@@ -1,5 +1,7 @@
 """The process in which jobs run: the operating system limits its memory, and it is ended if a job does not stop.
 
+``Stopping`` is the flag with which the parent tells the process that the worker has to stop.
+
 The limit is RLIMIT_DATA. Linux counts private writable memory against it: the heap, arrays, and the stacks of threads. It
 does not count memory that is only reserved, or files that are mapped for reading; RLIMIT_AS would count both, and numba,
 LLVM and the memory allocator reserve much more than they use. An allocation beyond the limit raises MemoryError. On
@@ -16,8 +18,10 @@ import faulthandler
 import logging
 import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 
 log = logging.getLogger(__name__)
@@ -72,6 +76,36 @@ class Child:
         for handler in logging.getLogger().handlers:
             handler.flush()
         os._exit(_EXIT_STATUS)
+
+
+class Stopping:
+    """The stop flag, shared with child processes that are forked later: the parent gets the signal, and a child runs the job.
+
+    The flag is one number in shared memory. The flag has no lock, because a signal handler writes it.
+    """
+
+    def __init__(self) -> None:
+        self._let_go_at = RawValue(
+            "d", 0.0
+        )  # the deadline, as a time of time.monotonic(), a clock that all processes share; 0: the worker need not stop
+
+    def ask(self, within_s: float) -> None:
+        """Tell the worker to take no more jobs, and to hand back the running job after ``within_s`` seconds.
+
+        If the worker was already told, the call changes nothing.
+        """
+        if not self.asked:
+            self._let_go_at.value = time.monotonic() + within_s
+
+    @property
+    def asked(self) -> bool:
+        """True after the worker was told to stop."""
+        return bool(self._let_go_at.value)
+
+    @property
+    def due(self) -> bool:
+        """True when the running job must be handed back."""
+        return self.asked and time.monotonic() >= self._let_go_at.value
 
 
 def allowed_mib(estimate_mib: int) -> int:

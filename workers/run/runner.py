@@ -11,6 +11,8 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
+from typing import Any
 
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 
@@ -25,8 +27,7 @@ from workers.contract.phases import Fault, JobError, Phase
 from workers.contract.queues import Queue
 from workers.files.store import NO_ROOM, STORAGE_FULL, Store, is_disk_full
 from workers.run.attempt import Assistance, Attempt, Cancelled, Progress, TookTooLong
-from workers.run.child import MARGIN, Child, allowed_mib, is_out_of_memory
-from workers.run.stopping import Stopping
+from workers.run.child import MARGIN, Child, Stopping, allowed_mib, is_out_of_memory
 from workers.settings import Settings
 from workers.tasks.context import Context, TurnOver
 from workers.tasks.stage_timer import StageTimer
@@ -35,6 +36,15 @@ log = logging.getLogger(__name__)
 FAILED = "job %s: %s (%s)"  # log line about a failed job: its id, and the message and the code of its error
 
 TRANSIENT = (OperationalError, InterfaceError, ConnectionError, TimeoutError)
+LATE = ("psfcore.build", "psfcore.drawing.plots")  # libraries that tasks load when they need them
+
+
+def load_tasks() -> None:
+    """Import every task and late library, so that the first job of each kind does not wait for them."""
+    for kind in KINDS.values():
+        kind.load_task()
+    for name in LATE:
+        import_module(name)
 
 
 def worker_name() -> str:
@@ -177,15 +187,7 @@ class Runner:
         if assistant is None:
             return
         assistance = Assistance(self._catalogue, job_id, self._stopping)
-        context = Context(
-            catalogue=self._catalogue,
-            store=self._store,
-            settings=self._settings,
-            owner=job.owner,
-            job_id=job.id,
-            report=assistance.report,
-            times=assistance.times,
-        )
+        context = self._context(job, assistance)
         with logs.bound(job=job.id, owner=job.owner):
             try:
                 with self._limited(job):
@@ -197,22 +199,30 @@ class Runner:
                 log.exception("job %s: assisting failed", job_id)
             self._keep_times(job, assistance.times)
 
-    def _attempt(self, job: JobRow, lease: Lease, attempt: Attempt) -> None:
-        context = Context(
+    def _context(self, job: JobRow, work: Attempt | Assistance, **functions: Any) -> Context:
+        """The context of a task or an assistant. functions: what only a task may use."""
+        return Context(
             catalogue=self._catalogue,
             store=self._store,
             settings=self._settings,
             owner=job.owner,
             job_id=job.id,
-            report=attempt.report,
+            report=work.report,
+            times=work.times,
+            previews=self._previews,
+            compile_beside=self._compile_beside,
+            total_psfs=self._total_psfs,
+            **functions,
+        )
+
+    def _attempt(self, job: JobRow, lease: Lease, attempt: Attempt) -> None:
+        context = self._context(
+            job,
+            attempt,
             call_for_help=lambda workers: self._call_for_help(job.id, workers),
             guarded=lambda piece: self._guarded(job, attempt, piece),
             others_wait=lambda: self._stopping.asked or self._catalogue.jobs.others_wait(job.kind),
             lease=lease,
-            times=attempt.times,
-            previews=self._previews,
-            compile_beside=self._compile_beside,
-            total_psfs=self._total_psfs,
         )
         try:
             self._check_room(job)
@@ -223,15 +233,13 @@ class Runner:
         except Cancelled:
             aborted = self._persist(lambda: self._catalogue.jobs.abort(lease))
             log.info("job %s: %s", job.id, "aborted" if aborted else "lease lost; another worker has the job")
-        except TookTooLong as error:
-            self._fail(lease, error.as_error())
-        except DataError as error:
-            self._fail(lease, JobError(fault=Fault.USER, code=error.code, message=error.message))
         except TRANSIENT as error:
             self._retry(job, lease, error)
+        except (DataError, TookTooLong) as error:
+            self._fail(lease, self._error_of(job, error))
         except Exception as error:
             log.exception("job %s failed", job.id)
-            self._fail(lease, self._unexpected(job, error))
+            self._fail(lease, self._error_of(job, error))
         else:
             completed = self._persist(lambda: self._catalogue.jobs.complete(lease, result_id))
             outcome = (
@@ -257,14 +265,8 @@ class Runner:
         An identical job, or an earlier attempt that could not record its end, may have made it.
         """
         made, find = job.work_key, self._catalogue.get
-        if made is None:
-            return False
-        found = (
-            find(ProductRow, made, job.owner),
-            find(PsfRow, made, job.owner),
-            find(ReportRow, made, job.owner),
-        )
-        return any(row is not None for row in found)
+        tables: tuple[type[Any], ...] = (ProductRow, PsfRow, ReportRow)
+        return made is not None and any(find(table, made, job.owner) is not None for table in tables)
 
     def _keep_times(self, job: JobRow, times: StageTimer) -> None:
         """Add the stage times of an attempt to the sums. The outcome of the attempt is already recorded, so a failure here is only logged."""
@@ -284,15 +286,13 @@ class Runner:
             piece()
         except (Cancelled, *TRANSIENT):
             raise
-        except TookTooLong as error:
-            return error.as_error()
-        except DataError as error:
-            return JobError(fault=Fault.USER, code=error.code, message=error.message)
+        except (DataError, TookTooLong) as error:
+            return self._error_of(job, error)
         except Exception as error:
             if is_disk_full(error):
                 raise
             log.exception("job %s: a piece of its work failed", job.id)
-            return self._unexpected(job, error)
+            return self._error_of(job, error)
         return None
 
     @contextmanager
@@ -308,9 +308,12 @@ class Runner:
         """The memory for which the job was admitted, MiB. Without an estimate, it is the operator's limit."""
         return int((job.estimate or {}).get("memory_mib", self._settings.max_job_memory_mib))
 
-    def _unexpected(self, job: JobRow, error: Exception) -> JobError:
-        """The error of a job whose task raised an exception that the user did not cause: a full disk, too little
-        memory, or a fault of the software."""
+    def _error_of(self, job: JobRow, error: Exception) -> JobError:
+        """The error of a job whose task raised this exception."""
+        if isinstance(error, TookTooLong):
+            return error.as_error()
+        if isinstance(error, DataError):
+            return JobError.of(error)
         if is_disk_full(error):
             return JobError(fault=Fault.TRANSIENT, code=STORAGE_FULL, message=NO_ROOM)
         if not is_out_of_memory(error):

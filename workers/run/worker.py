@@ -23,7 +23,7 @@ from workers import logs, traces
 from workers.broker import app as queue
 from workers.broker.order import TakeWhatCanStart
 from workers.contract.queues import broker_name, queue_of_broker
-from workers.run.stopping import Stopping
+from workers.run.child import Child, Stopping
 from workers.settings import Settings, software_version
 
 if TYPE_CHECKING:
@@ -157,9 +157,7 @@ def _runner() -> Runner:
     os.environ["NUMBA_THREADING_LAYER"] = "workqueue"
     os.environ["NUMBA_NUM_THREADS"] = str(settings.threads)
     from workers.files.store import open_store
-    from workers.run.child import Child
-    from workers.run.registry import load_tasks
-    from workers.run.runner import Runner
+    from workers.run.runner import Runner, load_tasks
 
     load_tasks()
     return Runner(

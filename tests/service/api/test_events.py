@@ -276,7 +276,7 @@ def test_ends_that_no_look_saw_coming_are_told_once(catalogue: Catalogue) -> Non
     quick = submitted(catalogue)
     catalogue.jobs.complete(claimed(catalogue, quick), "r" * 64)
     assert looks.phases() == [(quick, "COMPLETED")] and looks.told() == [], "between two looks"
-    assert catalogue.again.reopen(quick)
+    assert catalogue.jobs.reopen(quick)
     assert looks.phases() == [(quick, "QUEUED")], "it runs again"
     catalogue.jobs.complete(claimed(catalogue, quick), "r" * 64)
     assert looks.phases() == [(quick, "COMPLETED")]

@@ -21,8 +21,7 @@ from tests.service.http.attacks import ARCHIVES, FILES, MIB, REQUESTS, Attack
 from tests.service.keyed import Keyed, keyed
 from workers.contract.phases import Phase
 from workers.files.store import Store
-from workers.run.registry import load_tasks
-from workers.run.runner import Runner
+from workers.run.runner import Runner, load_tasks
 
 MOST_MIB = 64.0  # of memory more than before: an upload may be 8 MiB, and headers 4
 MOST_S = 10.0  # of processor time: what else the machine does counts for nothing

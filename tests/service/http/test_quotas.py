@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 from service.cli.main import main
 from tests.conftest import write_image
 from tests.service.conftest import refusal, upload
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue import owners
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow

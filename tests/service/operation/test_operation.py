@@ -22,7 +22,7 @@ from tests.conftest import write_image
 from tests.service.conftest import execute, job_after, upload
 from tests.whole.stack import Missing, Redis, free_port
 from workers import logs
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.stage_times import KeptStageTimes
 from workers.catalogue.tables import DEFAULT_OWNER

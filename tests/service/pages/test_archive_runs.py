@@ -14,14 +14,10 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from service.pages import archive_runs
 from tests.conftest import write_image
-from tests.service.conftest import upload
+from tests.service.conftest import upload, work_through_bulks
 from tests.service.keyed import keyed
-from workers.bulk.turns import keep_turns
 from workers.catalogue.access.keys import Scope
-from workers.catalogue.catalogue import Catalogue
 from workers.contract.layout import FIELDS
-from workers.files.store import Store
-from workers.run.runner import Runner
 from workers.settings import Settings
 
 LAYOUT = "{telescop}/{date:%Y/%m/%d}/{stem}_sharp.fits"
@@ -141,12 +137,7 @@ def test_a_check_says_what_the_run_then_does(
     assert started.status_code == 303
     run = api.get(f"/v1{started.headers['location']}").json()
     assert run["request"]["output"] == estimate["output"] and run["name"] == "Rome"
-    catalogue = Catalogue(settings.catalogue_url)
-    while catalogue.bulks.at_work():
-        keep_turns(catalogue, settings)
-        for turn in catalogue.jobs.of_kind("bulk"):
-            Runner(settings, catalogue, Store(settings.data_dir)).run(turn.id)
-    catalogue.close()
+    work_through_bulks(settings)
     done = api.get(f"/v1{started.headers['location']}").json()["images"]
     assert (done["total"], done["done"], done["failed"]) == (3, 2, 1)
     assert Path(example).is_file(), "the product is where the check said"

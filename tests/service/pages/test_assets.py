@@ -15,8 +15,7 @@ from fastapi.testclient import TestClient
 
 from service.pages import assets
 from tests.conftest import write_image
-from tests.service.conftest import upload
-from workers.bulk.turns import keep_turns
+from tests.service.conftest import upload, work_through_bulks
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store
 from workers.run.runner import Runner
@@ -127,10 +126,7 @@ def filled(api: TestClient, settings: Settings, psf_file: Path, tmp_path: Path) 
     for row in catalogue.jobs.of_kind("deconvolve"):
         runner.run(row.id)
     api.post("/v1/bulk", json={"images": ids, "psf_id": psf_id, "parameters": FEW})
-    while catalogue.bulks.at_work():
-        keep_turns(catalogue, settings)
-        for turn in catalogue.jobs.of_kind("bulk"):
-            runner.run(turn.id)
+    work_through_bulks(settings)
     for steps in range(3, 60):
         method = {"name": "richardson-lucy", "steps": steps}
         api.post("/v1/jobs", json={"kind": "deconvolve", "parameters": asked | {"method": method}})

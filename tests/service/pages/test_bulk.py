@@ -13,13 +13,9 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from service.pages import bulk as bulk_pages
 from tests.conftest import write_image, write_psf
-from tests.service.conftest import upload
+from tests.service.conftest import upload, work_through_bulks
 from tests.service.keyed import keyed
-from workers.bulk.turns import keep_turns
 from workers.catalogue.access.keys import Scope
-from workers.catalogue.catalogue import Catalogue
-from workers.files.store import Store
-from workers.run.runner import Runner
 from workers.settings import Settings
 
 FEW = {"method": {"name": "richardson-lucy", "steps": 2}}
@@ -45,19 +41,9 @@ def psf_id(api: TestClient, psf_file: Path) -> str:
 
 
 @pytest.fixture
-def work(settings: Settings, api: TestClient) -> Iterator[Callable[[], None]]:
+def work(settings: Settings, api: TestClient) -> Callable[[], None]:
     """Runs turns until no bulk run is at work."""
-    catalogue = Catalogue(settings.catalogue_url)
-    runner = Runner(settings, catalogue, Store(settings.data_dir))
-
-    def run() -> None:
-        while catalogue.bulks.at_work():
-            keep_turns(catalogue, settings)
-            for turn in catalogue.jobs.of_kind("bulk"):
-                runner.run(turn.id)
-
-    yield run
-    catalogue.close()
+    return lambda: work_through_bulks(settings)
 
 
 def uploaded(api: TestClient, folder: Path, count: int, first: int = 0) -> list[str]:

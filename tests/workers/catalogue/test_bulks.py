@@ -19,11 +19,11 @@ from tests.whole.many_rows import plan, statements
 from tests.workers.databases import BOTH, change, database, rows
 from tests.workers.jobs import bulk_row, claimed
 from tests.workers.psf_examples import product
-from workers.bulk import listing, matching
+from workers.bulk import listing
 from workers.catalogue import bulk_progress
 from workers.catalogue import bulks as bulk_rows
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
-from workers.catalogue.bulks import Listed, Taken, new_id
+from workers.catalogue.bulks import Listed, new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import ImageRow
@@ -59,17 +59,17 @@ def row(catalogue: Catalogue, bulk_id: str) -> BulkRow:
     return found
 
 
-def one_taken(catalogue: Catalogue, bulk_id: str, lease: Lease) -> Taken:
+def one_taken(catalogue: Catalogue, bulk_id: str, lease: Lease) -> BulkItemRow:
     taken = catalogue.bulks.take(bulk_id, lease, 3)
     assert taken is not None
     return taken
 
 
-def done(catalogue: Catalogue, taken: Taken, *, reused: bool = False, **values: Any) -> bool:
+def done(catalogue: Catalogue, taken: BulkItemRow, *, reused: bool = False, **values: Any) -> bool:
     return catalogue.bulks.finish(taken, reused=reused, **{**DONE, **values})
 
 
-def all_taken(catalogue: Catalogue, bulk_id: str, lease: Lease) -> Iterator[Taken]:
+def all_taken(catalogue: Catalogue, bulk_id: str, lease: Lease) -> Iterator[BulkItemRow]:
     while (taken := catalogue.bulks.take(bulk_id, lease, 3)) is not None:
         yield taken
 
@@ -310,25 +310,20 @@ def test_retry_queues_only_failed_images_and_is_refused_while_an_identical_run_i
     check_counts(catalogue, ended)
 
 
-def test_an_identical_run_that_ends_meanwhile_hinders_neither_a_retry_nor_a_new_run(
-    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ended, there = with_a_failure(catalogue), made(catalogue, 2)
-    real = database(catalogue).reading
-    ends = [there]  # just before the next look for an open run
+@BOTH
+def test_equal_requests_and_retries_at_the_same_moment_open_one_run(catalogue: Catalogue) -> None:
+    ended = with_a_failure(catalogue)
 
-    def reading() -> Any:
-        catalogue.bulks.cancel(ends[-1])
-        return real()
+    def retried(_: int) -> str | None:
+        try:
+            return ended if catalogue.bulks.retry(ended) else None
+        except DataError as refused:
+            assert refused.code == "equal-bulk-open"
+            return None
 
-    with monkeypatch.context() as patched:
-        patched.setattr(database(catalogue), "reading", reading)
-        assert catalogue.bulks.retry(ended) == 1
-    assert row(catalogue, ended).phase == "RUNNING"
-    ends.append(ended)
-    monkeypatch.setattr(database(catalogue), "reading", reading)
-    second = made(catalogue, 3)
-    assert second not in (ended, there) and row(catalogue, second).total == 3
+    with ThreadPoolExecutor(8) as pool:
+        opened = pool.map(lambda n: retried(n) if n % 2 else made(catalogue, 2), range(8))
+        assert len(set(opened) - {None}) == 1
 
 
 @BOTH
@@ -389,16 +384,16 @@ def test_files_whose_paths_cannot_be_stored_are_failed_images(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_image(path)
     (root / "loop.fits").symlink_to(root / "loop.fits")
+    bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
     context = Context(
-        catalogue=catalogue, store=Store(tmp_path / "data"), owner="o", job_id="j",
+        catalogue=catalogue, store=Store(tmp_path / "data"), owner="o", job_id="j", lease=lease,
         settings=settings.model_copy(update={"bulk_roots": str(root)}), report=lambda *_: None,
     )  # fmt: skip
-    bulk_id, lease = made(catalogue, 0, listed=False), turn(catalogue)
     request = {"files": [{"glob": f"{root}/**/*.fits", "where": {"NAXIS": 2}}]}
     change(catalogue, update(BulkRow).where(BulkRow.id == bulk_id).values(request=request))
     begun = catalogue.bulks.begin_listing(bulk_id, lease)
     assert begun is not None
-    listing.list_files(context, begun, lease, lambda: None, lambda: False)
+    listing.list_files(context, begun, lambda: None, lambda: False)
     assert row(catalogue, bulk_id).phase == BulkPhase.RUNNING
     (taken,) = all_taken(catalogue, bulk_id, lease)
     assert taken.source == str(root / "a.fits")
@@ -412,7 +407,7 @@ def test_files_whose_paths_cannot_be_stored_are_failed_images(
     assert "1024" in message and str(len(str(long))) in message and message.endswith("5/long.fits")
     sources = [item.source for item in items]
     assert f"{root}/\\xff\\xfe/Sonne\\xf6.fits" in sources
-    assert max(map(len, sources)) == matching.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
+    assert max(map(len, sources)) == listing.MOST_LETTERS == BulkItemRow.__table__.c.source.type.length  # type: ignore[attr-defined]
     check_counts(catalogue, bulk_id)
     assert done(catalogue, taken) and catalogue.bulks.retry(bulk_id) == 1, "no row tells where the others lie"
     assert [one.source for one in all_taken(catalogue, bulk_id, lease)] == [str(root / "loop.fits")]
@@ -452,7 +447,7 @@ def test_failed_images_are_counted_by_reason(catalogue: Catalogue, monkeypatch: 
     assert [(one.code, one.images) for one in reasons] == [("bad", 1), ("worse", 1)], "of the first two"
 
 
-def test_images_without_a_product_are_the_newest_of_their_owner_and_missing_uploads_are_named(
+def test_images_without_a_product_are_the_newest_of_their_owner(
     catalogue: Catalogue,
 ) -> None:
     for number in range(6):
@@ -461,20 +456,15 @@ def test_images_without_a_product_are_the_newest_of_their_owner_and_missing_uplo
             owner=owner, id=f"{number:064x}", created_at=float(number), bytes=1, filename=name, summary={}
         )
         catalogue.add(image)
-    products = {}
     for owner, number in (("o", 3), ("other", 2)):
         one = product(f"of {number}", "p", owner=owner)
         one.image_id = f"{number:064x}"
-        products[owner] = catalogue.add(one)[0].id
+        catalogue.add(one)
     progress = catalogue.bulks.progress
     ids = [f"{number:064x}" for number in (4, 2, 1, 0)]
     assert list(progress.without_product("o", 10)) == ids
     assert list(progress.without_product("o", 2)) == ids[:2]
     assert progress.names_of_uploads([ids[0], ids[3], f"{5:064x}"], "o") == {ids[0]: "4.fits"}
-    assert progress.still_there(list(products.values()), "o") == {products["o"]}
-    assert progress.first_not_uploaded(ids, "o") is None
-    assert progress.first_not_uploaded([ids[0], "b" * 64], "o") == "b" * 64
-    assert progress.first_not_uploaded(ids[:1], "other") == ids[0]
 
 
 def test_the_pace_is_that_of_the_last_images(catalogue: Catalogue) -> None:
@@ -522,7 +512,7 @@ def test_every_query_of_a_run_uses_an_index(catalogue: Catalogue) -> None:
         progress.pace(bulk), progress.to_look_at(bulk_id, 1.0), bulks.at_work(), progress.open_images()
         progress.items(bulk_id, ItemState.DONE, after=3, limit=51)
         progress.worst(bulk_id, after=(1.0, 3), limit=51), progress.without_product("o", 51)
-        progress.names_of_uploads(["a" * 64], "o"), progress.still_there(["a" * 64], "o")
+        progress.names_of_uploads(["a" * 64], "o")
         progress.done_before("o", "c" * 64, "/out/x.fits"), bulks.retry(bulk_id), bulks.pause(bulk_id)
         catalogue.page(BulkRow, owner="o", limit=51, after=(1.0, "a"))
         assert bulks.delete(bulk_id)

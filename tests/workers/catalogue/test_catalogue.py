@@ -115,7 +115,7 @@ WAIT_S = 1000.0  # a test moves the recorded time back and does not wait
 
 
 def waiting(catalogue: Catalogue) -> list[str]:
-    return [job.id for job in catalogue.jobs.unsubmitted(WAIT_S)]
+    return [job_id for job_id, _ in catalogue.jobs.unsubmitted(WAIT_S)]
 
 
 def age(catalogue: Catalogue, job: JobRow) -> None:

@@ -49,7 +49,7 @@ def test_each_phase_after_pending(catalogue: Catalogue) -> None:
     assert (row.phase, row.parameters["size"], row.request_key) == (Phase.QUEUED, 64, "k")
     assert not catalogue.uws.start(job.id, row.parameters, {}, "k")
     assert not catalogue.uws.amend(job.id, lambda given: {})
-    assert [waiting.id for waiting in catalogue.jobs.unsubmitted(0.0)] == [job.id]
+    assert [job_id for job_id, _ in catalogue.jobs.unsubmitted(0.0)] == [job.id]
     assert catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)[0].id != job.id, (
         "its client may destroy or limit it: an equal request does not share that end"
     )

@@ -48,8 +48,8 @@ def task(context, parameters):
     return "result"
 
 workers.tasks.psf_build.psf_build = task
-import workers.run.registry
-workers.run.registry.load_tasks = lambda: None  # this process has loaded the only task, before it starts others
+import workers.run.runner
+workers.run.runner.load_tasks = lambda: None  # this process has loaded the only task, before it starts others
 from workers.run.worker import main
 main()
 """

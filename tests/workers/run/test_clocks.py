@@ -99,7 +99,7 @@ def test_messages_parts_and_workers_go_by_the_database_s_clock(catalogue: Catalo
     move_times(catalogue, 10.0 - LEASE_S)
     assert catalogue.parts.take("o", "k", LEASE_S) is None
     move_times(catalogue, -LEASE_S)
-    assert [one.id for one in catalogue.jobs.unsubmitted(LEASE_S)] == [job.id]
+    assert [one for one, _ in catalogue.jobs.unsubmitted(LEASE_S)] == [job.id]
     assert catalogue.parts.take("o", "k", LEASE_S) is not None
     assert not catalogue.parts.heartbeat(part) and catalogue.census.workers(LEASE_S) == []
 
@@ -151,7 +151,7 @@ def test_a_running_job_survives_a_clock_that_is_set_back_and_a_lost_message_is_r
     waiting, _ = catalogue.jobs.submit("psf-build", {}, "waiting", DEFAULT_OWNER)
     catalogue.jobs.mark_submitted(waiting.id)
     move_times(catalogue, BACK_S)
-    assert [one.id for one in catalogue.jobs.unsubmitted(LEASE_S)] == [waiting.id]
+    assert [one for one, _ in catalogue.jobs.unsubmitted(LEASE_S)] == [waiting.id]
     catalogue.jobs.mark_submitted(waiting.id)
     assert catalogue.jobs.unsubmitted(LEASE_S) == [], "once"
     assert catalogue.jobs.give_up_silent(LEASE_S, 3) == []

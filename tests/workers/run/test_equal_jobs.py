@@ -39,7 +39,7 @@ def claim(catalogue: Catalogue, job_id: str) -> Lease | None:
 
 
 def waiting(catalogue: Catalogue) -> set[str]:
-    return {job.id for job in catalogue.jobs.unsubmitted(3600.0)}
+    return {job_id for job_id, _ in catalogue.jobs.unsubmitted(3600.0)}
 
 
 @BOTH

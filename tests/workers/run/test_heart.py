@@ -9,7 +9,7 @@ from sqlalchemy.exc import OperationalError
 
 from workers.catalogue.jobs import Lease
 from workers.run.attempt import Attempt
-from workers.run.stopping import Stopping
+from workers.run.child import Stopping
 
 
 def test_a_heartbeat_that_failed_is_followed_by_another() -> None:

@@ -19,9 +19,8 @@ from workers.contract.queues import Queue
 from workers.files.store import Store
 from workers.run import attempt
 from workers.run.attempt import Attempt
-from workers.run.child import Child
+from workers.run.child import Child, Stopping
 from workers.run.runner import Runner
-from workers.run.stopping import Stopping
 from workers.settings import Settings
 from workers.tasks.context import Context
 

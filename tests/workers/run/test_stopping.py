@@ -26,8 +26,8 @@ from workers.catalogue.census import FileTally
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
 from workers.contract.phases import Phase
 from workers.files.store import Store
+from workers.run.child import Stopping
 from workers.run.runner import Runner
-from workers.run.stopping import Stopping
 from workers.settings import Settings
 from workers.tasks.context import Context
 
@@ -79,7 +79,9 @@ def steps_for(seconds: float, at_work: Callable[[], None] = lambda: None) -> Tas
 def test_a_job_that_lasts_is_handed_back_and_the_attempt_does_not_count(bench: Bench) -> None:
     row = bench.run(steps_for(60.0, at_work=lambda: bench.stopping.ask(0.1)))
     assert (row.phase, row.attempt, row.lease) == (Phase.QUEUED, 0, None)
-    assert [job.id for job in bench.catalogue.jobs.unsubmitted(3600.0)] == [row.id], "it is submitted at once"
+    assert [job_id for job_id, _ in bench.catalogue.jobs.unsubmitted(3600.0)] == [row.id], (
+        "it is submitted at once"
+    )
     bench.stopping = Stopping()  # another worker
     row = bench.run(steps_for(0.0))
     assert (row.phase, row.attempt, row.result_id) == (Phase.COMPLETED, 1, "result")
@@ -111,7 +113,9 @@ def test_a_worker_that_stops_takes_no_job(bench: Bench) -> None:
     bench.stopping.ask(30.0)
     row = bench.run(steps_for(0.0))
     assert (row.phase, row.attempt) == (Phase.QUEUED, 0)
-    assert [job.id for job in bench.catalogue.jobs.unsubmitted(3600.0)] == [row.id], "the message is gone"
+    assert [job_id for job_id, _ in bench.catalogue.jobs.unsubmitted(3600.0)] == [row.id], (
+        "the message is gone"
+    )
 
 
 def test_a_cancelled_job_is_not_handed_back(bench: Bench) -> None:

@@ -19,7 +19,7 @@ from tests.conftest import write_image, write_psf
 from tests.service.api.bulk.conftest import FEW, failures, now, results, started
 from tests.service.conftest import refusal, upload
 from workers.bulk import image as bulk_image
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.contract.queues import Queue
 from workers.files import beneath
@@ -236,23 +236,17 @@ def test_a_run_waits_for_a_job_that_is_computing_the_image(
     assert api.get(f"/v1/jobs/{job['id']}").json()["result"] == f"/v1/products/{line['product_id']}"
 
 
-def test_an_internal_error_stops_one_image_and_one_of_a_turn_the_run(
+def test_an_internal_error_fails_one_image_and_tells_no_secret(
     api: TestClient, files: list[dict[str, str]], psf_id: str, work: Work
 ) -> None:
     real = bulk_image.read_one
 
-    def breaks(context: Any, bulk: Any, request: Any, taken: Any) -> Any:
+    def breaks(context: Any, bulk: Any, taken: Any) -> Any:
         if taken.position == 1:
             raise ZeroDivisionError("secret place")
-        return real(context, bulk, request, taken)
+        return real(context, bulk, taken)
 
     bulk = started(api, files=files, psf_id=psf_id)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("workers.bulk.task.list_files", lambda *_: 1 / 0)
-        work()
-    stopped = now(api, bulk)
-    assert stopped["phase"] == "ERROR" and stopped["error"]["code"] == "internal-error"
-    assert api.post(f"/v1/bulk/{bulk['id']}/resume").status_code == 200
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("workers.bulk.task.read_one", breaks)
         work()
@@ -387,24 +381,6 @@ def test_a_link_made_after_the_listing_is_not_followed(
     assert failed["error"]["code"] == "path-not-allowed"
 
 
-def test_the_turns_of_a_bulk_are_jobs_like_others_while_they_last(
-    api: TestClient, archive: Path, psf_id: str, catalogue: Catalogue, settings: Settings, work: Work
-) -> None:
-    bulk = started(api, files=[{"glob": f"{archive}/2020/image*"}], psf_id=psf_id)
-    keep_turns(catalogue, settings)
-    (turn,) = api.get("/v1/jobs").json()["items"]
-    assert (turn["kind"], turn["queue"]) == ("bulk", "bulk")
-    assert turn["parameters"]["bulk_id"] == bulk["id"]
-    assert api.get(f"/uws/jobs/{turn['id']}").status_code == api.get("/uws/jobs").status_code == 200
-    keep_turns(catalogue, settings)
-    assert len(api.get("/v1/jobs").json()["items"]) == 1, "a turn for a worker, and no more"
-    refusal(api.delete(f"/v1/jobs/{turn['id']}"), 409, "job-of-bulk")
-    work()
-    assert now(api, bulk)["images"]["done"] == 1
-    keep_turns(catalogue, settings)
-    assert api.get("/v1/jobs").json()["items"] == [], "what ended has nothing to say"
-
-
 def test_a_turn_lets_others_go_first_after_each_image(
     api: TestClient, files: list[dict[str, str]], psf_id: str, catalogue: Catalogue, settings: Settings
 ) -> None:
@@ -452,3 +428,28 @@ def test_images_of_another_channel_fail_alone_unless_the_request_says_so(
     assert [row["warnings"] for row in results(api, told)] == [[], ["channel"]]
     assert [row["warnings"] for row in results(api, told, warning="channel")] == [["channel"]]
     assert results(api, told, warning="frame") == []
+
+
+def test_failed_images_can_be_retried_after_the_identical_run_has_ended(
+    api: TestClient, archive: Path, psf_id: str, work: Work
+) -> None:
+    write_image(archive / "2020" / os.fsdecode(b"Sonne\xf6.fits"))
+    request = {"files": [{"glob": f"{archive}/2020/*.fits"}], "psf_id": psf_id}
+    first = started(api, **request)
+    work()
+    ended = now(api, first)
+    assert (ended["phase"], ended["images"]["done"], ended["images"]["failed"]) == ("COMPLETED", 1, 2)
+    failed = {line["error"]["code"]: line for line in failures(api, first)}
+    assert set(failed) == {"not-fits", "path-not-utf-8"} and failed["not-fits"]["attempts"] == 1
+    assert failed["path-not-utf-8"]["source"] == f"{archive}/2020/Sonne\\xf6.fits"
+    second = started(api, **request)
+    detail = refusal(api.post(f"/v1/bulk/{first['id']}/retry"), 409, "equal-bulk-open")
+    assert f"run {second['id']} is LISTING" in detail and now(api, first) == ended
+    work()
+    (archive / "2020" / "letter.fits").unlink()
+    write_image(archive / "2020" / "letter.fits", seed=1)
+    assert api.post(f"/v1/bulk/{first['id']}/retry").status_code == 200
+    work()
+    again = now(api, first)
+    assert (again["phase"], again["images"]["done"], again["images"]["failed"]) == ("COMPLETED", 2, 1)
+    assert failures(api, first) == [failed["path-not-utf-8"]], "there is no path to try again"

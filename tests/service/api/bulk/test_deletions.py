@@ -13,7 +13,7 @@ from tests.conftest import write_image
 from tests.service.api.bulk.conftest import FEW
 from tests.service.conftest import refusal, upload, work_through_bulks
 from tests.service.keyed import Keyed
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Bulks
@@ -93,28 +93,18 @@ def test_a_run_at_work_is_cancelled_first(ann: TestClient, image: str, psf: str)
     assert ann.get(run).status_code == 404
 
 
-def test_the_turns_of_a_deleted_run_stop(
+def test_turns_are_jobs_that_only_their_run_can_stop(
     service: Keyed, ann: TestClient, settings: Settings, image: str, psf: str
 ) -> None:
     before = used(service)
     run = started(ann, [image], psf)
-    keep_turns(service.catalogue, settings)
-    assert ann.post(f"{run}/pause").status_code == 200 and ann.delete(run).status_code == 204
-    (turn,) = service.catalogue.jobs.of_kind("bulk")
-    assert turn.phase == Phase.ABORTED
-    keep_turns(service.catalogue, settings)
-    assert service.catalogue.jobs.of_kind("bulk") == [] and used(service) == before
-
-
-def test_a_key_that_may_submit_cannot_stop_the_turn_of_a_bulk_run(
-    service: Keyed, ann: TestClient, settings: Settings, image: str, psf: str
-) -> None:
-    run = started(ann, [image], psf)
-    keep_turns(service.catalogue, settings)
-    (turn,) = service.catalogue.jobs.of_kind("bulk")
-    submitter = service.client("ann", Scope.READ, Scope.SUBMIT)
-    assert run in refusal(submitter.delete(f"/v1/jobs/{turn.id}"), 409, "job-of-bulk")
-    here = f"/uws/jobs/{turn.id}"
+    for _ in range(2):
+        keep_turns(service.catalogue, settings)
+        (turn,) = ann.get("/v1/jobs").json()["items"]
+    assert (turn["kind"], turn["queue"]) == ("bulk", "bulk") and turn["parameters"]["bulk_id"] in run
+    submitter, here = service.client("ann", Scope.READ, Scope.SUBMIT), f"/uws/jobs/{turn['id']}"
+    assert ann.get(here).status_code == ann.get("/uws/jobs").status_code == 200
+    assert run in refusal(submitter.delete(f"/v1/jobs/{turn['id']}"), 409, "job-of-bulk")
     for address, form in (
         (here, {"ACTION": "DELETE"}),
         (f"{here}/phase", {"PHASE": "ABORT"}),
@@ -124,11 +114,13 @@ def test_a_key_that_may_submit_cannot_stop_the_turn_of_a_bulk_run(
         answer = submitter.post(address, data=form, follow_redirects=False)
         assert answer.status_code == 409 and run in answer.text, address
     assert submitter.delete(here, follow_redirects=False).status_code == 409
-    row = service.catalogue.jobs.get(turn.id)
+    row = service.catalogue.jobs.get(turn["id"])
     assert row is not None and not row.cancel_requested and row.phase == Phase.QUEUED
-    assert ann.post(f"{run}/cancel").status_code == 200, "the bulk run itself can be cancelled"
-    row = service.catalogue.jobs.get(turn.id)
-    assert row is None or row.phase == Phase.ABORTED
+    assert ann.post(f"{run}/pause").status_code == 200 and ann.delete(run).status_code == 204
+    row = service.catalogue.jobs.get(turn["id"])
+    assert row is not None and row.phase == Phase.ABORTED
+    keep_turns(service.catalogue, settings)
+    assert ann.get("/v1/jobs").json()["items"] == [] and used(service) == before
 
 
 def test_a_run_deleted_while_its_image_is_at_work_leaves_nothing_open(

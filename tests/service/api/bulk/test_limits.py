@@ -16,7 +16,7 @@ from tests.service.api.bulk.conftest import FEW, failures, now, started
 from tests.service.conftest import refusal, result_of, upload, work_through_bulks
 from workers.bulk import dry_run
 from workers.bulk import task as bulk_task
-from workers.bulk.turns import keep_turns
+from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import Store
 from workers.intake import estimates

@@ -1,31 +1,36 @@
-"""Files are listed while images are processed: the first product, interruptions, errors, several patterns."""
+"""Turns of bulk runs: reading, computing, writing and listing overlap; interruptions, errors, images of lost workers."""
 
 from __future__ import annotations
 
 import os
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
 
+from psfcore.errors import DataError
 from service.app import create_app
 from tests.conftest import write_image
+from tests.s3 import s3_bucket, shared_server
 from tests.service.conftest import upload
 from tests.workers.databases import rows
 from tests.workers.jobs import claimed
+from workers.bulk import image as bulk_image
 from workers.bulk import listing, task
-from workers.bulk.matching import Place
-from workers.bulk.turns import keep_turns
+from workers.bulk.listing import Place
+from workers.bulk.runs import keep_turns
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.files import archive as archive_files
-from workers.files.store import Store
+from workers.files.store import Store, open_store
 from workers.run.runner import Runner
 from workers.settings import Settings
 from workers.tasks.context import Context
@@ -38,12 +43,12 @@ ALL = FOLDERS * IN_FOLDER
 
 @pytest.fixture
 def archive(tmp_path: Path) -> Path:
-    """Three folders of two images; each image has another content."""
+    """Three folders of two images; each image has another height, so that a test can tell them apart."""
     root = tmp_path / "archive"
     for number in range(ALL):
         path = root / f"{number // IN_FOLDER}" / f"{number}.fits"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, shape=(64, 64), seed=number)
+        write_image(path, shape=(64 + number, 64), seed=number)
     return root
 
 
@@ -58,7 +63,7 @@ def settings(tmp_path: Path, archive: Path) -> Settings:
 
 
 class Run:
-    """A bulk run of the files of an archive, and its turns in this process."""
+    """A bulk run of the files of an archive, or of its first four files as uploads, and its turns in this process."""
 
     def __init__(self, api: TestClient, settings: Settings, archive: Path, psf_id: str) -> None:
         self.api, self.settings, self.archive = api, settings, archive
@@ -66,9 +71,18 @@ class Run:
         self._psf_id = psf_id
 
     def start(self, *globs: str) -> None:
-        files = [{"glob": f"{self.archive}/{glob}"} for glob in globs or ("**/*.fits",)]
-        body = {"files": files, "psf_id": self._psf_id, "parameters": FEW}
-        self.id = self.api.post("/v1/bulk", json=body).json()["id"]
+        self.id = self.requested(
+            files=[{"glob": f"{self.archive}/{glob}"} for glob in globs or ("**/*.fits",)]
+        )
+
+    def start_uploaded(self) -> None:
+        self.images = [upload(self.api, path) for path in sorted(self.archive.glob("*/*"))[:4]]
+        self.id = self.requested(images=self.images)
+
+    def requested(self, *, parameters: dict[str, Any] | None = None, **body: Any) -> str:
+        """The id of the run of a request."""
+        body |= {"psf_id": self._psf_id, "parameters": FEW | (parameters or {})}
+        return str(self.api.post("/v1/bulk", json=body).json()["id"])
 
     def turn(self) -> None:
         keep_turns(self.catalogue, self.settings)
@@ -84,6 +98,16 @@ class Run:
             assert number < 50, self.now()
         return number
 
+    def lease(self) -> Lease:
+        """The lease of a worker that claims the only turn."""
+        keep_turns(self.catalogue, self.settings)
+        (job,) = self.catalogue.jobs.of_kind("bulk")
+        return claimed(self.catalogue, job.id)
+
+    def rows(self) -> list[BulkItemRow]:
+        query = select(BulkItemRow).where(BulkItemRow.bulk_id == self.id)
+        return rows(self.catalogue, query.order_by(BulkItemRow.position))
+
     def now(self) -> dict[str, Any]:
         return dict(self.api.get(f"/v1/bulk/{self.id}").json())
 
@@ -92,8 +116,7 @@ class Run:
 
     def check_listed_once(self) -> list[BulkItemRow]:
         """Every file is one image; returns the rows."""
-        query = select(BulkItemRow).where(BulkItemRow.bulk_id == self.id)
-        items = rows(self.catalogue, query.order_by(BulkItemRow.position))
+        items = self.rows()
         names = [Path(row.source).name for row in items]
         assert Counter(names) == Counter(f"{number}.fits" for number in range(ALL))
         assert [row.position for row in items] == list(range(ALL))
@@ -181,9 +204,9 @@ def test_first_images_are_added_after_a_moment_even_if_they_are_few(
 def test_a_search_that_was_stopped_at_every_step_finds_each_file_once(run: Run) -> None:
     """The paths that several patterns match are known again after an interruption."""
     run.start("0/*.fits", "**/*.fits", "*/*.fits")
-    bulks, lease, steps = run.catalogue.bulks, _lease(run), 0
+    bulks, lease, steps = run.catalogue.bulks, run.lease(), 0
     while (begun := bulks.begin_listing(run.id, lease)) is not None:
-        listing.list_files(_context(run), begun, lease, lambda: None, lambda: True)
+        listing.list_files(_context(run, lease), begun, lambda: None, lambda: True)
         steps += 1
         assert steps < 100
     run.catalogue.jobs.hand_back(lease)
@@ -193,13 +216,13 @@ def test_a_search_that_was_stopped_at_every_step_finds_each_file_once(run: Run) 
 
 def test_a_worker_that_is_lost_while_it_lists_is_followed_by_another(run: Run) -> None:
     run.start()
-    lost = _lease(run)
+    lost = run.lease()
     begun = _list_first_folder(run, lost)
     partly = run.now()
     assert (partly["phase"], partly["listed"]) == ("LISTING", False) and 0 < partly["images"]["total"] < ALL
     run.catalogue.jobs.give_up_silent(-1.0, 99)
     run.turns()
-    listing.list_files(_context(run), begun, lost, lambda: None, lambda: False)  # it comes back too late
+    listing.list_files(_context(run, lost), begun, lambda: None, lambda: False)  # it comes back too late
     run.check_all_done_once()
 
 
@@ -255,6 +278,18 @@ def test_a_listing_that_fails_midway_keeps_what_is_done_and_continues_when_resum
     run.check_all_done_once()
 
 
+def test_a_run_that_is_cancelled_while_it_finds_nothing_stops_at_once(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr(listing, "ADD_EVERY_S", 0.0)
+    run.start("**/*.none")
+    looked = at_folder(monkeypatch, run.archive, "1", lambda: run.change("cancel"))
+    run.turn()
+    assert looked == ["archive", "0", "1"] and run.now()["phase"] == "CANCELLED"
+    assert {job.phase for job in run.catalogue.jobs.of_kind("bulk")} <= {"ABORTED", "COMPLETED"}
+
+
 def test_a_listing_that_finds_nothing_lets_other_jobs_go_first(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -272,7 +307,7 @@ def test_a_listing_that_finds_nothing_lets_other_jobs_go_first(
     def slow(*given: Any, **named: Any) -> Iterator[Any]:
         for step in real(*given, **named):
             yield step
-            if step.place.names[0] == "1":
+            if step[0].names[0] == "1":
                 threading.Event().wait(0.2)
 
     monkeypatch.setattr(listing, "found_files", slow)
@@ -287,7 +322,7 @@ def test_as_many_turns_as_workers_process_images_while_one_lists(
 ) -> None:
     run.start()
     monkeypatch.setattr(type(run.catalogue.census), "workers", lambda *_: [object()] * 3)
-    lease = _lease(run)
+    lease = run.lease()
     _list_first_folder(run, lease)
     keep_turns(run.catalogue, run.settings)
     others = [job for job in run.catalogue.jobs.of_kind("bulk") if job.id != lease.job_id]
@@ -304,15 +339,161 @@ def test_a_place_keeps_every_name(tmp_path: Path) -> None:
     assert Place.of(stored) == Place(3, names)
 
 
+def test_an_identical_request_finds_the_open_run(run: Run) -> None:
+    run.start_uploaded()
+    defaults = {"other_channel": False, "again": False}
+    assert run.requested(images=run.images) == run.requested(images=run.images, parameters=defaults) == run.id
+    others = [run.requested(images=run.images, parameters={name: True}) for name in defaults]
+    assert len({run.id, *others}) == 3
+
+
+def number_of(ready: Any) -> int:
+    return int(ready.image.pixels.shape[0]) - 64
+
+
+def test_the_next_image_is_read_and_the_last_product_written_while_an_image_is_computed(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run.start_uploaded()
+    read, written = ([threading.Event() for _ in range(5)] for _ in range(2))
+    computing = threading.Event()
+    read_one, compute_one, write_one = task.read_one, task.compute_one, task.write_one
+    threads: set[int] = set()
+
+    def reading(context: Any, bulk: Any, taken: Any) -> Any:
+        ready = read_one(context, bulk, taken)
+        read[taken.position].set()
+        return ready
+
+    def compute(context: Any, ready: Any) -> Any:
+        number = number_of(ready)
+        computing.set()
+        threads.add(threading.get_ident())
+        assert number == 3 or read[number + 1].wait(WAIT_S), f"image {number + 1} was not read meanwhile"
+        assert number == 0 or written[number - 1].wait(WAIT_S), (
+            f"image {number - 1} was not written meanwhile"
+        )
+        made = compute_one(context, ready)
+        computing.clear()
+        return made
+
+    def write(context: Any, ready: Any, made: Any) -> Any:
+        number = number_of(ready)
+        assert number == 3 or computing.wait(WAIT_S), f"image {number} was written before the next one began"
+        outcome = write_one(context, ready, made)
+        written[number].set()
+        return outcome
+
+    for name, function in {"read_one": reading, "compute_one": compute, "write_one": write}.items():
+        monkeypatch.setattr(task, name, function)
+    run.turn()
+    assert [(row.state, row.attempts) for row in run.rows()] == [("done", 1)] * 4
+    assert threads == {threading.get_ident()}, "only the thread of the job computes"
+
+
+def test_an_image_in_its_second_attempt_has_no_neighbours(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run.start_uploaded()
+    lease = run.lease()
+    assert run.catalogue.bulks.take(run.id, lease, 3) is not None
+    assert run.catalogue.jobs.hand_back(lease)
+    at_work: list[list[int]] = []
+    compute_one = task.compute_one
+
+    def compute(context: Any, ready: Any) -> Any:
+        at_work.append([row.position for row in run.rows() if row.state == "taken"])
+        return compute_one(context, ready)
+
+    monkeypatch.setattr(task, "compute_one", compute)
+    run.turn()
+    assert at_work[0] == [0] and [row.attempts for row in run.rows()] == [2, 1, 1, 1]
+    assert [row.state for row in run.rows()] == ["done"] * 4
+
+
+def test_an_image_that_was_read_ahead_is_given_back(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run.start_uploaded()
+    begun = threading.Event()
+    read_one = task.read_one
+
+    def reading(context: Any, bulk: Any, taken: Any) -> Any:
+        if taken.position == 1:
+            begun.set()
+        return read_one(context, bulk, taken)
+
+    def compute(context: Any, ready: Any) -> Any:
+        assert begun.wait(WAIT_S)
+        run.catalogue.bulks.pause(run.id)
+        raise DataError("no-signal", "expected light; got none")
+
+    monkeypatch.setattr(task, "read_one", reading)
+    monkeypatch.setattr(task, "compute_one", compute)
+    run.turn()
+    states = [(row.state, row.attempts) for row in run.rows()]
+    assert states == [("failed", 1), ("waiting", 0), ("waiting", 0), ("waiting", 0)]
+
+
+def test_an_error_of_writing_belongs_to_its_image(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run.start_uploaded()
+    write_one = task.write_one
+
+    def write(context: Any, ready: Any, made: Any) -> Any:
+        if number_of(ready) in (1, 3):
+            raise DataError("output-not-written", "expected a folder; got a file")
+        return write_one(context, ready, made)
+
+    monkeypatch.setattr(task, "write_one", write)
+    run.turn()
+    assert [row.state for row in run.rows()] == ["done", "failed", "done", "failed"]
+    assert [row.error["code"] for row in run.rows() if row.error] == ["output-not-written"] * 2
+
+
+def test_files_of_equal_content_are_computed_once(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("b", "c"):
+        (run.archive / "0" / f"{name}.fits").write_bytes((run.archive / "0" / "0.fits").read_bytes())
+    computed: list[Any] = []
+    compute_one = task.compute_one
+    monkeypatch.setattr(task, "compute_one", lambda *told: computed.append(told) or compute_one(*told))  # type: ignore[func-returns-value]
+    run.start("0/[0bc].fits")
+    run.turns()
+    images = run.now()["images"]
+    assert (images["done"], images["reused"], len(computed)) == (3, 2, 1)
+
+
+def test_a_local_copy_removed_during_a_wait_is_downloaded_again(
+    tmp_path: Path, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with s3_bucket(monkeypatch, shared_server()) as (url, _):
+        data = {"data_dir": tmp_path / "data", "store_url": url}
+        settings = Settings.model_validate(
+            data | {"broker_url": "filesystem://", "allowed_hosts": "testserver"}
+        )
+        with TestClient(create_app(settings)) as api:
+            image_id, psf_id = upload(api, image_file), upload(api, psf_file, "/v1/psfs")
+            few = {"method": {"name": "richardson-lucy", "steps": 1}}
+            body = {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id, **few}}
+            job = api.post("/v1/jobs", json=body).json()
+            request = {"images": [image_id], "psf_id": psf_id, "parameters": few}
+            bulk = api.post("/v1/bulk", json=request).json()
+        catalogue = Catalogue(settings.catalogue_url)
+        lease = claimed(catalogue, job["id"], "another")
+        (copy,) = (path for path in tmp_path.rglob(image_id) if path.is_file())
+
+        def rest(_seconds: float) -> None:
+            copy.unlink()
+            assert catalogue.jobs.requeue(lease)
+
+        clock = SimpleNamespace(time=time.time, monotonic=time.monotonic, sleep=rest)
+        monkeypatch.setattr(bulk_image, "time", clock)
+        keep_turns(catalogue, settings)
+        (turn,) = catalogue.jobs.of_kind("bulk")
+        Runner(settings, catalogue, open_store(settings)).run(turn.id)
+        row = catalogue.bulks.get(bulk["id"])
+        assert row is not None and (row.done, row.failed) == (1, 0)
+        assert copy.is_file()
+        catalogue.close()
+
+
 def _must_be_set(event: threading.Event) -> None:
     assert event.wait(WAIT_S), "no image was processed while files are listed"
-
-
-def _lease(run: Run) -> Lease:
-    keep_turns(run.catalogue, run.settings)
-    (job,) = run.catalogue.jobs.of_kind("bulk")
-    lease = claimed(run.catalogue, job.id)
-    return lease
 
 
 def _list_first_folder(run: Run, lease: Lease) -> BulkRow:
@@ -320,12 +501,12 @@ def _list_first_folder(run: Run, lease: Lease) -> BulkRow:
     begun = run.catalogue.bulks.begin_listing(run.id, lease)
     assert begun is not None
     steps = iter([False] * (1 + FOLDERS + IN_FOLDER) + [True])
-    listing.list_files(_context(run), begun, lease, lambda: None, lambda: next(steps))
+    listing.list_files(_context(run, lease), begun, lambda: None, lambda: next(steps))
     return begun
 
 
-def _context(run: Run) -> Context:
+def _context(run: Run, lease: Lease) -> Context:
     return Context(
         catalogue=run.catalogue, store=Store(run.settings.data_dir), settings=run.settings, owner="local",
-        job_id="j", report=lambda *_: None,
+        job_id="j", report=lambda *_: None, lease=lease,
     )  # fmt: skip

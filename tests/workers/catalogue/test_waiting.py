@@ -11,15 +11,15 @@ from sqlalchemy import update
 
 from tests.workers.databases import BOTH, change
 from tests.workers.jobs import job_row
+from workers.catalogue import waiting
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.catalogue.tables import JobRow
-from workers.catalogue.waiting import places
 from workers.contract.phases import Phase
 from workers.contract.queues import Queue
 from workers.files.store import Store
+from workers.run.child import Stopping
 from workers.run.runner import Runner
-from workers.run.stopping import Stopping
 from workers.settings import Settings
 
 HERE = Queue.INTERACTIVE
@@ -150,7 +150,7 @@ def test_a_job_that_waits_for_an_equal_one_gets_another_message(catalogue: Catal
     assert next_one(catalogue, draft.id) is None
     assert catalogue.jobs.unsubmitted(3600.0) == [], "not while the equal job runs"
     assert catalogue.jobs.complete(lease, "r")
-    assert [job.id for job in catalogue.jobs.unsubmitted(3600.0)] == [draft.id]
+    assert [job_id for job_id, _ in catalogue.jobs.unsubmitted(3600.0)] == [draft.id]
 
 
 def test_a_stopping_worker_leaves_a_job_that_is_submitted_again(
@@ -162,7 +162,7 @@ def test_a_stopping_worker_leaves_a_job_that_is_submitted_again(
     stopping.ask(60.0)
     runner = Runner(settings, catalogue, Store(settings.data_dir), stopping=stopping)
     runner.run_next(jobs[0], HERE)  # the message of the job that runs already
-    assert [job.id for job in catalogue.jobs.unsubmitted(3600.0)] == [jobs[1]]
+    assert [job_id for job_id, _ in catalogue.jobs.unsubmitted(3600.0)] == [jobs[1]]
     row = job_row(catalogue, jobs[1])
     assert row.phase == Phase.QUEUED
 
@@ -176,8 +176,8 @@ def test_turns_do_not_depend_on_the_database_s_clock(catalogue: Catalogue) -> No
         ended = update(JobRow).where(JobRow.phase == Phase.COMPLETED)
         change(catalogue, ended.values(started_at=JobRow.started_at + back_s))
         assert [owner[0] for owner in served(catalogue, [*b[:2], *a[1:3]])] == ["b", "a", "b", "a"]
-        for waiting in (*a, *b):
-            catalogue.jobs.cancel(waiting)
+        for job_id in (*a, *b):
+            catalogue.jobs.cancel(job_id)
 
 
 def before(catalogue: Catalogue, job_id: str) -> int | None:
@@ -235,7 +235,7 @@ def test_only_a_waiting_job_has_a_place(catalogue: Catalogue) -> None:
 
 
 def test_no_more_than_the_limit_is_counted(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(places, "MOST_COUNTED", 3)
+    monkeypatch.setattr(waiting, "MOST_COUNTED", 3)
     jobs = submitted(catalogue, "ann", 6)
     assert [before(catalogue, job) for job in jobs] == [0, 1, 2, 3, 3, 3]
     assert catalogue.places.before_new("bob", Queue.BULK) == 3

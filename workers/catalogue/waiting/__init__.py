@@ -1,1 +1,0 @@
-"""The order in which waiting jobs start, and completed jobs that are queued again."""
