@@ -44,12 +44,12 @@ from service.pages import images as image_pages
 from service.pages import jobs as job_pages
 from service.pages import keys as key_pages
 from service.pages import products as product_pages
+from service.pages import reports as report_pages
 from service.pages import transits as transit_pages
 from service.pages.errors import problem_page
 from service.pages.psfs import comparison as psf_comparison
 from service.pages.psfs import listing as psf_listing
 from service.pages.psfs import version as psf_page
-from service.pages.reports import shown as report_page
 from service.uws import routes as uws
 from service.vo import cutouts, interfaces, links, lists
 from workers import traces
@@ -157,7 +157,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         psf_comparison,
         psf_page,
         transit_pages,
-        report_page,
+        report_pages,
         login,
         key_pages,
     ):

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
+from markupsafe import Markup
 
 from service.http import downloads
 from service.http.problems import Problem
@@ -15,7 +21,6 @@ from service.http.state import Shared, State
 from service.pages.jobs import TITLES
 from service.pages.parts import readings
 from service.pages.rendering import page
-from service.pages.reports.stored import StoredPage, read_stored
 from service.pages.visitors import PageReading
 from service.views.reports import ReportView
 from workers.catalogue.tables import ReportRow
@@ -27,7 +32,22 @@ KIND_TITLES = {
     "gap": TITLES["gap-diagnose"],
     "rerun": TITLES["rerun"],
 }
+MOST_KEPT = 4  # stored pages that stay in memory, with their figures
+# The parts of a page that ``psfcore/drawing/page.html`` made. All texts in it are escaped, so no text contains a tag.
+_SECTION = re.compile(r'<section id="s\d+">(.*?)</section>', re.DOTALL)
+_PNG = re.compile(r'src="data:image/png;base64,([^"]*)"')
 router = APIRouter(prefix="/reports/{report_id}", include_in_schema=False)
+
+
+@dataclass(frozen=True)
+class StoredPage:
+    """A stored page. Its sections contain addresses of figures; figures: PNG files in reading order."""
+
+    title: Markup
+    lead: Markup
+    footer: Markup
+    sections: tuple[Markup, ...]
+    figures: tuple[bytes, ...]
 
 
 @router.get("")
@@ -76,6 +96,26 @@ def _stored(state: State, row: ReportRow) -> StoredPage | None:
     if digest is None:
         return None
     return read_stored(downloads.found(state.store, digest), f"/reports/{row.id}/figures")
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def read_stored(path: Path, figures_at: str) -> StoredPage:
+    """The parts of a stored page, which stands alone: without its style, and with its figures as files of their own.
+
+    figures_at: the beginning of the addresses of the figures; "/" and the number of the figure follow. A file of the
+    store never changes, so its content can be kept in memory. Raises OSError.
+    """
+    figures: list[bytes] = []
+
+    def picture(source: re.Match[str]) -> str:
+        figures.append(base64.b64decode(source[1]))
+        return f'src="{figures_at}/{len(figures)}" loading="lazy"'
+
+    html = _PNG.sub(picture, path.read_text("utf-8"))
+    ends = (("<h1>", "</h1>"), ('<p class="lead">', "</p>"), ("<footer><p>", "</p>"))
+    title, lead, footer = (Markup(html.partition(begin)[2].partition(end)[0]) for begin, end in ends)
+    sections = tuple(Markup(one) for one in _SECTION.findall(html))
+    return StoredPage(title, lead, footer, sections, tuple(figures))
 
 
 def _said(state: State, row: ReportRow) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""The pages of reports: what a stored report says, its figures, and its download."""
+"""The pages of reports: the sections and figures of a stored report, and curves and tables from its numbers."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from tests.conftest import SMALL_INSTRUMENT
 from tests.fitted_transit import copied_data, fitted_transit
+from tests.html_page import read_page
 from tests.service.conftest import result_of, settings_in
 from tests.service.pages.gap_report import GAP_ID, keep_gap_report
 from tests.service.pages.test_login import PERSON
@@ -40,6 +41,10 @@ def test_a_gap_report_is_shown_with_its_sentence_map_sections_and_figures(
     ]
     assert places == sorted(places)
     assert page.count("<circle") == sum(image["residual_pct"] is not None for image in gap["images"]) > 5
+    tags = read_page(page)  # every tag is closed in the right order
+    assert next(t.text for t in tags if t.name == "h1").startswith("Gap between model and images of")
+    assert next(t.text.replace("\xa0", " ") for t in tags if t.name == "strong") == gap["sentence"]
+    assert {"h2", "dt", "figcaption", "summary", "td"} <= {t.name for t in tags}
     assert "data:image" not in page and "style=" not in page and "<style" not in page
     download = api.get(f"/v1/reports/{GAP_ID}/page").text
     count = download.count("data:image/png")
