@@ -18,10 +18,10 @@ from markupsafe import Markup
 from service.http import downloads
 from service.http.problems import Problem
 from service.http.state import Shared, State
+from service.pages import readings
 from service.pages.jobs import TITLES
-from service.pages.parts import readings
+from service.pages.login import PageReading
 from service.pages.rendering import page
-from service.pages.visitors import PageReading
 from service.views.reports import ReportView
 from workers.catalogue.tables import ReportRow
 from workers.contract.requests import Identity

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from service.pages.parts.plots import FINE_TO_PX, RATIO, Plot, Series, around, shown_radii, written
+from service.pages.plots import FINE_TO_PX, RATIO, Plot, Series, around, shown_radii, written
 
 
 def test_the_table_holds_x_the_values_and_the_ends_of_the_band() -> None:

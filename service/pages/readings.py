@@ -16,7 +16,7 @@ from itertools import pairwise
 from math import isfinite, sqrt
 from typing import Any
 
-from service.pages.parts.plots import Numbers, Plot, Series, around
+from service.pages.plots import Numbers, Plot, Series, around
 
 Report = Mapping[str, Any]
 Row = tuple[str, ...]

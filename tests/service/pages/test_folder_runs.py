@@ -12,7 +12,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from service.pages import archive_runs
+from service.pages import bulk
 from tests.conftest import write_image
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
@@ -199,7 +199,7 @@ def test_a_start_that_is_refused_shows_the_form_again(api: TestClient, form: dic
 def test_many_refused_images_are_counted_and_some_are_shown(
     api: TestClient, form: dict[str, str], archive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(archive_runs, "MOST_REFUSED", 2)
+    monkeypatch.setattr(bulk, "MOST_REFUSED", 2)
     for number in range(3):
         (archive / f"<b>{number}.fits").write_text("Dear reader,\n" * 300)
     page = api.post("/bulk/check", data=form).text

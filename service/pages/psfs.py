@@ -1,50 +1,106 @@
-"""The page of one PSF: facts, curves, provenance, downloads, and the changes of its status."""
+"""The pages of PSFs: the list with its forms, and one PSF with its facts, curves, provenance and status."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
+from pydantic import ValidationError, validate_call
 from starlette.datastructures import FormData
 
+from psfcore.instruments.files import instrument_names
 from psfcore.tables import lookup
 from service.api.lineage import get_psf_lineage, rerun_psf
 from service.api.psfs.affected import list_affected_by_psf
 from service.api.psfs.curves import get_cutout, tables_of
+from service.api.psfs.filters import psf_filter
 from service.api.psfs.series import SeriesChange, SeriesView, change_series, get_series
 from service.api.psfs.status import StatusChange, change_psf_status, get_psf_status
-from service.api.psfs.versions import delete_psf, get_psf
+from service.api.psfs.versions import delete_psf, get_psf, list_psfs, upload_psf
 from service.http import downloads
 from service.http.callers import Caller
 from service.http.paging import Cursor
 from service.http.problems import Problem
 from service.http.state import Shared, State
-from service.pages.parts.forms import checked, filled, start_job, text
-from service.pages.parts.plots import Plot, Series, around, light_beyond_plot, shown_radii
-from service.pages.parts.readings import fit_parameters, fit_plots
+from service.pages.forms import SentForm, checked, filled, parameters, start_job, text, wrong_fields
+from service.pages.login import PageCertifying, PageReading, PageSubmitting
+from service.pages.plots import Plot, Series, around, light_beyond_plot, shown_radii
+from service.pages.readings import fit_parameters, fit_plots
 from service.pages.rendering import number, page
-from service.pages.visitors import PageCertifying, PageReading, PageSubmitting
 from service.views.psfs import PsfView
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
-from workers.contract.requests import Identity
+from workers.contract.requests import Component, Identity, PsfBuild
 from workers.versions.series import TOTAL
 from workers.versions.status import PsfStatus
 from workers.versions.variants import without_variant
 
-MOST_OTHERS = 50
+PER_PAGE = MOST_OTHERS = 50
 MOST_REPORTS = 10
-PER_PAGE = 50
 CUTOUT_PX = 257
-router = APIRouter(prefix="/psfs/{psf_id}", include_in_schema=False)
+FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_at")
+router = APIRouter(prefix="/psfs", include_in_schema=False)
+_filter: Callable[..., PsfFilter] = validate_call(psf_filter)
 
 
 @router.get("")
+def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Cursor = None) -> Response:
+    """PSFs, newest first, with the filters of the API."""
+    asked = _asked(request)
+    found = list_psfs(request, caller, state, _wanted(asked), asked.get("context"), PER_PAGE, cursor)
+    return page(
+        request,
+        "psfs.html",
+        psfs=found.items,
+        next=found.next,
+        asked={name: asked.get(name, "") for name in (*FILTERS, "context")},
+        filtered=bool(asked),
+        statuses=list(PsfStatus),
+        instruments=instrument_names(),
+        components=get_args(Component),
+        usual_size=PsfBuild.model_fields["size"].default,
+        most_bytes=state.settings.max_upload_bytes,
+        may_submit=Scope.SUBMIT in caller.scopes,
+    )
+
+
+@router.post("")
+async def upload(
+    request: Request, response: Response, caller: PageSubmitting, state: Shared, kind: str | None = None
+) -> Response:
+    """Take a PSF from the form, and go to its page. kind: as for the API."""
+    view = await upload_psf(request, response, caller, state, kind=kind)
+    return RedirectResponse(f"/psfs/{view.id}", 303)
+
+
+@router.post("/build")
+def build(caller: PageSubmitting, state: Shared, form: SentForm) -> Response:
+    """Start the build of a PSF from a shipped instrument file, and go to its job."""
+    return start_job("psf-build", parameters(PsfBuild, form), caller, state)
+
+
+def _asked(request: Request) -> dict[str, str]:
+    """The filters of the request that are not empty. A browser also sends the empty fields of a form."""
+    names = (*FILTERS, "context")
+    return {name: text for name in names if (text := request.query_params.get(name, "").strip())}
+
+
+def _wanted(asked: dict[str, str]) -> PsfFilter:
+    """The filter of the catalogue. Raises ``Problem`` 422 for a wrong value."""
+    try:
+        return _filter(**{name: asked[name] for name in FILTERS if name in asked})
+    except ValidationError as error:
+        raise wrong_fields(error, PsfFilter) from error
+
+
+# --- a PSF ------------------------------------------------------------------------------------------------
+
+
+@router.get("/{psf_id}")
 def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The PSF. Without tables it has no curves; a form then starts the job that makes them."""
     view = get_psf(psf_id, caller, state)
@@ -75,7 +131,7 @@ def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) 
     )
 
 
-@router.get("/products")
+@router.get("/{psf_id}/products")
 def products(
     psf_id: Identity, request: Request, caller: PageReading, state: Shared, cursor: Cursor = None
 ) -> Response:
@@ -85,7 +141,7 @@ def products(
     return page(request, "psf_products.html", psf=view, products=found.items, next=found.next)
 
 
-@router.get("/cutout")
+@router.get("/{psf_id}/cutout")
 async def cutout(
     psf_id: Identity,
     size: Annotated[int, Query(ge=1)],
@@ -97,49 +153,41 @@ async def cutout(
     return await get_cutout(psf_id, size, request, caller, state)
 
 
-@router.post("/status")
-async def change(psf_id: Identity, request: Request, caller: PageCertifying, state: Shared) -> Response:
+@router.post("/{psf_id}/status")
+def change(psf_id: Identity, caller: PageCertifying, state: Shared, form: SentForm) -> Response:
     """Certify the PSF, change its range, deprecate it or name its successor; then show it."""
-    body = _change(await request.form())
-    await run_in_threadpool(change_psf_status, psf_id, body, caller, state)
+    change_psf_status(psf_id, _change(form), caller, state)
     return RedirectResponse(f"/psfs/{psf_id}", 303)
 
 
-@router.post("/series")
-async def change_interpolation(
-    psf_id: Identity, request: Request, caller: PageCertifying, state: Shared
-) -> Response:
+@router.post("/{psf_id}/series")
+def change_interpolation(psf_id: Identity, caller: PageCertifying, state: Shared, form: SentForm) -> Response:
     """Say whether the PSFs of the PSF's series may be interpolated in time; then show the PSF."""
-    body: SeriesChange = checked(SeriesChange, filled(await request.form(), "interpolated", "reason"))
-
-    def change() -> None:
-        series = get_psf_status(psf_id, caller, state).series
-        if series is None:
-            raise Problem(
-                409,
-                "no-series",
-                "expected a PSF of a series; the instrument of this PSF is unknown: upload the PSF again with its instrument",
-            )
-        instrument, channel, kind = series.split("/")
-        change_series(instrument, channel, kind, body, caller, state)
-
-    await run_in_threadpool(change)
+    body: SeriesChange = checked(SeriesChange, filled(form, "interpolated", "reason"))
+    series = get_psf_status(psf_id, caller, state).series
+    if series is None:
+        raise Problem(
+            409,
+            "no-series",
+            "expected a PSF of a series; the instrument of this PSF is unknown: upload the PSF again with its instrument",
+        )
+    change_series(*series.split("/"), body, caller, state)
     return RedirectResponse(f"/psfs/{psf_id}", 303)
 
 
-@router.post("/tables")
-async def make_tables(psf_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
+@router.post("/{psf_id}/tables")
+def make_tables(psf_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
     """Start the job that makes the tables and the picture, and go to it."""
-    return await start_job("psf-tables", {"psf_id": psf_id}, caller, state)
+    return start_job("psf-tables", {"psf_id": psf_id}, caller, state)
 
 
-@router.post("/rerun")
+@router.post("/{psf_id}/rerun")
 def rerun(psf_id: Identity, response: Response, caller: PageSubmitting, state: Shared) -> Response:
     """Make the PSF again, and go to the job."""
     return RedirectResponse(f"/jobs/{rerun_psf(psf_id, response, caller, state).id}", 303)
 
 
-@router.post("/delete")
+@router.post("/{psf_id}/delete")
 def delete(psf_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
     """Delete a draft that nothing uses, and go to the list."""
     delete_psf(psf_id, caller, state)

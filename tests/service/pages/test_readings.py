@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.pages.parts.readings import ABOVE, BELOW, MAP_PX, gap_map, rerun_makers
+from service.pages.readings import ABOVE, BELOW, MAP_PX, gap_map, rerun_makers
 
 
 def image(number: int, residual: float | None, after: float | None = None) -> dict[str, object]:

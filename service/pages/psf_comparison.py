@@ -16,10 +16,10 @@ from service.api.psfs.curves import tables_of
 from service.api.psfs.versions import get_psf
 from service.http.problems import Problem
 from service.http.state import Shared
-from service.pages.parts.plots import Plot, Series, around, light_beyond_plot, shown_radii
-from service.pages.psfs.version import profile_series, psf_facts
+from service.pages.login import PageReading
+from service.pages.plots import Plot, Series, around, light_beyond_plot, shown_radii
+from service.pages.psfs import profile_series, psf_facts
 from service.pages.rendering import page, short
-from service.pages.visitors import PageReading
 from service.views.psfs import PsfView
 from workers.contract.requests import Identity
 
