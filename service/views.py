@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel
 import time
 from typing import Any
+
 from pydantic import BaseModel, Field
-from workers.catalogue.tables import JobRow
+
+from psfcore.noise_figures import NoiseFigures
+from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow, TransitRow
 from workers.contract.kinds import KINDS
 from workers.contract.phases import JobError, Phase
 from workers.contract.queues import Queue
-from workers.catalogue.tables import ProductRow
-from workers.catalogue.tables import PsfRow
 from workers.versions.status import PsfStatus
 from workers.versions.validity import iso
-from workers.catalogue.tables import ReportRow
-from psfcore.noise_figures import NoiseFigures
-from workers.catalogue.tables import TransitRow
+
 
 class PastChange(BaseModel):
     """A change that was recorded: when (s since 1970), by whom, and why."""

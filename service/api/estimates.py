@@ -11,7 +11,7 @@ from service.api.jobs import prepared
 from service.http.callers import Caller, KeyFirst, Submitting
 from service.http.problems import RESPONSES
 from service.http.state import Shared
-from service.views.jobs import Estimate
+from service.views import Estimate
 from workers.contract.kinds import KINDS, JobRequest, queue_of
 from workers.contract.queues import Queue
 from workers.contract.requests import Deconvolve

@@ -14,7 +14,7 @@ from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_room
 from service.http.state import Shared
-from service.views.jobs import JobView
+from service.views import JobView
 from workers.catalogue.tables import JobRow
 from workers.contract.kinds import KINDS, JobRequest
 from workers.contract.phases import Phase

@@ -27,7 +27,7 @@ from service.api.events import TYPE, Said, stream
 from service.http.callers import Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
-from service.views.jobs import JobView
+from service.views import JobView
 from workers.catalogue.followed.rows import MOST, Followable, Followed, Place, State
 
 # Rows that ended up to this number of seconds before the last look are read again: they may have been committed late,

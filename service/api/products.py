@@ -9,7 +9,7 @@ from service.http.callers import Reading, Submitting
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem
 from service.http.state import Shared
-from service.views.products import ProductView
+from service.views import ProductView
 from workers.catalogue.tables import ProductRow
 from workers.contract.requests import Identity
 from workers.files.collection import remove_unnamed

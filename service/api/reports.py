@@ -9,7 +9,7 @@ from service.http.callers import Reading
 from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem
 from service.http.state import Shared
-from service.views.reports import ReportView
+from service.views import ReportView
 from workers.catalogue.tables import ReportRow
 from workers.contract.requests import Identity
 

@@ -11,7 +11,7 @@ from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES
 from service.http.quotas import Allowed
 from service.http.state import Shared
-from service.views.transits import TransitDetails, TransitView
+from service.views import TransitDetails, TransitView
 from workers.catalogue.tables import TransitRow
 from workers.contract.requests import Identity
 from workers.intake.uploads import transit_row

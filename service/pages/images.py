@@ -36,8 +36,7 @@ from service.pages.jobs import job_lines
 from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import duration, page, short
 from service.pages.sentences import of_problem
-from service.views.jobs import JobView
-from service.views.products import ProductView
+from service.views import JobView, ProductView
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow
 from workers.contract.phases import Phase

@@ -18,7 +18,7 @@ from service.pages.forms import address_of
 from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import page, page_of
 from service.pages.sentences import of_error
-from service.views.jobs import JobView
+from service.views import JobView
 from workers.contract.phases import Phase
 from workers.contract.requests import Identity
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any, Literal
+from typing import Literal
 
 DIGITS = 5
 FINE_TO_PX = 10.0  # up to this radius a table shows every radius
@@ -79,51 +79,53 @@ def written(value: float | None) -> str:
     return "" if value is None or not isfinite(value) else f"{value:.{DIGITS}g}"
 
 
-def around(values: Sequence[float], sigma: Sequence[float] | None) -> tuple[Numbers | None, Numbers | None]:
-    """Lower and upper ends of a band of one standard error around values; None and None if there are no errors."""
-    if sigma is None:
-        return None, None
-    pairs = list(zip(values, sigma, strict=True))
-    return [value - error for value, error in pairs], [value + error for value, error in pairs]
+def with_errors(
+    label: str,
+    values: Numbers,
+    sigma: Numbers | None,
+    places: Sequence[int] | None = None,
+    *,
+    draw: Draw = "line",
+) -> Series:
+    """A series with a band, or bars, of one standard error. sigma: None if there are no errors; an entry None: none there.
 
-
-def shown_radii(radii: Sequence[float], least: float = 0.0) -> list[int]:
-    """The indices of the radii that a table shows: all radii near the centre; farther out, radii in ratios of at least
-    ``RATIO``.
-
-    least: smaller radii are left out.
+    places: the indices of the shown values; default: all.
     """
+    chosen = range(len(values)) if places is None else places
+    shown = [values[at] for at in chosen]
+    if sigma is None:
+        return Series(label, shown, draw=draw)
+    errors = [sigma[at] for at in chosen]
+
+    def ends(sign: int) -> Numbers:
+        pairs = zip(shown, errors, strict=True)
+        return [None if value is None or error is None else value + sign * error for value, error in pairs]
+
+    return Series(label, shown, ends(-1), ends(1), draw)
+
+
+def radial_plot(
+    title: str, y_label: str, radii: Sequence[float], series: Sequence[Series], *, y_log: bool = True
+) -> Plot:
+    """Curves over the radius, on a logarithmic axis."""
+    return Plot(title, "radius (px)", y_label, radii, series, x_log=True, y_log=y_log)
+
+
+def shown_radii(radii: Sequence[float]) -> list[int]:
+    """The indices of the radii that a table shows: all radii near the centre; farther out, radii in ratios of at least
+    ``RATIO``."""
     chosen: list[int] = []
     for place, radius in enumerate(radii):
-        if radius < least:
-            continue
-        last = radii[chosen[-1]] if chosen else None
-        if last is None or radius <= FINE_TO_PX or radius >= last * RATIO:
+        if not chosen or radius <= FINE_TO_PX or radius >= radii[chosen[-1]] * RATIO:
             chosen.append(place)
-    if radii and chosen and chosen[-1] != len(radii) - 1:
+    if chosen and chosen[-1] != len(radii) - 1:
         chosen.append(len(radii) - 1)
     return chosen
 
 
-def light_beyond_plot(curves: Mapping[str, Mapping[str, Any]], title: str = "Light beyond a radius") -> Plot:
-    """1 - encircled energy of components or PSFs, in percent.
-
-    curves: the curves by label. Each curve has ``radii_px``, ``pct`` and ``sigma`` (a list, or None). All curves have
-    the same radii.
-    """
-    radii = next(iter(curves.values()))["radii_px"]
+def light_beyond_plot(radii: Sequence[float], curves: Mapping[str, tuple[Numbers, Numbers | None]]) -> Plot:
+    """1 - encircled energy of components or PSFs, in percent. curves: by label, the percentages and their errors."""
     places = shown_radii(radii)
-    series = []
-    for label, one in curves.items():
-        values = [one["pct"][at] for at in places]
-        sigma = None if one["sigma"] is None else [one["sigma"][at] for at in places]
-        series.append(Series(label, values, *around(values, sigma)))
-    return Plot(
-        title,
-        "radius (px)",
-        "1 - encircled energy (%)",
-        [radii[at] for at in places],
-        series,
-        x_log=True,
-        y_log=True,
-    )
+    series = [with_errors(label, pct, sigma, places) for label, (pct, sigma) in curves.items()]
+    shown = [radii[at] for at in places]
+    return radial_plot("Light beyond a radius", "1 - encircled energy (%)", shown, series)

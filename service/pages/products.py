@@ -19,7 +19,7 @@ from service.pages.forms import address_of
 from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import number, page
 from service.pages.sentences import of_problem
-from service.views.products import ProductView
+from service.views import ProductView
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow
 from workers.contract.requests import Identity
 from workers.intake.deprecated import CODE, deprecation

@@ -17,10 +17,10 @@ from service.api.psfs.versions import get_psf
 from service.http.problems import Problem
 from service.http.state import Shared
 from service.pages.login import PageReading
-from service.pages.plots import Plot, Series, around, light_beyond_plot, shown_radii
+from service.pages.plots import Plot, Series, light_beyond_plot, radial_plot, shown_radii, with_errors
 from service.pages.psfs import profile_series, psf_facts
 from service.pages.rendering import page, short
-from service.views.psfs import PsfView
+from service.views import PsfView
 from workers.contract.requests import Identity
 
 router = APIRouter(prefix="/psfs/{psf_id}/vs", include_in_schema=False)
@@ -121,28 +121,18 @@ def _plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Plot]:
     profiles = [lookup.profile(tables) for tables in (one, other)]
     rings = min(len(profile["radius_px"]) for profile in profiles)
     places = shown_radii(profiles[0]["radius_px"][:rings])
-    overlay = Plot(
-        "Mean weight by radius",
-        "radius (px)",
-        "mean weight of a pixel",
-        [profiles[0]["radius_px"][at] for at in places],
-        [
-            profile_series(label, profile, TOTAL, places)
-            for label, profile in zip(labels, profiles, strict=True)
-        ],
-        x_log=True,
-        y_log=True,
-    )
+    radii = [profiles[0]["radius_px"][at] for at in places]
+    curves = [
+        profile_series(label, profile, TOTAL, places) for label, profile in zip(labels, profiles, strict=True)
+    ]
     means = [profile["mean_weight"][TOTAL] for profile in profiles]
-    ratio = Plot(
-        f"Ratio of the mean weights: {labels[1]} / {labels[0]}",
-        "radius (px)",
-        "ratio",
-        overlay.x,
-        [Series("ratio", [means[1][at] / means[0][at] if means[0][at] > 0 else None for at in places])],
-        x_log=True,
-    )
-    return [overlay, ratio, *_light_plots(labels, one, other)]
+    ratios = [means[1][at] / means[0][at] if means[0][at] > 0 else None for at in places]
+    title = f"Ratio of the mean weights: {labels[1]} / {labels[0]}"
+    return [
+        radial_plot("Mean weight by radius", "mean weight of a pixel", radii, curves),
+        radial_plot(title, "ratio", radii, [Series("ratio", ratios)], y_log=False),
+        *_light_plots(labels, one, other),
+    ]
 
 
 def _light_plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Plot]:
@@ -153,23 +143,17 @@ def _light_plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Pl
     for label, tables in zip(labels, (one, other), strict=True):
         curve = lookup.curve(tables)
         at = {radius: place for place, radius in enumerate(curve["radii_px"])}
+        pct, sigma = curve["light_beyond_pct"][TOTAL], curve["sigma_points"].get(TOTAL)
         chosen = [at[radius] for radius in radii]
-        sigma = curve["sigma_points"].get(TOTAL)
-        curves[label] = {
-            "radii_px": radii,
-            "pct": [curve["light_beyond_pct"][TOTAL][place] for place in chosen],
-            "sigma": None if sigma is None else [sigma[place] for place in chosen],
-        }
+        errors = None if sigma is None else [sigma[place] for place in chosen]
+        curves[label] = ([pct[place] for place in chosen], errors)
     places = shown_radii(radii)
-    points = [compared["difference_points"][TOTAL][at] for at in places]
-    sigma = compared["sigma_points"].get(TOTAL)
-    errors = None if sigma is None else [sigma[at] for at in places]
-    difference = Plot(
+    points, sigma = compared["difference_points"][TOTAL], compared["sigma_points"].get(TOTAL)
+    difference = radial_plot(
         f"Difference of the light beyond a radius: {labels[1]} minus {labels[0]}",
-        "radius (px)",
         "percentage points",
         [radii[at] for at in places],
-        [Series("difference", points, *around(points, errors))],
-        x_log=True,
+        [with_errors("difference", points, sigma, places)],
+        y_log=False,
     )
-    return [light_beyond_plot(curves), difference]
+    return [light_beyond_plot(radii, curves), difference]

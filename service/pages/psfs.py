@@ -27,10 +27,10 @@ from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.forms import SentForm, checked, filled, parameters, start_job, text, wrong_fields
 from service.pages.login import PageCertifying, PageReading, PageSubmitting
-from service.pages.plots import Plot, Series, around, light_beyond_plot, shown_radii
+from service.pages.plots import Plot, Series, light_beyond_plot, radial_plot, shown_radii, with_errors
 from service.pages.readings import fit_parameters, fit_plots
 from service.pages.rendering import number, page
-from service.views.psfs import PsfView
+from service.views import PsfView
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
@@ -171,7 +171,8 @@ def change_interpolation(psf_id: Identity, caller: PageCertifying, state: Shared
             "no-series",
             "expected a PSF of a series; the instrument of this PSF is unknown: upload the PSF again with its instrument",
         )
-    change_series(*series.split("/"), body, caller, state)
+    instrument, channel, kind = series.split("/")
+    change_series(instrument, channel, kind, body, caller, state)
     return RedirectResponse(f"/psfs/{psf_id}", 303)
 
 
@@ -233,9 +234,7 @@ def validity(psf: PsfView) -> str:
 
 def profile_series(label: str, profile: Mapping[str, Any], name: str, places: list[int]) -> Series:
     """The mean weight of one component at each radius. If the PSF was fitted, the errors are included."""
-    values = [profile["mean_weight"][name][at] for at in places]
-    errors = profile["sigma"].get(name)
-    return Series(label, values, *around(values, None if errors is None else [errors[at] for at in places]))
+    return with_errors(label, profile["mean_weight"][name], profile["sigma"].get(name), places)
 
 
 def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Mapping[str, Any] | None, str | None]:
@@ -250,21 +249,17 @@ def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Mapping[str, Any
 
 def _plots(tables: Mapping[str, Any]) -> list[Plot]:
     curve, profile = lookup.curve(tables), lookup.profile(tables)
-    beyond = {
-        name: {"radii_px": curve["radii_px"], "pct": pct, "sigma": curve["sigma_points"].get(name)}
-        for name, pct in curve["light_beyond_pct"].items()
-    }
-    places = shown_radii(profile["radius_px"])
-    rings = Plot(
+    sigma = curve["sigma_points"]
+    beyond = {name: (pct, sigma.get(name)) for name, pct in curve["light_beyond_pct"].items()}
+    radii, names = profile["radius_px"], profile["mean_weight"]
+    places = shown_radii(radii)
+    rings = radial_plot(
         "Mean weight by radius",
-        "radius (px)",
         "mean weight of a pixel",
-        [profile["radius_px"][at] for at in places],
-        [profile_series(name, profile, name, places) for name in profile["mean_weight"]],
-        x_log=True,
-        y_log=True,
+        [radii[at] for at in places],
+        [profile_series(name, profile, name, places) for name in names],
     )
-    return [rings, light_beyond_plot(beyond)]
+    return [rings, light_beyond_plot(curve["radii_px"], beyond)]
 
 
 def _series(state: State, caller: Caller, name: str | None) -> SeriesView | None:

@@ -16,7 +16,7 @@ from itertools import pairwise
 from math import isfinite, sqrt
 from typing import Any
 
-from service.pages.plots import Numbers, Plot, Series, around
+from service.pages.plots import Numbers, Plot, Series, radial_plot, with_errors
 
 Report = Mapping[str, Any]
 Row = tuple[str, ...]
@@ -46,51 +46,32 @@ def fit_plots(fit: Report) -> list[Plot]:
 def _fit_curves(fit: Report) -> Plot:
     whole, diffuse = fit["curve"], fit["diffuse_curve"]
     series = [
-        Series(label, curve["light_beyond_pct"], *around(curve["light_beyond_pct"], curve["sigma"]))
+        with_errors(label, curve["light_beyond_pct"], curve["sigma"])
         for label, curve in (("whole PSF", whole), ("diffuse scatter", diffuse))
         if curve["radii_px"] == whole["radii_px"]
     ]
-    return Plot(
-        "Light beyond a radius, with the errors of the fit",
-        "radius (px)",
-        "1 - encircled energy (%)",
-        whole["radii_px"],
-        series,
-        x_log=True,
-        y_log=True,
-    )
+    title = "Light beyond a radius, with the errors of the fit"
+    return radial_plot(title, "1 - encircled energy (%)", whole["radii_px"], series)
 
 
 def _free_shells(fit: Report) -> list[Plot]:
     free = fit.get("free_shells")
     if free is None:
         return []
-    weight = free["weight"]
-    series = Series("free shells", weight["median"], weight["minus_1_sigma"], weight["plus_1_sigma"])
-    return [
-        Plot(
-            "Weight of the scatter without a formula",
-            "radius (px)",
-            "weight of a pixel",
-            _middles(free["edges_px"]),
-            [series],
-            x_log=True,
-            y_log=True,
-        )
-    ]
+    title, series = "Weight of the scatter without a formula", [_banded("free shells", free["weight"])]
+    return [radial_plot(title, "weight of a pixel", _middles(free["edges_px"]), series)]
 
 
 def _fit_residuals(fit: Report) -> Plot:
     frames = fit["frames"]
     residuals = [frame["residual_pct"] for frame in frames]
     errors = [100 * frame["noise_dn_s"] / frame["observed_dn_s"] for frame in frames]
-    series = Series("residual", residuals, *around(residuals, errors), draw="points")
     return Plot(
         "Residual of each image",
         "number of the image",
         "simulated minus observed (%)",
         list(range(len(frames))),
-        [series],
+        [with_errors("residual", residuals, errors, draw="points")],
         names=[_image_name(frame) for frame in frames],
     )
 
@@ -113,15 +94,11 @@ def band_parameters(report: Report) -> list[Row]:
 
 def cross_validation_plots(report: Report) -> list[Plot]:
     """The curve with its band, the weights with and without a formula, the residual of each held-out image, the folds."""
-    beyond = report["light_beyond_pct"]
-    curve = Plot(
+    curve = radial_plot(
         "Light beyond a radius, over all folds",
-        "radius (px)",
         "1 - encircled energy (%)",
         report["radii_px"],
-        [_banded("median, with the band of one standard deviation", beyond)],
-        x_log=True,
-        y_log=True,
+        [_banded("median, with the band of one standard deviation", report["light_beyond_pct"])],
     )
     return [curve, *_shell_plots(report["shells"]), _held_out(report), _fold_totals(report)]
 
@@ -129,18 +106,9 @@ def cross_validation_plots(report: Report) -> list[Plot]:
 def _shell_plots(shells: Report | None) -> list[Plot]:
     if shells is None:
         return []
-    weights = shells["weight"]
-    return [
-        Plot(
-            "Weight of the scatter, with and without a formula",
-            "radius (px)",
-            "weight of a pixel",
-            _middles(shells["edges_px"]),
-            [_banded("formula", weights["formula"]), _banded("free shells", weights["free"])],
-            x_log=True,
-            y_log=True,
-        )
-    ]
+    weights, title = shells["weight"], "Weight of the scatter, with and without a formula"
+    series = [_banded("formula", weights["formula"]), _banded("free shells", weights["free"])]
+    return [radial_plot(title, "weight of a pixel", _middles(shells["edges_px"]), series)]
 
 
 def _held_out(report: Report) -> Plot:
@@ -244,14 +212,8 @@ def _gap_residuals(images: Sequence[Report]) -> Plot:
 
 
 def _gap_series(label: str, images: Sequence[Report], of: str, error: str) -> Series:
-    ends: list[tuple[float | None, float | None]] = [
-        (None, None)
-        if image[of] is None or image[error] is None
-        else (image[of] - image[error], image[of] + image[error])
-        for image in images
-    ]
-    values = [image[of] for image in images]
-    return Series(label, values, [low for low, _ in ends], [high for _, high in ends], draw="points")
+    values, errors = ([image[name] for image in images] for name in (of, error))
+    return with_errors(label, values, errors, draw="points")
 
 
 def _colour(part: float) -> str:

@@ -22,7 +22,7 @@ from service.pages import readings
 from service.pages.jobs import TITLES
 from service.pages.login import PageReading
 from service.pages.rendering import page
-from service.views.reports import ReportView
+from service.views import ReportView
 from workers.catalogue.tables import ReportRow
 from workers.contract.requests import Identity
 

@@ -13,7 +13,7 @@ from service.api.psfs.filters import Filters, InContext
 from service.http.callers import Reading
 from service.http.problems import RESPONSES, problem
 from service.http.state import Shared
-from service.views.psfs import PsfView
+from service.views import PsfView
 from workers.catalogue.tables import ImageRow
 from workers.contract.requests import Identity
 from workers.intake.psf_choice import MOST_NAMED, Found, look, look_for_image

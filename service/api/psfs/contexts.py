@@ -14,7 +14,7 @@ from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, problem
 from service.http.quotas import check_rows
 from service.http.state import Shared
-from service.views.changes import PastChange
+from service.views import PastChange
 from workers.catalogue.contexts import NAME, Pin
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow
 from workers.contract.requests import ContextName, Identity

@@ -15,7 +15,7 @@ from service.http.paging import Page
 from service.http.problems import RESPONSES, problem
 from service.http.quotas import check_rows
 from service.http.state import Shared, State
-from service.views.changes import PastChange
+from service.views import PastChange
 from workers.catalogue.tables import SeriesChangeRow
 from workers.versions.series import WORD
 

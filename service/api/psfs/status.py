@@ -14,8 +14,7 @@ from service.http.callers import Caller, Certifying, KeyFirst, Reading
 from service.http.problems import RESPONSES, problem
 from service.http.quotas import check_rows
 from service.http.state import Shared, State
-from service.views.changes import PastChange
-from service.views.psfs import was_certified
+from service.views import PastChange, was_certified
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import PsfChangeRow, PsfRow
 from workers.contract.requests import Identity

@@ -18,7 +18,7 @@ from service.http.paging import Cursor, Limit, Page, page, position
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import Allowed
 from service.http.state import Shared
-from service.views.psfs import PsfView
+from service.views import PsfView
 from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfRow

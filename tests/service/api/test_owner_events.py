@@ -17,7 +17,7 @@ from sqlalchemy.exc import OperationalError
 
 from service.api import events, owner_events
 from service.api.owner_events import Watch
-from service.views.jobs import JobView
+from service.views import JobView
 from tests.service.api.live import Following, Live, running
 from tests.service.conftest import execute, refusal
 from tests.service.keyed import bearer, keyed

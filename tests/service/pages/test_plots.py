@@ -6,12 +6,15 @@ from itertools import pairwise
 
 import pytest
 
-from service.pages.plots import FINE_TO_PX, RATIO, Plot, Series, around, shown_radii, written
+from service.pages.plots import FINE_TO_PX, RATIO, Plot, Series, shown_radii, with_errors, written
 
 
 def test_the_table_holds_x_the_values_and_the_ends_of_the_band() -> None:
-    low, high = around([2.0, 4.0], [0.5, 1.0])
-    plot = Plot("t", "x", "y", [1.0, 2.0], [Series("a", [2.0, 4.0], low, high), Series("b", [None, 1e-5])])
+    series = [
+        with_errors("a", [9.0, 2.0, 4.0], [9.0, 0.5, 1.0], [1, 2]),
+        with_errors("b", [None, 1e-5], None),
+    ]
+    plot = Plot("t", "x", "y", [1.0, 2.0], series)
     assert [(heading, role) for heading, _, role, _ in plot.columns] == [
         ("a", "line"),
         ("a, low", "low"),

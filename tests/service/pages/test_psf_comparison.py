@@ -10,7 +10,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.pages.psf_comparison import differences
-from service.views.psfs import PsfView
+from service.views import PsfView
 from tests.conftest import write_psf
 from tests.service.conftest import upload
 from tests.service.pages.test_login import PERSON
