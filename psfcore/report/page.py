@@ -6,6 +6,7 @@ The template `page.html` holds the texts. The functions of this module make the 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -46,8 +47,6 @@ def report_page(report: PsfReport, provenance: dict[str, Any]) -> str:
     """The page of a report. provenance: names and values, possibly nested, that describe software and request."""
     of = report.transit.instrument or "an unnamed instrument"
     inputs = inputs_of(report)
-    rows = (chi2_error, curve_table, fold_rows, image_rows, limits_of)
-    rows += (offset_table, shape_rows, slope_rows, summary_rows)
     return render(
         "report/page.html",
         title=f"PSF of {of}" if report.fit is not None else f"PSF {report.psf.name} on a transit of {of}",
@@ -61,7 +60,7 @@ def report_page(report: PsfReport, provenance: dict[str, Any]) -> str:
         blocks=len(folds(len(report.transit.frames))),
         inputs=inputs,
         exposures=", ".join(f"{s:g}" for s in inputs["exposures_s"]),
-        **{function.__name__: function for function in rows},
+        **_FUNCTIONS,
     )
 
 
@@ -208,3 +207,12 @@ def _image_row(frame: FrameEvaluation, exposure_s: float) -> Row:
         with_error(frame.residual_pct, frame.noise_pct),
         with_error(frame.centre_pct, frame.centre_noise_pct),
     ]
+
+
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    one.__name__: one
+    for one in (
+        *(chi2_error, curve_table, fold_rows, image_rows, limits_of),
+        *(offset_table, shape_rows, slope_rows, summary_rows),
+    )
+}

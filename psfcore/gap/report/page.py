@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from typing import Any
 
 from psfcore.drawing.page import DASH, render, with_error
@@ -60,8 +61,6 @@ def gap_page(found: Diagnosis, report: Report) -> str:
     version = report.get("provenance", {}).get("software_version", "")
     members = [hypothesis_words(tuple(names)) for names in report["set"]["members"]]
     optical = [words(e.name) for one in found.corrected[:1] for e in one.effects if e.stage == "optics"]
-    functions = (best_words, effect_rows, hypothesis_rows, image_rows, interval_words, limit_rows)
-    functions += (pattern_rows, percent_words, psf_table, range_words, tied_words, untestable_rows)
     return render(
         "gap/report/page.html",
         title=f"Gap between model and images of {found.solution.transit.instrument or 'a transit'}",
@@ -82,7 +81,7 @@ def gap_page(found: Diagnosis, report: Report) -> str:
         SIGN_FLIPS=SIGN_FLIPS,
         VERDICTS=VERDICTS,
         **PAIRS,
-        **{function.__name__: function for function in functions},
+        **_FUNCTIONS,
     )
 
 
@@ -203,3 +202,12 @@ def image_rows(report: Report) -> list[Row]:
         ]
         for row in report["images"]
     ]
+
+
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    one.__name__: one
+    for one in (
+        *(best_words, effect_rows, hypothesis_rows, image_rows, interval_words, limit_rows),
+        *(pattern_rows, percent_words, psf_table, range_words, tied_words, untestable_rows),
+    )
+}
