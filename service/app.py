@@ -31,20 +31,16 @@ from service.http import guard, observation, problems
 from service.http.rates import AtOnce, Rates
 from service.http.state import Access, State
 from service.operation import docs, health, metrics
-from service.pages import archive_runs as archive_run_pages
-from service.pages import assets, login, visitors
+from service.pages import assets, login, psf_comparison
 from service.pages import bulk as bulk_pages
-from service.pages import image as image_page
 from service.pages import images as image_pages
 from service.pages import jobs as job_pages
 from service.pages import keys as key_pages
 from service.pages import products as product_pages
+from service.pages import psfs as psf_pages
+from service.pages import reports as report_pages
 from service.pages import transits as transit_pages
-from service.pages.errors import problem_page
-from service.pages.psfs import comparison as psf_comparison
-from service.pages.psfs import listing as psf_listing
-from service.pages.psfs import version as psf_page
-from service.pages.reports import shown as report_page
+from service.pages.rendering import problem_page
 from service.uws import routes as uws
 from service.vo import cutouts, interfaces, links, lists
 from workers import traces
@@ -112,7 +108,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         redoc_url=None,
     )
     problems.install(app, problem_page)
-    visitors.install(app)
+    login.install(app)
     _correct_description(app)
     guard.install(app, access, settings, problem_page)
     app.state.requests = observation.install(app)
@@ -150,16 +146,13 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         docs,
         assets,
         image_pages,
-        image_page,
         job_pages,
         product_pages,
-        archive_run_pages,
         bulk_pages,
-        psf_listing,
         psf_comparison,
-        psf_page,
+        psf_pages,
         transit_pages,
-        report_page,
+        report_pages,
         login,
         key_pages,
     )

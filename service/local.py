@@ -29,11 +29,7 @@ from psfcore.transit.archive import ArchiveLimits, FolderTransit, list_archive, 
 from service.client.errors import ServiceError
 from service.client.operations import Operations, Progress
 from service.client.outputs import written
-from service.views.jobs import JobView
-from service.views.products import ProductView
-from service.views.psfs import PsfView
-from service.views.reports import ReportView
-from service.views.transits import TransitDetails
+from service.views import JobView, ProductView, PsfView, ReportView, TransitDetails
 from workers.cache_folder import psf_cache
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, ProductRow, PsfRow, ReportRow

@@ -47,7 +47,7 @@ TOGETHER = {
     "gap": (
         "tests/psfcore/gap/",
         "tests/workers/tasks/test_gap.py",
-        "tests/service/pages/reports/test_shown.py",
+        "tests/service/pages/test_reports.py",
     ),
     "fits": ("tests/psfcore/scatter/", "tests/psfcore/evaluation/", "tests/psfcore/report/"),
 }

@@ -1,9 +1,10 @@
-"""An HTML page in one file, with text, figures, tables, and numbers with their errors.
+"""An HTML page of a report in one file, drawn from a template.
 
 A browser can open the page without a network: the page has no script, loads nothing, and contains its figures.
 Every text is escaped, including texts from the data, such as the name of a file.
 
-    Page("Title", "What was found.", (Section("Figures", ("A paragraph.", Figure(png, "How to read it.", "What it shows"))),))
+A template extends ``drawing/page.html``, sets ``title``, ``lead`` and ``footer``, and fills the block ``sections`` with
+the macros of ``drawing/parts.html``. Names of templates are paths below the folder of psfcore.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ import base64
 import math
 import re
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from itertools import count
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+from markupsafe import Markup, escape
 
 from psfcore.errors import DataError
 
@@ -28,146 +30,40 @@ PLOT_DPI = 160  # resolution of the figures on a page: sharp on screens of high 
 CSS_DPI = 96  # CSS pixels per inch: a figure is shown at the size (in inches) at which it was drawn
 
 _NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?[\d.]+(e[-+]?\d+)?( ?%)?( (±|to) [-+]?[\d.]+(e[-+]?\d+)?)?")
+_SPACES = re.compile(r"[ \n]+")
 
 
-@dataclass(frozen=True, eq=False)
-class Figure:
-    """A figure (PNG). caption: how to read the figure. alt: a description for readers who cannot see it.
+def render(template: str | Template, **values: Any) -> str:
+    """The page that a template draws from these values. Figures, tables and sections are numbered in reading order.
 
-    Raises DataError "not-a-png".
+    Raises DataError "not-a-png" for a figure that is no PNG, and "uneven-table" for a row of another length than the
+    header of its table.
     """
+    sections: list[str] = []
 
-    kind: ClassVar[str] = "figure"
-    png: bytes
-    caption: str
-    alt: str
+    def begin_section(title: str) -> int:
+        sections.append(title)
+        return len(sections)
 
-    def __post_init__(self) -> None:
-        if self.png[:8] != PNG_START or len(self.png) < 24:
-            raise DataError(
-                "not-a-png", f"expected a figure as PNG; got data that begin with {self.png[:8]!r}"
-            )
-
-    @property
-    def data_uri(self) -> str:
-        """The figure as a data URI."""
-        return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
-
-    @property
-    def shown_width(self) -> int:
-        """Width in CSS pixels."""
-        return self._size()[0]
-
-    @property
-    def shown_height(self) -> int:
-        """Height in CSS pixels."""
-        return self._size()[1]
-
-    def _size(self) -> tuple[int, int]:
-        width, height = struct.unpack(">II", self.png[16:24])
-        return round(width * CSS_DPI / PLOT_DPI), round(height * CSS_DPI / PLOT_DPI)
+    return (
+        environment()
+        .get_template(template)
+        .render(
+            values,
+            sections=sections,
+            begin_section=begin_section,
+            next_figure=count(1).__next__,
+            next_table=count(1).__next__,
+        )
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
-    """Rows of cells. The texts of the cells are not changed; columns of numbers are right-aligned.
+def with_error(value: float | None, sigma: float | None = None) -> str:
+    """A number rounded to the second digit of its error, "12.34 ± 0.56". Without an error it is rounded to five digits.
 
-    Raises DataError "uneven-table" if a row does not have the length of the header.
+    None and numbers that are not finite give a dash.
     """
-
-    kind: ClassVar[str] = "table"
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    caption: str
-
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.header):
-                raise DataError(
-                    "uneven-table",
-                    f"expected {len(self.header)} cells in each row; got {len(row)}: {list(row)[:3]}",
-                )
-
-    @property
-    def numeric(self) -> tuple[bool, ...]:
-        """For each column, whether all its cells are numbers or empty."""
-        columns = zip(*self.rows, strict=True) if self.rows else [()] * len(self.header)
-        return tuple(all(_is_number(cell) for cell in column) for column in columns)
-
-
-@dataclass(frozen=True)
-class Value:
-    """A number with its standard error, or a text. sigma: None if the error is unknown or the value has no error."""
-
-    name: str
-    value: float | str
-    sigma: float | None = None
-    unit: str = ""
-    meaning: str = ""
-
-    @property
-    def text(self) -> str:
-        """The number with its error and unit, rounded to the second digit of the error."""
-        number = self.value if isinstance(self.value, str) else with_error(self.value, self.sigma)
-        return f"{number} {self.unit}".rstrip()
-
-
-@dataclass(frozen=True, eq=False)
-class Values:
-    """A list of names and values."""
-
-    kind: ClassVar[str] = "values"
-    values: Sequence[Value]
-
-
-@dataclass(frozen=True, eq=False)
-class Bullets:
-    """A list of sentences."""
-
-    kind: ClassVar[str] = "bullets"
-    items: Sequence[str]
-
-
-@dataclass(frozen=True, eq=False)
-class Details:
-    """A part that is collapsed until the reader opens it."""
-
-    kind: ClassVar[str] = "details"
-    summary: str
-    parts: Sequence[Part]
-
-
-Part = str | Figure | Table | Values | Bullets | Details  # a str is a paragraph
-
-
-@dataclass(frozen=True, eq=False)
-class Section:
-    """A heading and the parts below it."""
-
-    title: str
-    parts: Sequence[Part]
-
-
-@dataclass(frozen=True, eq=False)
-class Page:
-    """A page. lead: the sentence that the reader meets first."""
-
-    title: str
-    lead: str
-    sections: Sequence[Section]
-    footer: str = ""
-
-    def html(self) -> str:
-        """The page as HTML."""
-        parts = [part for section in self.sections for part in _flat(section.parts)]
-        numbers = _numbered(p for p in parts if isinstance(p, Figure))
-        numbers |= _numbered(p for p in parts if isinstance(p, Table))
-        return _template().render(page=self, numbers=numbers)
-
-
-def with_error(value: float, sigma: float | None = None) -> str:
-    """A number rounded to the second digit of its error, "12.34 ± 0.56". Without an error it is rounded to five digits."""
-    if not math.isfinite(value):
+    if value is None or not math.isfinite(value):
         return DASH
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
         return f"{value:.5g}"
@@ -178,46 +74,57 @@ def with_error(value: float, sigma: float | None = None) -> str:
     return f"{rounded:.{digits}f} ± {sigma:.{digits}f}"
 
 
-def provenance_values(provenance: Mapping[str, Any]) -> Values:
-    """The provenance of a report as names and texts. A nested name is preceded by the names of the levels above."""
-    return Values([Value(name, text) for name, text in _named_texts(provenance)])
-
-
-def _named_texts(provenance: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in provenance.items():
+def named_texts(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    """Nested values as names and texts. A nested name is preceded by the names of the levels above."""
+    for key, value in values.items():
         name = f"{before}{key}".replace("_", " ")
         if isinstance(value, Mapping):
-            yield from _named_texts(value, f"{name}: ")
+            yield from named_texts(value, f"{name}: ")
         elif value is not None:
             yield name, str(value)
+
+
+def numeric_columns(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[bool]:
+    """For each column of a table, whether all its cells are numbers or empty. Raises DataError "uneven-table"."""
+    for row in rows:
+        if len(row) != len(header):
+            raise DataError(
+                "uneven-table",
+                f"expected {len(header)} cells in each row; got {len(row)}: {list(row)[:3]}",
+            )
+    return [all(_is_number(row[place]) for row in rows) for place in range(len(header))]
 
 
 def _is_number(cell: str) -> bool:
     return cell in ("", DASH) or _NUMBER.fullmatch(cell) is not None
 
 
-def _flat(parts: Sequence[Part]) -> Iterator[Part]:
-    """All parts in reading order, including those inside Details."""
-    for part in parts:
-        yield part
-        if isinstance(part, Details):
-            yield from _flat(part.parts)
+def source_and_size(png: bytes) -> Markup:
+    """The attributes src, width and height of a figure (PNG). Raises DataError "not-a-png"."""
+    if png[:8] != PNG_START or len(png) < 24:
+        raise DataError("not-a-png", f"expected a figure as PNG; got data that begin with {png[:8]!r}")
+    width, height = (round(side * CSS_DPI / PLOT_DPI) for side in struct.unpack(">II", png[16:24]))
+    data = base64.b64encode(png).decode("ascii")
+    return Markup('src="data:image/png;base64,{}" width="{}" height="{}"').format(data, width, height)
 
 
-def _numbered(parts: Iterable[Figure | Table]) -> dict[Figure | Table, int]:
-    return {part: number for number, part in enumerate(parts, start=1)}
+def prose(text: str) -> Markup:
+    """The text in one line, with no line break between a number and its error or its percent sign."""
+    space = "\N{NO-BREAK SPACE}"
+    line = _SPACES.sub(" ", str(escape(text))).strip()
+    return Markup(line.replace(" ± ", f"{space}±{space}").replace(" %", f"{space}%"))
 
 
 @cache
-def _template() -> Template:
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
+def environment() -> Environment:
+    """The templates of pages."""
+    made = Environment(
+        loader=FileSystemLoader(Path(__file__).parents[1]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    environment.filters["unbroken"] = _unbroken
-    return environment.get_template("page.html")
-
-
-def _unbroken(text: str) -> str:
-    """The text, with no line break between a number and its error or its percent sign."""
-    space = "\N{NO-BREAK SPACE}"
-    return text.replace(" ± ", f"{space}±{space}").replace(" %", f"{space}%")
+    made.filters |= {"prose": prose, "source_and_size": source_and_size, "with_error": with_error}
+    made.globals |= {"named_texts": named_texts, "numeric_columns": numeric_columns, "DASH": DASH}
+    return made

@@ -5,7 +5,8 @@ Each plot has its own figure on the Agg canvas, so threads share no state. pyplo
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
 
@@ -20,7 +21,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FixedFormatter, FuncFormatter
 from numpy.typing import NDArray
 
-from psfcore.drawing.colour_map import EUV_POINTS, NO_DATA
+from psfcore.drawing.thumbnail import EUV_POINTS, NO_DATA
 from psfcore.psf import Psf, crop_centred, cumulative_curve, radial_profile
 
 PANEL_PX = 640
@@ -58,6 +59,13 @@ def write_png(figure: Figure, target: str | Path | IO[bytes], **options: Any) ->
     FigureCanvasAgg(figure).print_png(target, **options)
 
 
+def png_of(figure: Figure) -> bytes:
+    """A figure as PNG."""
+    out = BytesIO()
+    write_png(figure, out)
+    return out.getvalue()
+
+
 def _plain_texts(artist: Artist) -> Iterator[Text]:
     """All texts of a figure except the numbers at its axes."""
     if isinstance(artist, Axis):
@@ -69,6 +77,20 @@ def _plain_texts(artist: Artist) -> Iterator[Text]:
         yield artist
     for child in artist.get_children():
         yield from _plain_texts(child)
+
+
+def tidy(charts: Sequence[Any]) -> None:
+    """Draw a light grid behind the data, and remove the top and right spines."""
+    for axes in charts:
+        axes.set_axisbelow(True)
+        axes.grid(which="major", color="#e2e2e2", linewidth=0.7)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+
+
+def points(colour: str, size: float) -> dict[str, Any]:
+    """The style of points with bars, for ``errorbar``."""
+    return {"fmt": "o", "color": colour, "markersize": size, "elinewidth": 1.0, "markeredgewidth": 0}
 
 
 def preview_png(before: Plane, after: Plane, path: str | Path, *, title: str, unit: str) -> None:

@@ -1,4 +1,4 @@
-"""Small pictures of images for lists: a PNG with the colours of EUV images and an asinh stretch.
+"""Small pictures of images for lists: a PNG with the colours of EUV images and an asinh stretch; and these colours.
 
 The stretch is asinh(I / (a T)) / asinh(1 / a), between 0 and 1, where
 
@@ -7,6 +7,9 @@ The stretch is asinh(I / (a T)) / asinh(1 / a), between 0 and 1, where
 | I | pixels | mean intensity of the image pixels that form one pixel of the picture |
 | T | top | 99.7th percentile of I, or the maximum of I if this percentile is not positive; brighter pixels are white |
 | a | SOFTENING | below a T the stretch is nearly linear, above it nearly logarithmic |
+
+heliopsf defines its own colour map of EUV images: black, deep gold, yellow, white, as images at 174 angstrom are often
+shown. The lightness (CIELAB L*) increases from level to level, so brighter pixels never look darker.
 
 The PNG has a palette and is written without matplotlib, in half the time and half the bytes (10 ms for 2048 x 2048 px).
 """
@@ -21,7 +24,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.drawing.colour_map import NO_DATA, euv_levels, rgb
+# Control points: a position in the range (0 to 1), and its colour. Between them, colours are interpolated linearly in
+# sRGB.
+EUV_POINTS = (
+    (0.0, "#000000"),
+    (0.18, "#2e1500"),
+    (0.40, "#7d4400"),
+    (0.62, "#c98612"),
+    (0.82, "#f3c34d"),
+    (1.0, "#fffbe8"),
+)
+NO_DATA = "#3a4a5a"  # a blue grey, which the map does not contain
 
 LONGER_SIDE_PX = 192
 SOFTENING = 0.05
@@ -30,6 +43,21 @@ TOP_PERCENTILE = 99.7
 _NO_DATA_LEVEL = 255
 
 Plane = NDArray[np.floating]
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green and blue (0 to 255) of a colour #rrggbb."""
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return red, green, blue
+
+
+def euv_levels(count: int = 256) -> NDArray[np.uint8]:
+    """The map as ``count`` levels of equal steps, shape (count, 3): red, green and blue, 0 to 255."""
+    shares = [share for share, _ in EUV_POINTS]
+    colours = np.array([rgb(colour) for _, colour in EUV_POINTS], dtype=np.float64)
+    at = np.linspace(0.0, 1.0, count)
+    levels = np.stack([np.interp(at, shares, channel) for channel in colours.T], axis=1)
+    return np.round(levels).astype(np.uint8)
 
 
 def write_thumbnail(pixels: Plane, path: Path) -> None:

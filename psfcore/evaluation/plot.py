@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
-from psfcore.drawing.plots import CHANGE, INK, write_png
+from psfcore.drawing.plots import CHANGE, INK, points, tidy, write_png
 from psfcore.evaluation.evaluation import Evaluation
 from psfcore.evaluation.frame import FrameEvaluation, Slice, Superposed
 from psfcore.evaluation.report import summaries
@@ -73,15 +73,6 @@ def evaluation_png(
         charts += offsets
     tidy(charts)
     write_png(figure, path)
-
-
-def tidy(charts: Sequence[Any]) -> None:
-    """Draw a light grid behind the data, and remove the top and right spines."""
-    for axes in charts:
-        axes.set_axisbelow(True)
-        axes.grid(which="major", color="#e2e2e2", linewidth=0.7)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
 
 
 def sentence(evaluation: Evaluation) -> str:
@@ -153,7 +144,7 @@ def draw_centres(axes: Any, frames: Sequence[FrameEvaluation]) -> None:
     minutes = minutes_of(frames)
     observed, simulated = np.array([f.centre_dn_s for f in frames]).T
     error = np.array([f.centre_noise_dn_s for f in frames])
-    axes.errorbar(minutes, observed, error, label="observed", **_points(_OBSERVED, _size(frames)))
+    axes.errorbar(minutes, observed, error, label="observed", **points(_OBSERVED, _size(frames)))
     axes.plot(minutes, simulated, "x", color=_SIMULATED, markersize=6, markeredgewidth=1.4, label="simulated")
     known = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in (observed, simulated)])
     if known.size:
@@ -231,7 +222,7 @@ def draw_errors(
     axes.axhline(0, color="#555555", linewidth=1.0)
     for n, fov in enumerate(sorted(set(fovs.tolist()))):
         here = fovs == fov
-        style = _points(_POINTINGS[n % len(_POINTINGS)], _size(frames))
+        style = points(_POINTINGS[n % len(_POINTINGS)], _size(frames))
         axes.errorbar(where[here], values[here], noise[here], label=f"{fov}", **style)
     span = np.abs(values) + noise
     top = 1.12 * float(span[np.isfinite(span)].max(initial=1e-3))
@@ -281,7 +272,3 @@ def minutes_of(frames: Sequence[FrameEvaluation]) -> Vector:
 
 def _size(frames: Sequence[FrameEvaluation]) -> float:
     return 5.0 if len(frames) < _MANY_IMAGES else 3.2
-
-
-def _points(colour: str, size: float) -> dict[str, Any]:
-    return {"fmt": "o", "color": colour, "markersize": size, "elinewidth": 1.0, "markeredgewidth": 0}

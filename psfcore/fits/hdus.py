@@ -25,7 +25,7 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.evaluation.report import summary_of
+from psfcore.fits.header import summary_of
 from psfcore.fits.blocks import FitsLimits, Hdu, Source, first_image, open_source, skip_data, walk
 from psfcore.fits.cards import optional_number
 from psfcore.fits.compression import may_hold_unwritten_memory

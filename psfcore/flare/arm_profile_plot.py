@@ -12,7 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from psfcore.drawing.plots import INK, write_png
+from psfcore.drawing.plots import INK, tidy, write_png
 from psfcore.flare.arm_profile import BOX_PX, MATCHED_PX, FlareComparison, FlareFit
 
 _OBSERVED, _TOTAL, _ALONE = "#6d6d6d", "#c2402f", "#7b3fa0"
@@ -39,9 +39,7 @@ def flare_png(
     _draw_residuals(below, found)
     for axes in (above, below):
         axes.axvspan(*MATCHED_PX, color="#eeeae0", zorder=0)
-        axes.grid(which="major", color="#e2e2e2", linewidth=0.7)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
+    tidy([above, below])
     write_png(figure, path)
 
 

@@ -1,125 +1,149 @@
-"""The HTML page of a report on a PSF. Every number has an error, and every caption explains how to read the figure."""
+"""The HTML page of a report on a PSF. Every number has an error, and every caption explains how to read the figure.
+
+The template `page.html` holds the texts. The functions of this module make the rows of its tables.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
-from psfcore.drawing.page import (
-    Bullets,
-    Details,
-    Figure,
-    Page,
-    Part,
-    Section,
-    Table,
-    Value,
-    Values,
-    provenance_values,
-    with_error,
-)
+import numpy as np
+
+from psfcore.drawing.page import DASH, render, with_error
 from psfcore.evaluation.evaluation import INVERSION_STEPS, NOISE_REALISATIONS, Evaluation
-from psfcore.evaluation.frame import CENTRE_PX, FrameEvaluation, Superposed
+from psfcore.evaluation.frame import CENTRE_PX, FrameEvaluation
 from psfcore.evaluation.report import TREND_PX, Summary, summaries, trends
 from psfcore.psf import REACH_GRID_PX
-from psfcore.report.fit_sections import found_sections, light_sections, uncertainty_sections
-from psfcore.report.plot import (
-    intensities_png,
-    maps_png,
-    residuals_png,
-    slices_png,
-)
-from psfcore.report.report import PsfReport, inputs_of
+from psfcore.report import plot
+from psfcore.report.plot import beyond_of
+from psfcore.report.report import CrossValidated, PsfReport, inputs_of
+from psfcore.scatter.fit import RADII_PX, TransitFit
 from psfcore.scatter.inversion import CONVERGED_POINTS
 from psfcore.scatter.reconstruction import DARK_MARGIN_PX, DARK_MARGIN_SIGMAS, LEAST_DARK_PIXELS
+from psfcore.scatter.total_psf import SCATTER
+from psfcore.scatter.validation.cross_validation import RUNS
+from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
+from psfcore.tables.make import TOTAL
+from psfcore.transit.transit import folds
+
+Row = list[str]
+Cells = tuple[Row, list[Row]]  # the header of a table, and its rows
+_CONSTANTS = {
+    "CENTRE_PX": CENTRE_PX,
+    "CONVERGED_POINTS": CONVERGED_POINTS,
+    "DARK_MARGIN_PX": DARK_MARGIN_PX,
+    "DARK_MARGIN_SIGMAS": DARK_MARGIN_SIGMAS,
+    "INVERSION_STEPS": INVERSION_STEPS,
+    "LEAST_DARK_PIXELS": LEAST_DARK_PIXELS,
+    "NOISE_REALISATIONS": NOISE_REALISATIONS,
+    "REACH_GRID_PX": REACH_GRID_PX,
+    "RUNS": RUNS,
+    "TREND_PX": TREND_PX,
+}
 
 
-def page_of(report: PsfReport, provenance: dict[str, Any]) -> Page:
+def report_page(report: PsfReport, provenance: dict[str, Any]) -> str:
     """The page of a report. provenance: names and values, possibly nested, that describe software and request."""
     of = report.transit.instrument or "an unnamed instrument"
-    title = f"PSF of {of}" if report.fit is not None else f"PSF {report.psf.name} on a transit of {of}"
-    sections = [
-        Section("Results", found_sections(report)),
-        Section("Light by distance from the source", light_sections(report)),
-    ]
-    if report.fit is not None:
-        sections.append(Section("Uncertainties", uncertainty_sections(report, report.fit)))
-    sections += [
-        Section("Comparison with the observations", _observed(report.evaluation, report.how_judged)),
-        Section("Limits of these data", (Bullets(_limits(report)),)),
-        Section("Images", _images(report)),
-        Section("Inputs and software", _made_of(report, provenance)),
-    ]
-    footer = f"heliopsf {provenance.get('software_version', '')}. Method: Hofmeister et al., A Point-Spread Function for the Extreme Ultraviolet High-Resolution Imager on board Solar Orbiter."
-    return Page(title, report.sentence, sections, footer)
-
-
-# --- observed and simulated -------------------------------------------------------------------------------
-
-
-def _observed(evaluation: Evaluation, how: str) -> list[Part]:
-    parts: list[Part] = [
-        f"{how}. The residual of an image compares two means over all fully dark pixels: the light that the PSF scatters "
-        "into the occulter, and the observed light. The residual is the first mean minus the second, divided by the "
-        f"second. The centre consists of the pixels within {CENTRE_PX:g} px of the occulter's centre. Noise is photon and "
-        "read noise.",
-        Table(
-            [
-                "pointing",
-                "images",
-                "mean (%)",
-                "rms (%)",
-                "noise (%)",
-                "largest (%)",
-                "centre, mean (%)",
-                "mean (DN/s)",
-            ],
-            [_summary_row(s, evaluation) for s in summaries(evaluation)],
-            "Residuals by pointing; the last row is for all images. The error of the mean comes from image noise. The "
-            "error of the rms is its sampling error for this number of images. Noise: the rms expected from noise alone. "
-            "Largest: the residual of the image whose residual has the largest absolute value.",
-        ),
-        Figure(
-            slices_png(evaluation),
-            "Intensity along a row (circles, solid line) and a column (squares, dashed line) through the centre of an "
-            "occulter, for one image of each pointing. Points: observed. Lines: simulated. Grey: fully dark pixels. "
-            "Outside the grey area, sunlight reaches the pixels directly.",
-            "Observed and simulated intensity along slices through occulters",
-        ),
-        Figure(
-            residuals_png(evaluation),
-            "Residuals of disc means (top) and of disc centres (bottom) by time, detector x and detector y, coloured by "
-            "pointing. Bars show one standard deviation of the noise. If noise alone causes the residuals, about one third "
-            "of the bars do not include zero.",
-            "Six charts of residuals about zero, by time and detector position",
-        ),
-    ]
-    parts += _trends(evaluation)
-    parts.append(
-        Figure(
-            intensities_png(evaluation),
-            "Left: observed intensity at the centre of the occulter, with its noise, and simulated intensity, by time. "
-            "Right: simulated minus observed mean intensity in DN/s, by detector x. The vertical axis is linear near "
-            "zero and logarithmic beyond.",
-            "Intensities in the occulter by time, and absolute errors by detector position",
-        )
+    inputs = inputs_of(report)
+    return render(
+        "report/page.html",
+        title=f"PSF of {of}" if report.fit is not None else f"PSF {report.psf.name} on a transit of {of}",
+        lead=report.sentence,
+        footer=f"heliopsf {provenance.get('software_version', '')}. Method: Hofmeister et al., A Point-Spread Function "
+        "for the Extreme Ultraviolet High-Resolution Imager on board Solar Orbiter.",
+        report=report,
+        provenance=provenance,
+        plot=plot,
+        constants=_CONSTANTS,
+        blocks=len(folds(len(report.transit.frames))),
+        inputs=inputs,
+        exposures=", ".join(f"{s:g}" for s in inputs["exposures_s"]),
+        **_FUNCTIONS,
     )
-    maps = evaluation.superposed
-    parts += [
-        _map_values(maps),
-        Figure(maps_png(maps), _MAPS_CAPTION, "Four maps of errors by position in the disc"),
+
+
+def chi2_error(fit: TransitFit) -> float:
+    """The expected statistical variation of chi2 per pixel."""
+    return math.sqrt(2 / sum(frame.dark[0].size for frame in fit.inversion.frames))
+
+
+def curve_table(report: PsfReport) -> Cells:
+    """1 - encircled energy of each component at some radii, and the bands of the folds."""
+    names = [name for name in (TOTAL, SCATTER) if name in report.tables["encircled"]]
+    header = ["R (px)", *(f"{'total PSF' if name == TOTAL else 'diffuse scatter'} (%)" for name in names)]
+    if report.cross is not None:
+        header += ["folds: median (%)", "1 sigma (%)", "2 sigma (%)"]
+    curves = [beyond_of(report.tables, name) for name in names]
+    rows = []
+    for radius in (r for r in RADII_PX if r < report.tables["reach_px"]):
+        row = [f"{radius:g}"]
+        for at, beyond, sigma in curves:
+            row.append(with_error(float(np.interp(radius, at, beyond)), float(np.interp(radius, at, sigma))))
+        if report.cross is not None:
+            row += _bands_at(report.cross, radius)
+        rows.append(row)
+    return header, rows
+
+
+def _bands_at(cross: CrossValidated, radius: float) -> Row:
+    at = np.flatnonzero(cross.bands.radii_px == radius)
+    return [DASH] * 3 if at.size == 0 else _band(cross.bands.curve_pct[:, at[0]], ".2f")
+
+
+def _band(limits: Any, digits: str) -> Row:
+    """The median, and the ranges of one and of two standard deviations."""
+    low_2, low_1, median, high_1, high_2 = (f"{limit:{digits}}" for limit in limits)
+    return [median, f"{low_1} to {high_1}", f"{low_2} to {high_2}"]
+
+
+def fold_rows(cross: CrossValidated, fit: TransitFit) -> list[Row]:
+    """Each parameter of the fit, and its distribution over the folds."""
+    values, sigma = fit.inversion.values, fit.value_sigma
+    return [
+        [
+            f"{p.name} ({p.unit})" if p.unit else p.name,
+            with_error(values[p.name], sigma[p.name]),
+            *_band(cross.bands.values[p.name], ".4g"),
+        ]
+        for p in fit.inversion.shape.parameters
     ]
-    return parts
 
 
-_MAPS_CAPTION = (
-    "All discs superposed, aligned to the nearest pixel. MPE: the percentage error of a pixel, averaged over the images. "
-    "MAPE: the absolute value of the percentage error, averaged over the images. Beside each map is the same map for "
-    "noise alone, on the same scale. If both maps look similar, noise explains the errors."
-)
+def shape_rows(fit: TransitFit) -> list[Row]:
+    """Other shapes of scatter: their additional parameters, and how much they improve the fit."""
+    rows = []
+    for shape in fit.shapes:
+        added = "; ".join(
+            f"{name} {with_error(value, sigma)}" for name, (value, sigma) in shape.added.items()
+        )
+        held_out = DASH if shape.held_out_gain is None else f"{shape.held_out_gain:+.1f}"
+        rows.append([shape.name, added, f"{shape.gain:.1f}", str(len(shape.added)), held_out])
+    return rows
 
 
-def _summary_row(of: Summary, evaluation: Evaluation) -> list[str]:
+def offset_table(study: DarkOffsetStudy, fit: TransitFit) -> Cells:
+    """The changes of the fit by each dark offset."""
+    names, radii = fit.inversion.shape.names, (0.5, 10.0, 100.0)
+    header = ["offset (DN)", *(f"change of {n}" for n in names), "largest change of a weight (%)"]
+    header += [*(f"change of light beyond {r:g} px (points)" for r in radii), "images"]
+    rows = []
+    for offset in study.offsets:
+        moved = [f"{offset.values[n] - study.nominal[n]:+.3g}" for n in names]
+        row = [f"{offset.offset_dn:+g}", *moved, f"{np.abs(offset.weight_change_pct).max():.1f}"]
+        curve = np.interp(radii, study.curve_radii_px, offset.total_curve_change_points)
+        rows.append([*row, *(f"{points:+.2f}" for points in curve), str(offset.images)])
+    return header, rows
+
+
+def summary_rows(evaluation: Evaluation) -> list[Row]:
+    """The residuals of each pointing, then of all images."""
+    return [_summary_row(one, evaluation) for one in summaries(evaluation)]
+
+
+def _summary_row(of: Summary, evaluation: Evaluation) -> Row:
     frames = [f for f in evaluation.frames if of.fov in (None, f.pointing)]
     largest = max(frames, key=lambda f: abs(f.residual_pct))
     mean_noise_dn_s = math.sqrt(sum(f.noise_dn_s**2 for f in frames)) / len(frames)
@@ -135,108 +159,42 @@ def _summary_row(of: Summary, evaluation: Evaluation) -> list[str]:
     ]
 
 
-def _trends(evaluation: Evaluation) -> list[Part]:
-    found = trends(evaluation)
-    if not found:
-        return []
-    rows = [
-        [
-            str(t.fov),
-            t.against,
-            str(t.images),
-            with_error(t.relative_pct.per_100_px, t.relative_pct.sigma),
-            with_error(t.absolute_dn_s.per_100_px, t.absolute_dn_s.sigma),
-        ]
-        for t in found
-    ]
-    caption = (
-        f"Slopes of the residuals along the detector axes, per {TREND_PX:g} px. The occulter's x and y change together "
-        "along its track. Therefore the slopes along x and along y are not independent."
-    )
+def slope_rows(evaluation: Evaluation) -> list[Row]:
+    """The slopes of the residuals along the detector axes."""
     return [
-        Table(
-            [
-                "pointing",
-                "along",
-                "images",
-                f"slope (% per {TREND_PX:g} px)",
-                f"slope (DN/s per {TREND_PX:g} px)",
-            ],
-            rows,
-            caption,
-        )
+        [
+            str(trend.fov),
+            trend.against,
+            str(trend.images),
+            with_error(trend.relative_pct.per_100_px, trend.relative_pct.sigma),
+            with_error(trend.absolute_dn_s.per_100_px, trend.absolute_dn_s.sigma),
+        ]
+        for trend in trends(evaluation)
     ]
 
 
-def _map_values(maps: Superposed) -> Values:
-    noise = "noise alone"
-    return Values(
-        [
-            Value(
-                "MPE, rms over the disc",
-                f"{maps.mpe_rms_pct:.2f}",
-                unit="%",
-                meaning=f"{noise}: {maps.mpe_noise_rms_pct:.2f} %",
-            ),
-            Value(
-                "MPE, largest of any pixel",
-                f"{maps.mpe_largest_pct:.2f}",
-                unit="%",
-                meaning=f"noise alone, rms over the pixels: {maps.mpe_noise_rms_pct:.2f} %",
-            ),
-            Value(
-                "MAPE, mean over the disc",
-                f"{maps.mape_mean_pct:.2f}",
-                unit="%",
-                meaning=f"{noise}: {maps.mape_noise_mean_pct:.2f} %",
-            ),
-        ]
-    )
-
-
-# --- limits, images, inputs -------------------------------------------------------------------------------
-
-
-def _limits(report: PsfReport) -> list[str]:
-    said = list(report.fit.limits) if report.fit is not None else []
-    said += [f"Not shown: {missing.what}, because {missing.why}" for missing in report.missing]
+def limits_of(report: PsfReport) -> list[str]:
+    """The limits of the data as sentences, and what the report does not show."""
+    limits = list(report.fit.limits) if report.fit is not None else []
+    limits += [f"Not shown: {missing.what}, because {missing.why}" for missing in report.missing]
     if report.given and report.fitted_to_these:
-        said.append(
+        limits.append(
             "the PSF was fitted to these images, so its agreement with them is not an independent test"
         )
     if report.evaluation.left_out:
-        said.append(f"images that could not be evaluated, listed below: {len(report.evaluation.left_out)}")
-    return [one[:1].upper() + one[1:] + "." for one in said] or [
+        limits.append(f"images that could not be evaluated, listed below: {len(report.evaluation.left_out)}")
+    return [one[:1].upper() + one[1:] + "." for one in limits] or [
         "There are no limits beyond the stated errors."
     ]
 
 
-def _images(report: PsfReport) -> list[Part]:
-    frames = report.evaluation.frames
-    header = [
-        *("file", "pointing", "time (min)", "exposure (s)", "x (px)", "y (px)", "dark pixels"),
-        *("observed (DN/s)", "simulated (DN/s)", "residual (%)", "centre (%)"),
-    ]
+def image_rows(report: PsfReport) -> list[Row]:
+    """Every evaluated image."""
     exposure_s = {frame.file: frame.exposure_s for frame in report.transit.frames}
-    table = Table(
-        header,
-        [_image_row(frame, exposure_s[frame.file]) for frame in frames],
-        "Every evaluated image: its time and exposure, the fitted position of its occulter, the number of fully dark "
-        "pixels, and the mean observed and simulated intensity of these pixels. The errors come from noise.",
-    )
-    parts: list[Part] = [Details(f"All {len(frames)} images", (table,))]
-    left_out = report.evaluation.left_out
-    if left_out:
-        why = Table(
-            ["file", "reason"],
-            [[file, reason] for file, reason in left_out.items()],
-            "Images that could not be evaluated.",
-        )
-        parts.append(Details(f"Images that could not be evaluated: {len(left_out)}", (why,)))
-    return parts
+    return [_image_row(frame, exposure_s[frame.file]) for frame in report.evaluation.frames]
 
 
-def _image_row(frame: FrameEvaluation, exposure_s: float) -> list[str]:
+def _image_row(frame: FrameEvaluation, exposure_s: float) -> Row:
     return [
         frame.file,
         str(frame.pointing),
@@ -252,69 +210,10 @@ def _image_row(frame: FrameEvaluation, exposure_s: float) -> list[str]:
     ]
 
 
-def _made_of(report: PsfReport, provenance: dict[str, Any]) -> list[Part]:
-    inputs = inputs_of(report)
-    noise = report.transit.noise
-    exposures = ", ".join(f"{s:g}" for s in inputs["exposures_s"])
-    prepared = inputs["prepared"]
-    data = Values(
-        [
-            Value("images", f"{inputs['images']} of {' x '.join(map(str, inputs['shape']))} px"),
-            Value("exposures", exposures, unit="s"),
-            Value("photon gain", noise.photon_gain_dn, unit="DN", meaning="DN per detected photon, as given"),
-            Value("read noise", noise.read_noise_dn, unit="DN", meaning="rms, as given"),
-            Value(
-                "images with filled pixels",
-                f"{len(prepared['frames'])}",
-                meaning="the pixels were saturated or had no value",
-            ),
-            Value("seed", f"{report.seed}", meaning="random seed of all random samples"),
-        ]
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    one.__name__: one
+    for one in (
+        *(chi2_error, curve_table, fold_rows, image_rows, limits_of),
+        *(offset_table, shape_rows, slope_rows, summary_rows),
     )
-    files = Table(
-        ["file", "SHA-256"], list(report.transit.sha256.items()), "Input files, with the hash of their bytes."
-    )
-    return [
-        data,
-        Values(_algorithm(report)),
-        provenance_values(provenance),
-        Details(f"{len(report.transit.sha256)} input files with their SHA-256", (files,)),
-    ]
-
-
-def _algorithm(report: PsfReport) -> list[Value]:
-    values = [
-        Value(
-            "steps of a reconstruction", f"{INVERSION_STEPS}", meaning="linear iterations, for the evaluation"
-        ),
-        Value(
-            "noise realisations", f"{NOISE_REALISATIONS}", meaning="per image, for the maps of noise alone"
-        ),
-        Value(
-            "fully dark pixels",
-            f"{DARK_MARGIN_PX:g} px and {DARK_MARGIN_SIGMAS:g} sigma of the position",
-            meaning=f"margin inside the edge of the occulter; at least {LEAST_DARK_PIXELS} pixels per image",
-        ),
-    ]
-    if report.fit is not None:
-        rounds = report.fit.inversion.rounds
-        values += [
-            Value(
-                "rounds of the fit",
-                f"{len(rounds)}",
-                meaning="converged" if report.fit.inversion.converged else "not converged",
-            ),
-            Value(
-                "convergence limit",
-                f"{CONVERGED_POINTS:g}",
-                unit="percentage points",
-                meaning="largest change of 1 - encircled energy in a round",
-            ),
-            Value(
-                "grid on which light is counted",
-                f"{REACH_GRID_PX}",
-                unit="px",
-                meaning="side of the square about the source",
-            ),
-        ]
-    return values
+}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from psfcore.drawing.page import PLOT_DPI
-from psfcore.drawing.plots import write_png
+from psfcore.drawing.plots import png_of, points, tidy
 from psfcore.evaluation.evaluation import Evaluation
 from psfcore.evaluation.frame import Superposed
 from psfcore.evaluation.plot import (
@@ -23,7 +22,6 @@ from psfcore.evaluation.plot import (
     draw_slices,
     minutes_of,
     shown_slices,
-    tidy,
 )
 from psfcore.psf import REACH_GRID_PX
 from psfcore.report.report import CrossValidated, PsfReport
@@ -66,7 +64,7 @@ def curves_png(report: PsfReport) -> bytes:
         axes.set_ylim(low, high + 0.45 * (high - low))  # room for the legend
         axes.legend(fontsize=7.5, loc="upper right", frameon=False, ncols=2)
     tidy(charts)
-    return _png(figure)
+    return png_of(figure)
 
 
 def _draw_curve(axes: Any, report: PsfReport, name: str) -> None:
@@ -96,7 +94,7 @@ def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
         np.zeros(shown.size),
         sigma[shown],
         label="fit to all images, ±1 σ",
-        **_points(_COLOURS[name], 3.0),
+        **points(_COLOURS[name], 3.0),
     )
     axes.set(xscale="log", xlim=(_NEAREST_PX, _FARTHEST_PX))
     axes.set(xlabel="Distance R (px)", ylabel="Difference from the fit (points)")
@@ -142,7 +140,7 @@ def _draw_free(curve: Any, spread: Any, report: PsfReport, shells: ShellBands) -
             (low_1, high_1, 1.6, "free shells, 1 and 2 sigma"),
         ):
             span = np.maximum([median - low, high - median], 0.0)
-            style = _points(_FREE, 3.2) | {"elinewidth": width}
+            style = points(_FREE, 3.2) | {"elinewidth": width}
             axes.errorbar(edges[shown], middle, span, label=label, zorder=3, **style)
 
 
@@ -199,7 +197,7 @@ def profile_png(report: PsfReport) -> bytes:
     _plain_ticks(axes)
     axes.legend(fontsize=9, loc="upper right", frameon=False)
     tidy([axes])
-    return _png(figure)
+    return png_of(figure)
 
 
 def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
@@ -224,7 +222,7 @@ def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
     _plain_ticks(axes)
     axes.legend(fontsize=9, loc="upper right", frameon=False)
     tidy([axes])
-    return _png(figure)
+    return png_of(figure)
 
 
 def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
@@ -240,7 +238,7 @@ def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
     axes.set(xlabel="Diffusely scattered light (% of all light)", ylabel="Number of fits")
     axes.legend(fontsize=9, frameon=False)
     tidy([axes])
-    return _png(figure)
+    return png_of(figure)
 
 
 def slices_png(evaluation: Evaluation) -> bytes:
@@ -256,14 +254,14 @@ def slices_png(evaluation: Evaluation) -> bytes:
     for axes in charts[len(shown) :]:
         axes.set_visible(False)
     tidy(charts)
-    return _png(figure)
+    return png_of(figure)
 
 
 def maps_png(maps: Superposed) -> bytes:
     """Maps of MPE and MAPE in the disc, with the maps of noise alone on the same scales."""
     figure, panels = _figure(8.2, 6.8, 2, 2)
     draw_maps(figure, panels, maps)
-    return _png(figure)
+    return png_of(figure)
 
 
 def residuals_png(evaluation: Evaluation) -> bytes:
@@ -291,7 +289,7 @@ def residuals_png(evaluation: Evaluation) -> bytes:
         handles, labels, title="pointing", loc="outside upper center", ncols=8, fontsize=9, frameon=False
     )
     tidy(charts)
-    return _png(figure)
+    return png_of(figure)
 
 
 def intensities_png(evaluation: Evaluation) -> bytes:
@@ -300,7 +298,7 @@ def intensities_png(evaluation: Evaluation) -> bytes:
     draw_centres(charts[0], evaluation.frames)
     draw_absolute(charts[1], evaluation.frames)
     tidy(charts)
-    return _png(figure)
+    return png_of(figure)
 
 
 def offsets_png(study: DarkOffsetStudy) -> bytes:
@@ -313,7 +311,7 @@ def offsets_png(study: DarkOffsetStudy) -> bytes:
         axes.legend(fontsize=7.5, frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
         _plain_ticks(axes)
     tidy(charts)
-    return _png(figure)
+    return png_of(figure)
 
 
 def _figure(
@@ -333,13 +331,3 @@ def _figure(
 def _plain_ticks(axes: Any) -> None:
     """Label ticks as 1, 10, 100 instead of powers of ten."""
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-
-
-def _png(figure: Figure) -> bytes:
-    out = BytesIO()
-    write_png(figure, out)
-    return out.getvalue()
-
-
-def _points(colour: str, size: float) -> dict[str, Any]:
-    return {"fmt": "o", "color": colour, "markersize": size, "elinewidth": 1.0, "markeredgewidth": 0}

@@ -13,7 +13,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from psfcore.drawing.plots import INK, write_png
+from psfcore.drawing.plots import INK, points, tidy, write_png
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.fit import Curve, ShellWeightFits, TransitFit
 from psfcore.scatter.inversion import CONVERGED_POINTS
@@ -62,11 +62,7 @@ def fit_figure(fit: TransitFit) -> Figure:
     across = np.array([f.found.place.x_px for f in fit.inversion.frames])
     _draw_residuals(by_place, fit, across, "Detector x of the occulter (px)", "Residuals by position")
     _draw_rounds(rounds, fit)
-    for axes in (weight, light, guess, by_time, by_place, rounds):
-        axes.set_axisbelow(True)
-        axes.grid(which="major", color="#e2e2e2", linewidth=0.7)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
+    tidy([weight, light, guess, by_time, by_place, rounds])
     return figure
 
 
@@ -165,7 +161,7 @@ def _draw_light(axes: Any, fit: TransitFit) -> None:
         sigma = _sigma_at(curve, radii)
         axes.fill_between(radii, beyond - sigma, beyond + sigma, color=colour, alpha=0.3, linewidth=0)
         axes.plot(radii, beyond, color=colour, linewidth=1.8, label=f"{name}, ±1 σ")
-        axes.errorbar(curve.radii_px, curve.pct, curve.sigma, **_points(colour, 3.5))
+        axes.errorbar(curve.radii_px, curve.pct, curve.sigma, **points(colour, 3.5))
     if fit.published is not None:
         _draw_published_light(axes, fit.published)
     axes.set(xscale="log", xlim=(_NEAREST_PX, _FARTHEST_PX), ylim=(0, None))
@@ -206,7 +202,7 @@ def _draw_residuals(axes: Any, fit: TransitFit, where: Vector, label: str, title
     size = 5.5 if len(frames) < _MANY_IMAGES else 3.5
     for n, fov in enumerate(sorted(set(fovs.tolist()))):
         here = fovs == fov
-        style = _points(_POINTINGS[n % len(_POINTINGS)], size)
+        style = points(_POINTINGS[n % len(_POINTINGS)], size)
         axes.errorbar(where[here], residual[here], noise[here], label=f"pointing {fov}", **style)
     top = 1.12 * float((np.abs(residual) + noise).max(initial=1e-3))
     axes.set(ylim=(-top, 1.3 * top), xlabel=label, ylabel="Residual: simulated - observed (%)", title=title)
@@ -295,7 +291,3 @@ def _mark_field(axes: Any, fit: TransitFit) -> None:
     field = max(fit.transit.shape)
     if field < _FARTHEST_PX:
         axes.axvspan(field, _FARTHEST_PX, color="#f0f0f0", zorder=0, linewidth=0, label="beyond the field")
-
-
-def _points(colour: str, size: float) -> dict[str, Any]:
-    return {"fmt": "o", "color": colour, "markersize": size, "elinewidth": 1.0, "markeredgewidth": 0}

@@ -13,7 +13,7 @@ from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, as_problems
 from service.http.quotas import check_rows
 from service.http.state import Shared
-from service.views.changes import PastChange
+from service.views import PastChange
 from workers.catalogue.contexts import NAME, Pin
 from workers.catalogue.tables import PsfContextRow
 from workers.contract.requests import ContextName, Identity

@@ -42,7 +42,7 @@ from service.api.jobs import find as find_job
 from service.http.callers import Caller, Reading, still_let_in
 from service.http.problems import RESPONSES
 from service.http.state import Shared
-from service.views.jobs import JobView
+from service.views import JobView
 from workers.catalogue.followed.rows import MOST, Followable, Followed, Place, State
 from workers.contract.bulk import BULK_ENDED, BulkPhase
 from workers.contract.phases import Phase

@@ -13,7 +13,7 @@ from service.http.callers import Reading, Submitting
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES
 from service.http.state import Shared
-from service.views.products import ProductView
+from service.views import ProductView
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.requests import Identity
 from workers.files.collection import files_of, remove_unnamed

@@ -13,7 +13,7 @@ from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, Problem, as_problems, problem
 from service.http.quotas import check_room
 from service.http.state import Shared
-from service.views.jobs import Estimate, JobView
+from service.views import Estimate, JobView
 from workers.catalogue.tables import JobRow
 from workers.contract.kinds import KINDS, JobRequest, queue_of
 from workers.contract.phases import Phase

@@ -10,7 +10,7 @@ from service.api.jobs import submit_job
 from service.http.callers import Reading, Submitting
 from service.http.problems import RESPONSES
 from service.http.state import Shared
-from service.views.jobs import JobView
+from service.views import JobView
 from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.kinds import KINDS
 from workers.contract.requests import Identity, Rerun

@@ -16,8 +16,7 @@ from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, as_problems
 from service.http.quotas import check_rows
 from service.http.state import Shared, State
-from service.views.changes import PastChange
-from service.views.psfs import was_certified
+from service.views import PastChange, was_certified
 from workers.catalogue.affected import Affected, Place
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import PsfRow

@@ -18,7 +18,7 @@ from service.http.callers import Caller, Reading, Submitting
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, Problem, as_problems, problem
 from service.http.state import Shared
-from service.views.psfs import PsfView
+from service.views import PsfView
 from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, PsfRow

@@ -10,8 +10,7 @@ from service.http.callers import Reading, Submitting
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES
 from service.http.state import Shared
-from service.views.reports import ReportView
-from service.views.transits import TransitDetails, TransitView
+from service.views import ReportView, TransitDetails, TransitView
 from workers.catalogue.tables import ReportRow, TransitRow
 from workers.contract.requests import Identity
 

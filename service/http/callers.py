@@ -11,7 +11,7 @@ A browser adds the cookie by itself, so a page of another site could try to use 
 - ``service.http.guard`` refuses every change whose ``Sec-Fetch-Site`` or ``Origin`` names another site.
 - If a change by cookie has neither of the two headers, the request must contain the form token of the session, which only
   pages of this service know: in the header ``X-Form-Token``. Pages also accept the field ``form_token`` of a form
-  (``service.pages.visitors``). All other routes, UWS included, look at headers alone and read no body for this check.
+  (``service.pages.login``). All other routes, UWS included, look at headers alone and read no body for this check.
 """
 
 from __future__ import annotations

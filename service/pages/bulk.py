@@ -1,4 +1,4 @@
-"""The pages of bulk runs: the list and the start of a run, its progress, its results as a contact sheet, and its failed images."""
+"""The pages of bulk runs: list, start and check of a run, its progress, its results as a contact sheet, and its failed images."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ from collections.abc import Sequence
 from pathlib import PurePath
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Form, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse, RedirectResponse
-from pydantic import ValidationError
 
 from service.api.bulk import (
     LOOK_FROM,
+    BulkEstimate,
     BulkId,
     BulkLine,
     BulkView,
     Failed,
     cancel_bulk,
     delete_bulk,
+    estimate_bulk,
     find,
     get_bulk,
     list_bulks,
@@ -32,19 +33,24 @@ from service.http.callers import Caller
 from service.http.paging import Cursor, following, number, place
 from service.http.problems import Problem
 from service.http.state import Shared, State
-from service.pages.parts import archive, methods
-from service.pages.parts.forms import wrong_fields
-from service.pages.parts.sentences import of_error
+from service.pages.forms import Sent, SentForm, checked, chosen_method, text, usual_steps
+from service.pages.login import PageBulk, PageReading
 from service.pages.rendering import page, short
-from service.pages.visitors import PageBulk, PageReading
+from service.pages.sentences import of_error, of_problem
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.bulk_progress import MOST_EXPLAINED
 from workers.catalogue.bulk_tables import BulkItemRow
-from workers.catalogue.tables import ProductRow
+from workers.catalogue.psfs import PsfFilter
+from workers.catalogue.tables import ProductRow, PsfContextRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, BulkRequest, ItemState
+from workers.contract.layout import FIELDS
+from workers.files import archive
 
 PER_PAGE, PER_SHEET = 20, 24
 MOST_STARTED = 1000  # images of one run that is started from the form
+MOST_CHOICES = 50  # PSFs and contexts that a form offers
+MOST_REFUSED = 20  # refused images that the page shows
+OF_FIELDS = (404, 409, 422)  # statuses of problems that the person can solve in the form
 CHANGES = {"pause": pause_bulk, "resume": resume_bulk, "retry": retry_bulk, "cancel": cancel_bulk}
 # The phases in which each change is allowed. A retry also needs failed images.
 ALLOWED_IN = {
@@ -55,41 +61,38 @@ ALLOWED_IN = {
     "delete": DELETABLE,
 }
 Order = Literal["worst", "bulk"]
+# The form of a run of files in a folder.
+NAMES = ("pattern", "choice", "name", "method", "steps", "folder", "only", "layout")
+LAYOUT_EXAMPLE = "{telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits"
+_PSF_NAMES = {"psf": "psf_id", "context": "context"}
 router = APIRouter(prefix="/bulk", include_in_schema=False)
+
+
+# --- start ------------------------------------------------------------------------------------------------
 
 
 @router.get("")
 def bulk_list(request: Request, caller: PageReading, state: Shared, cursor: Cursor = None) -> Response:
-    """The bulk runs, newest first, and the form that starts one."""
-    found = list_bulks(request, caller, state, limit=PER_PAGE, cursor=cursor)
+    """The bulk runs, newest first, and the forms that start one."""
+    runs = list_bulks(request, caller, state, limit=PER_PAGE, cursor=cursor)
     without = state.catalogue.bulks.progress.without_product(caller.owner, MOST_STARTED + 1)
     return page(
         request,
         "bulks.html",
-        runs=[(line, _pace(line, caller, state)) for line in found.items],
-        next=found.next,
+        runs=[(line, _pace(line, caller, state)) for line in runs.items],
+        next=runs.next,
         first_page=cursor is None,
         images=len(without[:MOST_STARTED]),
         more=len(without) > MOST_STARTED,
-        asked=archive.shown({}),
-        **archive.choices(caller, state),
-        **archive.folders(state.settings),
         may=Scope.BULK in caller.scopes,
+        **_form({}, caller, state),
     )
 
 
 @router.post("/start")
-def start(
-    response: Response,
-    caller: PageBulk,
-    state: Shared,
-    choice: Annotated[str, Form()] = "",
-    name: Annotated[str, Form()] = "",
-    method: Annotated[str, Form()] = "",
-    steps: Annotated[str, Form()] = "",
-) -> Response:
-    """Start a run of the uploaded images that have no product, and show it. choice: ``psf:ID`` or ``context:ID``."""
-    psf = archive.chosen_psf(choice)
+def start(response: Response, caller: PageBulk, state: Shared, form: SentForm) -> Response:
+    """Start a run of the uploaded images that have no product, and show it."""
+    parts = _common_parts(form)
     images = state.catalogue.bulks.progress.without_product(caller.owner, MOST_STARTED)
     if not images:
         raise Problem(
@@ -97,18 +100,103 @@ def start(
             "nothing-to-deconvolve",
             "expected uploaded images without a product; each of your images has one: upload other images first",
         )
-    parameters = {"method": methods.chosen({"method": method, "steps": steps})}
-    wanted = {**psf, "images": list(images), "name": name, "parameters": parameters}
+    body: BulkRequest = checked(BulkRequest, {**parts, "images": list(images)})
+    return RedirectResponse(f"/bulk/{submit_bulk(body, response, caller, state).id}", 303)
+
+
+@router.post("/check")
+def check_folder_run(request: Request, caller: PageBulk, state: Shared, form: SentForm) -> Response:
+    """Show what the run of files in a folder would do, and the form again. Nothing is started."""
     try:
-        body = BulkRequest.model_validate(wanted)
-    except ValidationError as error:
-        wrong = {str(found["loc"][0]) for found in error.errors() if found["loc"]}
-        if "parameters" in wrong:
-            raise wrong_fields(error, BulkRequest, above=len(("parameters",))) from error
-        advice = "a name of at most 80 letters in one line" if "name" in wrong else "a PSF of the list"
-        raise Problem(422, "invalid-request", f"expected {advice}: go back and correct the form") from error
-    made = submit_bulk(body, response, caller, state)
-    return RedirectResponse(f"/bulk/{made.id}", 303)
+        estimate = estimate_bulk(_folder_run(form), caller, state)
+    except Problem as problem:
+        return _check_page(request, form, caller, state, problem=problem)
+    return _check_page(request, form, caller, state, estimate=estimate)
+
+
+@router.post("/files")
+def start_folder_run(
+    request: Request, response: Response, caller: PageBulk, state: Shared, form: SentForm
+) -> Response:
+    """Start the run of files in a folder, and show it. If the form is refused, it is shown again with the reason."""
+    try:
+        run = submit_bulk(_folder_run(form), response, caller, state)
+    except Problem as problem:
+        return _check_page(request, form, caller, state, problem=problem)
+    return RedirectResponse(f"/bulk/{run.id}", 303)
+
+
+def _check_page(
+    request: Request,
+    form: Sent,
+    caller: Caller,
+    state: State,
+    *,
+    estimate: BulkEstimate | None = None,
+    problem: Problem | None = None,
+) -> Response:
+    """The page of a checked run. Raises a problem that the person cannot solve in the form."""
+    if problem is not None and problem.status not in OF_FIELDS:
+        raise problem
+    refused = [] if estimate is None else estimate.refused[:MOST_REFUSED]
+    return page(
+        request,
+        "archive_run.html",
+        status=200 if problem is None else problem.status,
+        estimate=estimate,
+        refused=[(one.source, of_error(one.error.code, one.error.message)) for one in refused],
+        problem=None if problem is None else of_problem(problem),
+        **_form(form, caller, state),
+    )
+
+
+def _form(form: Sent, caller: Caller, state: State) -> dict[str, Any]:
+    """What the forms show that start a run: their fields, PSFs, contexts, methods, folders, and fields of a layout."""
+    settings = state.settings
+    return {
+        "asked": {name: text(form, name) for name in NAMES},
+        "psfs": state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_CHOICES),
+        "contexts": state.catalogue.page(PsfContextRow, owner=caller.owner, limit=MOST_CHOICES),
+        "methods": usual_steps(),
+        "roots": [str(one) for one in archive.roots(settings.bulk_roots)],
+        "output_roots": [str(one) for one in archive.roots(settings.bulk_output_roots)],
+        "layout_fields": FIELDS,
+        "layout_example": LAYOUT_EXAMPLE,
+    }
+
+
+def _common_parts(form: Sent) -> dict[str, Any]:
+    """The name, PSF or context (``psf:ID`` or ``context:ID``) and method of a run. Raises ``Problem`` 422."""
+    kind, _, identity = text(form, "choice").partition(":")
+    if kind not in _PSF_NAMES:
+        raise Problem(
+            422, "invalid-request", "expected a PSF or a context for the run: go back and choose one"
+        )
+    method = {"method": chosen_method(form)}
+    return {_PSF_NAMES[kind]: identity, "name": text(form, "name"), "parameters": method}
+
+
+def _folder_run(form: Sent) -> BulkRequest:
+    """The request for a run of files in a folder. Raises ``Problem`` 422, which names each wrong field."""
+    pattern, folder = text(form, "pattern"), text(form, "folder")
+    if not pattern:
+        raise Problem(
+            422, "invalid-request", "expected a pattern that names files, for example /archive/2025/*.fits"
+        )
+    if not folder and (text(form, "layout") or text(form, "only")):
+        raise Problem(
+            422,
+            "invalid-request",
+            "expected an output folder, because names of files and products only in the folder need one: "
+            "enter the folder, or leave these fields empty",
+        )
+    output = {"folder": folder, "only": bool(text(form, "only")), "layout": text(form, "layout") or None}
+    values = {"files": [{"glob": pattern}], "output": output if folder else None, **_common_parts(form)}
+    body: BulkRequest = checked(BulkRequest, values)
+    return body
+
+
+# --- a run ------------------------------------------------------------------------------------------------
 
 
 @router.get("/{bulk_id}")

@@ -1,33 +1,57 @@
-"""The first page, where an image is dropped, and the uploads from it."""
+"""The first page, where an image is dropped; and the page of an image: its header, its PSF, the estimate, and the start of its deconvolution."""
 
 from __future__ import annotations
 
 import hashlib
 import shutil
 import tempfile
+from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import RedirectResponse
+from fastapi.responses import JSONResponse, RedirectResponse
 
 from psfcore.fits.header import read_summary
 from psfcore.instruments.files import instrument_names
 from service.api.images import ImageView, upload_image
+from service.api.jobs import EstimateView, estimate_job, submit_job
 from service.http.callers import Caller
+from service.http.problems import Problem
 from service.http.quotas import Allowed
 from service.http.state import Shared, State
+from service.pages.forms import (
+    Sent,
+    SentForm,
+    deconvolution,
+    image_address,
+    job_request,
+    shown_options,
+    text,
+    usual_steps,
+)
 from service.pages.jobs import job_lines
-from service.pages.rendering import page, short
-from service.pages.visitors import PageReading, PageSubmitting
-from service.views.jobs import JobView
-from service.views.products import ProductView
-from workers.catalogue.tables import ImageRow, JobRow, ProductRow
+from service.pages.login import PageReading, PageSubmitting
+from service.pages.rendering import duration, page, short
+from service.pages.sentences import of_problem
+from service.views import JobView, ProductView
+from workers.catalogue.psfs import PsfFilter
+from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow
+from workers.contract.phases import Phase
+from workers.contract.requests import Identity
+from workers.intake.psf_choice import ChosenPsf
 from workers.intake.uploads import image_row
 
 SAMPLE = "sample.fits"
 LATEST = 6
+MOST_PSFS = MOST_PRODUCTS = 50
+# Statuses of problems that other options of the form can solve.
+OF_OPTIONS = (404, 409, 413, 422)
+TO_ALLOW = ("channel-mismatch", "already-deconvolved", "psf-as-image")
+SURE = "If you are sure, allow it below."
+START, OPEN, CHECK = "Start", "Open the product", "Check and start"
 router = APIRouter(include_in_schema=False)
 
 
@@ -100,3 +124,149 @@ def _add_sample(state: State, caller: Caller) -> ImageRow:
             copy, digest, image_row(caller.owner, digest, copy.stat().st_size, SAMPLE, summary)
         )
     return row
+
+
+# --- an image ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Checked:
+    """The result of a check of the options. lines: sentences, the most important first. button: the button's text."""
+
+    good: bool
+    lines: tuple[str, ...]
+    button: str
+    problem: Problem | None = None
+
+    @property
+    def code(self) -> str:
+        """The code of the problem; empty if there is none."""
+        return "" if self.problem is None else self.problem.code
+
+
+@router.get("/images/{image_id}")
+def image(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """The image, its PSF and the estimate for the options in the query."""
+    row = state.row(ImageRow, image_id, caller.owner)
+    asked = request.query_params
+    checked = _checked(image_id, asked, caller, state)
+    psfs = _psfs(text(asked, "psf_id"), caller, state)
+    products = state.catalogue.page(ProductRow, owner=caller.owner, limit=MOST_PRODUCTS, image_id=image_id)
+    return page(
+        request,
+        "image.html",
+        image=row,
+        facts=_facts(row),
+        checked=checked,
+        ways={} if checked.problem is None else checked.problem.more,
+        psfs=psfs,
+        unknown=checked.code == "no-psf-for-instrument",
+        products=[product_line(ProductView.of(product)) for product in products],
+        methods=usual_steps(),
+        asked=shown_options(asked),
+    )
+
+
+@router.get("/images/{image_id}/check")
+def check(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """The check of the options in the query, for the script of the page."""
+    state.row(ImageRow, image_id, caller.owner)
+    found = _checked(image_id, request.query_params, caller, state)
+    return JSONResponse(
+        {"good": found.good, "lines": found.lines, "button": found.button, "code": found.code}
+    )
+
+
+@router.post("/images/{image_id}/start")
+def start(
+    image_id: Identity, response: Response, caller: PageSubmitting, state: Shared, form: SentForm
+) -> Response:
+    """Start the deconvolution with the options of the form, and go to its job.
+
+    If the options are refused, the page of the image is shown again, with these options and the reason.
+    """
+    try:
+        job = submit_job(deconvolution(image_id, form), response, caller, state)
+    except Problem as problem:
+        if problem.status not in OF_OPTIONS:
+            raise
+        return RedirectResponse(image_address(image_id, form), 303)
+    return RedirectResponse(f"/jobs/{job.id}", 303)
+
+
+@router.post("/images/{image_id}/build")
+def build(
+    image_id: Identity, response: Response, caller: PageSubmitting, state: Shared, form: SentForm
+) -> Response:
+    """Build the PSF of an instrument; then the page of the image is shown with this PSF."""
+    build = job_request("psf-build", {"instrument": text(form, "instrument")})
+    job = submit_job(build, response, caller, state)
+    if job.phase == Phase.COMPLETED and job.result is not None:
+        return RedirectResponse(f"/images/{image_id}?psf_id={job.result.rpartition('/')[2]}", 303)
+    return RedirectResponse(f"/jobs/{job.id}?image={image_id}", 303)
+
+
+def product_line(product: ProductView) -> dict[str, Any]:
+    """The entry of a product in the list of the products of an image."""
+    done = product.details["steps_done"]
+    return {
+        "id": product.id,
+        "told": f"{product.details['method']['name']}, {done} step{'' if done == 1 else 's'}, PSF {product.psf_version}",
+        "created_at": product.created_at,
+    }
+
+
+def _psfs(chosen: str, caller: Caller, state: State) -> list[PsfRow]:
+    """The PSFs that the form offers: the newest, and the chosen one."""
+    found = list(state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_PSFS))
+    if chosen and chosen not in [psf.id for psf in found]:
+        row = state.catalogue.get(PsfRow, chosen, caller.owner)
+        found += [] if row is None else [row]
+    return found
+
+
+def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> Checked:
+    try:
+        found = estimate_job(deconvolution(image_id, asked), caller, state)
+    except Problem as problem:
+        if problem.status not in OF_OPTIONS:
+            raise
+        advice = (SURE,) if problem.code in TO_ALLOW else ()
+        return Checked(False, (of_problem(problem), *advice), CHECK, problem)
+    return Checked(True, tuple(_lines(found)), OPEN if found.existing else START)
+
+
+def _lines(found: EstimateView) -> list[str]:
+    assert found.psf is not None
+    why = found.psf.why.replace("The request names this PSF.", "You chose this PSF.")
+    lines = [f"{_psf(found.psf)}. {why}"]
+    if found.existing:
+        return [*lines, "This product exists already."]
+    waiting = ""
+    if found.waiting_before:
+        waiting = f", after {found.waiting_before} other job{'' if found.waiting_before == 1 else 's'}"
+    seconds = found.estimate.seconds
+    time = duration(seconds).capitalize() if seconds < 1 else f"About {duration(seconds)}"
+    return [*lines, f"{time} and {found.estimate.memory_mib} MiB{waiting}."]
+
+
+def _psf(psf: ChosenPsf) -> str:
+    status = "" if psf.status is None else f" ({psf.status})"
+    return f"PSF {psf.name}{f' {psf.version}' if psf.version else ''}{status}"
+
+
+def _facts(row: ImageRow) -> list[tuple[str, str]]:
+    """The properties of the image that its header states: name and value."""
+    header, line = row.summary, image_line(row)
+    ny, nx = header["shape"]
+    scale = header.get("cdelt1")
+    facts = {
+        "Telescope": str(line["telescope"]),
+        "Observed": str(line["observed"]),
+        "Size": f"{nx} x {ny} px",
+        "Pixel scale": f"{abs(scale):.4g} arcsec" if scale else "not in the header",
+        "Exposure": f"{header['exposure_s']:g} s" if header.get("exposure_s") else "not in the header",
+        "Unit": header.get("unit") or "not in the header (BUNIT)",
+        "Id": row.id,
+    }
+    return list(facts.items())

@@ -14,11 +14,11 @@ from service.api.jobs import JobId, cancel_job, get_job, list_jobs
 from service.http.callers import Caller
 from service.http.paging import Cursor, Listing
 from service.http.state import Shared, State
-from service.pages.parts import options
-from service.pages.parts.sentences import of_error
+from service.pages.forms import address_of
+from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import page, page_of
-from service.pages.visitors import PageReading, PageSubmitting
-from service.views.jobs import JobView
+from service.pages.sentences import of_error
+from service.views import JobView
 from workers.contract.phases import Phase
 from workers.contract.requests import Identity
 
@@ -94,7 +94,7 @@ def _again(view: JobView) -> str | None:
     """The address where the request can be changed and started again."""
     # A job that was not started yet has the parameters that the client sent, and some may be missing.
     whole = {"image_id", "psf_id", "method"} <= view.parameters.keys()
-    return options.address_of(view.parameters) if view.kind == "deconvolve" and whole else None
+    return address_of(view.parameters) if view.kind == "deconvolve" and whole else None
 
 
 def result_page(result: str, image: str | None) -> str:

@@ -13,8 +13,8 @@ from service.http.callers import Caller
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
+from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import page
-from service.pages.visitors import PageReading, PageSubmitting
 from workers.catalogue.access.keys import LABEL_LENGTH, MEANINGS, OWNER_RULE, Scope
 
 PER_PAGE = 50

@@ -15,11 +15,11 @@ from service.api.pixels import prepare_image
 from service.http import downloads
 from service.http.problems import Problem
 from service.http.state import Shared, State
-from service.pages.parts import options
-from service.pages.parts.sentences import of_problem
+from service.pages.forms import address_of
+from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import number, page
-from service.pages.visitors import PageReading, PageSubmitting
-from service.views.products import ProductView
+from service.pages.sentences import of_problem
+from service.views import ProductView
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow
 from workers.contract.requests import Identity
 from workers.intake.deprecated import CODE, deprecation
@@ -102,7 +102,7 @@ def _warnings(details: dict[str, Any], *, without: str | None) -> list[str]:
 def _again(row: ProductRow, *, psf_id: str | None = None) -> str:
     """The page of the image, with the options of the product. psf_id: another PSF; empty: the one that the service chooses."""
     other = {} if psf_id is None else {"psf_id": psf_id, "picked_for": None, "psf_recipe": None}
-    return options.address_of({**row.details["parameters"], **other})
+    return address_of({**row.details["parameters"], **other})
 
 
 def _changed(details: dict[str, Any]) -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""Makes pages from templates.
+"""Makes pages from templates, and the page of an error.
 
 A page may load scripts and styles from this service alone, and no script may turn text into markup
 (``require-trusted-types-for``). Therefore templates hold no inline scripts or styles, and scripts build elements.
@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from functools import cache
 from typing import Any
 
-from fastapi import Request
+from fastapi import Request, Response
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
@@ -19,7 +19,8 @@ from markupsafe import Markup
 from service.http.callers import Caller
 from service.http.state import state_of
 from service.pages import assets
-from service.pages.parts.sentences import plain
+from service.pages.forms import number_field
+from service.pages.sentences import of_error, plain
 from workers.settings import software_version
 
 POLICY = (
@@ -28,6 +29,25 @@ POLICY = (
 )
 SHORT = 12  # letters of an id that a page shows
 PLAIN_BELOW = 1e6  # larger numbers are shown with a power of ten
+TITLES = {
+    403: "This key does not allow that",
+    404: "There is nothing here",
+    410: "The file is lost",
+    413: "This is too large",
+    415: "The service cannot read this file",
+    421: "This host name is not served",
+    429: "Too many requests",
+    503: "The service cannot answer now",
+    507: "The disk of the service is full",
+}
+TITLES_OF_CODES = {
+    "cross-site": "This request came from another site",
+    "form-token-missing": "This form is too old",
+}
+# Other pages of this address would be refused too.
+WITHOUT_LINKS = {421}
+# The image was stored before these errors, or its page still shows it.
+KEPT = "Nothing is lost: your earlier uploads are kept, and you need not send them again."
 
 
 def page(
@@ -75,7 +95,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.globals |= {"asset": assets.address, "version": software_version()}
+    made.globals |= {"asset": assets.address, "number_field": number_field, "version": software_version()}
     made.filters |= {
         "short": short,
         "date": date,
@@ -148,3 +168,34 @@ def percent(value: float | None) -> str:
 def page_of(address: str) -> str:
     """The address of the page for an address of the API: ``/products/ID`` for ``/v1/products/ID``."""
     return address.removeprefix("/v1")
+
+
+# --- the page of an error ---------------------------------------------------------------------------------
+
+
+def problem_page(
+    request: Request, status: int, code: str, detail: str, fields: Mapping[str, Any]
+) -> Response:
+    """The page of an error."""
+    usual = "The service failed" if status >= 500 else "The service cannot do that"
+    title = TITLES_OF_CODES.get(code) or TITLES.get(status) or usual
+    kept = KEPT if status in (429, 500, 503, 507) else ""
+    return page(
+        request,
+        "problem.html",
+        status=status,
+        told_status=status,
+        title=title,
+        detail=_told(request, code, detail, fields),
+        code=code,
+        kept=kept,
+        linked=status not in WITHOUT_LINKS,
+    )
+
+
+def _told(request: Request, code: str, detail: str, fields: Mapping[str, Any]) -> str:
+    if code == "http-404":
+        return f"Nothing is at {request.url.path}. Choose a page above."
+    if any(str(one["at"]).startswith("path/") for one in fields.get("errors", [])):
+        return f"{request.url.path} is not the address of a page. Copy the whole address, or choose a page above."
+    return of_error(code, detail, fields)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import get_args
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse, RedirectResponse
@@ -12,30 +12,24 @@ from service.api.transits import get_transit, list_transits, upload_transit
 from service.http.paging import Cursor, Listing
 from service.http.problems import Problem
 from service.http.state import Shared
+from service.pages.forms import SentForm, parameters, start_job
 from service.pages.jobs import TITLES
-from service.pages.parts.forms import Sent, filled, noise, start_job, ticked
+from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import page
-from service.pages.visitors import PageReading, PageSubmitting
 from workers.catalogue.access.keys import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
+from workers.contract.kinds import KINDS
 from workers.contract.requests import CrossValidate, Identity, ShapeName
 
 PER_PAGE = 50
 MOST_PSFS = 200
 MOST_REPORTS = 50
-# The options of each job in its form: fields with a text, and boxes.
-TEXTS = {
-    "psf-fit": ("shape", "seed", "saturation_dn"),
-    "cross-validate": ("shape", "scheme", "runs", "seed", "saturation_dn"),
-    "report": ("psf_id", "seed", "saturation_dn"),
-    "gap-diagnose": ("psf_id", "seed", "saturation_dn"),
-}
-BOXES: dict[str, tuple[str, ...]] = {
-    "psf-fit": ("as_published",),
-    "cross-validate": (),
-    "report": ("dark_offsets", "shapes"),
-    "gap-diagnose": ("correct",),
+# The jobs that use a transit, with the models of their parameters.
+JOBS = {
+    name: kind.parameters
+    for name, kind in KINDS.items()
+    if kind.parameters is not None and "transit_id" in kind.parameters.model_fields
 }
 router = APIRouter(prefix="/transits", include_in_schema=False)
 
@@ -93,20 +87,9 @@ def transit(transit_id: Identity, request: Request, caller: PageReading, state: 
 
 
 @router.post("/{transit_id}/jobs/{kind}")
-async def start(
-    transit_id: Identity, kind: str, request: Request, caller: PageSubmitting, state: Shared
-) -> Response:
+def start(transit_id: Identity, kind: str, caller: PageSubmitting, state: Shared, form: SentForm) -> Response:
     """Start a job on the transit with the options of its form, and go to the job."""
-    return await start_job(kind, _parameters(kind, transit_id, await request.form()), caller, state)
-
-
-def _parameters(kind: str, transit_id: str, form: Sent) -> dict[str, Any]:
-    """The parameters of a job. Raises ``Problem`` 404 for a kind that does not use a transit."""
-    if kind not in TEXTS:
-        raise Problem(404, "no-such-kind", f"expected one of {', '.join(TEXTS)}; got {kind[:40]!r}")
-    return {
-        "transit_id": transit_id,
-        **filled(form, *TEXTS[kind]),
-        **ticked(form, *BOXES[kind]),
-        **noise(form),
-    }
+    if kind not in JOBS:
+        raise Problem(404, "no-such-kind", f"expected one of {', '.join(JOBS)}; got {kind[:40]!r}")
+    values = parameters(JOBS[kind], form) | {"transit_id": transit_id}
+    return start_job(kind, values, caller, state)

@@ -25,7 +25,7 @@ from service.uws import documents
 from service.uws import plain_errors as routing
 from service.uws.parameters import Form, bad, check, integer, kind_of, moment, phase, query_of, resolved
 from service.uws.uploads import SentForm, ids_of, keep
-from service.views.jobs import time_left_s
+from service.views import time_left_s
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.contract.phases import JobError, Phase
 from workers.rows import no_such

@@ -19,7 +19,7 @@ from pydantic import BaseModel, Field
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
-from psfcore.fits.header import FitsLimits, read_summary
+from psfcore.fits.header import read_summary
 from workers.bulk.listing import found_files, no_images
 from workers.bulk.outputs import target_of
 from workers.bulk.runs import new_run, resolved_image

@@ -167,7 +167,7 @@ def _save(
         context.store.temporary() as picture,
     ):
         write_json(text, said)
-        page.write_text(gap_page(found, said).html(), "utf-8")
+        page.write_text(gap_page(found, said), "utf-8")
         picture.write_bytes(gap_png(found, said))
         keep_report(
             context,

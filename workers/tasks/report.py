@@ -9,7 +9,7 @@ import numpy as np
 
 from psfcore.evaluation.plot import evaluation_png
 from psfcore.evaluation.shapes import compare_shapes_by_errors
-from psfcore.report.page import page_of
+from psfcore.report.page import report_page
 from psfcore.report.report import PsfReport, make_report, report_json
 from psfcore.transit.transit import Kernel
 from workers.catalogue.tables import ReportRow
@@ -82,7 +82,7 @@ def _save(
         context.store.temporary() as picture,
     ):
         write_json(text, said)
-        page.write_text(page_of(report, provenance).html(), "utf-8")
+        page.write_text(report_page(report, provenance), "utf-8")
         evaluation_png(report.evaluation, picture, title=report.how_judged, study=report.study)
         keep_report(
             context,

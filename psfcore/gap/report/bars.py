@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from psfcore.drawing.plots import INK
-from psfcore.evaluation.plot import tidy
+from psfcore.drawing.plots import INK, tidy
 from psfcore.gap.report.report import fits_of, percent_words
 
 Report = dict[str, Any]

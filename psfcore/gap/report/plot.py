@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -19,8 +18,7 @@ from matplotlib.patches import Circle, Wedge
 from numpy.typing import NDArray
 
 from psfcore.drawing.page import PLOT_DPI
-from psfcore.drawing.plots import CHANGE, INK, write_png
-from psfcore.evaluation.plot import tidy
+from psfcore.drawing.plots import CHANGE, INK, png_of, tidy
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.cells import RINGS, DiscCells
 from psfcore.gap.report.bars import MOST_EFFECTS, draw_effects, draw_where
@@ -43,7 +41,7 @@ def residuals_png(report: Report) -> bytes:
     """Residuals of the discs' means against detector x, y and time, without and with the named effects."""
     figure = _figure(WIDTH_IN, 3.7)
     draw_residuals(figure, list(figure.subplots(1, 3, sharey=True)), report)
-    return _png(figure)
+    return png_of(figure)
 
 
 def draw_residuals(figure: Any, charts: Sequence[Any], report: Report) -> None:
@@ -86,7 +84,7 @@ def map_png(report: Report) -> bytes:
     figure = _figure(4.95 * panels + 0.6, 4.6)
     charts = list(np.ravel(figure.subplots(1, panels, squeeze=False)))
     draw_map(figure, charts, report)
-    return _png(figure)
+    return png_of(figure)
 
 
 def draw_map(figure: Any, charts: Sequence[Any], report: Report) -> None:
@@ -131,7 +129,7 @@ def cells_png(found: Diagnosis) -> bytes:
     panels = 2 if found.corrected else 1
     figure = _figure(4.2 * panels + 0.9, 4.2)
     draw_cells(figure, list(np.ravel(figure.subplots(1, panels, squeeze=False))), found)
-    return _png(figure)
+    return png_of(figure)
 
 
 def draw_cells(figure: Any, charts: Sequence[Any], found: Diagnosis) -> None:
@@ -220,14 +218,14 @@ def where_png(report: Report) -> bytes:
     """The share of the gap along each axis."""
     figure = _figure(7.4, 0.9 + 0.32 * len(report["where"]))
     draw_where(figure.subplots(), report)
-    return _png(figure)
+    return png_of(figure)
 
 
 def effects_png(report: Report) -> bytes:
     """The closure by each effect on held-out images, best effect first."""
     figure = _figure(WIDTH_IN, 1.1 + 0.34 * min(len(fits_of(report)), MOST_EFFECTS))
     draw_effects(figure.subplots(), report)
-    return _png(figure)
+    return png_of(figure)
 
 
 def slices_png(found: Diagnosis) -> bytes:
@@ -235,7 +233,7 @@ def slices_png(found: Diagnosis) -> bytes:
     panels = 2 if found.corrected else 1
     figure = _figure(4.95 * panels + 0.1, 3.7)
     draw_slices(list(np.ravel(figure.subplots(1, panels, squeeze=False, sharey=True))), found)
-    return _png(figure)
+    return png_of(figure)
 
 
 def draw_slices(charts: Sequence[Any], found: Diagnosis) -> None:
@@ -294,7 +292,7 @@ def simulated_of(found: Diagnosis, n: int, *, with_answer: bool = False) -> NDAr
 
 def gap_png(found: Diagnosis, report: Report) -> bytes:
     """The figure of `gap_figure` as PNG."""
-    return _png(gap_figure(found, report))
+    return png_of(gap_figure(found, report))
 
 
 def gap_figure(found: Diagnosis, report: Report) -> Figure:
@@ -346,9 +344,3 @@ def _legend(pointings: Sequence[int], *, after: bool) -> list[Any]:
 
 def _figure(width_in: float, height_in: float) -> Any:
     return Figure(figsize=(width_in, height_in), dpi=PLOT_DPI, facecolor="white", layout="constrained")
-
-
-def _png(figure: Figure) -> bytes:
-    out = BytesIO()
-    write_png(figure, out)
-    return out.getvalue()

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from psfcore.drawing.plots import INK, write_png
+from psfcore.drawing.plots import INK, tidy, write_png
 from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.cross_validation import Bands, FoldFit, ShellBands
 
@@ -42,11 +42,7 @@ def cross_validation_png(
     draw_curve(panels[-1, 0], bands)
     draw_totals(panels[-1, 1], bands)
     draw_held_out(panels[-1, 2], bands, fov_of)
-    for axes in panels.flat:
-        axes.grid(color="#dddddd", linewidth=0.7)
-        axes.set_axisbelow(True)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
+    tidy(list(panels.flat))
     write_png(figure, path)
 
 

@@ -52,7 +52,7 @@ def plan(
     need not exist: transit.json may state size_px, and the exposure_s of each image.
     """
     from psfcore.gap.planning import limits_of_file
-    from psfcore.gap.report.plan_page import lines, plan_page
+    from psfcore.gap.report.limits import lines, plan_page
 
     with user_errors():
         with progress_bar() as say:
@@ -68,7 +68,7 @@ def plan(
         write_json(json_file, found.as_json(), overwrite=overwrite)
         if output is not None:
             with written(output, overwrite=overwrite) as partial:
-                partial.write_text(plan_page(found).html(), "utf-8")
+                partial.write_text(plan_page(found), "utf-8")
     click.echo("\n".join(lines(found)))
 
 

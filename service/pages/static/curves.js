@@ -9,25 +9,15 @@ const dark = matchMedia("(prefers-color-scheme: dark)");
 const plots = new Map();
 
 /** A number for an axis or the cursor: uPlot itself writes 0.00001 as 0. */
-export function written(value) {
+function written(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
   const size = Math.abs(value);
   return size < 1e-3 || size >= 1e6 ? value.toExponential(2).replace(/\.?0+e/, "e") : String(Number(value.toPrecision(4)));
 }
 
-/** The plot in a figure, once it is drawn. */
-export function plotIn(figure) {
-  return plots.get(figure);
-}
-
-/** Call back when the cursor moves in a plot: place of the row of the table, or null. */
-export function onCursor(figure, listener) {
-  figure.addEventListener("plot-cursor", (event) => listener(event.detail));
-}
-
 /** Move the cursor of a plot to a row of its table. */
-export function moveCursor(figure, row) {
+function moveCursor(figure, row) {
   const { plot, order } = plots.get(figure);
   const at = order.indexOf(row);
   const x = plot.data[0][at];
@@ -171,3 +161,35 @@ dark.addEventListener("change", () => figures.forEach(draw));
 addEventListener("resize", () => {
   for (const figure of figures) plots.get(figure).plot.setSize({ width: figure.querySelector(".area").clientWidth, height: HEIGHT });
 });
+
+/** Link the map of discs with the plot of their residuals: a slider, the map and the plot choose the same disc. */
+function linkDiscs(place) {
+  const figure = place.querySelector("[data-plot]");
+  const slider = document.getElementById("gap-disc");
+  const told = document.getElementById("gap-told");
+  const discs = new Map([...place.querySelectorAll("circle")].map((disc) => [Number(disc.dataset.row), disc]));
+
+  function choose(row) {
+    for (const disc of place.querySelectorAll("circle.chosen")) disc.classList.remove("chosen");
+    discs.get(row).classList.add("chosen");
+    slider.value = row;
+    told.textContent = discs.get(row).dataset.told;
+  }
+
+  document.getElementById("gap-choice").hidden = false;
+  slider.addEventListener("input", () => {
+    choose(Number(slider.value));
+    moveCursor(figure, Number(slider.value));
+  });
+  for (const [row, disc] of discs) {
+    disc.addEventListener("pointerenter", () => {
+      choose(row);
+      moveCursor(figure, row);
+    });
+  }
+  figure.addEventListener("plot-cursor", (event) => event.detail !== null && choose(event.detail));
+  choose(0);
+}
+
+const gap = document.getElementById("gap");
+if (gap !== null) linkDiscs(gap);

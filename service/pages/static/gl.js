@@ -1,9 +1,8 @@
 // Draws sheets of pixels with WebGL2. All numbers that decide what is seen (which texels, which level, which colour) come as tables
-// from geometry.js, stretch.js and colours.js. The shader only looks them up. It averages texels itself, because some phones cannot
+// from view.js and stretch.js. The shader only looks them up. It averages texels itself, because some phones cannot
 // filter float textures.
-import { NO_DATA } from "./colours.js";
-import { texelRanges } from "./geometry.js";
-import { LEVELS } from "./stretch.js";
+import { LEVELS, NO_DATA } from "./stretch.js";
+import { texelRanges } from "./view.js";
 
 export const PLANES = ["before", "after", "quality", "error"];
 const TABLES = ["columns", "rows", "limits", "colours"];

@@ -1,6 +1,6 @@
 // Gets the pixels of the two images from the service, and keeps the parts that the viewer shows.
 import { request } from "./page.js";
-import { partInView } from "./geometry.js";
+import { partInView } from "./view.js";
 
 const LARGEST_WHOLE = 2048; // px; of larger images only the part in view is loaded. Every graphics card supports this texture size
 const NARROW = 600; // px; windows of phones

@@ -1,7 +1,6 @@
 // Checks a transit before it is sent: the name and size of an archive, or transit.json against the schema of the service and the chosen files.
 import { element, json, say, size, told } from "./page.js";
-import { tar } from "./tar.js";
-import { send } from "./sending.js";
+import { send, tar } from "./sending.js";
 
 const form = document.getElementById("upload");
 const archive = document.getElementById("file");

@@ -1,13 +1,10 @@
 // The viewer of a product: the image before and after with one view, one stretch and one readout. The view is in the address.
-import { changes, exactText, levelLimits, LEVELS, percentiles, STRETCHES, valueAt } from "./stretch.js";
-import { CHANGE, colourTable, MAP_NAMES } from "./colours.js";
-import { fitZoom, imageAt } from "./geometry.js";
+import { CHANGE, changes, colourTable, exactText, levelLimits, LEVELS, MAP_NAMES, percentiles, STRETCHES, valueAt } from "./stretch.js";
 import { Renderer } from "./gl.js";
 import { Source } from "./planes.js";
 import { Readout } from "./readout.js";
-import { follow } from "./gestures.js";
-import { addressOf, viewOf } from "./view.js";
-import { element, say, told } from "./page.js";
+import { addressOf, fitZoom, follow, imageAt, viewOf } from "./view.js";
+import { element, say, showHeader, told } from "./page.js";
 
 const MOST_ZOOM = 64;
 const SETTLED_MS = 150;
@@ -388,4 +385,4 @@ try {
   else say(part("viewer-said"), told(error), "error");
 }
 // The header is loaded last, so that the pixels do not wait for it.
-await import("./header.js");
+for (const header of document.querySelectorAll("[data-header]")) showHeader(header);

@@ -15,9 +15,17 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from psfcore.drawing import plots
-from psfcore.drawing.colour_map import EUV_POINTS, NO_DATA, euv_levels, rgb
 from psfcore.drawing.plots import GOLD, preview_png, psf_png, write_png
-from psfcore.drawing.thumbnail import SOFTENING, levels_of, reduced, write_thumbnail
+from psfcore.drawing.thumbnail import (
+    EUV_POINTS,
+    NO_DATA,
+    SOFTENING,
+    euv_levels,
+    levels_of,
+    reduced,
+    rgb,
+    write_thumbnail,
+)
 from psfcore.drawing.units import rate_label, unit_label
 from psfcore.image import Image
 from tests.psfcore.conftest import gaussian, make_psf

@@ -11,8 +11,7 @@ import pytest
 from psfcore.errors import DataError
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.planning import Planned, planned_limits
-from psfcore.gap.report.limits_tables import NOT_FOUND
-from psfcore.gap.report.plan_page import lines, plan_page
+from psfcore.gap.report.limits import NOT_FOUND, lines, plan_page
 from psfcore.gap.verdict.limits import ALIKE, EffectLimits, ParameterLimits
 from psfcore.simulate.plan import HIGH, Plan, default_plan
 from tests.html_page import check_stands_alone, read_page
@@ -83,7 +82,7 @@ def test_a_plan_of_two_images_is_refused() -> None:
 
 def test_text_and_page_name_every_effect_and_pair() -> None:
     plan = planned(ONE)
-    html = plan_page(plan).html()
+    html = plan_page(plan)
     check_stands_alone(html)
     (page,) = (tag.text for tag in read_page(html) if tag.name == "body")
     text = "\n".join(lines(plan))
@@ -105,7 +104,7 @@ def test_a_strength_that_would_not_be_found_is_said() -> None:
         planned(LADDER).limits, effects={"dark_offset": hidden, "wide_halo": strong}, alike=(), untestable={}
     )
     plan = replace(planned(LADDER), left_out={}, limits=limits)
-    text, html = "\n".join(lines(plan)), plan_page(plan).html()
+    text, html = "\n".join(lines(plan)), plan_page(plan)
     assert f"offset: {NOT_FOUND}" in text and "hidden at every plausible size" in text
     assert "share 0.2" in text and "hidden at its likely size" in text
     assert "would show 0 of 2 effects at their likely size; all of them could be told apart" in text

@@ -19,7 +19,7 @@ from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import evaluate
 from psfcore.psf import Psf, crop_or_pad, cumulative_curve
 from psfcore.report import report as report_module
-from psfcore.report.page import page_of
+from psfcore.report.page import report_page
 from psfcore.report.plot import beyond_of
 from psfcore.report.report import PsfReport, make_report, report_json
 from psfcore.scatter import fit
@@ -142,7 +142,7 @@ def test_too_few_images_for_folds_are_evaluated_with_their_own_fit_and_the_page_
     said = {missing.what: missing.why for missing in report.missing}
     assert "at least 6 images" in said["a test on held-out images"]
     assert said["the effect of wrong dark levels"] == "it was not requested"
-    html = page_of(report, PROVENANCE).html()
+    html = report_page(report, PROVENANCE)
     check_stands_alone(html)
     assert "this is not an independent test" in html
 
@@ -172,7 +172,7 @@ def test_the_curve_on_the_page_is_that_of_the_psf() -> None:
 
 
 def test_the_page_shows_every_part_and_every_image() -> None:
-    html = page_of(whole(), PROVENANCE).html()
+    html = report_page(whole(), PROVENANCE)
     check_stands_alone(html)
     tags = read_page(html)
     text = next(t for t in tags if t.name == "body").text
@@ -187,13 +187,13 @@ def test_the_page_shows_every_part_and_every_image() -> None:
     assert all(limit[1:] in text for limit in whole_json()["fit"]["limits"])
 
 
-def test_the_page_of_a_given_psf_lists_what_it_does_not_show_and_why() -> None:
+def test_the_report_page_a_given_psf_lists_what_it_does_not_show_and_why() -> None:
     report = given()
     assert report.given and not report.held_out and not report.fitted_to_these
     residuals = np.array([f.residual_pct / f.noise_pct for f in report.evaluation.frames])
     assert abs(residuals.mean()) < 4 / np.sqrt(residuals.size)
     with blank_figures():
-        html = page_of(report, PROVENANCE).html()
+        html = report_page(report, PROVENANCE)
     check_stands_alone(html)
     text = next(t for t in read_page(html) if t.name == "body").text
     assert "Not shown: other shapes of scatter" in text
@@ -212,6 +212,6 @@ def test_a_malicious_file_name_is_text() -> None:
         evaluation=dataclasses.replace(report.evaluation, frames=judged, left_out={name: name}),
     )
     with blank_figures():
-        html = page_of(changed, {"file": name}).html()
+        html = report_page(changed, {"file": name})
     check_stands_alone(html)
     assert [t.text for t in read_page(html) if t.name == "td"].count(name) == 4

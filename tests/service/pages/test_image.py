@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.pages.parts.options import address_of
-from service.pages.parts.sentences import of_error, plain
+from service.pages.forms import address_of
+from service.pages.sentences import of_error, plain
 from tests.conftest import write_image
 from tests.service.conftest import upload
 

@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 from sqlalchemy import Double, literal_column, update
 
-from service.views.jobs import time_left_s
+from service.views import time_left_s
 from tests.workers.databases import BOTH, change, database
 from tests.workers.jobs import claimed, job_row
 from tests.workers.psf_examples import product

@@ -59,7 +59,7 @@ def html() -> str:
     """The page of the small diagnosis, with small figures, which are quicker to draw."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(gap_plot, "PLOT_DPI", 40)
-        return gap_page(found(), report_of(found())).html()
+        return gap_page(found(), report_of(found()))
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def blank() -> Iterator[None]:
 
 
 def page_of(diagnosis: Diagnosis) -> str:
-    return gap_page(diagnosis, report_of(diagnosis)).html()
+    return gap_page(diagnosis, report_of(diagnosis))
 
 
 def texts(page: str, tag: str) -> list[str]:
@@ -207,7 +207,7 @@ def test_the_bars_mark_the_named_and_the_tied_effects(blank: None) -> None:
         assert sum("(" in label for label in labels) == len(chosen), name
     report = report_of(with_shares(marked["tie of pairs"][0]))
     assert report["ties"] == [["core_blur", "gain_mismatch"]]
-    tie = gap_page(with_shares(marked["tie of pairs"][0]), report).html()
+    tie = gap_page(with_shares(marked["tie of pairs"][0]), report)
     assert "Tied: dark offset, together with core blur or gain mismatch." in text_of(tie)
     pair = page_of(with_shares(marked["pair"][0]))
     effects = [row[0] for row in rows_of(pair) if len(row) == EFFECT_COLUMNS]
@@ -235,7 +235,7 @@ def test_a_malicious_file_name_is_shown_as_text(blank: None) -> None:
     report["images"][0]["file"] = name
     report["cautions"] = [name]
     report["provenance"] = {"file": name}
-    page = gap_page(found(), report).html()
+    page = gap_page(found(), report)
     check_stands_alone(page)
     assert texts(page, "td").count(name) == 1
 

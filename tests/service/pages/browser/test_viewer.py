@@ -15,7 +15,7 @@ from astropy.wcs import WCS
 from numpy.typing import NDArray
 from playwright.sync_api import Page, expect
 
-from psfcore.drawing.colour_map import NO_DATA, euv_levels, rgb
+from psfcore.drawing.thumbnail import NO_DATA, euv_levels, rgb
 from tests.service.pages.browser.conftest import Site, Watch
 from tests.service.pages.browser.products import COORDINATES, Looked, made
 
@@ -218,7 +218,7 @@ def test_each_mode_shows_its_part_of_both_images(page: Page, looked: Looked) -> 
 
 def table(page: Page, name: str) -> NDArray[np.uint8]:
     """The colours of a map [256, 3], as the scripts make them."""
-    found = script(page, "colours.js", f"[...module.colourTable({json.dumps(name)})]")
+    found = script(page, "stretch.js", f"[...module.colourTable({json.dumps(name)})]")
     return np.array(found, dtype=np.uint8).reshape(256, 4)[:, :3]
 
 
@@ -326,7 +326,7 @@ def test_coordinates_equal_those_of_astropy(page: Page, looked: Looked) -> None:
         described = json.dumps([list(card) for card in header.items()])
         pairs = script(
             page,
-            "coordinates.js",
+            "readout.js",
             f"{places}.map((place) => module.coordinates(new Map({described})).of(...place))",
         )
         right = [arcsec(WCS(header), *place) for place in places]

@@ -1,1 +1,0 @@
-"""Code that several pages share: curves with their tables, and forms that start jobs."""

@@ -1,0 +1,313 @@
+"""The pages of PSFs: the list with its forms, and one PSF with its facts, curves, provenance and status."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, get_args
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import RedirectResponse
+from pydantic import ValidationError, validate_call
+from starlette.datastructures import FormData
+
+from psfcore.instruments.files import instrument_names
+from psfcore.tables import lookup
+from service.api.lineage import get_psf_lineage, rerun_psf
+from service.api.psf_curves import get_cutout, tables_of
+from service.api.psf_status import (
+    SeriesChange,
+    SeriesView,
+    StatusChange,
+    change_psf_status,
+    change_series,
+    get_psf_status,
+    get_series,
+    list_affected_by_psf,
+)
+from service.api.psfs import delete_psf, get_psf, list_psfs, psf_filter, upload_psf
+from service.http import downloads
+from service.http.callers import Caller
+from service.http.paging import Cursor, Listing
+from service.http.problems import Problem
+from service.http.state import Shared, State
+from service.pages.forms import SentForm, checked, filled, parameters, start_job, text, wrong_fields
+from service.pages.login import PageCertifying, PageReading, PageSubmitting
+from service.pages.plots import Plot, Series, light_beyond_plot, radial_plot, shown_radii, with_errors
+from service.pages.readings import fit_parameters, fit_plots
+from service.pages.rendering import number, page
+from service.views import PsfView
+from workers.catalogue.access.keys import Scope
+from workers.catalogue.psfs import PsfFilter
+from workers.catalogue.tables import ReportRow
+from workers.contract.requests import Component, Identity, PsfBuild
+from workers.versions.series import TOTAL
+from workers.versions.status import PsfStatus
+from workers.versions.variants import without_variant
+
+PER_PAGE = MOST_OTHERS = 50
+MOST_REPORTS = 10
+CUTOUT_PX = 257
+FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_at")
+router = APIRouter(prefix="/psfs", include_in_schema=False)
+_filter: Callable[..., PsfFilter] = validate_call(psf_filter)
+
+
+@router.get("")
+def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Cursor = None) -> Response:
+    """PSFs, newest first, with the filters of the API."""
+    asked = _asked(request)
+    found = list_psfs(Listing(request, PER_PAGE, cursor), caller, state, _wanted(asked), asked.get("context"))
+    return page(
+        request,
+        "psfs.html",
+        psfs=found.items,
+        next=found.next,
+        asked={name: asked.get(name, "") for name in (*FILTERS, "context")},
+        filtered=bool(asked),
+        statuses=list(PsfStatus),
+        instruments=instrument_names(),
+        components=get_args(Component),
+        usual_size=PsfBuild.model_fields["size"].default,
+        most_bytes=state.settings.max_upload_bytes,
+        may_submit=Scope.SUBMIT in caller.scopes,
+    )
+
+
+@router.post("")
+async def upload(
+    request: Request, response: Response, caller: PageSubmitting, state: Shared, kind: str | None = None
+) -> Response:
+    """Take a PSF from the form, and go to its page. kind: as for the API."""
+    view = await upload_psf(request, response, caller, state, kind=kind)
+    return RedirectResponse(f"/psfs/{view.id}", 303)
+
+
+@router.post("/build")
+def build(caller: PageSubmitting, state: Shared, form: SentForm) -> Response:
+    """Start the build of a PSF from a shipped instrument file, and go to its job."""
+    return start_job("psf-build", parameters(PsfBuild, form), caller, state)
+
+
+def _asked(request: Request) -> dict[str, str]:
+    """The filters of the request that are not empty. A browser also sends the empty fields of a form."""
+    names = (*FILTERS, "context")
+    return {name: text for name in names if (text := request.query_params.get(name, "").strip())}
+
+
+def _wanted(asked: dict[str, str]) -> PsfFilter:
+    """The filter of the catalogue. Raises ``Problem`` 422 for a wrong value."""
+    try:
+        return _filter(**{name: asked[name] for name in FILTERS if name in asked})
+    except ValidationError as error:
+        raise wrong_fields(error, PsfFilter) from error
+
+
+# --- a PSF ------------------------------------------------------------------------------------------------
+
+
+@router.get("/{psf_id}")
+def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """The PSF. Without tables it has no curves; a form then starts the job that makes them."""
+    view = get_psf(psf_id, caller, state)
+    tables, told = _tables(state, caller, psf_id)
+    fit = _fit(state, view)
+    others = state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_OTHERS + 1)
+    status = get_psf_status(psf_id, caller, state)
+    return page(
+        request,
+        "psf.html",
+        psf=view,
+        facts=psf_facts(view),
+        status_view=status,
+        series=_series(state, caller, status.series),
+        plots=[] if tables is None else _plots(tables),
+        resolution=None if tables is None else lookup.curve(tables)["resolution"],
+        no_tables=told,
+        fit=fit,
+        fit_values=[] if fit is None else fit_parameters(fit),
+        fit_plots=[] if fit is None else fit_plots(fit),
+        lineage=get_psf_lineage(psf_id, caller, state),
+        others=[one for one in others if one.id != psf_id][:MOST_OTHERS],
+        rivals=_rivals(state, caller, view),
+        reports=state.catalogue.page(ReportRow, owner=caller.owner, limit=MOST_REPORTS, about_id=psf_id),
+        cutout_px=min(CUTOUT_PX, *view.details["shape"]),
+        may_certify=Scope.CERTIFY in caller.scopes,
+        may_submit=Scope.SUBMIT in caller.scopes,
+    )
+
+
+@router.get("/{psf_id}/products")
+def products(
+    psf_id: Identity, request: Request, caller: PageReading, state: Shared, cursor: Cursor = None
+) -> Response:
+    """The products that were made with the PSF."""
+    found = list_affected_by_psf(psf_id, Listing(request, PER_PAGE, cursor), caller, state)
+    view = get_psf(psf_id, caller, state)
+    return page(request, "psf_products.html", psf=view, products=found.items, next=found.next)
+
+
+@router.get("/{psf_id}/cutout")
+async def cutout(
+    psf_id: Identity,
+    size: Annotated[int, Query(ge=1)],
+    request: Request,
+    caller: PageReading,
+    state: Shared,
+) -> Response:
+    """The central part of the PSF as FITS; an error is shown as a page."""
+    return await get_cutout(psf_id, size, request, caller, state)
+
+
+@router.post("/{psf_id}/status")
+def change(psf_id: Identity, caller: PageCertifying, state: Shared, form: SentForm) -> Response:
+    """Certify the PSF, change its range, deprecate it or name its successor; then show it."""
+    change_psf_status(psf_id, _change(form), caller, state)
+    return RedirectResponse(f"/psfs/{psf_id}", 303)
+
+
+@router.post("/{psf_id}/series")
+def change_interpolation(psf_id: Identity, caller: PageCertifying, state: Shared, form: SentForm) -> Response:
+    """Say whether the PSFs of the PSF's series may be interpolated in time; then show the PSF."""
+    body: SeriesChange = checked(SeriesChange, filled(form, "interpolated", "reason"))
+    series = get_psf_status(psf_id, caller, state).series
+    if series is None:
+        raise Problem(
+            409,
+            "no-series",
+            "expected a PSF of a series; the instrument of this PSF is unknown: upload the PSF again with its instrument",
+        )
+    instrument, channel, kind = series.split("/")
+    change_series(instrument, channel, kind, body, caller, state)
+    return RedirectResponse(f"/psfs/{psf_id}", 303)
+
+
+@router.post("/{psf_id}/tables")
+def make_tables(psf_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
+    """Start the job that makes the tables and the picture, and go to it."""
+    return start_job("psf-tables", {"psf_id": psf_id}, caller, state)
+
+
+@router.post("/{psf_id}/rerun")
+def rerun(psf_id: Identity, response: Response, caller: PageSubmitting, state: Shared) -> Response:
+    """Make the PSF again, and go to the job."""
+    return RedirectResponse(f"/jobs/{rerun_psf(psf_id, response, caller, state).id}", 303)
+
+
+@router.post("/{psf_id}/delete")
+def delete(psf_id: Identity, caller: PageSubmitting, state: Shared) -> Response:
+    """Delete a draft that nothing uses, and go to the list."""
+    delete_psf(psf_id, caller, state)
+    return RedirectResponse("/psfs", 303)
+
+
+def psf_facts(psf: PsfView) -> list[tuple[str, str]]:
+    """The properties of a PSF that a page shows: name and value."""
+    details = psf.details
+    scale, total = details.get("plate_scale_arcsec"), details.get("sum")
+    facts = {
+        "Instrument": psf.instrument or "unknown",
+        "Channel": _channel(psf.channel),
+        "Kind": psf.kind,
+        "Origin": psf.origin,
+        "Size": "{1} x {0} px".format(*details["shape"]),
+        "Pixel scale": f"{scale:.4g} arcsec" if scale else "unknown",
+        "Sum of the weights": number(total, 6),
+        "Components": ", ".join(details.get("components") or []) or "-",
+        "Valid": validity(psf),
+        "Id": psf.id,
+    }
+    return [(name, said) for name, said in facts.items() if said != "-"]
+
+
+def _channel(channel: str | None) -> str:
+    """A channel with its unit, and its variant, if it names one."""
+    if channel is None:
+        return "unknown"
+    plain = without_variant(channel)
+    variant = channel[len(plain) + 1 :]
+    return f"{plain} angstrom" + (f", variant {variant}" if variant else "")
+
+
+def validity(psf: PsfView) -> str:
+    """The range of observation times for which the PSF is certified."""
+    if not psf.was_certified:
+        return "not certified"
+    if psf.valid_from is None and psf.valid_to is None:
+        return "at all times"
+    return f"from {psf.valid_from or 'the beginning'} to {psf.valid_to or 'now and later'}"
+
+
+def profile_series(label: str, profile: Mapping[str, Any], name: str, places: list[int]) -> Series:
+    """The mean weight of one component at each radius. If the PSF was fitted, the errors are included."""
+    return with_errors(label, profile["mean_weight"][name], profile["sigma"].get(name), places)
+
+
+def _tables(state: State, caller: Caller, psf_id: str) -> tuple[Mapping[str, Any] | None, str | None]:
+    """Two results: the tables, and None; or None, and the reason why the PSF has no tables."""
+    try:
+        return tables_of(state, caller, psf_id), None
+    except Problem as problem:
+        if problem.code != "no-tables":
+            raise
+        return None, problem.detail
+
+
+def _plots(tables: Mapping[str, Any]) -> list[Plot]:
+    curve, profile = lookup.curve(tables), lookup.profile(tables)
+    sigma = curve["sigma_points"]
+    beyond = {name: (pct, sigma.get(name)) for name, pct in curve["light_beyond_pct"].items()}
+    radii, names = profile["radius_px"], profile["mean_weight"]
+    places = shown_radii(radii)
+    rings = radial_plot(
+        "Mean weight by radius",
+        "mean weight of a pixel",
+        [radii[at] for at in places],
+        [profile_series(name, profile, name, places) for name in names],
+    )
+    return [rings, light_beyond_plot(curve["radii_px"], beyond)]
+
+
+def _series(state: State, caller: Caller, name: str | None) -> SeriesView | None:
+    """The series of total PSFs with this name; None if there is no such series, or if none of its PSFs was certified."""
+    if name is None:
+        return None
+    instrument, channel, kind = name.split("/")
+    if kind != TOTAL:
+        return None
+    try:
+        return get_series(instrument, channel, kind, caller, state)
+    except Problem as problem:
+        if problem.code != "no-such-series":
+            raise
+        return None
+
+
+def _fit(state: State, view: PsfView) -> dict[str, Any] | None:
+    """The report on the fit; None if the PSF was not fitted. Raises ``Problem`` 410 if the report is lost."""
+    digest = view.details.get("report_sha256")
+    if digest is None:
+        return None
+    said: dict[str, Any] = json.loads(downloads.found(state.store, digest).read_bytes())
+    return said
+
+
+def _rivals(state: State, caller: Caller, view: PsfView) -> list[PsfView]:
+    """The other certified PSFs of the same series. This PSF can supersede them, or one of them can be its successor."""
+    wanted = PsfFilter(
+        instrument=view.instrument, channel=view.channel, kind=view.kind, status=PsfStatus.CERTIFIED
+    )
+    rows = state.catalogue.psfs.page(wanted, caller.owner, limit=MOST_OTHERS)
+    return [PsfView.of(row) for row in rows if row.id != view.id]
+
+
+def _change(form: FormData) -> StatusChange:
+    """The change of status in a form. Raises ``Problem`` 422 for a wrong field."""
+    values: dict[str, Any] = filled(
+        form, "status", "reason", "version", "successor", "instrument", "channel", "kind"
+    )
+    if text(form, "with_range"):
+        values |= {name: text(form, name) or None for name in ("valid_from", "valid_to")}
+    values["supersedes"] = [one for one in form.getlist("supersedes") if isinstance(one, str)]
+    body: StatusChange = checked(StatusChange, values)
+    return body

@@ -1,1 +1,0 @@
-"""The pages of PSFs: their list, one PSF, and two PSFs compared."""

@@ -1,0 +1,156 @@
+"""The page of a report: the sentence, the sections of the stored page, and curves from the stored numbers."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from markupsafe import Markup
+
+from service.http import downloads
+from service.http.problems import Problem
+from service.http.state import Shared, State
+from service.pages import readings
+from service.pages.jobs import TITLES
+from service.pages.login import PageReading
+from service.pages.rendering import page
+from service.views import ReportView
+from workers.catalogue.tables import ReportRow
+from workers.contract.requests import Identity
+
+KIND_TITLES = {
+    "report": TITLES["report"],
+    "cross-validation": TITLES["cross-validate"],
+    "gap": TITLES["gap-diagnose"],
+    "rerun": TITLES["rerun"],
+}
+MOST_KEPT = 4  # stored pages that stay in memory, with their figures
+# The parts of a page that ``psfcore/drawing/page.html`` made. All texts in it are escaped, so no text contains a tag.
+_SECTION = re.compile(r'<section id="s\d+">(.*?)</section>', re.DOTALL)
+_PNG = re.compile(r'src="data:image/png;base64,([^"]*)"')
+router = APIRouter(prefix="/reports/{report_id}", include_in_schema=False)
+
+
+@dataclass(frozen=True)
+class StoredPage:
+    """A stored page. Its sections contain addresses of figures; figures: PNG files in reading order."""
+
+    title: Markup
+    lead: Markup
+    footer: Markup
+    sections: tuple[Markup, ...]
+    figures: tuple[bytes, ...]
+
+
+@router.get("")
+def report(report_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """The report. It has the same sections as the HTML page that can be downloaded."""
+    row = state.row(ReportRow, report_id, caller.owner)
+    stored = _stored(state, row)
+    said = _said(state, row)
+    view = ReportView.of(row)
+    return page(
+        request,
+        "report.html",
+        report=view,
+        title=stored.title if stored is not None else KIND_TITLES.get(row.kind, row.kind),
+        sentence=stored.lead if stored is not None else row.details.get("sentence", ""),
+        sections=[] if stored is None else stored.sections,
+        footer="" if stored is None else stored.footer,
+        gap=readings.gap_map(said) if row.kind == "gap" else None,
+        plots=_plots(row.kind, said),
+        tables=_tables(row.kind, said),
+        about=_about(said, row),
+    )
+
+
+@router.get("/figures/{number}")
+def figure(
+    report_id: Identity, number: int, request: Request, caller: PageReading, state: Shared
+) -> Response:
+    """A figure of the report as PNG; the first has the number 1."""
+    stored = _stored(state, state.row(ReportRow, report_id, caller.owner))
+    figures = () if stored is None else stored.figures
+    if not 1 <= number <= len(figures):
+        raise Problem(
+            404, "no-such-figure", f"expected a figure from 1 to {len(figures)} of the report; got {number}"
+        )
+    png = figures[number - 1]
+    headers = {"ETag": f'"{hashlib.sha256(png).hexdigest()}"', "Cache-Control": downloads.KEPT}
+    if downloads.known(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return Response(png, media_type="image/png", headers=headers)
+
+
+def _stored(state: State, row: ReportRow) -> StoredPage | None:
+    """The stored page; None if the report has none. Raises ``Problem`` 410 if it is lost."""
+    digest = row.details.get("page_sha256")
+    if digest is None:
+        return None
+    return read_stored(downloads.found(state.store, digest), f"/reports/{row.id}/figures")
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def read_stored(path: Path, figures_at: str) -> StoredPage:
+    """The parts of a stored page, which stands alone: without its style, and with its figures as files of their own.
+
+    figures_at: the beginning of the addresses of the figures; "/" and the number of the figure follow. A file of the
+    store never changes, so its content can be kept in memory. Raises OSError.
+    """
+    figures: list[bytes] = []
+
+    def picture(source: re.Match[str]) -> str:
+        figures.append(base64.b64decode(source[1]))
+        return f'src="{figures_at}/{len(figures)}" loading="lazy"'
+
+    html = _PNG.sub(picture, path.read_text("utf-8"))
+    ends = (("<h1>", "</h1>"), ('<p class="lead">', "</p>"), ("<footer><p>", "</p>"))
+    title, lead, footer = (Markup(html.partition(begin)[2].partition(end)[0]) for begin, end in ends)
+    sections = tuple(Markup(one) for one in _SECTION.findall(html))
+    return StoredPage(title, lead, footer, sections, tuple(figures))
+
+
+def _said(state: State, row: ReportRow) -> Mapping[str, Any]:
+    said: dict[str, Any] = json.loads(downloads.found(state.store, row.file_sha256, row.bytes).read_bytes())
+    return said
+
+
+def _plots(kind: str, said: Mapping[str, Any]) -> list[readings.Plot]:
+    if kind == "cross-validation":
+        return readings.cross_validation_plots(said)
+    if kind == "report" and "fit" in said:
+        return readings.fit_plots(said["fit"])
+    return []
+
+
+def _tables(kind: str, said: Mapping[str, Any]) -> list[tuple[str, tuple[str, ...], list[readings.Row]]]:
+    """Tables from the numbers of a report without a stored page: title, headings, rows."""
+    if kind == "cross-validation":
+        heads = ("Parameter", "Median", "One standard deviation", "Two standard deviations")
+        return [("Parameters over all folds", heads, readings.band_parameters(said))]
+    if kind == "rerun":
+        return [
+            ("Arrays", ("Array", "Values", "Largest difference"), readings.rerun_arrays(said)),
+            ("What differed when they were made", ("Property", "First", "New"), readings.rerun_makers(said)),
+        ]
+    return []
+
+
+def _about(said: Mapping[str, Any], row: ReportRow) -> list[tuple[str, str]]:
+    """Links to the transit, product or PSF on which the report is, and to the PSFs of its job: (text, address)."""
+    found = [("Transit", f"/transits/{row.transit_id}")] if row.transit_id else []
+    if row.kind == "rerun" and row.about_id:
+        of = said["of"]
+        found.append((f"The {'PSF' if of == 'psf' else of} that was made again", f"/{of}s/{row.about_id}"))
+    for name, title in (("psf_id", "PSF of the request"), ("corrected_psf_id", "Corrected PSF")):
+        if row.details.get(name):
+            found.append((title, f"/psfs/{row.details[name]}"))
+    return found
