@@ -167,7 +167,7 @@ FAULTS = (
           "found = sha256_of(path)\n", "found = path.name\n",
           ("tests/workers/files/test_store.py",), ("tests/service/operation/test_disk.py",)),
     Fault("intake-end-of-validity-included", "workers/catalogue/psfs.py",
-          "PsfRow.valid_to > wanted.valid_at", "PsfRow.valid_to >= wanted.valid_at",
+          "PsfRow.valid_to > filters.valid_at", "PsfRow.valid_to >= filters.valid_at",
           ("tests/workers/catalogue/test_psfs.py", "tests/workers/intake"), ("tests/service/api/psfs",)),
     Fault("bulk-image-of-a-living-worker-taken", "workers/catalogue/bulks.py",
           "BulkItemRow.state == ItemState.TAKEN, ~held.exists()", "BulkItemRow.state == ItemState.TAKEN",

@@ -28,7 +28,7 @@ from service.http.callers import Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
 from service.views.jobs import JobView
-from workers.catalogue.followed.rows import MOST, Followable, Followed, Place, State
+from workers.catalogue.followed import MOST, Followable, Followed, Place, State
 
 # Rows that ended up to this number of seconds before the last look are read again: they may have been committed late,
 # and the clocks of the machines that write the ends of bulk runs may differ from the clock of the database.

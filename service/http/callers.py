@@ -39,8 +39,7 @@ from service.http.guard import SAFE_METHODS
 from service.http.problems import Problem
 from service.http.rates import Bucket
 from service.http.state import Shared, State, state_of
-from workers.catalogue.access.keys import OWNER, OWNER_RULE, KeyRefused, Scope
-from workers.catalogue.access.sessions import SessionRow
+from workers.catalogue.access import OWNER, OWNER_RULE, KeyRefused, Scope, SessionRow
 from workers.catalogue.tables import DEFAULT_OWNER, KeyRow
 
 ACT_FOR = "X-Owner"  # names the owner that an administrator acts for

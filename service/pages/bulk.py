@@ -37,7 +37,7 @@ from service.pages.parts.forms import wrong_fields
 from service.pages.parts.sentences import of_error
 from service.pages.rendering import page, short
 from service.pages.visitors import PageBulk, PageReading
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.bulk_progress import MOST_EXPLAINED
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, BulkRequest, ItemState

@@ -13,7 +13,7 @@ from service.http.state import Shared, State
 from service.pages.parts.sentences import of_error
 from service.pages.rendering import page
 from service.pages.visitors import PageVisiting
-from workers.catalogue.access.keys import KeyRefused
+from workers.catalogue.access import KeyRefused
 
 DAY_S = 86_400
 # The longest time that browsers keep a cookie. The service decides when the session ends, and can say so to a browser that

@@ -16,7 +16,7 @@ from service.pages.jobs import TITLES
 from service.pages.parts.forms import Sent, filled, noise, start_job, ticked
 from service.pages.rendering import page
 from service.pages.visitors import PageReading, PageSubmitting
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
 from workers.contract.requests import CrossValidate, Identity, ShapeName

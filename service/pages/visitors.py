@@ -24,7 +24,7 @@ from service.http.guard import SAFE_METHODS
 from service.http.problems import Problem
 from service.http.state import Shared
 from service.pages.rendering import page
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 
 FORM = "application/x-www-form-urlencoded"
 

@@ -7,8 +7,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from workers.catalogue.tables import PsfRow
-from workers.versions.status import PsfStatus
-from workers.versions.validity import iso
+from workers.versions import PsfStatus, iso
 
 
 def was_certified(row: PsfRow) -> bool:

@@ -29,7 +29,7 @@ from service.vo.asked import (
 from service.vo.columns import PRODUCTS, PSFS, Table
 from service.vo.names import PRODUCT, PSF, did
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
-from workers.versions.validity import iso, seconds
+from workers.versions import iso, seconds
 
 LINKS_TYPE = f"{VOTABLE_TYPE};content=datalink"
 LINKS_STANDARD = "ivo://ivoa.net/std/DataLink#links-1.1"

@@ -11,7 +11,7 @@ import re
 from service.http.callers import Caller
 from service.http.state import State
 from workers.catalogue.tables import ProductRow, PsfRow
-from workers.provenance import NAMES
+from workers.lineage import NAMES
 
 PRODUCT, PSF = "product", "psf"
 _ID = re.compile(r"[0-9a-f]{64}")

@@ -12,7 +12,7 @@ from workers.contract.bulk import Output
 from workers.contract.layout import MOST_IN_PATH, Value, laid_out
 from workers.files import archive as archive_files
 from workers.settings import Settings
-from workers.versions.validity import seconds
+from workers.versions import seconds
 
 
 def target_of(

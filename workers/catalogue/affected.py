@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Select, exists, select, tuple_, union_all
+from sqlalchemy import Select, exists, select, union_all
 from sqlalchemy.orm import Session
 
-from workers.catalogue.database import Database
+from workers.catalogue.database import Database, newest_first
 from workers.catalogue.tables import ProductRow, PsfRow
-from workers.versions.status import PsfStatus
+from workers.versions import PsfStatus
 
 PSFS_AT_A_TIME = 16
 MOST_SUCCESSORS = 32
@@ -88,9 +88,7 @@ def _next_psfs(owner: str, superseded: bool, after: str) -> Select[Any]:
 def _products(psf: PsfRow, limit: int, after: tuple[float, str] | None = None) -> Select[Any]:
     """Products of a PSF, newest first."""
     query = select(ProductRow).where(ProductRow.owner == psf.owner, ProductRow.psf_id == psf.id)
-    if after is not None:
-        query = query.where(tuple_(ProductRow.created_at, ProductRow.id) < after)
-    return query.order_by(ProductRow.created_at.desc(), ProductRow.id.desc()).limit(limit)
+    return newest_first(query, ProductRow, limit, after)
 
 
 def _first_products(session: Session, psfs: Sequence[PsfRow], limit: int) -> list[ProductRow]:

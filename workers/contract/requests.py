@@ -17,7 +17,7 @@ from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise_figures import NoiseFigures
 from workers.contract.methods import Method, Parameters, RichardsonLucy
 from workers.contract.option import Option
-from workers.versions.validity import TIME, iso, seconds
+from workers.versions import TIME, iso, seconds
 
 ContextName = Annotated[
     str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="id or name of a context")

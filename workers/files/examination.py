@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.named_files import Kept
+from workers.catalogue.owners import FileRow
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
 from workers.files.intact import files_of
 from workers.files.store import FileState, Store
@@ -26,7 +26,7 @@ NAMES: dict[type[Any], str] = {
 class Fault:
     """A row of the catalogue with a lost or damaged file. files: SHA-256 and state of each lost or damaged file."""
 
-    row: Kept
+    row: FileRow
     files: tuple[tuple[str, FileState], ...]
 
     @property
@@ -54,7 +54,7 @@ def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iter
                 yield Fault(row, tuple(bad))
 
 
-def _files(row: Kept) -> Iterator[tuple[str, int | None]]:
+def _files(row: FileRow) -> Iterator[tuple[str, int | None]]:
     match row:
         case ImageRow() | TransitRow():
             yield row.id, row.bytes

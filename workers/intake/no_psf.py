@@ -11,9 +11,7 @@ from psfcore.instruments.unknown import agreement_with_image, channel_of, same_a
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import PsfRow
-from workers.versions.series import TOTAL, UPLOADED
-from workers.versions.status import PsfStatus
-from workers.versions.variants import without_variant
+from workers.versions import TOTAL, UPLOADED, PsfStatus, without_variant
 
 MOST_NAMED = 20
 MOST_SEARCHED = 500

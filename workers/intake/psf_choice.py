@@ -15,15 +15,21 @@ from typing import Any
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import NOW
-from workers.catalogue.interpolated.series import Ends
 from workers.catalogue.psfs import PsfFilter
+from workers.catalogue.series import Ends
 from workers.catalogue.tables import PsfContextRow, PsfRow
 from workers.contract.requests import PsfInterpolate
-from workers.versions.interpolation import rounded
-from workers.versions.series import TOTAL, channel_of, instrument_of, series_of
-from workers.versions.status import PsfStatus
-from workers.versions.validity import iso, seconds
-from workers.versions.variants import variant_for
+from workers.versions import (
+    TOTAL,
+    PsfStatus,
+    channel_of,
+    instrument_of,
+    interpolated_time,
+    iso,
+    seconds,
+    series_of,
+    variant_for,
+)
 
 MOST_NAMED = 20
 
@@ -44,7 +50,7 @@ class Found:
         ends, at = self.ends, self.wanted.valid_at
         if ends is None or at is None:
             return None
-        time = rounded(ends.before_time, ends.after_time, at)
+        time = interpolated_time(ends.before_time, ends.after_time, at)
         return PsfInterpolate(
             before_psf_id=ends.before_psf_id,
             before_time=iso(ends.before_time) or "",

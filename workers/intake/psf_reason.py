@@ -10,8 +10,7 @@ from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.requests import Deconvolve, PsfInterpolate
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.intake.psf_choice import seen_through
-from workers.versions.interpolation import name_of
-from workers.versions.series import TOTAL, series_of
+from workers.versions import TOTAL, interpolated_name, series_of
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ def reasoned_psf(
     if resolved.psf_interpolation is not None:
         before = catalogue.get(PsfRow, resolved.psf_interpolation.before_psf_id, owner)
         assert before is not None  # resolve() has found it
-        name, version = name_of(before.instrument, resolved.psf_id)
+        name, version = interpolated_name(before.instrument, resolved.psf_id)
         why = _why_interpolated(resolved.psf_interpolation, catalogue, owner) + "; the job makes it first."
         return ReasonedPsf(resolved.psf_id, name, version, None, why)
     # resolve() has found the image and the PSF, or the recipe of the PSF

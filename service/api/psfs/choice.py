@@ -17,8 +17,7 @@ from service.views.psfs import PsfView
 from workers.catalogue.tables import ImageRow
 from workers.contract.requests import Identity
 from workers.intake.psf_choice import MOST_NAMED, Found, look, look_for_image
-from workers.versions.series import TOTAL, WORD
-from workers.versions.validity import iso
+from workers.versions import TOTAL, WORD, iso
 
 router = APIRouter(tags=["PSFs"], responses=RESPONSES)
 

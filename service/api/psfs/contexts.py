@@ -18,7 +18,7 @@ from service.views.changes import PastChange
 from workers.catalogue.contexts import NAME, Pin
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow
 from workers.contract.requests import ContextName, Identity
-from workers.versions.validity import TIME, Validity, iso
+from workers.versions import TIME, Validity, iso
 
 router = APIRouter(prefix="/v1/contexts", tags=["contexts"], responses=RESPONSES, route_class=KeyFirst)
 

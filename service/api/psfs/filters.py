@@ -10,8 +10,7 @@ from psfcore.errors import DataError
 from service.http.problems import Problem, problem
 from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
-from workers.versions.status import PsfStatus
-from workers.versions.validity import TIME, seconds
+from workers.versions import TIME, PsfStatus, seconds
 
 PRINTABLE = r"^[^\x00-\x1f\x7f]+$"
 TEXT = r"^[^\x00-\x08\x0b-\x1f\x7f]*$"  # for free text: PostgreSQL cannot store NUL

@@ -17,7 +17,7 @@ from service.http.quotas import check_rows
 from service.http.state import Shared, State
 from service.views.changes import PastChange
 from workers.catalogue.tables import SeriesChangeRow
-from workers.versions.series import WORD
+from workers.versions import WORD
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/series", tags=["PSFs"], responses=RESPONSES, route_class=KeyFirst)

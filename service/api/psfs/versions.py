@@ -25,8 +25,7 @@ from workers.catalogue.tables import PsfRow
 from workers.contract.requests import Identity
 from workers.files.collection import remove_unnamed
 from workers.intake.uploads import uploaded_psf_row
-from workers.versions.series import WORD
-from workers.versions.status import PsfStatus
+from workers.versions import WORD, PsfStatus
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)

@@ -13,7 +13,7 @@ from sqlalchemy import make_url
 
 from service.cli.operator.database import opened_catalogue
 from service.cli.options import DATA, read_settings
-from workers.catalogue.access.keys import MEANINGS, OWNER, Scope
+from workers.catalogue.access import MEANINGS, OWNER, Scope
 from workers.catalogue.tables import KeyRow
 
 UNITS_S = {"h": 3600, "d": 86_400, "w": 604_800}

@@ -9,7 +9,7 @@ import click
 from service.cli.operator.database import opened_catalogue
 from service.cli.operator.key import Duration
 from service.cli.options import DATA, read_settings, user_errors
-from workers.catalogue.access.keys import OWNER, OWNER_RULE
+from workers.catalogue.access import OWNER, OWNER_RULE
 from workers.catalogue.owners import MIB, Usage
 from workers.files.collection import collect
 from workers.files.examination import examine

@@ -11,8 +11,7 @@ import click
 
 from service.cli.connection import CONTEXT, ID, SERVER, id_argument, remote, short, whole_id, whole_ids
 from service.cli.options import FILE, JSON, OUTPUT, progress_bar, user_errors, write_json, writes_files
-from workers.versions.series import TOTAL
-from workers.versions.status import PsfStatus
+from workers.versions import TOTAL, PsfStatus
 
 if TYPE_CHECKING:
     from service.client.http import Client

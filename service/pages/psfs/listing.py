@@ -17,10 +17,10 @@ from service.http.state import Shared
 from service.pages.parts.forms import fields, filled, start_job, wrong_fields
 from service.pages.rendering import page
 from service.pages.visitors import PageReading, PageSubmitting
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.contract.requests import Component, PsfBuild
-from workers.versions.status import PsfStatus
+from workers.versions import PsfStatus
 
 PER_PAGE = 50
 FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_at")

@@ -29,13 +29,11 @@ from service.pages.parts.readings import fit_parameters, fit_plots
 from service.pages.rendering import number, page
 from service.pages.visitors import PageCertifying, PageReading, PageSubmitting
 from service.views.psfs import PsfView
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
 from workers.contract.requests import Identity
-from workers.versions.series import TOTAL
-from workers.versions.status import PsfStatus
-from workers.versions.variants import without_variant
+from workers.versions import TOTAL, PsfStatus, without_variant
 
 MOST_OTHERS = 50
 MOST_REPORTS = 10

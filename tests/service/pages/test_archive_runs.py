@@ -17,7 +17,7 @@ from tests.conftest import write_image
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
 from workers.bulk.turns import keep_turns
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.contract.layout import FIELDS
 from workers.files.store import Store

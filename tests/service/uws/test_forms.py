@@ -20,7 +20,7 @@ from tests.service.keyed import keyed
 from tests.service.uws.test_uws import BUILD, JOBS, created, document, parameters
 from tests.service.vo.made import add_product
 from tests.transit_files import write_transit
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.tables import ImageRow
 from workers.files.store import sha256_of
 from workers.settings import Settings

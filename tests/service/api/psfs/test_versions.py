@@ -1,6 +1,6 @@
 """PSF versions over HTTP: certified, searched, pinned, superseded; consequences for images and products.
 
-The rules themselves are tested in tests/workers/catalogue and tests/workers/versions.
+The rules themselves are tested in tests/workers/catalogue and tests/workers/test_versions.py.
 """
 
 from __future__ import annotations
