@@ -50,8 +50,8 @@ from service.pages.psfs import comparison as psf_comparison
 from service.pages.psfs import listing as psf_listing
 from service.pages.psfs import version as psf_page
 from service.pages.reports import shown as report_page
-from service.uws import routes as uws
 from service.vo import cutouts, interfaces, links, lists
+from service.vo import jobs as uws
 from workers import traces
 from workers.catalogue.catalogue import Catalogue
 from workers.files.modes import private_folder

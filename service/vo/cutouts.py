@@ -23,9 +23,8 @@ from service.http.callers import Reading
 from service.http.problems import Problem, problem
 from service.http.quotas import check_disk
 from service.http.state import Shared, State
-from service.uws.plain_errors import PlainErrors
-from service.vo.asked import Fields, described, one, refused
-from service.vo.names import row_named
+from service.vo.lists import row_named
+from service.vo.parameters import Fields, PlainErrors, one, query, refuse
 from workers.catalogue.tables import ProductRow
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ router = APIRouter(prefix="/vo", tags=["VO"], route_class=PlainErrors)
         },
         "4XX": {"content": {"text/plain": {}}, "description": "What was expected, what was received, and what to do."},
     },
-    openapi_extra=described(
+    openapi_extra=query(
         ID="id of a product, or its name urn:heliopsf:product:...",
         **{name.upper(): numbers for name, numbers in SHAPES.items()},
         FRAME=FRAME,
@@ -71,7 +70,7 @@ async def get_region(request: Request, caller: Reading, state: Shared, fields: F
     POLYGON."""
     names = fields.get("id", [])
     if len(names) != 1:
-        refused("ID", "of one product", f"{len(names)} of them" if names else None)
+        refuse("ID", "of one product", f"{len(names)} of them" if names else None)
     shape, numbers, frame = _asked(fields)
     row = await run_in_threadpool(row_named, state, caller, names[0])
     if not isinstance(row, ProductRow):
@@ -122,17 +121,17 @@ def _asked(fields: Mapping[str, list[str]]) -> tuple[str, tuple[float, ...], Fra
     given = [name for name in SHAPES if name in fields]
     if len(given) != 1:
         got = " and ".join(name.upper() for name in given) if given else None
-        refused("CIRCLE, BOX or POLYGON", "exactly one of them", got)
+        refuse("CIRCLE, BOX or POLYGON", "exactly one of them", got)
     [shape] = given
     text = fields[shape][0]
     numbers = _numbers(shape, text)
     sizes = {"circle": numbers[2:], "box": numbers[2:]}.get(shape, ())
     if any(size <= 0 for size in sizes):
-        refused(shape.upper(), f"{SHAPES[shape]}: sizes above 0", text)
+        refuse(shape.upper(), f"{SHAPES[shape]}: sizes above 0", text)
     named = one(fields, "frame") or FRAMES[0]
     frame = next((known for known in FRAMES if known == named), None)
     if frame is None:
-        refused("FRAME", " or ".join(FRAMES), named)
+        refuse("FRAME", " or ".join(FRAMES), named)
     return shape, numbers, frame
 
 
@@ -143,7 +142,7 @@ def _numbers(shape: str, text: str) -> tuple[float, ...]:
     except ValueError:
         numbers = ()
     if len(numbers) not in counts[shape] or not all(map(math.isfinite, numbers)):
-        refused(shape.upper(), f"finite numbers: {SHAPES[shape]}", text)
+        refuse(shape.upper(), f"finite numbers: {SHAPES[shape]}", text)
     return numbers
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from astropy.io.votable import tree
 
-from service.uws.documents import NO_XML
 from service.vo.columns import Column
+from service.vo.parameters import NO_XML
 from workers.settings import software_version
 
 VERSION = "1.4"

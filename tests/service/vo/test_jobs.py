@@ -15,7 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from service.uws import routes as uws
+from service.vo import jobs as uws
 from tests.conftest import SMALL_INSTRUMENT
 from tests.service.conftest import upload
 from tests.service.serving import in_own_loop

@@ -17,8 +17,8 @@ from vo_models.uws.types import ExecutionPhase
 from psfcore.transit.archive import pack
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
-from tests.service.uws.test_uws import BUILD, JOBS, created, document, parameters
 from tests.service.vo.made import add_product
+from tests.service.vo.test_jobs import BUILD, JOBS, created, document, parameters
 from tests.transit_files import write_transit
 from workers.catalogue.access import Scope
 from workers.catalogue.tables import ImageRow
@@ -111,7 +111,7 @@ REFUSED = [
     ("id and file", {**IMAGE, "image_id": "0" * 64}, 400, "expected one image; got several"),
     ("bad parameter", {**IMAGE, "error_draws": "many"}, 400, "error_draws: "),
     ("no KIND", {"UPLOAD": "image,param:f"}, 400, "expected KIND"),
-    ("field twice", {**IMAGE, "KIND": ["deconvolve", "deconvolve"]}, 400, "expected 'kind' once"),
+    ("field twice", {**IMAGE, "KIND": ["deconvolve", "deconvolve"]}, 400, "expected KIND once"),
 ]  # fmt: skip
 
 

@@ -1,4 +1,7 @@
-"""Files that UWS clients send with the parameters of a job: ``UPLOAD=name,param:part`` and a part of the form with the file.
+"""Reads and checks the forms of UWS clients: the parameters of a job, and files that are sent with them.
+
+Each parameter of a job is a text in a form; it is checked against the contract. A file is in a part of a multipart form, and
+``UPLOAD=name,param:part`` names it.
 
 Citation: IVOA DALI 1.1 (17 May 2017), standard parameter UPLOAD. The name says what the file is, and determines which
 parameter of the job gets the id of the file: ``UPLOAD=image,param:f`` adds the image in the part ``f``, and sets
@@ -10,23 +13,38 @@ clients could use it to reach machines that they cannot reach themselves.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, BinaryIO
+from typing import Annotated, Any, BinaryIO
 
 from fastapi import Depends, Request
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails, from_json
 
+from psfcore.errors import DataError
 from service.http import uploads
 from service.http.callers import Caller, Submitting
 from service.http.forms import FORM, FormPart, Piece, media_type_of
-from service.http.quotas import Allowed
+from service.http.problems import Problem
+from service.http.quotas import Allowed, check_room
 from service.http.state import Shared, State
-from service.uws.parameters import MAX_FORM_BYTES, bad, multipart_pairs, read_form, single
-from workers.contract.kinds import KINDS
+from service.vo.parameters import (
+    MAX_FORM_BYTES,
+    NO_XML,
+    bad,
+    multipart_pairs,
+    read_pairs,
+    shown,
+    single,
+)
+from workers.contract.kinds import KINDS, REQUESTS
+from workers.contract.suggestions import did_you_mean, explained
 from workers.files.store import Store
+from workers.intake import estimates
+from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row
 
 # The names in UPLOAD, and for each name the parameter that gets the id of the file.
@@ -34,6 +52,88 @@ NAMES = {"image": "image_id", "mask": "mask_id", "transit": "transit_id", "psf":
 INLINE = "param:"
 MOST_FILES = len(NAMES)
 COUNTED_BYTES = 2**20  # bytes that are counted against the caller's allowance in one step
+
+
+def kind_of(form: dict[str, str]) -> str:
+    """Remove KIND from a form and return it. Raises ``Problem`` if clients cannot request jobs of this kind."""
+    kind = form.pop("kind", None)
+    if kind is None or kind not in REQUESTS:
+        hint = did_you_mean(kind or "", REQUESTS)
+        raise bad(f"expected KIND, one of {', '.join(REQUESTS)}; got {shown(kind)}{hint}")
+    return kind
+
+
+def check(kind: str, given: dict[str, str]) -> None:
+    """Raise ``Problem`` for a wrong parameter of a PENDING job; parameters may still be missing."""
+    _values, errors = _understood(kind, given)
+    wrong = [e for e in errors if e["loc"] and not (e["type"] == "missing" and len(e["loc"]) == 1)]
+    if wrong:
+        raise _wrong(kind, wrong)
+
+
+def resolved(
+    state: State, owner: str, kind: str, given: dict[str, str]
+) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    """Resolved parameters of a job, the identity of its result, and its estimate.
+
+    Raises ``Problem`` 400 if the parameters are wrong or the job would exceed the limits on memory or time, and 507 if the
+    owner's quota is full.
+    """
+    check_room(state, owner)
+    values, errors = _understood(kind, given)
+    if errors:
+        raise _wrong(kind, errors)
+    asked: Any = REQUESTS[kind].model_validate({"kind": kind, "parameters": values})
+    try:
+        parameters, key = resolve(asked, state.catalogue, owner, added_effects=state.settings.added_effects)
+        return parameters, key, estimates.checked(kind, parameters, state.catalogue, owner, state.settings)
+    except DataError as error:
+        raise bad(error.message) from error
+
+
+def _understood(kind: str, given: dict[str, str]) -> tuple[dict[str, Any], list[ErrorDetails]]:
+    """The parameters, and an error for each parameter that the contract does not accept.
+
+    Each parameter is a text. If the contract accepts the text as it is (a name, a number, true or false), the text is
+    kept. Otherwise the text is read as JSON.
+    """
+    for name, text in given.items():
+        if NO_XML.search(text):
+            raise bad(f"{name}: expected characters that XML can hold, got {shown(text)}")
+    values: dict[str, Any] = dict(given)
+    for name in {str(error["loc"][0]) for error in _errors(kind, values) if error["loc"]} & given.keys():
+        with suppress(ValueError):
+            values[name] = from_json(given[name], allow_inf_nan=False)
+    return values, _errors(kind, values)
+
+
+def _errors(kind: str, values: dict[str, Any]) -> list[ErrorDetails]:
+    try:
+        _model(kind).model_validate(values)
+    except ValidationError as error:
+        return error.errors(include_url=False)
+    return []
+
+
+def _wrong(kind: str, errors: Iterable[ErrorDetails]) -> Problem:
+    lines = []
+    for error, message in explained(errors, _model(kind)):
+        name = "/".join(map(str, error["loc"])) or kind
+        if error["type"] == "missing":
+            message = "expected a value, got none"
+        elif error["type"] not in ("extra_forbidden", "union_tag_invalid"):
+            message = f"{message}; got {shown(error['input'])}"
+        lines.append(f"{name}: {message}")
+    return bad("\n".join(lines))
+
+
+def _model(kind: str) -> type[BaseModel]:
+    model = KINDS[kind].parameters
+    assert model is not None
+    return model
+
+
+# Files ----------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -56,27 +156,24 @@ class Sent:
     """A form: its fields by their names in lower case, the values of UPLOAD, and the files by the names of their parts."""
 
     fields: dict[str, str]
-    wanted: tuple[str, ...] = ()
+    uploads: tuple[str, ...] = ()
     parts: Mapping[str, Part] = field(default_factory=dict)
 
 
 async def _sent(request: Request, caller: Submitting, state: Shared) -> AsyncIterator[Sent]:
     """The form of a request, with its files. The temporary files are removed after the answer."""
     if media_type_of(request) != FORM:
-        form = await read_form(request)
+        form = single(await read_pairs(request))
         upload = form.pop("upload", None)
         yield Sent(form, () if upload is None else tuple(upload.split(";")))
         return
     with ExitStack() as resources:
         files = _Files(state.store, Allowed(state, caller), resources)
         most = MAX_FORM_BYTES + max(state.settings.max_upload_bytes, state.settings.max_transit_bytes)
-        pairs = [
-            *request.query_params.multi_items(),
-            *await multipart_pairs(request, most, files.write),
-        ]
-        wanted = [value for name, value in pairs if name.lower() == "upload" and value]
+        pairs = [*request.query_params.multi_items(), *await multipart_pairs(request, most, files.write)]
+        named = [value for name, value in pairs if name.lower() == "upload" and value]
         fields = single((name, value) for name, value in pairs if name.lower() != "upload")
-        yield Sent(fields, tuple(one for value in wanted for one in value.split(";")), files.parts)
+        yield Sent(fields, tuple(one for value in named for one in value.split(";")), files.parts)
 
 
 SentForm = Annotated[Sent, Depends(_sent)]
@@ -102,16 +199,14 @@ def keep(state: State, caller: Caller, sent: Sent, kind: str) -> None:
 
 def _named(sent: Sent, kind: str) -> dict[str, str]:
     """The part of the form for each name in UPLOAD."""
-    model = KINDS[kind].parameters
-    assert model is not None
-    possible = [name for name, parameter in NAMES.items() if parameter in model.model_fields]
-    found: dict[str, str] = {}
-    for wanted in sent.wanted:
-        name, comma, uri = (text.strip() for text in wanted.partition(","))
+    possible = [name for name, parameter in NAMES.items() if parameter in _model(kind).model_fields]
+    parts: dict[str, str] = {}
+    for upload in sent.uploads:
+        name, comma, uri = (text.strip() for text in upload.partition(","))
         name = name.lower()
         if not comma or not uri.startswith(INLINE):
             raise bad(
-                f"expected UPLOAD=NAME,{INLINE}PART, and the file in the part PART of a multipart form; got {wanted[:80]!a}: "
+                f"expected UPLOAD=NAME,{INLINE}PART, and the file in the part PART of a multipart form; got {upload[:80]!a}: "
                 "files at other addresses are not fetched"
             )
         if name not in possible:
@@ -123,17 +218,17 @@ def _named(sent: Sent, kind: str) -> dict[str, str]:
             raise bad(
                 f"expected a part {part[:40]!a} with a file in the form, because UPLOAD names it; got none"
             )
-        if name in found or NAMES[name] in sent.fields:
+        if name in parts or NAMES[name] in sent.fields:
             raise bad(f"expected one {name}; got several: remove an UPLOAD or the parameter {NAMES[name]}")
-        found[name] = part
-    unused = sent.parts.keys() - found.values()
+        parts[name] = part
+    unused = sent.parts.keys() - parts.values()
     if unused:
         part = min(unused)
         raise bad(
             f"expected UPLOAD=NAME,{INLINE}{part[:40]} for the file in the part {part[:40]!a}, with NAME one of {', '.join(possible)}; "
             "got none"
         )
-    return found
+    return parts
 
 
 def _addition(
