@@ -21,7 +21,7 @@ from enum import StrEnum
 from sqlalchemy import ColumnElement, Select, String, delete, func, or_, select, update
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from workers.catalogue.database import Database, newest_first
+from workers.catalogue.database import Database, Queries, newest_first
 from workers.catalogue.owners import lock_owner
 from workers.catalogue.tables import Base, KeyRow
 
@@ -65,11 +65,8 @@ class TooManyKeys(Exception):
     """An owner already has the largest allowed number of valid keys."""
 
 
-class Keys:
-    """The table of keys; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Keys(Queries):
+    """The table of keys."""
 
     def make(
         self,

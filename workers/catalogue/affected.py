@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import Select, exists, select, union_all
 from sqlalchemy.orm import Session
 
-from workers.catalogue.database import Database, newest_first
+from workers.catalogue.database import Queries, newest_first
 from workers.catalogue.tables import ProductRow, PsfRow
 from workers.versions import PsfStatus
 
@@ -35,11 +35,8 @@ class Place:
     product_id: str
 
 
-class AffectedProducts:
-    """Products by the status of their PSF; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class AffectedProducts(Queries):
+    """Products by the status of their PSF."""
 
     def of_psf(self, psf: PsfRow, *, limit: int, after: tuple[float, str] | None = None) -> list[Affected]:
         """Products that were made with a PSF, newest first."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, case, delete, func, literal, select
 
-from workers.catalogue.database import Database, insert_into
+from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.jobs import no_equal_at_work
 from workers.catalogue.owners import FileRow
 from workers.catalogue.tables import (
@@ -57,11 +57,8 @@ class FileTally:
     bytes: int
 
 
-class Census:
-    """Counts, and the list of workers; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Census(Queries):
+    """Counts, and the list of workers."""
 
     def announce(self, worker: str, started_at: float, version: str) -> None:
         """Record that a worker process is alive; delete the rows of workers that have been silent for an hour."""

@@ -13,7 +13,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
-from workers.catalogue.database import Database, begins_with, several_ids_fit
+from workers.catalogue.database import Queries, begins_with, several_ids_fit
 from workers.catalogue.psfs import existing_psf, validity_of
 from workers.catalogue.series import may_interpolate
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow, PsfRow
@@ -36,11 +36,8 @@ class Pin:
     validity: Validity | None = None
 
 
-class Contexts:
-    """The tables of contexts; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Contexts(Queries):
+    """The tables of contexts."""
 
     def create(
         self, name: str, owner: str, by: str, *, reason: str = "", pins: Sequence[Pin] | None = None

@@ -110,6 +110,13 @@ class Database:
             return result.rowcount
 
 
+class Queries:
+    """Queries on the tables of one subject. Each method of a subclass is one transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+
 def newest_first(query: Query, table: Any, limit: int, after: tuple[float, str] | None = None) -> Query:
     """A page of a query for rows of a table, newest first.
 

@@ -41,7 +41,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import Session
 
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
-from workers.catalogue.database import Database, insert_into
+from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.tables import (
     Base,
     DefaultContextRow,
@@ -142,11 +142,8 @@ class OverQuota(Exception):
         self.usage = usage
 
 
-class Owners:
-    """The limits of owners, and what they keep; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Owners(Queries):
+    """The limits of owners, and what they keep."""
 
     def usage(self, owner: str, quota_mib: int) -> Usage:
         """The usage of an owner. quota_mib: the limit if the owner has no individual limit; 0: unlimited."""
@@ -181,16 +178,13 @@ class Owners:
             self._database.change(_removal(row))
 
 
-class NamedFiles:
+class NamedFiles(Queries):
     """The files of all owners to which the database refers.
 
     A row refers to a file if the file's hash appears in any text or JSON column. The search therefore works for all
     tables in the same way. The search may find hashes that are not hashes of files, for example the hash of a key. It
     misses no file.
     """
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
 
     def all(self, *, solutions_from: float = -math.inf) -> Iterator[str]:
         """Every hash in the database; a hash may occur more than once. Rows are read in batches.

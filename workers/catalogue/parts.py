@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, and_, or_, select, update
 
-from workers.catalogue.database import Database
+from workers.catalogue.database import Queries
 from workers.catalogue.tables import PartRow
 
 
@@ -26,11 +26,8 @@ class Part:
     token: str
 
 
-class Parts:
-    """The table of parts; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Parts(Queries):
+    """The table of parts."""
 
     def open(self, owner: str, request_key: str, count: int) -> None:
         """Create the parts 0 to ``count`` - 1, except those that exist."""

@@ -16,7 +16,7 @@ from sqlalchemy import Select, String, cast, select
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
-from workers.catalogue.database import Database, insert_into, newest_first
+from workers.catalogue.database import Queries, insert_into, newest_first
 from workers.catalogue.tables import PsfChangeRow, PsfPinRow, PsfRow, PsfSeriesRow
 from workers.versions import (
     INTERPOLATED,
@@ -68,11 +68,8 @@ class PsfFilter:
         return series_of(self.instrument, self.channel, self.kind or "") if whole else None
 
 
-class Psfs:
-    """Searches for PSFs and changes of their status; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Psfs(Queries):
+    """Searches for PSFs and changes of their status."""
 
     def describe(self, psf_id: str, owner: str, *, tables_sha256: str, preview_sha256: str) -> None:
         """Store the hashes of the tables and of the picture that were made from a PSF's file."""

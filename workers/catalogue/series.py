@@ -15,7 +15,7 @@ from sqlalchemy import Select, exists, select
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
-from workers.catalogue.database import Database
+from workers.catalogue.database import Queries
 from workers.catalogue.tables import PsfPinRow, PsfRow, PsfSeriesRow, SeriesChangeRow
 from workers.versions import SEPARATOR, TOTAL, PsfStatus
 
@@ -34,11 +34,8 @@ class Ends:
     after_time: float
 
 
-class Series:
-    """Series of which a PSF was certified; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Series(Queries):
+    """Series of which a PSF was certified."""
 
     def all(self, owner: str) -> dict[str, bool]:
         """All series of which a PSF was certified, sorted by name: whether the PSFs of each may be interpolated."""
