@@ -14,7 +14,7 @@ from fastapi import APIRouter, Request, Response
 from pydantic import AnyUrl
 
 from service.http.state import Shared
-from service.operation.health import faults, states
+from service.operation import faults, states
 from service.vo import jobs
 from service.vo.columns import TABLES
 from service.vo.lists import LINKS_STANDARD

@@ -179,26 +179,12 @@ async def _sent(request: Request, caller: Submitting, state: Shared) -> AsyncIte
 SentForm = Annotated[Sent, Depends(_sent)]
 
 
-def ids_of(sent: Sent, kind: str) -> dict[str, str]:
-    """The parameters that the files of a form set: the id of each file, by the name of the parameter.
+def files_of(sent: Sent, kind: str) -> dict[str, Part]:
+    """The file for each name in UPLOAD.
 
     Raises ``Problem`` if UPLOAD is malformed, names a part that the form does not have, or sets a parameter twice; if
     the kind of job has no such parameter; and if the form contains a file that no UPLOAD names.
     """
-    return {NAMES[name]: sent.parts[part].sha256 for name, part in _named(sent, kind).items()}
-
-
-def keep(state: State, caller: Caller, sent: Sent, kind: str) -> None:
-    """Check the files of a form, and add them to the catalogue. If one of them is refused, none is added."""
-    named = {name: sent.parts[part] for name, part in _named(sent, kind).items()}
-    allowed = Allowed(state, caller)  # the bytes were counted against the caller's rate when they arrived
-    additions = [_addition(state, caller.owner, name, part, allowed) for name, part in named.items()]
-    for add in additions:
-        add()
-
-
-def _named(sent: Sent, kind: str) -> dict[str, str]:
-    """The part of the form for each name in UPLOAD."""
     possible = [name for name, parameter in NAMES.items() if parameter in _model(kind).model_fields]
     parts: dict[str, str] = {}
     for upload in sent.uploads:
@@ -228,7 +214,20 @@ def _named(sent: Sent, kind: str) -> dict[str, str]:
             f"expected UPLOAD=NAME,{INLINE}{part[:40]} for the file in the part {part[:40]!a}, with NAME one of {', '.join(possible)}; "
             "got none"
         )
-    return parts
+    return {name: sent.parts[part] for name, part in parts.items()}
+
+
+def ids_of(files: Mapping[str, Part]) -> dict[str, str]:
+    """The parameters that the files of a form set: the id of each file, by the name of the parameter."""
+    return {NAMES[name]: file.sha256 for name, file in files.items()}
+
+
+def keep(state: State, caller: Caller, files: Mapping[str, Part]) -> None:
+    """Check the files of a form, and add them to the catalogue. If one of them is refused, none is added."""
+    allowed = Allowed(state, caller)  # the bytes were counted against the caller's rate when they arrived
+    additions = [_addition(state, caller.owner, name, file, allowed) for name, file in files.items()]
+    for add in additions:
+        add()
 
 
 def _addition(

@@ -23,7 +23,7 @@ from service.http.quotas import check_rows
 from service.http.state import Shared, State
 from service.views.jobs import time_left_s
 from service.vo import job_documents as documents
-from service.vo.job_forms import SentForm, check, ids_of, keep, kind_of, resolved
+from service.vo.job_forms import SentForm, check, files_of, ids_of, keep, kind_of, resolved
 from service.vo.parameters import (
     NO_XML,
     Form,
@@ -144,10 +144,11 @@ def create_uws_job(caller: Submitting, sent: SentForm, request: Request, state: 
         raise bad(f"expected RUNID of at most {MAX_RUN_ID} characters that XML can hold; got {run_id[:40]!a}")
     if start not in (None, "RUN"):
         raise bad(f"expected PHASE=RUN or no PHASE; got {start[:40]!a}")
-    form |= ids_of(sent, kind)
+    files = files_of(sent, kind)
+    form |= ids_of(files)
     check(kind, form)
     check_rows(state, caller.owner)
-    keep(state, caller, sent, kind)
+    keep(state, caller, files)
     ready = resolved(state, caller.owner, kind, form) if start else None
     row = state.catalogue.uws.draft(
         kind,
@@ -305,9 +306,10 @@ def post_uws_parameters(
             f"expected KIND={row.kind}; got {form['kind']}: the kind of a job cannot change, so create another job"
         )
     form.pop("kind", None)
-    form |= ids_of(sent, row.kind)
+    files = files_of(sent, row.kind)
+    form |= ids_of(files)
     check(row.kind, row.parameters | form)
-    keep(state, caller, sent, row.kind)
+    keep(state, caller, files)
 
     def change(given: dict[str, Any]) -> dict[str, Any]:
         check(row.kind, given | form)
