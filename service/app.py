@@ -9,6 +9,7 @@ import anyio
 from fastapi import FastAPI
 
 from psfcore.fits.viewing.planes import Planes
+from service import api_page, operation
 from service.api import (
     bulk,
     bulk_results,
@@ -35,7 +36,6 @@ from service.http.access import Access
 from service.http.bodies import BodyLimits
 from service.http.rates import AtOnce, Rates
 from service.http.state import State
-from service.operation import docs, health, metrics
 from service.pages import archive_runs as archive_run_pages
 from service.pages import assets, login, visitors
 from service.pages import bulk as bulk_pages
@@ -110,7 +110,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         version=software_version(),
         summary="Point-spread functions of solar EUV telescopes, and deconvolved images.",
         lifespan=lifespan,
-        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.operation.docs serves a page without them
+        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.api_page serves a page without them
         redoc_url=None,
     )
     problems.install(app, problem_page)
@@ -143,9 +143,8 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         lists,
         links,
         cutouts,
-        health,
-        metrics,
-        docs,
+        operation,
+        api_page,
         assets,
         image_pages,
         image_page,

@@ -165,7 +165,7 @@ FAULTS = (
           ("tests/workers/run",)),
     Fault("files-hash-not-compared", "workers/files/store.py",
           "found = sha256_of(path)\n", "found = path.name\n",
-          ("tests/workers/files/test_store.py",), ("tests/service/operation/test_disk.py",)),
+          ("tests/workers/files/test_store.py",), ("tests/service/test_disk.py",)),
     Fault("intake-end-of-validity-included", "workers/catalogue/psfs.py",
           "PsfRow.valid_to > filters.valid_at", "PsfRow.valid_to >= filters.valid_at",
           ("tests/workers/catalogue/test_psfs.py", "tests/workers/intake"), ("tests/service/api/psfs",)),
