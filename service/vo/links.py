@@ -16,8 +16,8 @@ from service.http.callers import Caller, Reading
 from service.http.downloads import FITS_TYPE, GZIP_TYPE
 from service.http.state import Shared, State
 from service.vo.columns import LINKS
-from service.vo.lists import LINKS_STANDARD, LINKS_TYPE, PSF, VOTABLE_ERROR, did, row_named
-from service.vo.parameters import VOTABLE, Fields, VotableErrors, base_url, format_of, query, refuse
+from service.vo.lists import LINKS_STANDARD, LINKS_TYPE, PSF, VOTABLE_ERROR, VotableErrors, did, row_named
+from service.vo.parameters import VOTABLE, Fields, base_url, format_of, query, refuse
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 
 MOST_IDS = 200

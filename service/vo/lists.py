@@ -14,12 +14,14 @@ from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
 
 from psfcore.errors import DataError
 from psfcore.fits.header import plate_scale_arcsec
 from service.http.callers import Caller, Reading
 from service.http.paging import following, position
+from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.vo.columns import PRODUCTS, PSFS, Table
 from service.vo.parameters import (
@@ -28,7 +30,7 @@ from service.vo.parameters import (
     VOTABLE,
     VOTABLE_TYPE,
     Fields,
-    VotableErrors,
+    PlainErrors,
     base_url,
     format_of,
     integer,
@@ -48,6 +50,23 @@ USUAL, MOST = 1000, 5000
 MJD_1970, DAY_S = 40587.0, 86400.0
 M_PER_ANGSTROM = 1e-10
 COLLECTION = "heliopsf"
+
+
+class VotableErrors(PlainErrors):
+    """Errors as VOTables."""
+
+    async def error(self, problem: Problem) -> Response:
+        """The answer that reports an error."""
+        content = await run_in_threadpool(_error_document, problem.detail)
+        return Response(content, problem.status, headers=problem.headers, media_type=VOTABLE_TYPE)
+
+
+def _error_document(message: str) -> bytes:
+    from service.vo.votables import error_document  # loads the numerical libraries
+
+    return error_document(message)
+
+
 VOTABLE_ERROR: dict[int | str, dict[str, Any]] = {
     "4XX": {"content": {VOTABLE_TYPE: {}}, "description": "A VOTable with QUERY_STATUS=ERROR"}
 }

@@ -192,21 +192,6 @@ class PlainErrors(APIRoute):
         return PlainTextResponse(f"{problem.detail}\n", problem.status, headers=problem.headers)
 
 
-class VotableErrors(PlainErrors):
-    """Errors as VOTables."""
-
-    async def error(self, problem: Problem) -> Response:
-        """The answer that reports an error."""
-        content = await run_in_threadpool(_error_document, problem.detail)
-        return Response(content, problem.status, headers=problem.headers, media_type=VOTABLE_TYPE)
-
-
-def _error_document(message: str) -> bytes:
-    from service.vo.votables import error_document  # loads the numerical libraries
-
-    return error_document(message)
-
-
 def base_url(request: Request) -> str:
     """The address of the service, without a slash at the end."""
     return str(request.base_url).rstrip("/")
