@@ -52,20 +52,26 @@ FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0  # a waiting request checks its job at 
 PHASES = frozenset({*Phase, "HELD", "SUSPENDED", "UNKNOWN", "ARCHIVED"})
 
 
-def _form(*, files: bool = False, **described: str) -> dict[str, Any]:
-    """OpenAPI description of the fields of a form. files: whether a multipart form may contain files."""
-    fields = {name: {"type": "string", "description": text} for name, text in described.items()}
-    schema = {"type": "object", "properties": fields, "additionalProperties": {"type": "string"}}
-    media_types = ["application/x-www-form-urlencoded", *(["multipart/form-data"] if files else [])]
-    return {"requestBody": {"content": {name: {"schema": schema} for name in media_types}}}
-
-
 TEXT: dict[str, Any] = {"response_class": PlainTextResponse}
 XML: dict[str, Any] = {
     "response_class": Response,
     "responses": {200: {"content": {documents.MEDIA_TYPE: {}}, "description": "A document of UWS 1.1"}},
 }
 TO_JOB: dict[str, Any] = {"status_code": 303, "response_class": RedirectResponse}
+
+
+def _form(*, files: bool = False, **described: str) -> dict[str, Any]:
+    """A route that reads a form and answers with the address of a job.
+
+    described: the descriptions of the fields. files: whether a multipart form may contain files.
+    """
+    fields = {name: {"type": "string", "description": text} for name, text in described.items()}
+    schema = {"type": "object", "properties": fields, "additionalProperties": {"type": "string"}}
+    media_types = ["application/x-www-form-urlencoded", *(["multipart/form-data"] if files else [])]
+    content = {name: {"schema": schema} for name in media_types}
+    return {**TO_JOB, "openapi_extra": {"requestBody": {"content": content}}}
+
+
 router = APIRouter(
     prefix="/uws/jobs",
     tags=["uws"],
@@ -123,8 +129,7 @@ def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
 @router.post(
     "",
     summary="UWS: create a job",
-    **TO_JOB,
-    openapi_extra=_form(
+    **_form(
         files=True,
         KIND="kind of job, for example deconvolve",
         PHASE="RUN: start the job at once",
@@ -200,7 +205,7 @@ def delete_uws_job(row: OwnJob, request: Request, state: Shared) -> Response:
     return RedirectResponse(_jobs_url(request), 303)
 
 
-@router.post("/{job_id}", summary="UWS: destroy a job", **TO_JOB, openapi_extra=_form(ACTION="DELETE"))
+@router.post("/{job_id}", summary="UWS: destroy a job", **_form(ACTION="DELETE"))
 def post_uws_job(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
     """The same as DELETE, for browsers."""
     if form.get("action") != "DELETE":
@@ -214,12 +219,7 @@ def get_uws_phase(row: Job) -> Response:
     return PlainTextResponse(row.phase)
 
 
-@router.post(
-    "/{job_id}/phase",
-    summary="UWS: start or abort a job",
-    **TO_JOB,
-    openapi_extra=_form(PHASE="RUN or ABORT"),
-)
+@router.post("/{job_id}/phase", summary="UWS: start or abort a job", **_form(PHASE="RUN or ABORT"))
 def post_uws_phase(form: Form, row: OwnJob, caller: Submitting, request: Request, state: Shared) -> Response:
     """RUN queues a PENDING job. ABORT stops a job that has not ended. A repeated request changes nothing."""
     match form.get("phase"):
@@ -241,8 +241,7 @@ def get_uws_duration(row: Job, state: Shared) -> Response:
 @router.post(
     "/{job_id}/executionduration",
     summary="UWS: limit how long a job may execute",
-    **TO_JOB,
-    openapi_extra=_form(EXECUTIONDURATION="seconds; 0: unlimited"),
+    **_form(EXECUTIONDURATION="seconds; 0: unlimited"),
 )
 def post_uws_duration(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
     """Set the limit. If it exceeds the largest limit that the operator allows, the service sets that limit."""
@@ -260,8 +259,7 @@ def get_uws_destruction(row: Job, state: Shared) -> Response:
 @router.post(
     "/{job_id}/destruction",
     summary="UWS: set when a job is destroyed",
-    **TO_JOB,
-    openapi_extra=_form(DESTRUCTION="a time (ISO 8601, UTC)"),
+    **_form(DESTRUCTION="a time (ISO 8601, UTC)"),
 )
 def post_uws_destruction(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
     """Set the time. If it is later than the latest time that the operator allows, the service sets that time."""
@@ -291,8 +289,7 @@ def get_uws_parameters(row: Job) -> Response:
 @router.post(
     "/{job_id}/parameters",
     summary="UWS: change a pending job's parameters",
-    **TO_JOB,
-    openapi_extra=_form(files=True, UPLOAD=UPLOADS),
+    **_form(files=True, UPLOAD=UPLOADS),
 )
 def post_uws_parameters(
     job_id: str, caller: Submitting, sent: SentForm, request: Request, state: Shared

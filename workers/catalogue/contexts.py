@@ -162,11 +162,16 @@ def _certified(session: Session, owner: str) -> list[PsfPinRow]:
 def _given(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRow]:
     if not pins:
         raise DataError("nothing-to-pin", "expected at least one PSF to pin; got an empty list")
-    rows = []
-    for pin in pins:
-        rows.append(_pin(existing_psf(session, pin.psf_id, owner), pin.validity))
+    rows = [_pin(existing_psf(session, pin.psf_id, owner), pin.validity) for pin in pins]
     rows.sort(key=lambda pinned: (pinned.series, pinned.valid_from))
-    _check_apart(rows)
+    for one, other in pairwise(rows):
+        first, second = Validity(one.valid_from, one.valid_to), Validity(other.valid_from, other.valid_to)
+        if one.series == other.series and first.overlaps(second):
+            raise DataError(
+                "ranges-overlap",
+                f"expected at most one PSF of {one.series} for any time; the ranges of PSF {one.psf_id}, {first}, and PSF "
+                f"{other.psf_id}, {second}, overlap",
+            )
     return rows
 
 
@@ -187,22 +192,12 @@ def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
     )
 
 
-def _check_apart(rows: Sequence[PsfPinRow]) -> None:
-    for one, other in pairwise(rows):
-        first, second = Validity(one.valid_from, one.valid_to), Validity(other.valid_from, other.valid_to)
-        if one.series == other.series and first.overlaps(second):
-            raise DataError(
-                "ranges-overlap",
-                f"expected at most one PSF of {one.series} for any time; the ranges of PSF {one.psf_id}, {first}, and PSF "
-                f"{other.psf_id}, {second}, overlap",
-            )
-
-
 def _context(name: str, owner: str, by: str, reason: str, pins: Sequence[PsfPinRow]) -> PsfContextRow:
     """Make the row of a context, and write the context's id into the rows of its pins."""
     content = []
     for pin in pins:
         one = [pin.series, iso(pin.valid_from), iso(pin.valid_to), pin.psf_id]
+        # The word is a part of the id only where it is needed, so that all other contexts keep their ids.
         content.append([*one, "interpolated"] if pin.interpolated else one)
     identity = canonical_hash({"name": name, "pins": content})
     for pin in pins:
