@@ -20,7 +20,7 @@ from service.vo.columns import TABLES
 from service.vo.lists import LINKS_STANDARD
 from service.vo.parameters import base_url
 
-MEDIA_TYPE = "text/xml"
+MEDIA_TYPE, VERSION = "text/xml", "1.1"
 BASIC = "ivo://ivoa.net/sso#BasicAA"
 router = APIRouter(prefix="/vo", tags=["VO"])
 
@@ -33,7 +33,6 @@ class Offered:
     path: str
     description: str
     use: Literal["full", "base"] = "full"
-    version: str = "1.1"
     needs_key: bool = True
 
 
@@ -84,7 +83,7 @@ def get_capabilities(request: Request, state: Shared) -> Response:
             interface=[
                 ParamHTTP(
                     role="std",
-                    version=offered.version,
+                    version=VERSION,
                     access_url=[AccessURL(value=AnyUrl(base + offered.path), use=offered.use)],
                     security_method=keys if offered.needs_key else [],
                 )

@@ -245,7 +245,7 @@ def get_uws_duration(row: Job, state: Shared) -> Response:
 )
 def post_uws_duration(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
     """Set the limit. If it exceeds the largest limit that the operator allows, the service sets that limit."""
-    limit_s = _duration(state, _given(form, "EXECUTIONDURATION"))
+    limit_s = _duration(state, _field(form, "EXECUTIONDURATION"))
     state.catalogue.uws.set_terms(row.id, execution_duration_s=limit_s)
     return _see(request, row.id)
 
@@ -263,7 +263,7 @@ def get_uws_destruction(row: Job, state: Shared) -> Response:
 )
 def post_uws_destruction(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
     """Set the time. If it is later than the latest time that the operator allows, the service sets that time."""
-    at = _destruction(state, _given(form, "DESTRUCTION"))
+    at = _destruction(state, _field(form, "DESTRUCTION"))
     state.catalogue.uws.set_terms(row.id, destruction_at=at)
     return _see(request, row.id)
 
@@ -385,7 +385,7 @@ def _destruction(state: State, text: str | None) -> float:
     return min(asked, last)
 
 
-def _given(form: dict[str, str], name: str) -> str:
+def _field(form: dict[str, str], name: str) -> str:
     if name.lower() not in form:
         raise bad(f"expected the field {name}; got none")
     return form[name.lower()]

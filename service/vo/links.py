@@ -160,5 +160,5 @@ def _link(
 
 def _fault(name: str | None, message: str, semantics: str = "#this", local: str | None = None) -> Link:
     """A row that says why there is no link."""
-    told = {"error_message": message, "semantics": semantics, "local_semantics": local}
-    return told if name is None else {"ID": name, **told}
+    fault = {"error_message": message, "semantics": semantics, "local_semantics": local}
+    return fault if name is None else {"ID": name, **fault}

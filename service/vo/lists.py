@@ -215,9 +215,9 @@ def _listed(
     """The answer to a request for a list."""
     answer_format = format_of(fields, VOTABLE, JSON)
     limit = min(integer("MAXREC", one(fields, "maxrec") or str(USUAL), 0), MOST)
-    found = page(limit=limit + 1, after=position(one(fields, "cursor")))
-    rows = found[:limit]
-    status = "OVERFLOW" if len(found) > limit else "OK"
+    listed = page(limit=limit + 1, after=position(one(fields, "cursor")))
+    rows = listed[:limit]
+    status = "OVERFLOW" if len(listed) > limit else "OK"
     after = rows[-1] if rows and status == "OVERFLOW" else None
     link = None if after is None else following(request, repr(after.created_at), after.id)
     following_page = None if link is None else base_url(request) + link

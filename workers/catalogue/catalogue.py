@@ -6,12 +6,14 @@ that are common to all content-addressed rows.
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Collection, Sequence
 from typing import TypeVar
 
-from sqlalchemy import Select, String, cast, select
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import Select, String, cast, create_engine, select
+from sqlalchemy.exc import DatabaseError, IntegrityError
 from sqlalchemy.orm import Session
+from sqlalchemy.pool import NullPool
 
 from psfcore.errors import DataError
 from workers.catalogue.access import Keys, Sessions
@@ -56,6 +58,7 @@ AnyRow = TypeVar(
 )
 ListedRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | JobRow | PsfContextRow | BulkRow
 MOST_CANDIDATES = 6
+QUICK_CHECK = "PRAGMA quick_check(1)"  # SQLite compares all pages of the file, and reports the first fault
 _IN_A_QUERY = 500  # databases limit the number of values in a query
 
 
@@ -64,7 +67,6 @@ class Catalogue:
 
     def __init__(self, url: str) -> None:
         self._database = Database(url)
-        self._engine = self._database.engine
         self.schema = Schema(self._database)
         self.jobs = Jobs(self._database)
         self.again = Again(self._database)
@@ -103,7 +105,14 @@ class Catalogue:
 
         This reads the whole file. PostgreSQL checks the pages that it reads itself.
         """
-        self._database.check_pages()
+        if not self._database.sqlite:
+            return
+        # A new connection, because the other connections keep pages in memory and do not read these pages again.
+        fresh = create_engine(self._database.engine.url, poolclass=NullPool)
+        with fresh.connect() as connection:
+            (state,) = connection.exec_driver_sql(QUICK_CHECK).one()
+        if state != "ok":
+            raise DatabaseError(QUICK_CHECK, None, sqlite3.DatabaseError(f"malformed: {state}"))
 
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
         """Insert a content-addressed row; returns the row with this identity, and whether it is new.

@@ -57,7 +57,7 @@ class Contexts(Queries):
             )
         try:
             with self._database.writing.begin() as session:
-                rows = _certified(session, owner) if pins is None else _given(session, owner, pins)
+                rows = _pins_of_all(session, owner) if pins is None else _pins_of(session, owner, pins)
                 for row in rows:
                     row.interpolated = may_interpolate(session, row.series, owner)
                 context = _context(name, owner, by, reason, rows)
@@ -93,13 +93,13 @@ class Contexts(Queries):
 
     def named(self, id_or_name: str, owner: str) -> PsfContextRow:
         """The context with this id or name. Raises ``DataError`` "no-such-context" or "several-ids-fit"."""
-        found = self.find(id_or_name, owner)
-        if found is None:
+        context = self.find(id_or_name, owner)
+        if context is None:
             raise DataError(
                 "no-such-context",
                 f"expected the id or name of a context; got {id_or_name!r}, which does not exist: list the contexts",
             )
-        return found
+        return context
 
     def pins(self, context_id: str, owner: str) -> Sequence[PsfPinRow]:
         """The pins of a context, sorted by series and time."""
@@ -148,7 +148,7 @@ class Contexts(Queries):
         return None if context == NOW else self.named(context, owner)
 
 
-def _certified(session: Session, owner: str) -> list[PsfPinRow]:
+def _pins_of_all(session: Session, owner: str) -> list[PsfPinRow]:
     query = select(PsfRow).where(PsfRow.owner == owner, PsfRow.status == PsfStatus.CERTIFIED)
     rows = session.scalars(query.order_by(PsfRow.series, PsfRow.valid_from)).all()
     if not rows:
@@ -159,7 +159,7 @@ def _certified(session: Session, owner: str) -> list[PsfPinRow]:
     return [_pin(row, None) for row in rows]
 
 
-def _given(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRow]:
+def _pins_of(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRow]:
     if not pins:
         raise DataError("nothing-to-pin", "expected at least one PSF to pin; got an empty list")
     rows = [_pin(existing_psf(session, pin.psf_id, owner), pin.validity) for pin in pins]

@@ -24,13 +24,10 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import CursorResult
-from sqlalchemy.exc import DatabaseError
 from sqlalchemy.orm import InstrumentedAttribute, Session, sessionmaker
-from sqlalchemy.pool import NullPool
 
 from psfcore.errors import DataError
 
-QUICK_CHECK = "PRAGMA quick_check(1)"  # SQLite compares all pages of the file, and reports the first fault
 PATIENCE_S = 30.0  # longest time to wait for other writers of SQLite
 Row = TypeVar("Row")
 Value = TypeVar("Value")
@@ -70,18 +67,6 @@ class Database:
         """The time of the database's clock, in seconds since 1970."""
         with self.reading() as session:
             return session.scalars(select(self.now)).one()
-
-    def check_pages(self) -> None:
-        """Raise ``sqlalchemy.exc.DatabaseError`` if the file of an SQLite database is damaged. Other databases are not checked."""
-        if not self.sqlite:
-            return
-        # A new connection, because the other connections keep pages in memory and do not read these pages
-        # again.
-        fresh = create_engine(self.engine.url, poolclass=NullPool)
-        with fresh.connect() as connection:
-            (found,) = connection.exec_driver_sql(QUICK_CHECK).one()
-        if found != "ok":
-            raise DatabaseError(QUICK_CHECK, None, sqlite3.DatabaseError(f"malformed: {found}"))
 
     def all(self, query: Select[Value]) -> Sequence[Value]:
         """All rows, or values of the only column, that a query selects."""

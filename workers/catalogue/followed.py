@@ -74,14 +74,14 @@ class Followed(Generic[Followable]):
 
     def open(self, owner: str) -> list[State]:
         """Rows that have not ended: the newest ``MOST`` rows of each group of phases, newest first."""
-        table, found = self._table, []
+        table, states = self._table, []
         with self._database.reading() as session:
             for group in self._open_phases:
                 phase = table.phase == group[0] if len(group) == 1 else table.phase.in_(group)
                 query = select(*self._columns).where(table.owner == owner, phase, *self._conditions)
                 newest = query.order_by(table.created_at.desc(), table.id.desc()).limit(MOST)
-                found += _states(session.execute(newest))
-        return found
+                states += _states(session.execute(newest))
+        return states
 
     def ended(self, owner: str, after: Place) -> list[State]:
         """The next ``MOST`` rows that ended after a place, in the order in which they ended."""

@@ -364,11 +364,11 @@ def _deprecate_interpolated(session: Session, end: PsfRow, reason: str, by: str)
         PsfRow.status == PsfStatus.DRAFT,
         cast(PsfRow.details, String).contains(end.id),  # the details name the ends
     )
-    said = f"it was interpolated from PSF {end.id[:12]}, which is deprecated" + (
+    why = f"it was interpolated from PSF {end.id[:12]}, which is deprecated" + (
         f": {reason}" if reason else ""
     )
     for row in session.scalars(query.order_by(PsfRow.id).with_for_update()).all():
-        _write(session, row, said[:MOST_REASON], by, status=PsfStatus.DEPRECATED)
+        _write(session, row, why[:MOST_REASON], by, status=PsfStatus.DEPRECATED)
 
 
 def _refuse(asked: StatusAsked, other: str, **given: object) -> None:

@@ -157,15 +157,6 @@ def test_nothing_stays_of_a_refused_form(
     refused("one of two files is bad", post(api, JOBS, both, files), 415, "")
 
 
-def test_forms_without_files_may_be_multipart_and_are_bounded(api: TestClient) -> None:
-    made = api.post(JOBS, files={"KIND": (None, "deconvolve")}, follow_redirects=False)
-    assert made.status_code == 303, made.text
-    long = api.post(JOBS, files={"KIND": (None, "deconvolve"), "a": (None, "b" * (2**20 + 1))})
-    assert long.status_code == 413
-    many = api.post(JOBS, files=[(f"f{n}", (None, "v")) for n in range(65)])
-    assert many.status_code == 400 and "at most 64 fields" in many.text
-
-
 @pytest.mark.usefixtures("one_minute")
 def test_a_file_needs_the_scope_and_counts_for_its_owner(settings: Settings, image_file: Path) -> None:
     files = {"f": ("sun.fits", image_file.read_bytes())}
