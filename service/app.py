@@ -11,6 +11,7 @@ import anyio
 from fastapi import FastAPI
 
 from psfcore.fits.viewing.planes import Planes
+from service import api_page, operation
 from service.api import (
     bulk,
     bulk_results,
@@ -30,7 +31,6 @@ from service.api import (
 from service.http import guard, observation, problems
 from service.http.rates import AtOnce, Rates
 from service.http.state import Access, State
-from service.operation import docs, health, metrics
 from service.pages import assets, login, psf_comparison
 from service.pages import bulk as bulk_pages
 from service.pages import images as image_pages
@@ -41,8 +41,8 @@ from service.pages import psfs as psf_pages
 from service.pages import reports as report_pages
 from service.pages import transits as transit_pages
 from service.pages.rendering import problem_page
-from service.uws import routes as uws
 from service.vo import cutouts, interfaces, links, lists
+from service.vo import jobs as uws
 from workers import traces
 from workers.catalogue.catalogue import Catalogue
 from workers.contract.requests import FEWEST_DIGITS
@@ -104,7 +104,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         version=software_version(),
         summary="Point-spread functions of solar EUV telescopes, and deconvolved images.",
         lifespan=lifespan,
-        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.operation.docs serves a page without them
+        docs_url=None,  # FastAPI's pages load scripts from other hosts; service.api_page serves a page without them
         redoc_url=None,
     )
     problems.install(app, problem_page)
@@ -141,9 +141,8 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         lists,
         links,
         cutouts,
-        health,
-        metrics,
-        docs,
+        operation,
+        api_page,
         assets,
         image_pages,
         job_pages,
@@ -177,10 +176,10 @@ def _correct_description(app: FastAPI) -> None:
 
 def _correct(description: dict[str, Any]) -> None:
     for operations in description["paths"].values():
-        for operation in operations.values():
-            for parameter in operation.get("parameters", ()):
+        for one in operations.values():
+            for parameter in one.get("parameters", ()):
                 _shorten(parameter)
-            for response in operation["responses"].values():
+            for response in one["responses"].values():
                 content = response.get("content", {})
                 if content.get("application/json", {}).get("schema", {}).get("$ref") == PROBLEM:
                     content[problems.MEDIA_TYPE] = content.pop("application/json")

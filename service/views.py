@@ -12,8 +12,7 @@ from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow, Tran
 from workers.contract.kinds import KINDS
 from workers.contract.phases import JobError, Phase
 from workers.contract.queues import Queue
-from workers.versions.status import PsfStatus
-from workers.versions.validity import iso
+from workers.versions import PsfStatus, iso
 
 
 class PastChange(BaseModel):

@@ -45,7 +45,7 @@ from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.service.http.attacks import ARCHIVES, FILES, REQUESTS, Attack
 from tests.whole import stack as stacks
 from tests.whole.stack import Stack
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 

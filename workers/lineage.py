@@ -1,21 +1,41 @@
-"""Lineage of a product or a PSF: inputs, parameters, versions and jobs, back to the uploads.
+"""Lineage of a product or a PSF: inputs, parameters, versions and jobs, back to the uploads; also as W3C PROV.
 
 The lineage of a product or PSF was recorded when it was made. A parent that was deleted later is still listed, by its
 id.
+
+Citation: PROV-DM (W3C, 30 April 2013); PROV-N and PROV-JSON; IVOA ProvenanceDM 1.0 (11 April 2020), whose terms the
+document uses.
+
+| in the lineage | in PROV | identifier |
+|---|---|---|
+| product, PSF, image, transit, report, instrument file | entity, ``voprov:DatasetEntity`` | its id: a SHA-256 |
+| job | activity | the id of the job |
+| job kind and version of its algorithm | plan, ``voprov:ActivityDescription`` | kind and version |
+| parameter of a job | entity, ``voprov:Parameter``, which influenced the activity | job and name |
+| owner | agent, role ``owner`` of entities and ``operator`` of activities | name |
+| heliopsf and its libraries | software agent | version, and a hash of the versions of the libraries |
+
+A thing whose job was not recorded has an activity of its own. An upload has no activity.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import json
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from pydantic import BaseModel, Field, ValidationError
 
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, TransitRow
+from workers.contract.identities import canonical_hash
 from workers.contract.kinds import kind_of_origin
 from workers.contract.requests import ResolvedRerun
-from workers.versions.series import INTERPOLATED
+from workers.versions import INTERPOLATED
+
+if TYPE_CHECKING:
+    from prov.model import ProvDocument
 
 MOST_DEEP = 16
 MOST_THINGS = 200
@@ -63,7 +83,7 @@ class Ancestor(BaseModel):
 
 def lineage(catalogue: Catalogue, row: ProductRow | PsfRow) -> Ancestor:
     """A product or PSF and its ancestors: at most MOST_DEEP generations and MOST_THINGS entries."""
-    return _Walk(catalogue, row.owner).of_row(row, 0)
+    return _Walk(catalogue, row.owner).entry(row, 0)
 
 
 def made_by(catalogue: Catalogue, row: ProductRow | PsfRow) -> ResolvedRerun:
@@ -117,14 +137,17 @@ def _origin(row: ProductRow | PsfRow) -> str:
 
 
 def _parameters(row: ProductRow | PsfRow) -> dict[str, Any] | None:
-    said = row.details if isinstance(row, ProductRow) else _provenance(row)
-    found: dict[str, Any] | None = said.get("parameters")
-    return found
+    details = row.details if isinstance(row, ProductRow) else _provenance(row)
+    parameters: dict[str, Any] | None = details.get("parameters")
+    return parameters
 
 
 def _provenance(row: PsfRow) -> dict[str, Any]:
-    found: dict[str, Any] = row.details.get("provenance") or {}
-    return found
+    return row.details.get("provenance") or {}
+
+
+# The tables of the entries that a row of the catalogue can be.
+_TABLES: dict[Type, Any] = {"psf": PsfRow, "image": ImageRow, "transit": TransitRow, "report": ReportRow}
 
 
 class _Walk:
@@ -135,43 +158,26 @@ class _Walk:
         self._catalogue, self._owner = catalogue, owner
         self._visited: set[str] = set()
 
-    def of_row(self, row: ProductRow | PsfRow, depth: int) -> Ancestor:
+    def entry(self, row: ProductRow | PsfRow, depth: int) -> Ancestor:
         parents = _parents(row)
         enough = row.id in self._visited or depth >= MOST_DEEP or len(self._visited) >= MOST_THINGS
         self._visited.add(row.id)
+        weights: dict[str, float] = row.details.get("weights") or {}  # of an interpolated PSF
         return Ancestor(
             type="product" if isinstance(row, ProductRow) else "psf",
             id=row.id,
             there=True,
             made=_made_of(row),
-            parents=[]
-            if enough
-            else [self._weighted(row, self._parent(*parent, depth + 1)) for parent in parents],
+            parents=[] if enough else [self._parent(*one, depth + 1, weights.get(one[1])) for one in parents],
             cut=enough and bool(parents),
         )
 
-    @staticmethod
-    def _weighted(row: ProductRow | PsfRow, parent: Ancestor) -> Ancestor:
-        """The parent with its weight, if the PSF was interpolated from it."""
-        weights: dict[str, float] = row.details.get("weights") or {}
-        return parent.model_copy(update={"weight": weights.get(parent.id)})
-
-    def _parent(self, kind: Type, identity: str, depth: int) -> Ancestor:
-        match kind:
-            case "psf":
-                psf = self._catalogue.get(PsfRow, identity, self._owner)
-                return (
-                    Ancestor(type=kind, id=identity, there=False) if psf is None else self.of_row(psf, depth)
-                )
-            case "image":
-                there = self._catalogue.get(ImageRow, identity, self._owner) is not None
-            case "transit":
-                there = self._catalogue.get(TransitRow, identity, self._owner) is not None
-            case "report":
-                there = self._catalogue.get(ReportRow, identity, self._owner) is not None
-            case _:
-                there = False
-        return Ancestor(type=kind, id=identity, there=there)
+    def _parent(self, kind: Type, identity: str, depth: int, weight: float | None) -> Ancestor:
+        table = _TABLES.get(kind)
+        row = None if table is None else self._catalogue.get(table, identity, self._owner)
+        if isinstance(row, PsfRow):
+            return self.entry(row, depth).model_copy(update={"weight": weight})
+        return Ancestor(type=kind, id=identity, there=row is not None, weight=weight)
 
 
 def _parents(row: ProductRow | PsfRow) -> list[tuple[Type, str]]:
@@ -180,40 +186,169 @@ def _parents(row: ProductRow | PsfRow) -> list[tuple[Type, str]]:
         return [("image", row.image_id), ("psf", row.psf_id)]
     provenance = _provenance(row)
     parameters = provenance.get("parameters") or {}
-    found: list[tuple[Type, str]] = []
     named: dict[str, str] = row.details.get("parents") or {}
-    if "transit_id" in row.details:
-        found.append(("transit", row.details["transit_id"]))
-    if "report" in named:
-        found.append(("report", named["report"]))
-    found += [("psf", named[name]) for name in ("psf", "before", "after") if name in named]
-    if row.details.get("diffraction_psf_id") is not None:
-        found.append(("psf", row.details["diffraction_psf_id"]))
-    if provenance.get("instrument_file_sha256") is not None:
-        found.append(("instrument-file", provenance["instrument_file_sha256"]))
-    if parameters.get("mask_id") is not None:
-        found.append(("image", parameters["mask_id"]))
-    return found
+    inputs: tuple[tuple[Type, str | None], ...] = (
+        ("transit", row.details.get("transit_id")),
+        ("report", named.get("report")),
+        *(("psf", named.get(name)) for name in ("psf", "before", "after")),
+        ("psf", row.details.get("diffraction_psf_id")),
+        ("instrument-file", provenance.get("instrument_file_sha256")),
+        ("image", parameters.get("mask_id")),
+    )
+    return [(kind, identity) for kind, identity in inputs if identity is not None]
 
 
 def _made_of(row: ProductRow | PsfRow) -> Made:
-    said = {**_provenance(row), **row.details} if isinstance(row, PsfRow) else row.details
-    written = {
-        name: said.get(name) for name in ("job_id", "algorithm_version", "software_version", "libraries")
+    details, names = row.details, {"created_at", "file_sha256"}
+    if isinstance(row, PsfRow):
+        details = _provenance(row) | row.details
+        names |= {"name", "version", "status", "origin"}
+    recorded = {
+        name: details.get(name) for name in ("job_id", "algorithm_version", "software_version", "libraries")
     }
     uploaded = isinstance(row, PsfRow) and row.origin == "uploaded"
-    written["kind"] = None if uploaded else kind_of_origin(_origin(row)).name
-    if isinstance(row, ProductRow):
-        return Made(
-            created_at=row.created_at, file_sha256=row.file_sha256, parameters=_parameters(row), **written
-        )
     return Made(
-        created_at=row.created_at,
-        name=row.name,
-        version=row.version,
-        status=row.status,
-        origin=row.origin,
-        file_sha256=row.file_sha256,
+        kind=None if uploaded else kind_of_origin(_origin(row)).name,
         parameters=_parameters(row),
-        **written,
+        **{name: getattr(row, name) for name in names},
+        **recorded,
     )
+
+
+# W3C PROV -------------------------------------------------------------------------------------------
+
+NAMES = "urn:heliopsf:"
+VOPROV = "http://www.ivoa.net/documents/ProvenanceDM/index.html#"  # as the package voprov writes it
+Format = Literal["json", "provn"]
+PREFIXES = (*get_args(Type), "job", "kind", "parameter", "owner", "software")
+SHOWN_HASH = 12
+
+
+def provenance_text(catalogue: Catalogue, row: ProductRow | PsfRow, form: Format) -> str:
+    """The lineage of a product or PSF as PROV-JSON or PROV-N."""
+    document = provenance(catalogue, row)
+    text = document.get_provn() if form == "provn" else document.serialize(format="json", indent=1)
+    return f"{text}\n"
+
+
+def provenance(catalogue: Catalogue, row: ProductRow | PsfRow) -> ProvDocument:
+    """The lineage of a product or PSF, as far as ``lineage`` follows it."""
+    document = _Document(catalogue, row.owner)
+    document.add(lineage(catalogue, row))
+    return document.prov
+
+
+class _Document:
+    """A document that is filled entry by entry. Every entity, activity and agent is declared once."""
+
+    def __init__(self, catalogue: Catalogue, owner: str) -> None:
+        from prov.model import ProvDocument  # half a second, which only requests for provenance need
+
+        self.prov = ProvDocument()
+        self.prov.add_namespace("voprov", VOPROV)
+        self.prov.add_namespace("heliopsf", NAMES)
+        for prefix in PREFIXES:
+            self.prov.add_namespace(prefix, f"{NAMES}{prefix}:")
+        self._catalogue, self._declared = catalogue, set[str]()
+        self._owner = f"owner:{owner}"
+        self.prov.agent(self._owner, {"voprov:name": owner, "prov:label": owner})
+
+    def add(self, one: Ancestor) -> str:
+        """Declare an entry with its ancestors; returns the name of its entity."""
+        name = f"{one.type}:{one.id}"
+        if self._new(name):
+            self.prov.entity(name, _entity_attributes(one, self.prov))
+            self.prov.wasAttributedTo(name, self._owner, other_attributes={"voprov:role": "owner"})
+        if one.made is None or one.made.kind is None:
+            return name
+        activity = self._activity(one, one.made)
+        if self._new(f"{name} by {activity}"):
+            self.prov.wasGeneratedBy(name, activity, _time(one.made.created_at))
+        for parent in one.parents:
+            above = self.add(parent)
+            if not self._new(f"{name} from {above}"):
+                continue
+            weight: dict[Any, Any] = {} if parent.weight is None else {"heliopsf:weight": parent.weight}
+            self.prov.used(activity, above, other_attributes={"prov:role": parent.type, **weight})
+            self.prov.wasDerivedFrom(name, above, activity)
+        return name
+
+    def _activity(self, one: Ancestor, made: Made) -> str:
+        """The activity that made an entry, with its plan, parameters and agents."""
+        job_id = made.job_id or f"of-{one.id}"
+        name, plan = f"job:{job_id}", f"kind:{made.kind}"
+        if made.algorithm_version is not None:
+            plan = f"{plan}-{made.algorithm_version}"
+        if not self._new(name):
+            return name
+        job = None if made.job_id is None else self._catalogue.jobs.get(made.job_id)
+        started = None if job is None or job.started_at is None else _time(job.started_at)
+        ended = _time(made.created_at) if job is None or job.ended_at is None else _time(job.ended_at)
+        self.prov.activity(name, started, ended, {"voprov:name": made.kind, "prov:label": made.kind})
+        if self._new(plan):
+            types = [("prov:type", self._named(one)) for one in ("prov:Plan", "voprov:ActivityDescription")]
+            number = made.algorithm_version
+            version = [] if number is None else [("voprov:version", str(number))]
+            self.prov.entity(plan, [*types, ("voprov:name", made.kind), *version])
+        self.prov.wasAssociatedWith(
+            name, self._software(made), plan, other_attributes={"prov:role": "software"}
+        )
+        self.prov.wasAssociatedWith(name, self._owner, other_attributes={"prov:role": "operator"})
+        for key, value in sorted((made.parameters or {}).items()):
+            self._parameter(name, f"parameter:{job_id}.{key}", key, value)
+        return name
+
+    def _software(self, made: Made) -> str:
+        """The agent for the version of heliopsf and of its libraries."""
+        version, libraries = made.software_version or "unknown", made.libraries or {}
+        name = f"software:heliopsf-{version}"
+        if libraries:
+            name = f"{name}-{canonical_hash(libraries)[:SHOWN_HASH]}"
+        if self._new(name):
+            used = [("heliopsf:library", f"{one} {number}") for one, number in sorted(libraries.items())]
+            kind = ("prov:type", self._named("prov:SoftwareAgent"))
+            self.prov.agent(name, [kind, ("voprov:name", "heliopsf"), ("heliopsf:version", version), *used])
+        return name
+
+    def _parameter(self, activity: str, name: str, key: str, value: Any) -> None:
+        text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+        kind = self._named("voprov:Parameter")
+        self.prov.entity(name, {"prov:type": kind, "voprov:name": key, "prov:value": text})
+        self.prov.wasInfluencedBy(
+            activity, name, other_attributes={"prov:type": self._named("voprov:WasConfiguredBy")}
+        )
+
+    def _named(self, name: str) -> Any:
+        return self.prov.valid_qualified_name(name)
+
+    def _new(self, name: str) -> bool:
+        """Whether this name was not declared before; it counts as declared afterwards."""
+        new = name not in self._declared
+        self._declared.add(name)
+        return new
+
+
+def _entity_attributes(one: Ancestor, document: ProvDocument) -> dict[str, Any]:
+    made = one.made
+    digest = one.id if made is None else made.file_sha256
+    # The ids of uploads and instrument files are the SHA-256 of their bytes; that of a deleted result is not.
+    known = made is not None or one.type in ("image", "transit", "instrument-file")
+    attributes: dict[str, Any] = {
+        "prov:type": document.valid_qualified_name("voprov:DatasetEntity"),
+        "prov:label": f"{one.type} {one.id[:SHOWN_HASH]}",
+        "heliopsf:sha256": digest if known else None,
+        "heliopsf:deleted": True if not one.there and one.type != "instrument-file" else None,
+    }
+    if made is not None:
+        attributes |= {
+            "voprov:generatedAtTime": _time(made.created_at),
+            "voprov:name": made.name,
+            "heliopsf:version": made.version,
+            "heliopsf:status": made.status,
+            "heliopsf:origin": made.origin,
+        }
+    return {key: value for key, value in attributes.items() if value is not None}
+
+
+def _time(at: float) -> datetime:
+    return datetime.fromtimestamp(at, UTC)

@@ -25,11 +25,10 @@ from astropy.io.fits.verify import VerifyError
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError, HeaderError
-from psfcore.fits.header import summary_of
 from psfcore.fits.blocks import FitsLimits, Hdu, Source, first_image, open_source, skip_data, walk
 from psfcore.fits.cards import optional_number
 from psfcore.fits.compression import may_hold_unwritten_memory
-from psfcore.fits.header import HeaderSummary, is_plane
+from psfcore.fits.header import HeaderSummary, is_plane, summary_of
 from psfcore.limited import fill_new_memory, run_limited
 from psfcore.whole_files import probe
 

@@ -17,7 +17,7 @@ from service.views import PastChange
 from workers.catalogue.contexts import NAME, Pin
 from workers.catalogue.tables import PsfContextRow
 from workers.contract.requests import ContextName, Identity
-from workers.versions.validity import Validity
+from workers.versions import Validity
 
 router = APIRouter(prefix="/v1/contexts", tags=["contexts"], responses=RESPONSES, route_class=KeyFirst)
 

@@ -43,7 +43,7 @@ from service.http.callers import Caller, Reading, still_let_in
 from service.http.problems import RESPONSES
 from service.http.state import Shared
 from service.views import JobView
-from workers.catalogue.followed.rows import MOST, Followable, Followed, Place, State
+from workers.catalogue.followed import MOST, Followable, Followed, Place, State
 from workers.contract.bulk import BULK_ENDED, BulkPhase
 from workers.contract.phases import Phase
 

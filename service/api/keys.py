@@ -18,7 +18,7 @@ from service.http.callers import Caller, KeyFirst, Reading, Submitting
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.state import Shared
-from workers.catalogue.access.keys import LABEL_LENGTH, OWNER, Scope, TooManyKeys
+from workers.catalogue.access import LABEL_LENGTH, OWNER, Scope, TooManyKeys
 from workers.catalogue.tables import KeyRow
 from workers.rows import no_such
 

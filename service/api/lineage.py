@@ -14,8 +14,7 @@ from service.views import JobView
 from workers.catalogue.tables import ProductRow, PsfRow
 from workers.contract.kinds import KINDS
 from workers.contract.requests import Identity, Rerun
-from workers.lineage import Ancestor, lineage
-from workers.provenance import Format, provenance_text
+from workers.lineage import Ancestor, Format, lineage, provenance_text
 
 MEDIA_TYPES: dict[Format, str] = {"json": "application/json", "provn": "text/provenance-notation"}
 FILES: dict[Format, str] = {"json": "prov.json", "provn": "provn"}

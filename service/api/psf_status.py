@@ -21,9 +21,7 @@ from workers.catalogue.affected import Affected, Place
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import Identity
-from workers.versions.series import WORD
-from workers.versions.status import MAY_BECOME, PsfStatus, next_version
-from workers.versions.validity import TIME, Validity, iso
+from workers.versions import MAY_BECOME, TIME, WORD, PsfStatus, Validity, iso, next_version
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES, route_class=KeyFirst)

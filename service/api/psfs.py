@@ -25,9 +25,7 @@ from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.requests import Identity
 from workers.files.collection import remove_unnamed
 from workers.intake.psf_choice import MOST_NAMED, Found, look, look_for_image
-from workers.versions.series import TOTAL, WORD
-from workers.versions.status import PsfStatus
-from workers.versions.validity import TIME, iso, seconds
+from workers.versions import TIME, TOTAL, WORD, PsfStatus, iso, seconds
 
 log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)

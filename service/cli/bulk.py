@@ -32,7 +32,7 @@ from service.client.errors import ServiceError
 from service.client.operations import treatment
 from service.client.outputs import written
 from workers.contract.requests import Treatment
-from workers.versions.status import PsfStatus
+from workers.versions import PsfStatus
 
 if TYPE_CHECKING:
     from service.client.http import Client

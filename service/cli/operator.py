@@ -16,7 +16,7 @@ from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from service.cli.options import DATA, read_settings, user_errors
 from workers import checks
-from workers.catalogue.access.keys import MEANINGS, OWNER, OWNER_RULE, Scope
+from workers.catalogue.access import MEANINGS, OWNER, OWNER_RULE, Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.owners import MIB, Usage
 from workers.catalogue.schema import SchemaError, SchemaStatus

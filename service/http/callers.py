@@ -38,8 +38,7 @@ from service.http.guard import BULK, SAFE_METHODS, JsonRequest
 from service.http.problems import Problem, problem
 from service.http.rates import Bucket
 from service.http.state import Shared, State, state_of
-from workers.catalogue.access.keys import OWNER, OWNER_RULE, KeyRefused, Scope
-from workers.catalogue.access.sessions import SessionRow
+from workers.catalogue.access import OWNER, OWNER_RULE, KeyRefused, Scope, SessionRow
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.catalogue import ListedRow
 from workers.catalogue.database import several_ids_fit

@@ -37,7 +37,7 @@ from service.pages.forms import Sent, SentForm, checked, chosen_method, text, us
 from service.pages.login import PageBulk, PageReading
 from service.pages.rendering import page, short
 from service.pages.sentences import of_error, of_problem
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.bulk_progress import MOST_EXPLAINED
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.psfs import PsfFilter

@@ -15,7 +15,7 @@ from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import page
-from workers.catalogue.access.keys import LABEL_LENGTH, MEANINGS, OWNER_RULE, Scope
+from workers.catalogue.access import LABEL_LENGTH, MEANINGS, OWNER_RULE, Scope
 
 PER_PAGE = 50
 LIFETIMES_DAYS = (7, 30, 90, 365)

@@ -26,7 +26,7 @@ from service.http.rates import Bucket
 from service.http.state import Shared, State
 from service.pages.rendering import page
 from service.pages.sentences import of_error
-from workers.catalogue.access.keys import KeyRefused, Scope
+from workers.catalogue.access import KeyRefused, Scope
 
 FORM = "application/x-www-form-urlencoded"
 DAY_S = 86_400

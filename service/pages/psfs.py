@@ -37,13 +37,11 @@ from service.pages.plots import Plot, Series, light_beyond_plot, radial_plot, sh
 from service.pages.readings import fit_parameters, fit_plots
 from service.pages.rendering import number, page
 from service.views import PsfView
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
 from workers.contract.requests import Component, Identity, PsfBuild
-from workers.versions.series import TOTAL
-from workers.versions.status import PsfStatus
-from workers.versions.variants import without_variant
+from workers.versions import TOTAL, PsfStatus, without_variant
 
 PER_PAGE = MOST_OTHERS = 50
 MOST_REPORTS = 10

@@ -16,7 +16,7 @@ from service.pages.forms import SentForm, parameters, start_job
 from service.pages.jobs import TITLES
 from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import page
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ReportRow
 from workers.contract.kinds import KINDS

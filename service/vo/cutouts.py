@@ -23,9 +23,8 @@ from service.http.callers import Reading
 from service.http.problems import Problem, problem
 from service.http.quotas import check_disk
 from service.http.state import Shared, State
-from service.uws.plain_errors import PlainErrors
-from service.vo.asked import Fields, described, one, refused
-from service.vo.names import row_named
+from service.vo.lists import row_named
+from service.vo.parameters import Fields, PlainErrors, one, query, refuse
 from workers.catalogue.tables import ProductRow
 
 if TYPE_CHECKING:
@@ -44,6 +43,7 @@ SHAPES = {
     "box": "x y width height, with x y the centre",
     "polygon": f"x1 y1 x2 y2 x3 y3 ..., with 3 to {MOST_CORNERS} corners",
 }
+COUNTS = {"circle": (3,), "box": (4,), "polygon": range(6, 2 * MOST_CORNERS + 1, 2)}
 FRAME = "pixel (default): px, counted from 0 at the centre of the first pixel; helioprojective: arcsec"
 router = APIRouter(prefix="/vo", tags=["VO"], route_class=PlainErrors)
 
@@ -59,7 +59,7 @@ router = APIRouter(prefix="/vo", tags=["VO"], route_class=PlainErrors)
         },
         "4XX": {"content": {"text/plain": {}}, "description": "What was expected, what was received, and what to do."},
     },
-    openapi_extra=described(
+    openapi_extra=query(
         ID="id of a product, or its name urn:heliopsf:product:...",
         **{name.upper(): numbers for name, numbers in SHAPES.items()},
         FRAME=FRAME,
@@ -71,8 +71,8 @@ async def get_region(request: Request, caller: Reading, state: Shared, fields: F
     POLYGON."""
     names = fields.get("id", [])
     if len(names) != 1:
-        refused("ID", "of one product", f"{len(names)} of them" if names else None)
-    shape, numbers, frame = _asked(fields)
+        refuse("ID", "of one product", f"{len(names)} of them" if names else None)
+    shape, numbers, frame = _region_of(fields)
     row = await run_in_threadpool(row_named, state, caller, names[0])
     if not isinstance(row, ProductRow):
         raise Problem(
@@ -117,34 +117,27 @@ def described_cutout(identity: str, base: str) -> Service:
     )
 
 
-def _asked(fields: Mapping[str, list[str]]) -> tuple[str, tuple[float, ...], Frame]:
+def _region_of(fields: Mapping[str, list[str]]) -> tuple[str, tuple[float, ...], Frame]:
     """The shape, its numbers and the frame of a request."""
     given = [name for name in SHAPES if name in fields]
     if len(given) != 1:
         got = " and ".join(name.upper() for name in given) if given else None
-        refused("CIRCLE, BOX or POLYGON", "exactly one of them", got)
+        refuse("CIRCLE, BOX or POLYGON", "exactly one of them", got)
     [shape] = given
     text = fields[shape][0]
-    numbers = _numbers(shape, text)
-    sizes = {"circle": numbers[2:], "box": numbers[2:]}.get(shape, ())
-    if any(size <= 0 for size in sizes):
-        refused(shape.upper(), f"{SHAPES[shape]}: sizes above 0", text)
-    named = one(fields, "frame") or FRAMES[0]
-    frame = next((known for known in FRAMES if known == named), None)
-    if frame is None:
-        refused("FRAME", " or ".join(FRAMES), named)
-    return shape, numbers, frame
-
-
-def _numbers(shape: str, text: str) -> tuple[float, ...]:
-    counts = {"circle": (3,), "box": (4,), "polygon": range(6, 2 * MOST_CORNERS + 1, 2)}
     try:
         numbers = tuple(map(float, text.split()))
     except ValueError:
         numbers = ()
-    if len(numbers) not in counts[shape] or not all(map(math.isfinite, numbers)):
-        refused(shape.upper(), f"finite numbers: {SHAPES[shape]}", text)
-    return numbers
+    if len(numbers) not in COUNTS[shape] or not all(map(math.isfinite, numbers)):
+        refuse(shape.upper(), f"finite numbers: {SHAPES[shape]}", text)
+    if shape != "polygon" and min(numbers[2:]) <= 0:
+        refuse(shape.upper(), f"{SHAPES[shape]}: sizes above 0", text)
+    named = one(fields, "frame") or FRAMES[0]
+    frame = next((known for known in FRAMES if known == named), None)
+    if frame is None:
+        refuse("FRAME", " or ".join(FRAMES), named)
+    return shape, numbers, frame
 
 
 def _written(state: State, row: ProductRow, shape: str, numbers: tuple[float, ...], frame: Frame) -> BinaryIO:

@@ -14,13 +14,13 @@ from fastapi import APIRouter, Request, Response
 from pydantic import AnyUrl
 
 from service.http.state import Shared
-from service.operation.health import faults, states
-from service.uws import routes as uws
-from service.vo.asked import base_url
+from service.operation import faults, states
+from service.vo import jobs
 from service.vo.columns import TABLES
 from service.vo.lists import LINKS_STANDARD
+from service.vo.parameters import base_url
 
-MEDIA_TYPE = "text/xml"
+MEDIA_TYPE, VERSION = "text/xml", "1.1"
 BASIC = "ivo://ivoa.net/sso#BasicAA"
 router = APIRouter(prefix="/vo", tags=["VO"])
 
@@ -33,7 +33,6 @@ class Offered:
     path: str
     description: str
     use: Literal["full", "base"] = "full"
-    version: str = "1.1"
     needs_key: bool = True
 
 
@@ -41,7 +40,7 @@ OFFERED = (
     Offered("ivo://ivoa.net/std/VOSI#availability", "/vo/availability", "Whether the service is available.", needs_key=False),
     Offered("ivo://ivoa.net/std/VOSI#capabilities", "/vo/capabilities", "This document.", needs_key=False),
     Offered("ivo://ivoa.net/std/VOSI#tables-1.1", "/vo/tables", "The columns of the lists.", needs_key=False),
-    Offered("ivo://ivoa.net/std/UWS#rest-1.1", uws.router.prefix, "All jobs: deconvolve images, build and fit PSFs, ...", "base"),
+    Offered("ivo://ivoa.net/std/UWS#rest-1.1", jobs.router.prefix, "All jobs: deconvolve images, build and fit PSFs, ...", "base"),
     Offered(LINKS_STANDARD, "/vo/links", "The files and services that belong to a product or PSF.", "base"),
     Offered("urn:heliopsf:products", "/vo/products", "The list of products, with columns of ObsCore.", "base"),
     Offered("urn:heliopsf:psfs", "/vo/psfs", "The list of PSFs, with columns of ObsCore.", "base"),
@@ -84,7 +83,7 @@ def get_capabilities(request: Request, state: Shared) -> Response:
             interface=[
                 ParamHTTP(
                     role="std",
-                    version=offered.version,
+                    version=VERSION,
                     access_url=[AccessURL(value=AnyUrl(base + offered.path), use=offered.use)],
                     security_method=keys if offered.needs_key else [],
                 )

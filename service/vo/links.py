@@ -15,19 +15,9 @@ from fastapi import APIRouter, Request, Response
 from service.http.callers import Caller, Reading
 from service.http.downloads import FITS_TYPE, GZIP_TYPE
 from service.http.state import Shared, State
-from service.vo.asked import (
-    VOTABLE,
-    VOTABLE_TYPE,
-    Fields,
-    VotableErrors,
-    base_url,
-    described,
-    format_of,
-    refused,
-)
 from service.vo.columns import LINKS
-from service.vo.lists import LINKS_STANDARD, LINKS_TYPE
-from service.vo.names import PSF, did, row_named
+from service.vo.lists import LINKS_STANDARD, LINKS_TYPE, PSF, VOTABLE_ERROR, VotableErrors, did, row_named
+from service.vo.parameters import VOTABLE, Fields, base_url, format_of, query, refuse
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 
 MOST_IDS = 200
@@ -43,9 +33,9 @@ router = APIRouter(prefix="/vo", tags=["VO"], route_class=VotableErrors)
     response_class=Response,
     responses={
         200: {"content": {LINKS_TYPE: {}}, "description": "A table of DataLink 1.1"},
-        "4XX": {"content": {VOTABLE_TYPE: {}}, "description": "A VOTable with QUERY_STATUS=ERROR"},
+        **VOTABLE_ERROR,
     },
-    openapi_extra=described(
+    openapi_extra=query(
         ID=f"id of a product or PSF, or its name urn:heliopsf:product:... or urn:heliopsf:psf:...; at most {MOST_IDS}",
         RESPONSEFORMAT="votable, the only format",
     ),
@@ -56,7 +46,7 @@ def get_links(request: Request, caller: Reading, state: Shared, fields: Fields) 
     format_of(fields, VOTABLE)
     names = fields.get("id", [])
     if len(names) > MOST_IDS:
-        refused("ID", f"at most {MOST_IDS} of them", f"{len(names)} of them")
+        refuse("ID", f"at most {MOST_IDS} of them", f"{len(names)} of them")
     rows = [link for name in names for link in _links(state, caller, name, base_url(request))]
     from service.vo.cutouts import described_cutout
     from service.vo.votables import table_document  # loads the numerical libraries
@@ -170,5 +160,5 @@ def _link(
 
 def _fault(name: str | None, message: str, semantics: str = "#this", local: str | None = None) -> Link:
     """A row that says why there is no link."""
-    told = {"error_message": message, "semantics": semantics, "local_semantics": local}
-    return told if name is None else {"ID": name, **told}
+    fault = {"error_message": message, "semantics": semantics, "local_semantics": local}
+    return fault if name is None else {"ID": name, **fault}

@@ -1,88 +1,134 @@
-"""Lists of products and PSFs with the columns of ObsCore, as VOTable or JSON: ``/vo/products`` and ``/vo/psfs``."""
+"""Lists of products and PSFs with the columns of ObsCore, as VOTable or JSON: ``/vo/products`` and ``/vo/psfs``.
+
+The name of a product or PSF for VO clients is ``urn:heliopsf:product:ID`` or ``urn:heliopsf:psf:ID``. The names are in lists,
+DataLink tables and provenance. A request may also give the bare id; if a product and a PSF had the same id, the bare id
+would mean the product.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
 
 from psfcore.errors import DataError
 from psfcore.fits.frame import plate_scale_arcsec
-from service.http.callers import Reading
+from service.http.callers import Caller, Reading
 from service.http.paging import following, position
-from service.http.state import Shared
-from service.uws.parameters import integer
-from service.vo.asked import (
+from service.http.problems import Problem
+from service.http.state import Shared, State
+from service.vo.columns import PRODUCTS, PSFS, Table
+from service.vo.parameters import (
     JSON,
+    JSON_TYPE,
     VOTABLE,
     VOTABLE_TYPE,
     Fields,
-    VotableErrors,
+    PlainErrors,
     base_url,
-    described,
     format_of,
+    integer,
     one,
+    query,
 )
-from service.vo.columns import PRODUCTS, PSFS, Table
-from service.vo.names import PRODUCT, PSF, did
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
-from workers.versions.validity import iso, seconds
+from workers.lineage import NAMES
+from workers.versions import iso, seconds
 
+PRODUCT, PSF = "product", "psf"
+TABLES_OF_NAMES: dict[str, type[Any]] = {PRODUCT: ProductRow, PSF: PsfRow}
+NAME = re.compile(rf"(?:{NAMES}({PRODUCT}|{PSF}):)?([0-9a-f]{{64}})")
 LINKS_TYPE = f"{VOTABLE_TYPE};content=datalink"
 LINKS_STANDARD = "ivo://ivoa.net/std/DataLink#links-1.1"
 USUAL, MOST = 1000, 5000
 MJD_1970, DAY_S = 40587.0, 86400.0
 M_PER_ANGSTROM = 1e-10
 COLLECTION = "heliopsf"
-PARAMETERS = described(
-    MAXREC=f"largest number of rows; default {USUAL}, at most {MOST}; 0: only the columns",
-    CURSOR="the cursor in the address of the next page, INFO `next`",
-    RESPONSEFORMAT="votable (default) or json",
-)
-BODY: dict[str, Any] = {
+
+
+class VotableErrors(PlainErrors):
+    """Errors as VOTables."""
+
+    async def error(self, problem: Problem) -> Response:
+        """The answer that reports an error."""
+        content = await run_in_threadpool(_error_document, problem.detail)
+        return Response(content, problem.status, headers=problem.headers, media_type=VOTABLE_TYPE)
+
+
+def _error_document(message: str) -> bytes:
+    from service.vo.votables import error_document  # loads the numerical libraries
+
+    return error_document(message)
+
+
+VOTABLE_ERROR: dict[int | str, dict[str, Any]] = {
+    "4XX": {"content": {VOTABLE_TYPE: {}}, "description": "A VOTable with QUERY_STATUS=ERROR"}
+}
+LIST: dict[str, Any] = {
     "response_class": Response,
     "responses": {
         200: {
             "description": "A VOTable 1.4, or JSON: `columns`, `rows`, `status` (OK or OVERFLOW), `next`",
-            "content": {VOTABLE_TYPE: {}, "application/json": {"schema": {"type": "object"}}},
+            "content": {VOTABLE_TYPE: {}, JSON_TYPE: {"schema": {"type": "object"}}},
         },
-        "4XX": {"content": {VOTABLE_TYPE: {}}, "description": "A VOTable with QUERY_STATUS=ERROR"},
+        **VOTABLE_ERROR,
     },
-    "openapi_extra": PARAMETERS,
+    "openapi_extra": query(
+        MAXREC=f"largest number of rows; default {USUAL}, at most {MOST}; 0: only the columns",
+        CURSOR="the cursor in the address of the next page, INFO `next`",
+        RESPONSEFORMAT="votable (default) or json",
+    ),
 }
 router = APIRouter(prefix="/vo", tags=["VO"], route_class=VotableErrors)
 
 
-@router.get("/products", summary="Products with the columns of ObsCore", **BODY)
+@router.get("/products", summary="Products with the columns of ObsCore", **LIST)
 @router.post("/products", include_in_schema=False)
 def list_vo_products(request: Request, caller: Reading, state: Shared, fields: Fields) -> Response:
     """Your products, newest first. A harvester reads pages until it meets a product that it knows."""
-
-    def page(limit: int, after: tuple[float, str] | None) -> Sequence[ProductRow]:
-        return state.catalogue.page(ProductRow, owner=caller.owner, limit=limit, after=after)
 
     def records(rows: Sequence[ProductRow]) -> list[dict[str, Any]]:
         images = state.catalogue.rows(ImageRow, {row.image_id for row in rows}, caller.owner)
         return [product_record(row, images.get(row.image_id), base_url(request)) for row in rows]
 
+    page = partial(state.catalogue.page, ProductRow, owner=caller.owner)
     return _listed(request, fields, PRODUCTS, page, records)
 
 
-@router.get("/psfs", summary="PSFs with the columns of ObsCore", **BODY)
+@router.get("/psfs", summary="PSFs with the columns of ObsCore", **LIST)
 @router.post("/psfs", include_in_schema=False)
 def list_vo_psfs(request: Request, caller: Reading, state: Shared, fields: Fields) -> Response:
     """Your PSFs, newest first. `t_min` and `t_max` are the validity of certified PSFs."""
 
-    def page(limit: int, after: tuple[float, str] | None) -> Sequence[PsfRow]:
-        return state.catalogue.page(PsfRow, owner=caller.owner, limit=limit, after=after)
-
     def records(rows: Sequence[PsfRow]) -> list[dict[str, Any]]:
         return [psf_record(row, base_url(request)) for row in rows]
 
+    page = partial(state.catalogue.page, PsfRow, owner=caller.owner)
     return _listed(request, fields, PSFS, page, records)
+
+
+def did(kind: str, identity: str) -> str:
+    """The name of a product or PSF."""
+    return f"{NAMES}{kind}:{identity}"
+
+
+def row_named(state: State, caller: Caller, name: str) -> ProductRow | PsfRow | None:
+    """The row of the product or PSF with this name or id; None if the caller has none."""
+    parts = NAME.fullmatch(name)
+    if parts is None:
+        return None
+    rows: Iterator[ProductRow | PsfRow | None] = (
+        state.catalogue.get(table, parts[2], caller.owner)
+        for kind, table in TABLES_OF_NAMES.items()
+        if parts[1] in (None, kind)
+    )
+    return next((row for row in rows if row is not None), None)
 
 
 def product_record(row: ProductRow, image: ImageRow | None, base: str) -> dict[str, Any]:
@@ -163,20 +209,24 @@ def _listed(
     request: Request,
     fields: Mapping[str, list[str]],
     table: Table,
-    page: Callable[[int, tuple[float, str] | None], Sequence[Any]],
+    page: Callable[..., Sequence[Any]],
     records: Callable[[Sequence[Any]], list[dict[str, Any]]],
 ) -> Response:
     """The answer to a request for a list."""
-    asked_format = format_of(fields, VOTABLE, JSON)
+    answer_format = format_of(fields, VOTABLE, JSON)
     limit = min(integer("MAXREC", one(fields, "maxrec") or str(USUAL), 0), MOST)
-    found = page(limit + 1, position(one(fields, "cursor")))
-    rows = found[:limit]
-    status = "OVERFLOW" if len(found) > limit else "OK"
+    listed = page(limit=limit + 1, after=position(one(fields, "cursor")))
+    rows = listed[:limit]
+    status = "OVERFLOW" if len(listed) > limit else "OK"
     after = rows[-1] if rows and status == "OVERFLOW" else None
     link = None if after is None else following(request, repr(after.created_at), after.id)
     following_page = None if link is None else base_url(request) + link
-    if asked_format == JSON:
-        return JSONResponse(_as_json(table, records(rows), status, following_page))
+    if answer_format == JSON:
+        about = ("name", "description", "datatype", "unit", "ucd", "utype", "xtype")
+        columns = [{key: getattr(column, key) for key in about} for column in table.columns]
+        cells = [{column.name: row.get(column.name) for column in table.columns} for row in records(rows)]
+        document = {"table": table.name, "columns": columns, "rows": cells}
+        return JSONResponse(document | {"status": status, "next": following_page})
     from service.vo.votables import Input, Service, table_document  # loads the numerical libraries
 
     links = Service(
@@ -192,19 +242,6 @@ def _listed(
         table.name, table.columns, records(rows), status=status, infos=infos, services=[links]
     )
     return Response(content, media_type=VOTABLE_TYPE)
-
-
-def _as_json(
-    table: Table, rows: Sequence[Mapping[str, Any]], status: str, following_page: str | None
-) -> dict[str, Any]:
-    about = ("name", "description", "datatype", "unit", "ucd", "utype", "xtype")
-    return {
-        "table": table.name,
-        "columns": [{key: getattr(column, key) for key in about} for column in table.columns],
-        "rows": [{column.name: row.get(column.name) for column in table.columns} for row in rows],
-        "status": status,
-        "next": following_page,
-    }
 
 
 def _channel(angstrom: float | None) -> dict[str, float | None]:

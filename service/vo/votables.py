@@ -12,8 +12,8 @@ from typing import Any
 
 from astropy.io.votable import tree
 
-from service.uws.documents import NO_XML
 from service.vo.columns import Column
+from service.vo.parameters import NO_XML
 from workers.settings import software_version
 
 VERSION = "1.4"
@@ -64,8 +64,8 @@ def table_document(
     results = tree.Resource(type="results")
     votable.resources.append(results)
     results.infos.append(tree.Info(name="QUERY_STATUS", value=status))
-    said = {"server_software": f"heliopsf {software_version()}", **(infos or {})}
-    results.infos.extend(tree.Info(name=name, value=value) for name, value in said.items())
+    notes = {"server_software": f"heliopsf {software_version()}", **(infos or {})}
+    results.infos.extend(tree.Info(name=name, value=value) for name, value in notes.items())
     table = tree.TableElement(votable, name=name)
     results.tables.append(table)
     for column in columns:
@@ -134,7 +134,7 @@ def _described(votable: tree.VOTableFile, service: Service) -> tree.Resource:
 
 
 def _parameter(votable: tree.VOTableFile, service_id: str, one: Input) -> tree.Param:
-    found = tree.Param(
+    parameter = tree.Param(
         votable,
         ID=f"{service_id}-{one.name}",  # otherwise astropy writes the name, which may be the ID of a column
         name=one.name,
@@ -144,9 +144,9 @@ def _parameter(votable: tree.VOTableFile, service_id: str, one: Input) -> tree.P
         ucd=one.ucd,
         ref=one.ref,
     )
-    found.description = one.description or None
-    found.values.options.extend((option, option) for option in one.options)
-    return found
+    parameter.description = one.description or None
+    parameter.values.options.extend((option, option) for option in one.options)
+    return parameter
 
 
 def _written(votable: tree.VOTableFile) -> bytes:

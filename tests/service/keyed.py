@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 

@@ -21,7 +21,7 @@ from sqlalchemy import create_engine, make_url, select, text
 from sqlalchemy.exc import OperationalError
 
 from service.client.http import Client
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings

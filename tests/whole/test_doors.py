@@ -21,7 +21,7 @@ from service.client.http import Client
 from tests.conftest import write_image
 from tests.service.keyed import ALL, bearer
 from tests.whole.stack import QUICK, wait_for
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
 

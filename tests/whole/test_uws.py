@@ -20,7 +20,7 @@ from pyvo.io.uws import parse_job_list
 from service.client.http import Client, ServiceError
 from tests.conftest import SMALL_INSTRUMENT, write_image
 from tests.whole.stack import Stack, wait_for
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 
 BUILD = {"KIND": "psf-build", "instrument_file": SMALL_INSTRUMENT, "size": "128", "RUNID": "<small> & quick"}
 

@@ -18,7 +18,7 @@ from service.client.http import Client
 from tests.conftest import write_image, write_psf
 from tests.service.vo.made import OBSERVED, WCS_CARDS
 from tests.whole.stack import Stack, wait_for
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 
 pytestmark = pytest.mark.slow
 

@@ -13,9 +13,7 @@ from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ProductRow, PsfRow
-from workers.versions.series import series_of
-from workers.versions.status import PsfStatus
-from workers.versions.validity import Validity
+from workers.versions import PsfStatus, Validity, series_of
 
 OWNER = "local"
 ALWAYS = Validity()

@@ -16,7 +16,7 @@ from workers.files import archive as archive_files
 from workers.files import beneath
 from workers.files.store import is_disk_full, sha256_of
 from workers.settings import Settings
-from workers.versions.validity import seconds
+from workers.versions import seconds
 
 
 def target_of(

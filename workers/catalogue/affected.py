@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Select, exists, select, tuple_, union_all
+from sqlalchemy import Select, exists, select, union_all
 from sqlalchemy.orm import Session
 
-from workers.catalogue.database import Database
+from workers.catalogue.database import Queries, newest_first
 from workers.catalogue.tables import ProductRow, PsfRow
-from workers.versions.status import PsfStatus
+from workers.versions import PsfStatus
 
 PSFS_AT_A_TIME = 16
 MOST_SUCCESSORS = 32
@@ -35,16 +35,13 @@ class Place:
     product_id: str
 
 
-class AffectedProducts:
-    """Products by the status of their PSF; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class AffectedProducts(Queries):
+    """Products by the status of their PSF."""
 
     def of_psf(self, psf: PsfRow, *, limit: int, after: tuple[float, str] | None = None) -> list[Affected]:
         """Products that were made with a PSF, newest first."""
         with self._database.reading() as session:
-            return _told(session, [psf], session.scalars(_products(psf, limit, after)).all())
+            return _affected(session, [psf], session.scalars(_products(psf, limit, after)).all())
 
     def replacement(self, psf: PsfRow) -> PsfRow | None:
         """The certified PSF at the end of a PSF's chain of successors; None if there is none."""
@@ -57,21 +54,21 @@ class AffectedProducts:
         The method makes several queries, each of which reads only the rows that it returns. A single query with a join
         would be slower: it would sort all products of a PSF first.
         """
-        found: list[Affected] = []
+        affected: list[Affected] = []
         with self._database.reading() as session:
             done = ""
             if after is not None:
                 psf, done = session.get(PsfRow, (owner, after.psf_id)), after.psf_id
                 if psf is not None:
                     rest = _products(psf, limit, (after.created_at, after.product_id))
-                    found += _told(session, [psf], session.scalars(rest).all())
-            while len(found) < limit:
+                    affected += _affected(session, [psf], session.scalars(rest).all())
+            while len(affected) < limit:
                 psfs = session.scalars(_next_psfs(owner, superseded, done)).all()
                 if not psfs:
                     break
-                found += _told(session, psfs, _first_products(session, psfs, limit - len(found)))
+                affected += _affected(session, psfs, _first_products(session, psfs, limit - len(affected)))
                 done = psfs[-1].id
-        return found[:limit]
+        return affected[:limit]
 
 
 def _next_psfs(owner: str, superseded: bool, after: str) -> Select[Any]:
@@ -88,9 +85,7 @@ def _next_psfs(owner: str, superseded: bool, after: str) -> Select[Any]:
 def _products(psf: PsfRow, limit: int, after: tuple[float, str] | None = None) -> Select[Any]:
     """Products of a PSF, newest first."""
     query = select(ProductRow).where(ProductRow.owner == psf.owner, ProductRow.psf_id == psf.id)
-    if after is not None:
-        query = query.where(tuple_(ProductRow.created_at, ProductRow.id) < after)
-    return query.order_by(ProductRow.created_at.desc(), ProductRow.id.desc()).limit(limit)
+    return newest_first(query, ProductRow, limit, after)
 
 
 def _first_products(session: Session, psfs: Sequence[PsfRow], limit: int) -> list[ProductRow]:
@@ -105,7 +100,7 @@ def _first_products(session: Session, psfs: Sequence[PsfRow], limit: int) -> lis
     return sorted(rows, key=lambda row: (-place[row.psf_id], row.created_at, row.id), reverse=True)
 
 
-def _told(session: Session, psfs: Sequence[PsfRow], products: Sequence[ProductRow]) -> list[Affected]:
+def _affected(session: Session, psfs: Sequence[PsfRow], products: Sequence[ProductRow]) -> list[Affected]:
     """For each product: its PSF, and the certified PSF at the end of the chain of successors of this PSF."""
     known = _with_successors(session, psfs)
     return [Affected(row, known[row.psf_id], _last_successor(known, known[row.psf_id])) for row in products]

@@ -6,30 +6,30 @@ that are common to all content-addressed rows.
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Collection, Sequence
 from typing import TypeVar
 
-from sqlalchemy import Select, String, cast, select, tuple_
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import Select, String, cast, create_engine, select
+from sqlalchemy.exc import DatabaseError, IntegrityError
 from sqlalchemy.orm import Session
+from sqlalchemy.pool import NullPool
 
 from psfcore.errors import DataError
-from workers.catalogue.access.keys import Keys
-from workers.catalogue.access.sessions import Sessions
+from workers.catalogue.access import Keys, Sessions
 from workers.catalogue.affected import AffectedProducts
 from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Bulks
 from workers.catalogue.census import Census
 from workers.catalogue.contexts import Contexts
-from workers.catalogue.database import Database, begins_with
-from workers.catalogue.followed.rows import followed_bulks, followed_jobs
-from workers.catalogue.interpolated.series import Series
+from workers.catalogue.database import Database, begins_with, newest_first
+from workers.catalogue.followed import followed_bulks, followed_jobs
 from workers.catalogue.jobs import Jobs
-from workers.catalogue.named_files import NamedFiles
-from workers.catalogue.owners import Owners, hold_to_quota, lock_owner
+from workers.catalogue.owners import NamedFiles, Owners, hold_to_quota, lock_owner
 from workers.catalogue.parts import Parts
-from workers.catalogue.psfs import Psfs
+from workers.catalogue.psfs import Psfs, existing_psf
 from workers.catalogue.schema import Schema
+from workers.catalogue.series import Series
 from workers.catalogue.stage_times import KeptStageTimes
 from workers.catalogue.tables import (
     ImageRow,
@@ -47,7 +47,7 @@ from workers.catalogue.waiting import Places, Turns
 from workers.contract.bulk import OPEN
 from workers.contract.identities import canonical_hash
 from workers.contract.phases import ENDED, Phase
-from workers.versions.status import PsfStatus
+from workers.versions import PsfStatus
 
 Row = TypeVar("Row", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 Made = TypeVar("Made", ProductRow, PsfRow, ReportRow)
@@ -56,6 +56,7 @@ AnyRow = TypeVar(
 )
 ListedRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | JobRow | PsfContextRow | BulkRow
 MOST_CANDIDATES = 6
+QUICK_CHECK = "PRAGMA quick_check(1)"  # SQLite compares all pages of the file, and reports the first fault
 _IN_A_QUERY = 500  # databases limit the number of values in a query
 
 
@@ -64,7 +65,6 @@ class Catalogue:
 
     def __init__(self, url: str) -> None:
         self._database = Database(url)
-        self._engine = self._database.engine
         self.schema = Schema(self._database)
         self.jobs = Jobs(self._database)
         self.turns = Turns(self._database, self.jobs)
@@ -95,15 +95,21 @@ class Catalogue:
 
     def ping(self) -> None:
         """Raise ``sqlalchemy.exc.SQLAlchemyError`` if the database does not answer."""
-        with self._database.reading() as session:
-            session.execute(select(1))
+        self._database.clock()
 
     def check_pages(self) -> None:
         """Raise ``sqlalchemy.exc.DatabaseError`` if the file of an SQLite database is damaged.
 
         This reads the whole file. PostgreSQL checks the pages that it reads itself.
         """
-        self._database.check_pages()
+        if not self._database.sqlite:
+            return
+        # A new connection, because the other connections keep pages in memory and do not read these pages again.
+        fresh = create_engine(self._database.engine.url, poolclass=NullPool)
+        with fresh.connect() as connection:
+            (state,) = connection.exec_driver_sql(QUICK_CHECK).one()
+        if state != "ok":
+            raise DatabaseError(QUICK_CHECK, None, sqlite3.DatabaseError(f"malformed: {state}"))
 
     def add(self, row: Row, quota_mib: int | None = None) -> tuple[Row, bool]:
         """Insert a content-addressed row; returns the row with this identity, and whether it is new.
@@ -142,18 +148,16 @@ class Catalogue:
 
     def get(self, table: type[Row], identity: str, owner: str) -> Row | None:
         """The row with this identity, or None."""
-        with self._database.reading() as session:
-            return session.get(table, (owner, identity))
+        return self._database.row(table, (owner, identity))
 
     def rows(self, table: type[Row], identities: Collection[str], owner: str) -> dict[str, Row]:
         """The rows with these identities, by their id. An identity without a row is left out."""
-        found: dict[str, Row] = {}
-        wanted = sorted(identities)
-        with self._database.reading() as session:
-            for at in range(0, len(wanted), _IN_A_QUERY):
-                query = select(table).where(table.owner == owner, table.id.in_(wanted[at : at + _IN_A_QUERY]))
-                found |= {row.id: row for row in session.scalars(query)}
-        return found
+        rows: dict[str, Row] = {}
+        ids = sorted(identities)
+        for at in range(0, len(ids), _IN_A_QUERY):
+            query = select(table).where(table.owner == owner, table.id.in_(ids[at : at + _IN_A_QUERY]))
+            rows |= {row.id: row for row in self._database.all(query)}
+        return rows
 
     def delete_draft(self, psf_id: str, owner: str) -> PsfRow:
         """Delete a draft PSF that nothing uses; returns the deleted row.
@@ -162,24 +166,13 @@ class Catalogue:
         Raises ``DataError`` "no-such-psf", "not-a-draft" or "psf-in-use", and then deletes nothing.
         """
         with self._database.writing.begin() as session:
-            row = session.get(PsfRow, (owner, psf_id), with_for_update=True)
-            if row is None:
-                raise DataError(
-                    "no-such-psf",
-                    f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
-                )
+            row = existing_psf(session, psf_id, owner, lock=True)
             if row.status != PsfStatus.DRAFT:
                 raise DataError(
                     "not-a-draft",
                     f"expected a draft; PSF {psf_id} is {row.status}, and such PSFs are never deleted: deprecate it instead",
                 )
-            user = _user_of(session, row)
-            if user is not None:
-                raise DataError(
-                    "psf-in-use",
-                    f"expected a PSF that nothing uses; {user[0]} {user[1][:SHOWN_DIGITS]} uses PSF {psf_id}: "
-                    + _FIRST[user[0]].format(id=user[1][:SHOWN_DIGITS]),
-                )
+            _check_unused(session, row)
             session.delete(row)
             _unshare_jobs(session, owner, psf_id)
             return row
@@ -187,14 +180,12 @@ class Catalogue:
     def ids_from(self, table: type[ListedRow], digits: str, owner: str) -> Sequence[str]:
         """The ids of an owner's rows that begin with these digits, at most MOST_CANDIDATES."""
         query = select(table.id).where(table.owner == owner, begins_with(table.id, digits))
-        with self._database.reading() as session:
-            return session.scalars(query.order_by(table.id).limit(MOST_CANDIDATES)).all()
+        return self._database.all(query.order_by(table.id).limit(MOST_CANDIDATES))
 
     def ids_among(self, table: type[AnyRow], identities: Collection[str], owner: str) -> set[str]:
         """The ids in ``identities`` that the catalogue contains."""
         query = select(table.id).where(table.owner == owner, table.id.in_(identities))
-        with self._database.reading() as session:
-            return set(session.scalars(query))
+        return set(self._database.all(query))
 
     def delete_product(self, identity: str, owner: str) -> bool:
         """Remove a product from the catalogue; returns whether it was there.
@@ -227,24 +218,7 @@ class Catalogue:
         for column, value in equal.items():
             if value is not None:
                 query = query.where(getattr(table, column) == value)
-        if after is not None:
-            query = query.where(tuple_(table.created_at, table.id) < after)
-        query = query.order_by(table.created_at.desc(), table.id.desc()).limit(limit)
-        with self._database.reading() as session:
-            return session.scalars(query).all()
-
-
-# Advice in the error "psf-in-use": what to do first, by the type of the thing that uses the PSF.
-_FIRST = {
-    "product": "delete that product first: `heliopsf product delete {id}`",
-    "context": "a context never changes, so its PSFs are kept",
-    "bulk run": "cancel that run first: `heliopsf bulk cancel {id}`",
-    "job": "wait until the job has ended, or cancel it: `heliopsf job cancel {id}`",
-    "PSF": "that PSF was made from this one; delete it first: `heliopsf psf delete {id}`",
-}
-SHOWN_DIGITS = (
-    12  # messages show this many digits of an id; every command accepts ids that are shortened in this way
-)
+        return self._database.all(newest_first(query, table, limit, after))
 
 
 def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:
@@ -259,33 +233,39 @@ def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:
         job.request_key = canonical_hash({"request_key": job.request_key, "deleted": job.id})
 
 
-def _user_of(session: Session, psf: PsfRow) -> tuple[str, str] | None:
-    """The type (a key of _FIRST) and the id of one product, context, ... that uses a PSF; None if nothing uses the
-    PSF."""
-    found: str | None
-    owner = psf.owner
-    products = select(ProductRow.id).where(ProductRow.owner == owner, ProductRow.psf_id == psf.id)
-    pins = select(PsfPinRow.context_id).where(PsfPinRow.owner == owner, PsfPinRow.psf_id == psf.id)
-    runs = select(BulkRow.id).where(
-        BulkRow.owner == owner, BulkRow.psf_id == psf.id, BulkRow.phase.in_(sorted(OPEN))
-    )
-    jobs = select(JobRow.id).where(
-        JobRow.owner == owner,
-        JobRow.phase.not_in(sorted(ENDED)),
-        cast(JobRow.parameters, String).contains(psf.id),
-    )
+def _check_unused(session: Session, psf: PsfRow) -> None:
+    """Raise ``DataError`` "psf-in-use" if a product, context, open bulk run, unfinished job or other PSF uses a PSF."""
+    products = select(ProductRow.id).where(ProductRow.owner == psf.owner, ProductRow.psf_id == psf.id)
+    pins = select(PsfPinRow.context_id).where(PsfPinRow.owner == psf.owner, PsfPinRow.psf_id == psf.id)
+    runs = select(BulkRow.id).where(BulkRow.owner == psf.owner, BulkRow.psf_id == psf.id)
+    jobs = select(JobRow.id).where(JobRow.owner == psf.owner, JobRow.phase.not_in(sorted(ENDED)))
+    psfs = select(PsfRow.id).where(PsfRow.owner == psf.owner, PsfRow.id != psf.id)
     # The details of a fitted or corrected PSF name the PSFs from which it was made.
-    psfs = select(PsfRow.id).where(
-        PsfRow.owner == owner, PsfRow.id != psf.id, cast(PsfRow.details, String).contains(psf.id)
+    in_details = cast(PsfRow.details, String).contains(psf.id)
+    users: tuple[tuple[str, Select[str], str], ...] = (
+        ("product", products, "delete that product first: `heliopsf product delete {id}`"),
+        ("context", pins, "a context never changes, so its PSFs are kept"),
+        (
+            "bulk run",
+            runs.where(BulkRow.phase.in_(sorted(OPEN))),
+            "cancel that run first: `heliopsf bulk cancel {id}`",
+        ),
+        (
+            "job",
+            jobs.where(cast(JobRow.parameters, String).contains(psf.id)),
+            "wait until the job has ended, or cancel it: `heliopsf job cancel {id}`",
+        ),
+        (
+            "PSF",
+            psfs.where(in_details),
+            "that PSF was made from this one; delete it first: `heliopsf psf delete {id}`",
+        ),
     )
-    for what, query in (
-        ("product", products),
-        ("context", pins),
-        ("bulk run", runs),
-        ("job", jobs),
-        ("PSF", psfs),
-    ):
-        found = session.scalars(query.limit(1)).first()
-        if found is not None:
-            return what, found
-    return None
+    for kind, query, advice in users:
+        user = session.scalars(query.limit(1)).first()
+        if user is not None:
+            shown = user[:12]  # every command accepts ids that are shortened in this way
+            raise DataError(
+                "psf-in-use",
+                f"expected a PSF that nothing uses; {kind} {shown} uses PSF {psf.id}: {advice.format(id=shown)}",
+            )

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import case, delete, func, select
-from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy import ColumnElement, case, delete, func, literal, select
 
-from workers.catalogue.database import Database
+from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.jobs import no_equal_at_work
+from workers.catalogue.owners import FileRow
 from workers.catalogue.tables import (
     ImageRow,
     JobRow,
@@ -36,6 +36,17 @@ class JobTally:
     run_s: float  # sum over the jobs that ended: seconds from the last start to the end
 
 
+# The tables of files, and the origin of their files; a PSF has its own origin.
+ORIGINS: dict[type[FileRow], str] = {
+    ImageRow: "uploaded",
+    TransitRow: "uploaded",
+    PsfRow: "",
+    ProductRow: "built",
+    ReportRow: "built",
+    SolutionRow: "built",
+}
+
+
 @dataclass(frozen=True)
 class FileTally:
     """The number of files of one kind and origin, and their size."""
@@ -46,26 +57,21 @@ class FileTally:
     bytes: int
 
 
-class Census:
-    """Counts, and the list of workers; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Census(Queries):
+    """Counts, and the list of workers."""
 
     def announce(self, worker: str, started_at: float, version: str) -> None:
         """Record that a worker process is alive; delete the rows of workers that have been silent for an hour."""
         now = self._database.now
-        insert = sqlite.insert if self._database.sqlite else postgresql.insert
-        said = {"started_at": started_at, "heartbeat_at": now, "version": version}
-        there = insert(WorkerRow).values(name=worker, **said)
+        values = {"started_at": started_at, "heartbeat_at": now, "version": version}
         with self._database.writing.begin() as session:
             session.execute(delete(WorkerRow).where(WorkerRow.heartbeat_at < now - 3600.0))
-            session.execute(there.on_conflict_do_update(index_elements=["name"], set_=said))
+            row = insert_into(session, WorkerRow).values(name=worker, **values)
+            session.execute(row.on_conflict_do_update(index_elements=["name"], set_=values))
 
     def take_leave(self, worker: str) -> None:
         """Record that a worker process ends."""
-        with self._database.writing.begin() as session:
-            session.execute(delete(WorkerRow).where(WorkerRow.name == worker))
+        self._database.change(delete(WorkerRow).where(WorkerRow.name == worker))
 
     def workers(self, lease_s: float) -> Sequence[WorkerRow]:
         """Worker processes whose last heartbeat is at most ``lease_s`` seconds old.
@@ -74,8 +80,7 @@ class Census:
         """
         now = self._database.now
         query = select(WorkerRow).where(WorkerRow.heartbeat_at.between(now - lease_s, now + lease_s))
-        with self._database.reading() as session:
-            return session.scalars(query.order_by(WorkerRow.name)).all()
+        return self._database.all(query.order_by(WorkerRow.name))
 
     def tally(self) -> list[JobTally]:
         """Jobs by kind and phase."""
@@ -95,49 +100,41 @@ class Census:
 
     def tally_files(self) -> list[FileTally]:
         """Numbers and bytes of files, by kind and origin."""
-        found = []
+        tallies = []
         with self._database.reading() as session:
-            for kind, upload in (("image", ImageRow), ("transit", TransitRow)):
-                files, size = session.execute(
-                    select(func.count(), func.coalesce(func.sum(upload.bytes), 0)).select_from(upload)
-                ).one()
-                found.append(FileTally(kind, "uploaded", int(files), int(size)))
-            query = select(PsfRow.origin, func.count(), func.sum(PsfRow.bytes)).group_by(PsfRow.origin)
-            for origin, files, size in session.execute(query):
-                found.append(FileTally("psf", origin, int(files), int(size)))
-            for kind, made in (("product", ProductRow), ("report", ReportRow), ("solution", SolutionRow)):
-                files, size = session.execute(
-                    select(func.count(), func.coalesce(func.sum(made.bytes), 0)).select_from(made)
-                ).one()
-                found.append(FileTally(kind, "built", int(files), int(size)))
-        return found
+            for table, origin in ORIGINS.items():
+                sums = (func.count(), func.coalesce(func.sum(table.bytes), 0))
+                query = select(literal(origin), *sums).select_from(table)
+                if table is PsfRow:
+                    query = select(PsfRow.origin, *sums).group_by(PsfRow.origin)
+                kind = table.__tablename__.removesuffix("s")
+                rows = session.execute(query)
+                tallies += [FileTally(kind, of, int(files), int(size)) for of, files, size in rows]
+        return tallies
 
     def oldest_queued_at(self, queue: Queue | None = None) -> float | None:
         """Creation time of the oldest waiting job, in one queue or in all; None if no job waits."""
         waiting = select(func.min(JobRow.created_at)).where(JobRow.phase == Phase.QUEUED)
-        with self._database.reading() as session:
-            return session.scalar(waiting if queue is None else waiting.where(JobRow.queue == queue))
+        return self._database.first(waiting if queue is None else waiting.where(JobRow.queue == queue))
 
     def count_silent(self, lease_s: float) -> int:
         """Number of executing jobs whose worker has been silent for longer than the lease."""
         now = self._database.now
         heard = JobRow.heartbeat_at.between(now - lease_s, now + lease_s)
-        silent = (JobRow.phase == Phase.EXECUTING, ~heard)
-        with self._database.reading() as session:
-            return session.scalar(select(func.count()).select_from(JobRow).where(*silent)) or 0
+        return self._count_jobs(JobRow.phase == Phase.EXECUTING, ~heard)
 
     def count_unsubmitted(self, older_than_s: float) -> int:
         """Number of queued jobs that could start, but were not given to the broker within ``older_than_s``."""
-        left = (
+        return self._count_jobs(
             JobRow.phase == Phase.QUEUED,
             JobRow.submitted_at.is_(None),
             JobRow.created_at < self._database.now - older_than_s,
             no_equal_at_work(),
         )
-        with self._database.reading() as session:
-            return session.scalar(select(func.count()).select_from(JobRow).where(*left)) or 0
+
+    def _count_jobs(self, *conditions: ColumnElement[bool]) -> int:
+        return self._database.first(select(func.count()).select_from(JobRow).where(*conditions)) or 0
 
     def clock(self) -> float:
         """The time of the database's clock, in seconds since 1970."""
-        with self._database.reading() as session:
-            return float(session.scalars(select(self._database.now)).one())
+        return self._database.clock()

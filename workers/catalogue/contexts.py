@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -14,13 +13,13 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
-from workers.catalogue.database import Database, begins_with, several_ids_fit
-from workers.catalogue.interpolated.series import may_interpolate
+from workers.catalogue.database import Queries, begins_with, several_ids_fit
+from workers.catalogue.psfs import existing_psf, validity_of
+from workers.catalogue.series import may_interpolate
 from workers.catalogue.tables import DefaultContextRow, PsfContextRow, PsfPinRow, PsfRow
 from workers.contract.identities import canonical_hash
 from workers.contract.requests import SHORT_ID
-from workers.versions.status import PsfStatus
-from workers.versions.validity import Validity, iso
+from workers.versions import PsfStatus, Validity, iso
 
 NOW = "now"  # in place of a context's name: use the PSFs that are certified now, not the owner's default context
 RESERVED = (NOW, "default")
@@ -37,20 +36,11 @@ class Pin:
     validity: Validity | None = None
 
 
-class Contexts:
-    """The tables of contexts; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Contexts(Queries):
+    """The tables of contexts."""
 
     def create(
-        self,
-        name: str,
-        owner: str,
-        by: str,
-        *,
-        reason: str = "",
-        pins: Sequence[Pin] | None = None,
+        self, name: str, owner: str, by: str, *, reason: str = "", pins: Sequence[Pin] | None = None
     ) -> tuple[PsfContextRow, bool]:
         """Create a context of these pins; if ``pins`` is None, of all certified PSFs.
 
@@ -67,17 +57,17 @@ class Contexts:
             )
         try:
             with self._database.writing.begin() as session:
-                rows = _certified(session, owner) if pins is None else _given(session, owner, pins)
+                rows = _pins_of_all(session, owner) if pins is None else _pins_of(session, owner, pins)
                 for row in rows:
                     row.interpolated = may_interpolate(session, row.series, owner)
-                made = _context(name, owner, by, reason, rows)
-                session.add_all((made, *rows))
-            return made, True
+                context = _context(name, owner, by, reason, rows)
+                session.add_all((context, *rows))
+            return context, True
         except IntegrityError:
             existing = self.find(name, owner)
             if existing is None:
                 raise
-            if existing.id != made.id:
+            if existing.id != context.id:
                 raise DataError(
                     "name-taken",
                     f"expected a name that no other context has; {name} is the context {existing.id} with other PSFs or other series "
@@ -91,49 +81,46 @@ class Contexts:
         Raises ``DataError`` "several-ids-fit".
         """
         of_owner = select(PsfContextRow).where(PsfContextRow.owner == owner)
-        with self._database.reading() as session:
-            if _ID.fullmatch(id_or_name):
-                return session.get(PsfContextRow, (owner, id_or_name))
-            found = session.scalars(of_owner.where(PsfContextRow.name == id_or_name)).first()
-            if found is not None or not _SHORT_ID.fullmatch(id_or_name):
-                return found
-            rows = session.scalars(of_owner.where(begins_with(PsfContextRow.id, id_or_name)).limit(6)).all()
+        if _ID.fullmatch(id_or_name):
+            return self._database.row(PsfContextRow, (owner, id_or_name))
+        named = self._database.first(of_owner.where(PsfContextRow.name == id_or_name))
+        if named is not None or not _SHORT_ID.fullmatch(id_or_name):
+            return named
+        rows = self._database.all(of_owner.where(begins_with(PsfContextRow.id, id_or_name)).limit(6))
         if len(rows) > 1:
             raise several_ids_fit(id_or_name, [row.id for row in rows])
         return rows[0] if rows else None
 
     def named(self, id_or_name: str, owner: str) -> PsfContextRow:
         """The context with this id or name. Raises ``DataError`` "no-such-context" or "several-ids-fit"."""
-        found = self.find(id_or_name, owner)
-        if found is None:
+        context = self.find(id_or_name, owner)
+        if context is None:
             raise DataError(
                 "no-such-context",
                 f"expected the id or name of a context; got {id_or_name!r}, which does not exist: list the contexts",
             )
-        return found
+        return context
 
     def pins(self, context_id: str, owner: str) -> Sequence[PsfPinRow]:
         """The pins of a context, sorted by series and time."""
         query = select(PsfPinRow).where(PsfPinRow.owner == owner, PsfPinRow.context_id == context_id)
-        with self._database.reading() as session:
-            return session.scalars(query.order_by(PsfPinRow.series, PsfPinRow.valid_from)).all()
+        return self._database.all(query.order_by(PsfPinRow.series, PsfPinRow.valid_from))
 
     def any_pinned(self, context_id: str, series: str, owner: str) -> bool:
         """Whether a context pins a PSF of the series."""
         query = select(PsfPinRow.psf_id).where(
             PsfPinRow.owner == owner, PsfPinRow.context_id == context_id, PsfPinRow.series == series
         )
-        with self._database.reading() as session:
-            return session.scalars(query.limit(1)).first() is not None
+        return self._database.any(query)
 
     # The default --------------------------------------------------------------------------------------
 
     def default(self, owner: str) -> PsfContextRow | None:
         """The owner's default context; None if the owner uses the PSFs that are certified now."""
-        query = select(DefaultContextRow.context_id).where(DefaultContextRow.owner == owner)
-        with self._database.reading() as session:
-            context_id = session.scalars(query.order_by(DefaultContextRow.number.desc()).limit(1)).first()
-            return None if context_id is None else session.get(PsfContextRow, (owner, context_id))
+        latest = self.default_changes(owner, limit=1)
+        if not latest or latest[0].context_id is None:
+            return None
+        return self._database.row(PsfContextRow, (owner, latest[0].context_id))
 
     def set_default(self, id_or_name: str | None, owner: str, by: str, reason: str = "") -> None:
         """Set an owner's default context; None: use the PSFs that are certified now.
@@ -148,8 +135,7 @@ class Contexts:
     def default_changes(self, owner: str, limit: int = 200) -> Sequence[DefaultContextRow]:
         """The changes of an owner's default context, latest first."""
         query = select(DefaultContextRow).where(DefaultContextRow.owner == owner)
-        with self._database.reading() as session:
-            return session.scalars(query.order_by(DefaultContextRow.number.desc()).limit(limit)).all()
+        return self._database.all(query.order_by(DefaultContextRow.number.desc()).limit(limit))
 
     def asked_for(self, context: str | None, owner: str) -> PsfContextRow | None:
         """The context for a request that gives an id, a name, NOW or None.
@@ -162,7 +148,7 @@ class Contexts:
         return None if context == NOW else self.named(context, owner)
 
 
-def _certified(session: Session, owner: str) -> list[PsfPinRow]:
+def _pins_of_all(session: Session, owner: str) -> list[PsfPinRow]:
     query = select(PsfRow).where(PsfRow.owner == owner, PsfRow.status == PsfStatus.CERTIFIED)
     rows = session.scalars(query.order_by(PsfRow.series, PsfRow.valid_from)).all()
     if not rows:
@@ -173,21 +159,19 @@ def _certified(session: Session, owner: str) -> list[PsfPinRow]:
     return [_pin(row, None) for row in rows]
 
 
-def _given(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRow]:
+def _pins_of(session: Session, owner: str, pins: Sequence[Pin]) -> list[PsfPinRow]:
     if not pins:
         raise DataError("nothing-to-pin", "expected at least one PSF to pin; got an empty list")
-    rows = []
-    for pin in pins:
-        row = session.get(PsfRow, (owner, pin.psf_id))
-        if row is None:
-            raise DataError(
-                "no-such-psf",
-                f"expected the id of a PSF in the catalogue; got {pin.psf_id}, which is not in it: "
-                "list the PSFs with `heliopsf psf list`",
-            )
-        rows.append(_pin(row, pin.validity))
+    rows = [_pin(existing_psf(session, pin.psf_id, owner), pin.validity) for pin in pins]
     rows.sort(key=lambda pinned: (pinned.series, pinned.valid_from))
-    _check_apart(rows)
+    for one, other in pairwise(rows):
+        first, second = Validity(one.valid_from, one.valid_to), Validity(other.valid_from, other.valid_to)
+        if one.series == other.series and first.overlaps(second):
+            raise DataError(
+                "ranges-overlap",
+                f"expected at most one PSF of {one.series} for any time; the ranges of PSF {one.psf_id}, {first}, and PSF "
+                f"{other.psf_id}, {second}, overlap",
+            )
     return rows
 
 
@@ -197,11 +181,7 @@ def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
             "no-line",
             f"expected PSFs with an instrument; PSF {row.id} has no instrument: certify it with an instrument first",
         )
-    own = Validity(
-        -math.inf if row.valid_from is None else row.valid_from,
-        math.inf if row.valid_to is None else row.valid_to,
-    )
-    pinned = validity or own
+    pinned = validity or validity_of(row)
     return PsfPinRow(
         owner=row.owner,
         series=row.series,
@@ -212,36 +192,14 @@ def _pin(row: PsfRow, validity: Validity | None) -> PsfPinRow:
     )
 
 
-def _check_apart(rows: Sequence[PsfPinRow]) -> None:
-    for one, other in pairwise(rows):
-        first, second = Validity(one.valid_from, one.valid_to), Validity(other.valid_from, other.valid_to)
-        if one.series == other.series and first.overlaps(second):
-            raise DataError(
-                "ranges-overlap",
-                f"expected at most one PSF of {one.series} for any time; the ranges of PSF {one.psf_id}, {first}, and PSF "
-                f"{other.psf_id}, {second}, overlap",
-            )
-
-
-def _context(name: str, owner: str, by: str, reason: str, rows: Iterable[PsfPinRow]) -> PsfContextRow:
+def _context(name: str, owner: str, by: str, reason: str, pins: Sequence[PsfPinRow]) -> PsfContextRow:
     """Make the row of a context, and write the context's id into the rows of its pins."""
-    pins = list(rows)
-    identity = canonical_hash(
-        {
-            "name": name,
-            # The ids of contexts without interpolation are those from before PSFs were interpolated.
-            "pins": [
-                [
-                    pin.series,
-                    iso(pin.valid_from),
-                    iso(pin.valid_to),
-                    pin.psf_id,
-                    *(["interpolated"] if pin.interpolated else []),
-                ]
-                for pin in pins
-            ],
-        }
-    )
+    content = []
+    for pin in pins:
+        one = [pin.series, iso(pin.valid_from), iso(pin.valid_to), pin.psf_id]
+        # The word is a part of the id only where it is needed, so that all other contexts keep their ids.
+        content.append([*one, "interpolated"] if pin.interpolated else one)
+    identity = canonical_hash({"name": name, "pins": content})
     for pin in pins:
         pin.context_id = identity
     return PsfContextRow(

@@ -6,27 +6,32 @@ import json
 import sqlite3
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import (
     ColumnElement,
+    Delete,
     Double,
     Engine,
+    Select,
     Update,
     and_,
     create_engine,
     event,
     literal_column,
+    select,
+    tuple_,
 )
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import CursorResult
-from sqlalchemy.exc import DatabaseError
 from sqlalchemy.orm import InstrumentedAttribute, Session, sessionmaker
-from sqlalchemy.pool import NullPool
 
 from psfcore.errors import DataError
 
-QUICK_CHECK = "PRAGMA quick_check(1)"  # SQLite compares all pages of the file, and reports the first fault
 PATIENCE_S = 30.0  # longest time to wait for other writers of SQLite
+Row = TypeVar("Row")
+Value = TypeVar("Value")
+Query = TypeVar("Query", bound=Select[*tuple[Any, ...]])
 
 
 class Database:
@@ -58,24 +63,59 @@ class Database:
         )
         return literal_column(f"({now})", Double)
 
-    def check_pages(self) -> None:
-        """Raise ``sqlalchemy.exc.DatabaseError`` if the file of an SQLite database is damaged. Other databases are not checked."""
-        if not self.sqlite:
-            return
-        # A new connection, because the other connections keep pages in memory and do not read these pages
-        # again.
-        fresh = create_engine(self.engine.url, poolclass=NullPool)
-        with fresh.connect() as connection:
-            (found,) = connection.exec_driver_sql(QUICK_CHECK).one()
-        if found != "ok":
-            raise DatabaseError(QUICK_CHECK, None, sqlite3.DatabaseError(f"malformed: {found}"))
+    def clock(self) -> float:
+        """The time of the database's clock, in seconds since 1970."""
+        with self.reading() as session:
+            return session.scalars(select(self.now)).one()
 
-    def change(self, statement: Update) -> int:
-        """Run one UPDATE in a separate transaction; returns the number of changed rows."""
+    def all(self, query: Select[Value]) -> Sequence[Value]:
+        """All rows, or values of the only column, that a query selects."""
+        with self.reading() as session:
+            return session.scalars(query).all()
+
+    def first(self, query: Select[Value]) -> Value | None:
+        """The first row, or value of the only column, that a query selects; None if there is none."""
+        with self.reading() as session:
+            return session.scalars(query.limit(1)).first()
+
+    def any(self, query: Select[Any]) -> bool:
+        """Whether a query selects a row."""
+        return self.first(query) is not None
+
+    def row(self, table: type[Row], key: str | tuple[str, str]) -> Row | None:
+        """The row with this primary key, or None."""
+        with self.reading() as session:
+            return session.get(table, key)
+
+    def change(self, statement: Update | Delete) -> int:
+        """Run one UPDATE or DELETE in a separate transaction; returns the number of changed rows."""
         with self.writing.begin() as session:
             result = session.execute(statement)
             assert isinstance(result, CursorResult)
             return result.rowcount
+
+
+class Queries:
+    """Queries on the tables of one subject. Each method of a subclass is one transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+
+def newest_first(query: Query, table: Any, limit: int, after: tuple[float, str] | None = None) -> Query:
+    """A page of a query for rows of a table, newest first.
+
+    after: (created_at, id) of the last row of the previous page; None for the first page.
+    """
+    if after is not None:
+        query = query.where(tuple_(table.created_at, table.id) < after)
+    return query.order_by(table.created_at.desc(), table.id.desc()).limit(limit)
+
+
+def insert_into(session: Session, table: type[Any]) -> postgresql.Insert | sqlite.Insert:
+    """An INSERT with the method ``on_conflict_do_nothing``, which each database has in its own dialect."""
+    insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
+    return insert(table)
 
 
 def begins_with(column: InstrumentedAttribute[str], digits: str) -> ColumnElement[bool]:

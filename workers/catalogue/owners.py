@@ -1,4 +1,6 @@
-"""The quota of each owner: the bytes of the files that the owner keeps, and the number of database rows without a file.
+"""The files to which rows refer, and the quota of each owner.
+
+The quota limits the bytes of the files that the owner keeps, and the number of database rows without a file.
 
 The files of the owner's uploads, PSFs, products, reports and kept solutions count; their pictures do not. The sums are
 read from the rows, so they are always exact. A transaction that adds a file under a quota first locks the owner's
@@ -14,17 +16,34 @@ a result or another solution needs their room.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import chain
+from typing import Any, TypeVar
 
-from sqlalchemy import ColumnElement, Select, delete, func, select, update
-from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy import (
+    JSON,
+    ColumnElement,
+    Delete,
+    FromClause,
+    String,
+    Table,
+    cast,
+    delete,
+    func,
+    or_,
+    select,
+    tuple_,
+    update,
+)
 from sqlalchemy.orm import Session
 
-from workers.catalogue.bulk_tables import BulkRow
-from workers.catalogue.database import Database
+from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
+from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.tables import (
+    Base,
     DefaultContextRow,
     ImageRow,
     JobRow,
@@ -56,6 +75,11 @@ NOT_KEPT = "the result of this job could not be kept"
 ROWS_NOT_KEPT = "what this request adds to the database could not be kept"
 
 FileRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | SolutionRow
+AnyFileRow = TypeVar("AnyFileRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
+BATCH = 1000  # rows that are read at once
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+# This table is very long. The tables of images and products also refer to all of its files.
+_SKIPPED = frozenset({BulkItemRow.__tablename__})
 
 
 @dataclass(frozen=True)
@@ -118,11 +142,8 @@ class OverQuota(Exception):
         self.usage = usage
 
 
-class Owners:
-    """The limits of owners, and what they keep; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Owners(Queries):
+    """The limits of owners, and what they keep."""
 
     def usage(self, owner: str, quota_mib: int) -> Usage:
         """The usage of an owner. quota_mib: the limit if the owner has no individual limit; 0: unlimited."""
@@ -137,7 +158,8 @@ class Owners:
     def all(self, quota_mib: int) -> list[Usage]:
         """The usage of all owners who keep files, made a key or have an individual limit. quota_mib: as for ``usage``."""
         with self._database.reading() as session:
-            owners = {name for row in (OwnerRow, *WITH_FILES) for name in session.scalars(_names(row))}
+            tables: tuple[Any, ...] = (OwnerRow, *WITH_FILES)
+            owners = {name for row in tables for name in session.scalars(select(row.owner).distinct())}
         return [self.usage(name, quota_mib) for name in sorted(owners)]
 
     def set_quota(self, owner: str, quota_mib: int | None) -> None:
@@ -148,14 +170,74 @@ class Owners:
 
     def solutions_before(self, time: float) -> Sequence[SolutionRow]:
         """The kept solutions of all owners that were made before this time."""
-        with self._database.reading() as session:
-            return session.scalars(select(SolutionRow).where(SolutionRow.created_at < time)).all()
+        return self._database.all(select(SolutionRow).where(SolutionRow.created_at < time))
 
     def forget_solutions(self, rows: Sequence[SolutionRow]) -> None:
         """Remove these kept solutions. Their files stay until ``workers.files.collection`` removes them."""
         for row in rows:
-            with self._database.writing.begin() as session:
-                _forget(session, row)
+            self._database.change(_removal(row))
+
+
+class NamedFiles(Queries):
+    """The files of all owners to which the database refers.
+
+    A row refers to a file if the file's hash appears in any text or JSON column. The search therefore works for all
+    tables in the same way. The search may find hashes that are not hashes of files, for example the hash of a key. It
+    misses no file.
+    """
+
+    def all(self, *, solutions_from: float = -math.inf) -> Iterator[str]:
+        """Every hash in the database; a hash may occur more than once. Rows are read in batches.
+
+        solutions_from: solutions that were stored before this time are left out.
+        """
+        for table in Base.metadata.sorted_tables:
+            if table.name not in _SKIPPED:
+                yield from self._in(table, solutions_from)
+
+    def among(self, digests: frozenset[str]) -> frozenset[str]:
+        """The hashes in ``digests`` (a few) to which the row of an upload, a PSF, a product, a report or a solution
+        refers.
+
+        Jobs and bulk runs are not searched. Jobs and bulk runs refer to things by id, and every existing thing has a
+        row of its own.
+        """
+        named: set[str] = set()
+        with self._database.reading() as session:
+            for table in (row.__table__ for row in WITH_FILES):
+                texts = _texts(table)
+                for digest in digests - named:
+                    contains = or_(*(text.contains(digest) for text in texts))
+                    if session.scalar(select(select(table).where(contains).exists())):
+                        named.add(digest)
+        return frozenset(named)
+
+    def kept(self, table: type[AnyFileRow]) -> Iterator[AnyFileRow]:
+        """All rows of a table that refers to files. The rows are read in batches, so that no transaction stays open
+        for long.
+        """
+        last: tuple[str, str] | None = None
+        while True:
+            query = select(table).order_by(table.owner, table.id).limit(BATCH)
+            if last is not None:
+                query = query.where(tuple_(table.owner, table.id) > last)
+            rows = self._database.all(query)
+            yield from rows
+            if len(rows) < BATCH:
+                return
+            last = (rows[-1].owner, rows[-1].id)
+
+    def _in(self, table: Table, solutions_from: float) -> Iterator[str]:
+        texts = _texts(table)
+        if not texts:
+            return
+        with self._database.engine.execution_options(read_only=True).connect() as connection:
+            query = select(*texts)
+            if table is SolutionRow.__table__ and math.isfinite(solutions_from):
+                query = query.where(table.c.created_at >= solutions_from)
+            rows = connection.execution_options(stream_results=True, yield_per=BATCH).execute(query)
+            for text in chain.from_iterable(rows):
+                yield from _DIGEST.findall(text or "")
 
 
 def lock_owner(session: Session, owner: str) -> None:
@@ -163,8 +245,7 @@ def lock_owner(session: Session, owner: str) -> None:
 
     On SQLite, a writing transaction already excludes all others.
     """
-    insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
-    session.execute(insert(OwnerRow).values(owner=owner).on_conflict_do_nothing())
+    session.execute(insert_into(session, OwnerRow).values(owner=owner).on_conflict_do_nothing())
     session.execute(select(OwnerRow.owner).where(OwnerRow.owner == owner).with_for_update())
 
 
@@ -182,34 +263,22 @@ def hold_to_quota(session: Session, row: FileRow, quota_mib: int) -> None:
     before = replace(now, used_bytes=now.used_bytes - row.bytes, removable_bytes=removable_bytes)
     if not before.allows(row.bytes):
         raise OverQuota(before)
-    _make_room(session, row.owner, now.used_bytes - now.limit_bytes)
+    missing_bytes = now.used_bytes - now.limit_bytes
+    if missing_bytes > 0:
+        oldest = select(SolutionRow).where(SolutionRow.owner == row.owner).order_by(SolutionRow.created_at)
+        for solution in session.scalars(oldest).all():
+            if missing_bytes > 0:
+                missing_bytes -= solution.bytes
+                session.execute(_removal(solution))
 
 
-def _make_room(session: Session, owner: str, missing_bytes: int) -> None:
-    """Remove the owner's oldest solutions until ``missing_bytes`` bytes are free."""
-    if missing_bytes <= 0:
-        return
-    oldest = select(SolutionRow).where(SolutionRow.owner == owner).order_by(SolutionRow.created_at)
-    for row in session.scalars(oldest).all():
-        if missing_bytes <= 0:
-            return
-        missing_bytes -= row.bytes
-        _forget(session, row)
-
-
-def _forget(session: Session, row: SolutionRow) -> None:
-    """Remove a solution. If another transaction removed or replaced it, do nothing."""
-    same = (
+def _removal(row: SolutionRow) -> Delete:
+    """A statement that removes a solution, unless another transaction has removed or replaced it."""
+    return delete(SolutionRow).where(
         SolutionRow.owner == row.owner,
         SolutionRow.id == row.id,
         SolutionRow.created_at == row.created_at,
     )
-    session.execute(delete(SolutionRow).where(*same))
-
-
-def _names(row: type[Any]) -> Select[str]:
-    """A query for the owners of the rows of a table."""
-    return select(row.owner).distinct()
 
 
 def _limit_mib(session: Session, owner: str, quota_mib: int) -> int:
@@ -236,3 +305,7 @@ def _usage(session: Session, owner: str, limit_mib: int) -> Usage:
         limit_bytes=limit_mib * MIB if limit_mib else None,
         removable_bytes=totals[SolutionRow],
     )
+
+
+def _texts(table: FromClause) -> list[ColumnElement[str]]:
+    return [cast(one, String) for one in table.columns if isinstance(one.type, String | JSON)]

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import and_, or_, select, update
+from sqlalchemy import ColumnElement, and_, or_, select, update
 
-from workers.catalogue.database import Database
+from workers.catalogue.database import Queries
 from workers.catalogue.tables import PartRow
 
 
@@ -26,20 +26,13 @@ class Part:
     token: str
 
 
-class Parts:
-    """The table of parts; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Parts(Queries):
+    """The table of parts."""
 
     def open(self, owner: str, request_key: str, count: int) -> None:
         """Create the parts 0 to ``count`` - 1, except those that exist."""
         with self._database.writing.begin() as session:
-            there = set(
-                session.scalars(
-                    select(PartRow.number).where(PartRow.owner == owner, PartRow.request_key == request_key)
-                )
-            )
+            there = set(session.scalars(select(PartRow.number).where(*_of(owner, request_key))))
             missing = [number for number in range(count) if number not in there]
             session.add_all(PartRow(owner=owner, request_key=request_key, number=one) for one in missing)
 
@@ -47,30 +40,16 @@ class Parts:
         """Take an open part, or a part whose worker has been silent for ``lease_s`` seconds; None if there is no such part."""
         # A heartbeat in the future was sent before the database's clock was set back; it counts as a heartbeat of now.
         now = self._database.now
-        self._set(
-            [
-                PartRow.owner == owner,
-                PartRow.request_key == request_key,
-                PartRow.heartbeat_at > now + lease_s,
-            ],
-            heartbeat_at=now,
-        )
-        free = [
-            PartRow.owner == owner,
-            PartRow.request_key == request_key,
-            PartRow.result.is_(None),
-            or_(PartRow.token.is_(None), PartRow.heartbeat_at < now - lease_s),
-        ]
-        while True:
-            with self._database.reading() as session:
-                number = session.scalars(select(PartRow.number).where(*free).order_by(PartRow.number)).first()
-            if number is None:
-                return None
+        of_job = _of(owner, request_key)
+        self._set([*of_job, PartRow.heartbeat_at > now + lease_s], heartbeat_at=now)
+        silent = PartRow.heartbeat_at < now - lease_s
+        free = [*of_job, PartRow.result.is_(None), or_(PartRow.token.is_(None), silent)]
+        lowest = select(PartRow.number).where(*free).order_by(PartRow.number)
+        while (number := self._database.first(lowest)) is not None:
             part = Part(owner, request_key, number, uuid.uuid4().hex)
-            if self._set(
-                [*free, PartRow.number == number], token=part.token, heartbeat_at=self._database.now
-            ):
+            if self._set([*free, PartRow.number == number], token=part.token, heartbeat_at=now):
                 return part
+        return None
 
     def heartbeat(self, part: Part) -> bool:
         """Renew the lease. Returns False if another worker took the part or the part is done."""
@@ -89,23 +68,20 @@ class Parts:
 
     def results(self, owner: str, request_key: str) -> list[dict[str, Any]]:
         """Results of the parts that are done, sorted by number."""
-        query = select(PartRow.result).where(
-            PartRow.owner == owner, PartRow.request_key == request_key, PartRow.result.is_not(None)
-        )
-        with self._database.reading() as session:
-            return [dict(result) for result in session.scalars(query.order_by(PartRow.number)) if result]
+        done = select(PartRow.result).where(*_of(owner, request_key), PartRow.result.is_not(None))
+        return [dict(one) for one in self._database.all(done.order_by(PartRow.number)) if one]
 
     def _set(self, conditions: Sequence[Any], **values: Any) -> bool:
         return bool(self._database.change(update(PartRow).where(and_(*conditions)).values(**values)))
 
 
+def _of(owner: str, request_key: str) -> list[ColumnElement[bool]]:
+    return [PartRow.owner == owner, PartRow.request_key == request_key]
+
+
 def _undone(part: Part) -> list[Any]:
-    return [
-        PartRow.owner == part.owner,
-        PartRow.request_key == part.request_key,
-        PartRow.number == part.number,
-        PartRow.result.is_(None),
-    ]
+    this = [*_of(part.owner, part.request_key), PartRow.number == part.number]
+    return [*this, PartRow.result.is_(None)]
 
 
 def _holding(part: Part) -> list[Any]:

@@ -9,20 +9,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import Select, String, and_, cast, exists, select, tuple_
-from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy import Select, String, cast, select
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
-from workers.catalogue.database import Database
+from workers.catalogue.database import Queries, insert_into, newest_first
 from workers.catalogue.tables import PsfChangeRow, PsfPinRow, PsfRow, PsfSeriesRow
-from workers.versions.series import INTERPOLATED, UPLOADED, series_of
-from workers.versions.status import PsfStatus, check_transition, check_version
-from workers.versions.validity import Validity
-from workers.versions.variants import is_variant_of
+from workers.versions import (
+    INTERPOLATED,
+    UPLOADED,
+    PsfStatus,
+    Validity,
+    check_transition,
+    check_version,
+    is_variant_of,
+    series_of,
+)
 
 MOST_REASON = 400  # characters of a reason that the database stores
 
@@ -63,11 +68,8 @@ class PsfFilter:
         return series_of(self.instrument, self.channel, self.kind or "") if whole else None
 
 
-class Psfs:
-    """Searches for PSFs and changes of their status; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Psfs(Queries):
+    """Searches for PSFs and changes of their status."""
 
     def describe(self, psf_id: str, owner: str, *, tables_sha256: str, preview_sha256: str) -> None:
         """Store the hashes of the tables and of the picture that were made from a PSF's file."""
@@ -80,48 +82,35 @@ class Psfs:
     # Searches -----------------------------------------------------------------------------------------
 
     def page(
-        self, wanted: PsfFilter, owner: str, *, limit: int, after: tuple[float, str] | None = None
+        self, filters: PsfFilter, owner: str, *, limit: int, after: tuple[float, str] | None = None
     ) -> Sequence[PsfRow]:
         """A page of PSFs, newest first. after: (created_at, id) of the last row of the previous page."""
-        query = _query(wanted, owner)
-        if after is not None:
-            query = query.where(tuple_(PsfRow.created_at, PsfRow.id) < after)
-        with self._database.reading() as session:
-            return session.scalars(query.order_by(*_NEWEST_FIRST).limit(limit)).all()
+        return self._database.all(newest_first(_query(filters, owner), PsfRow, limit, after))
 
-    def emptied_by(self, wanted: PsfFilter, owner: str) -> str | None:
+    def emptied_by(self, filters: PsfFilter, owner: str) -> str | None:
         """Apply the filters one by one; return the name of the first filter after which no PSF is left, or None."""
-        met = PsfFilter()
-        with self._database.reading() as session:
-            for name in (field.name for field in fields(PsfFilter)):
-                value = getattr(wanted, name)
-                if value is None:
-                    continue
-                met = replace(met, **{name: value})
-                # Sorted as in the index for lists.
-                first = _query(met, owner).order_by(*_NEWEST_FIRST).limit(1)
-                if session.scalars(first).first() is None:
+        applied = PsfFilter()
+        for name, value in vars(filters).items():
+            if value is not None:
+                applied = replace(applied, **{name: value})
+                if not self.page(applied, owner, limit=1):
                     return name.removesuffix("_id")
         return None
 
     def any_certified(self, series: str, owner: str) -> bool:
         """Whether the series has a certified PSF."""
-        certified = and_(PsfRow.owner == owner, PsfRow.series == series, PsfRow.status == PsfStatus.CERTIFIED)
-        with self._database.reading() as session:
-            return bool(session.scalar(select(exists().where(certified))))
+        return self._database.any(_certified_of(series, owner))
 
     # Status -------------------------------------------------------------------------------------------
 
     def changes(self, psf_id: str, owner: str) -> Sequence[PsfChangeRow]:
         """The changes of a PSF's status, oldest first."""
         query = select(PsfChangeRow).where(PsfChangeRow.owner == owner, PsfChangeRow.psf_id == psf_id)
-        with self._database.reading() as session:
-            return session.scalars(query.order_by(PsfChangeRow.number)).all()
+        return self._database.all(query.order_by(PsfChangeRow.number))
 
     def released(self, series: str, owner: str) -> Sequence[str]:
         """The versions under which PSFs of a series were certified."""
-        with self._database.reading() as session:
-            return session.scalars(_released(series, owner)).all()
+        return self._database.all(_released(series, owner))
 
     def change(self, psf_id: str, owner: str, asked: StatusAsked, by: str) -> PsfRow:
         """Change the status of a PSF.
@@ -134,11 +123,15 @@ class Psfs:
         "changed-meanwhile", and the errors of ``check_version``.
         """
         with self._database.writing.begin() as session:
-            row = _found(session, psf_id, owner)
-            series = _series(row, asked)
-            self._lock(session, series, owner)
-            row = _found(session, psf_id, owner, lock=True)  # it may have been deleted meanwhile
-            if _series(row, asked) != series:
+            row = existing_psf(session, psf_id, owner)
+            series, _ = _series(row, asked)
+            # Lock the series until the transaction ends. On SQLite the transaction already holds the write lock.
+            line = insert_into(session, PsfSeriesRow).values(owner=owner, series=series)
+            session.execute(line.on_conflict_do_nothing())
+            session.get(PsfSeriesRow, (owner, series), with_for_update=True)
+            row = existing_psf(session, psf_id, owner, lock=True)  # it may have been deleted meanwhile
+            now, columns = _series(row, asked)
+            if now != series:
                 raise DataError(
                     "changed-meanwhile",
                     f"another request just put PSF {psf_id} in another series: send this request again",
@@ -146,22 +139,13 @@ class Psfs:
             before = PsfStatus(row.status)
             check_transition(before, asked.status)
             if asked.status == PsfStatus.CERTIFIED:
-                _certify(session, row, series, asked, by)
+                _certify(session, row, columns, asked, by)
             else:
                 _deprecate(session, row, asked, by)
             return row
 
-    def _lock(self, session: Session, series: str, owner: str) -> None:
-        """Lock the series until the transaction ends. On SQLite the transaction already holds the write lock."""
-        insert = sqlite.insert if self._database.sqlite else postgresql.insert
-        session.execute(insert(PsfSeriesRow).values(owner=owner, series=series).on_conflict_do_nothing())
-        session.get(PsfSeriesRow, (owner, series), with_for_update=True)
 
-
-_NEWEST_FIRST = (PsfRow.created_at.desc(), PsfRow.id.desc())
-
-
-def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
+def _query(filters: PsfFilter, owner: str) -> Select[Any]:
     """A query for the PSFs that meet the filters, unsorted.
 
     A context has few PSFs, and few PSFs are valid at one time. Therefore a subquery finds these PSFs first. The subquery
@@ -169,34 +153,34 @@ def _query(wanted: PsfFilter, owner: str) -> Select[Any]:
     context.
     """
     query = select(PsfRow).where(PsfRow.owner == owner)
-    if wanted.context_id is not None:
-        query = query.join(pinned := _pinned(wanted, owner).subquery(), PsfRow.id == pinned.c.psf_id)
-    elif wanted.valid_at is not None:
-        query = query.join(latest := _latest_from(wanted, owner).subquery(), PsfRow.id == latest.c.psf_id)
-        query = query.where(PsfRow.valid_to > wanted.valid_at)
+    if filters.context_id is not None:
+        query = query.join(pinned := _pinned(filters, owner).subquery(), PsfRow.id == pinned.c.psf_id)
+    elif filters.valid_at is not None:
+        query = query.join(latest := _latest_from(filters, owner).subquery(), PsfRow.id == latest.c.psf_id)
+        query = query.where(PsfRow.valid_to > filters.valid_at)
     # If the series is known, it replaces instrument, channel and kind, because the indexes begin with the series.
-    whole = ("series",) if wanted.series is not None else ("instrument", "channel", "kind")
+    whole = ("series",) if filters.series is not None else ("instrument", "channel", "kind")
     for name in (*whole, "name", "version", "status"):
-        value = getattr(wanted, name)
+        value = getattr(filters, name)
         if value is not None:
             query = query.where(getattr(PsfRow, name) == value)
     return query
 
 
-def _pinned(wanted: PsfFilter, owner: str) -> Select[Any]:
+def _pinned(filters: PsfFilter, owner: str) -> Select[Any]:
     """Ids of the PSFs that a context pins; if a time is given, only those that are pinned for that time."""
     query = select(PsfPinRow.psf_id).where(
-        PsfPinRow.owner == owner, PsfPinRow.context_id == wanted.context_id
+        PsfPinRow.owner == owner, PsfPinRow.context_id == filters.context_id
     )
-    if wanted.series is not None:
-        query = query.where(PsfPinRow.series == wanted.series)
-    if wanted.valid_at is not None:
-        query = query.where(PsfPinRow.valid_from <= wanted.valid_at, PsfPinRow.valid_to > wanted.valid_at)
+    if filters.series is not None:
+        query = query.where(PsfPinRow.series == filters.series)
+    if filters.valid_at is not None:
+        query = query.where(PsfPinRow.valid_from <= filters.valid_at, PsfPinRow.valid_to > filters.valid_at)
     return query.distinct()  # a PSF may be pinned for several ranges
 
 
-def _latest_from(wanted: PsfFilter, owner: str) -> Select[Any]:
-    """For each series, the id of the certified PSF whose range begins last before ``wanted.valid_at``.
+def _latest_from(filters: PsfFilter, owner: str) -> Select[Any]:
+    """For each series, the id of the certified PSF whose range begins last before ``filters.valid_at``.
 
     The ranges of a series do not overlap, so no other PSF of the series can be valid at that time.
     """
@@ -206,7 +190,7 @@ def _latest_from(wanted: PsfFilter, owner: str) -> Select[Any]:
             PsfRow.owner == PsfSeriesRow.owner,
             PsfRow.series == PsfSeriesRow.series,
             PsfRow.status == PsfStatus.CERTIFIED,
-            PsfRow.valid_from <= wanted.valid_at,
+            PsfRow.valid_from <= filters.valid_at,
         )
         .order_by(PsfRow.valid_from.desc())
         .limit(1)
@@ -215,11 +199,18 @@ def _latest_from(wanted: PsfFilter, owner: str) -> Select[Any]:
     )
     query = select(latest.label("psf_id")).distinct()
     query = query.select_from(PsfSeriesRow).where(PsfSeriesRow.owner == owner)
-    if wanted.series is not None:
-        query = query.where(PsfSeriesRow.series == wanted.series)
-    elif wanted.instrument is not None:
-        query = query.where(PsfSeriesRow.series.startswith(f"{wanted.instrument}/", autoescape=True))
+    if filters.series is not None:
+        query = query.where(PsfSeriesRow.series == filters.series)
+    elif filters.instrument is not None:
+        query = query.where(PsfSeriesRow.series.startswith(f"{filters.instrument}/", autoescape=True))
     return query
+
+
+def _certified_of(series: str, owner: str) -> Select[PsfRow]:
+    """The certified PSFs of a series."""
+    return select(PsfRow).where(
+        PsfRow.owner == owner, PsfRow.series == series, PsfRow.status == PsfStatus.CERTIFIED
+    )
 
 
 def _released(series: str, owner: str) -> Select[Any]:
@@ -227,63 +218,61 @@ def _released(series: str, owner: str) -> Select[Any]:
     return select(PsfRow.version).where(PsfRow.owner == owner, PsfRow.series == series, released)
 
 
-def _found(session: Session, psf_id: str, owner: str, *, lock: bool = False) -> PsfRow:
+def existing_psf(session: Session, psf_id: str, owner: str, *, lock: bool = False) -> PsfRow:
+    """The row of a PSF; lock: until the transaction ends. Raises ``DataError`` "no-such-psf"."""
     row = session.get(PsfRow, (owner, psf_id), populate_existing=lock, with_for_update=lock or None)
     if row is None:
         raise DataError(
             "no-such-psf",
-            f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: list the PSFs",
+            f"expected the id of a PSF in the catalogue; got {psf_id}, which is not in it: "
+            "list the PSFs with `heliopsf psf list`",
         )
     return row
 
 
-def _series(row: PsfRow, asked: StatusAsked) -> str:
-    """The series of a PSF, completed with ``asked``. Raises ``DataError`` "line-known" or "no-line"."""
-    instrument, channel, kind = _said_of_series(row, asked)
-    series = series_of(instrument, channel, kind)
+def _series(row: PsfRow, asked: StatusAsked) -> tuple[str, dict[str, Any]]:
+    """The series of a PSF, completed with ``asked``, and the columns that form its name.
+
+    Raises ``DataError`` "line-known" or "no-line".
+    """
+    draft = row.status == PsfStatus.DRAFT
+    columns = {
+        "instrument": row.instrument,
+        "channel": row.channel,
+        "kind": None if draft and row.kind == UPLOADED else row.kind,
+    }
+    for name, value in columns.items():
+        new = getattr(asked, name)
+        if new is None or new == value:
+            continue
+        # The file may name the channel, and the request a variant of it.
+        if value is not None and not (name == "channel" and draft and is_variant_of(new, value)):
+            raise DataError(
+                "line-known",
+                f"{name}: expected {value!r}, which PSF {row.id} has and which cannot change; got {new!r}",
+            )
+        columns[name] = new
+    kind = columns["kind"] or row.kind
+    series = series_of(columns["instrument"], columns["channel"], kind)
     if series is None:
         raise DataError(
             "no-line",
             f"expected an instrument, because the file of PSF {row.id} does not name one: give instrument, channel and kind",
         )
-    return series
+    return series, columns | {"kind": kind, "series": series}
 
 
-def _said_of_series(row: PsfRow, asked: StatusAsked) -> tuple[str | None, str | None, str]:
-    open_to = row.status == PsfStatus.DRAFT
-    known = {
-        "instrument": row.instrument,
-        "channel": row.channel,
-        "kind": None if open_to and row.kind == UPLOADED else row.kind,
-    }
-    for name, value in known.items():
-        said = getattr(asked, name)
-        if name == "channel" and open_to and said and value and is_variant_of(said, value):
-            continue  # the file names the channel, the request a variant of it
-        if said is not None and value is not None and said != value:
-            raise DataError(
-                "line-known",
-                f"{name}: expected {value!r}, which PSF {row.id} has and which cannot change; got {said!r}",
-            )
-    return (
-        row.instrument or asked.instrument,
-        asked.channel or row.channel,
-        known["kind"] or asked.kind or row.kind,
-    )
-
-
-def _certify(session: Session, row: PsfRow, series: str, asked: StatusAsked, by: str) -> None:
+def _certify(session: Session, row: PsfRow, columns: dict[str, Any], asked: StatusAsked, by: str) -> None:
     _refuse(asked, "deprecation", successor_id=asked.successor_id)
-    version = row.version
+    version, series = row.version, columns["series"]
     if row.status == PsfStatus.DRAFT:
-        others = session.scalars(_released(series, row.owner)).all()
-        version = check_version(asked.version, others)
+        version = check_version(asked.version, session.scalars(_released(series, row.owner)))
     elif asked.version not in (None, row.version):
         raise DataError(
             "not-of-this-change",
             f"expected version {row.version}, because the version of a certified PSF cannot change; got {asked.version}",
         )
-    validity = asked.validity or _validity(row)
+    validity = asked.validity or validity_of(row)
     for superseded_id in asked.supersedes:
         superseded = session.get(PsfRow, (row.owner, superseded_id), with_for_update=True)
         if (
@@ -303,24 +292,15 @@ def _certify(session: Session, row: PsfRow, series: str, asked: StatusAsked, by:
         raise DataError(
             "ranges-overlap",
             f"expected a range that overlaps with no certified PSF of {series}; got {validity}, which overlaps with the range of "
-            f"PSF {other.id} ({other.name} {other.version}), {_validity(other)}: deprecate that PSF, name it "
+            f"PSF {other.id} ({other.name} {other.version}), {validity_of(other)}: deprecate that PSF, name it "
             "in `supersedes`, or change its range first",
         )
-    row.instrument, row.channel, row.kind = _said_of_series(row, asked)
-    row.series = series
-    _write(
-        session,
-        row,
-        asked.reason,
-        by,
-        status=PsfStatus.CERTIFIED,
-        version=version,
-        valid_from=validity.start,
-        valid_to=validity.end,
-    )
+    validity_columns = {"valid_from": validity.start, "valid_to": validity.end}
+    columns = columns | validity_columns | {"status": PsfStatus.CERTIFIED, "version": version}
+    _write(session, row, asked.reason, by, **columns)
 
 
-def _validity(row: PsfRow) -> Validity:
+def validity_of(row: PsfRow) -> Validity:
     """The range of times for which a PSF is valid; all times if the PSF has no range."""
     if row.valid_from is None or row.valid_to is None:
         return Validity()
@@ -333,15 +313,10 @@ def _overlapping(session: Session, row: PsfRow, series: str, validity: Validity)
     The ranges of the certified PSFs do not overlap each other. So it is enough to check the PSF whose range begins last
     before ``validity`` ends.
     """
-    query = select(PsfRow).where(
-        PsfRow.owner == row.owner,
-        PsfRow.series == series,
-        PsfRow.status == PsfStatus.CERTIFIED,
-        PsfRow.id != row.id,
-        PsfRow.valid_from < validity.end,
-    )
+    others = _certified_of(series, row.owner).where(PsfRow.id != row.id)
+    query = others.where(PsfRow.valid_from < validity.end)
     last = session.scalars(query.order_by(PsfRow.valid_from.desc()).limit(1)).first()
-    return last if last is not None and _validity(last).overlaps(validity) else None
+    return last if last is not None and validity_of(last).overlaps(validity) else None
 
 
 def _deprecate(session: Session, row: PsfRow, asked: StatusAsked, by: str) -> None:
@@ -389,11 +364,11 @@ def _deprecate_interpolated(session: Session, end: PsfRow, reason: str, by: str)
         PsfRow.status == PsfStatus.DRAFT,
         cast(PsfRow.details, String).contains(end.id),  # the details name the ends
     )
-    said = f"it was interpolated from PSF {end.id[:12]}, which is deprecated" + (
+    why = f"it was interpolated from PSF {end.id[:12]}, which is deprecated" + (
         f": {reason}" if reason else ""
     )
     for row in session.scalars(query.order_by(PsfRow.id).with_for_update()).all():
-        _write(session, row, said[:MOST_REASON], by, status=PsfStatus.DEPRECATED)
+        _write(session, row, why[:MOST_REASON], by, status=PsfStatus.DEPRECATED)
 
 
 def _refuse(asked: StatusAsked, other: str, **given: object) -> None:

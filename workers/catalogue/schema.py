@@ -191,16 +191,16 @@ def _numbers(revisions: Path) -> tuple[str, ...]:
 
 
 def _faults(connection: Connection) -> SchemaFaults:
-    found: Any = inspect(connection)
-    there = set(found.get_table_names())
+    inspector: Any = inspect(connection)
+    there = set(inspector.get_table_names())
     tables, columns, indexes = [], [], []
     for table in Base.metadata.sorted_tables:
         if table.name not in there:
             tables.append(table.name)
             continue
-        has = {column["name"] for column in found.get_columns(table.name)}
+        has = {column["name"] for column in inspector.get_columns(table.name)}
         columns += [f"{table.name}.{column.name}" for column in table.columns if column.name not in has]
-        known = {index["name"] for index in found.get_indexes(table.name)}
+        known = {index["name"] for index in inspector.get_indexes(table.name)}
         indexes += [str(index.name) for index in table.indexes if index.name not in known]
     empty = len(tables) == len(Base.metadata.tables)
     return SchemaFaults(tuple(tables), tuple(columns), tuple(sorted(indexes)), empty)

@@ -42,12 +42,32 @@ def _summed(table: str) -> Index:
     return Index(f"{table}_summed", "owner", "bytes")
 
 
-class Uploaded:
-    """Columns of an upload; its id is the SHA-256 of its bytes."""
+def _partial(name: str, condition: Any, *columns: str, unique: bool = False) -> Index:
+    """An index of the rows that meet a condition."""
+    return Index(name, *columns, unique=unique, sqlite_where=condition, postgresql_where=condition)
+
+
+class Owned:
+    """Columns of a thing of an owner."""
 
     owner: Mapped[str] = mapped_column(String(64), primary_key=True)
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
     created_at: Mapped[float]
+
+
+class Change:
+    """Columns of a change: the person who made it, its time and the reason. Rows are never changed or deleted."""
+
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    owner: Mapped[str] = mapped_column(String(64))
+    at: Mapped[float]
+    by: Mapped[str] = mapped_column(String(128))
+    reason: Mapped[str] = mapped_column(String(400))
+
+
+class Uploaded(Owned):
+    """Columns of an upload; its id is the SHA-256 of its bytes."""
+
     bytes: Mapped[int] = mapped_column(BigInteger)
     filename: Mapped[str | None]
     summary: Mapped[dict[str, Any]]
@@ -67,16 +87,13 @@ class TransitRow(Uploaded, Base):
     __table_args__ = (_listed("transits"), _summed("transits"))
 
 
-class PsfRow(Base):
+class PsfRow(Owned, Base):
     """An uploaded, built or fitted PSF. Its content never changes; a PSF with other content has another row.
 
     Before the PSF is certified, ``version`` is the version in the file. Afterwards it is the version in the series.
     """
 
     __tablename__ = "psfs"
-    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    created_at: Mapped[float]
     name: Mapped[str]
     version: Mapped[str]
     instrument: Mapped[str | None]
@@ -97,32 +114,16 @@ class PsfRow(Base):
     __table_args__ = (
         _summed("psfs"),
         Index("psfs_bytes", "origin", "bytes"),
+        _listed("psfs"),
+        _listed("psfs", "series", "status"),
         *(
-            _listed("psfs", *by.split())
-            for by in (
-                "",
-                "instrument",
-                "channel",
-                "kind",
-                "series",
-                "series status",
-                "name",
-                "version",
-                "status",
-            )
+            _listed("psfs", by)
+            for by in ("instrument", "channel", "kind", "series", "name", "version", "status")
         ),
         Index("psfs_by_validity", "owner", "series", "status", "valid_from"),
         # Each version occurs only once in a series.
-        Index(
-            "one_psf_a_version",
-            "owner",
-            "series",
-            "version",
-            unique=True,
-            sqlite_where=_RELEASED,
-            postgresql_where=_RELEASED,
-        ),
-        Index("psfs_deprecated", "owner", "id", sqlite_where=_DEPRECATED, postgresql_where=_DEPRECATED),
+        _partial("one_psf_a_version", _RELEASED, "owner", "series", "version", unique=True),
+        _partial("psfs_deprecated", _DEPRECATED, "owner", "id"),
     )
 
 
@@ -134,33 +135,24 @@ class PsfSeriesRow(Base):
     series: Mapped[str] = mapped_column(String(128), primary_key=True)
 
 
-class SeriesChangeRow(Base):
+class SeriesChangeRow(Change, Base):
     """A change of a series: whether its PSFs may be interpolated. The latest row of a series is valid.
 
-    The PSFs of a series without a row may not be interpolated. Rows are never changed or deleted.
+    The PSFs of a series without a row may not be interpolated.
     """
 
     __tablename__ = "series_changes"
-    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
-    owner: Mapped[str] = mapped_column(String(64))
     series: Mapped[str] = mapped_column(String(128))
     interpolated: Mapped[bool]
-    at: Mapped[float]
-    by: Mapped[str] = mapped_column(String(128))
-    reason: Mapped[str] = mapped_column(String(400))
 
     __table_args__ = (Index("series_changes_of_a_series", "owner", "series", "number"),)
 
 
-class PsfChangeRow(Base):
-    """A change of a PSF's status, with the person, time and reason. Rows are never changed or deleted."""
+class PsfChangeRow(Change, Base):
+    """A change of a PSF's status, with the person, time and reason."""
 
     __tablename__ = "psf_changes"
-    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
-    owner: Mapped[str] = mapped_column(String(64))
     psf_id: Mapped[str] = mapped_column(String(64))
-    at: Mapped[float]
-    by: Mapped[str] = mapped_column(String(128))
     status_before: Mapped[str] = mapped_column(String(16))
     status: Mapped[str] = mapped_column(String(16))
     version_before: Mapped[str]
@@ -168,22 +160,18 @@ class PsfChangeRow(Base):
     valid_from: Mapped[float | None]
     valid_to: Mapped[float | None]
     successor_id: Mapped[str | None] = mapped_column(String(64))
-    reason: Mapped[str] = mapped_column(String(400))
 
     __table_args__ = (Index("psf_changes_of_a_psf", "owner", "psf_id", "number"),)
 
 
-class PsfContextRow(Base):
+class PsfContextRow(Owned, Base):
     """A context: a named set of PSFs, with one PSF for each series and range of times.
 
     A context never changes. Its id is the hash of its name and of its pins.
     """
 
     __tablename__ = "psf_contexts"
-    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
     name: Mapped[str] = mapped_column(String(80))
-    created_at: Mapped[float]
     created_by: Mapped[str] = mapped_column(String(128))
     reason: Mapped[str] = mapped_column(String(400))
     pins: Mapped[int]
@@ -209,30 +197,22 @@ class PsfPinRow(Base):
     interpolated: Mapped[bool] = mapped_column(default=False, server_default=false())
 
 
-class DefaultContextRow(Base):
+class DefaultContextRow(Change, Base):
     """A change of an owner's default context. The latest row of an owner is valid.
 
     context_id None: the owner uses the PSFs that are certified now.
     """
 
     __tablename__ = "default_contexts"
-    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
-    owner: Mapped[str] = mapped_column(String(64))
     context_id: Mapped[str | None] = mapped_column(String(64))
-    at: Mapped[float]
-    by: Mapped[str] = mapped_column(String(128))
-    reason: Mapped[str] = mapped_column(String(400))
 
     __table_args__ = (Index("default_contexts_of_an_owner", "owner", "number"),)
 
 
-class ProductRow(Base):
+class ProductRow(Owned, Base):
     """A deconvolved image; its id is the identity of its request."""
 
     __tablename__ = "products"
-    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    created_at: Mapped[float]
     kind: Mapped[str]
     image_id: Mapped[str] = mapped_column(String(64))
     psf_id: Mapped[str] = mapped_column(String(64))
@@ -292,23 +272,9 @@ class JobRow(Base):
 
     __table_args__ = (
         # If two identical requests arrive at the same moment, the second insert fails; the request then finds the first job.
-        Index(
-            "one_live_job_a_request",
-            "owner",
-            "request_key",
-            unique=True,
-            sqlite_where=phase.in_(sorted(LIVE)),
-            postgresql_where=phase.in_(sorted(LIVE)),
-        ),
+        _partial("one_live_job_a_request", phase.in_(sorted(LIVE)), "owner", "request_key", unique=True),
         # If two jobs have the same result, the second cannot be claimed while the first executes.
-        Index(
-            "one_at_work_a_result",
-            "owner",
-            "work_key",
-            unique=True,
-            sqlite_where=_EXECUTING,
-            postgresql_where=_EXECUTING,
-        ),
+        _partial("one_at_work_a_result", _EXECUTING, "owner", "work_key", unique=True),
         Index("jobs_by_phase", "phase", "heartbeat_at", "submitted_at"),
         # This index contains the owner, so that the owners of many waiting jobs are found without reading the rows.
         Index("jobs_waiting", "phase", "queue", "created_at", "submitted_at", "owner"),
@@ -339,13 +305,10 @@ class OwnerTurnRow(Base):
     number: Mapped[int] = mapped_column(BigInteger)
 
 
-class ReportRow(Base):
+class ReportRow(Owned, Base):
     """A report about a transit or about a rerun; its id is the identity of the request."""
 
     __tablename__ = "reports"
-    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    created_at: Mapped[float]
     kind: Mapped[str]
     transit_id: Mapped[str | None] = mapped_column(String(64))
     about_id: Mapped[str | None] = mapped_column(String(64))  # the PSF or product of a rerun
@@ -362,16 +325,13 @@ class ReportRow(Base):
     )
 
 
-class SolutionRow(Base):
+class SolutionRow(Owned, Base):
     """The kept solution of a transit.
 
     The solution is removed when it is old or when its room is needed, because a job can make it again.
     """
 
     __tablename__ = "solutions"
-    owner: Mapped[str] = mapped_column(String(64), primary_key=True)
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    created_at: Mapped[float]
     file_sha256: Mapped[str] = mapped_column(String(64))
     bytes: Mapped[int] = mapped_column(BigInteger)
 

@@ -12,7 +12,7 @@ from sqlalchemy import delete, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from workers.catalogue.database import Database
+from workers.catalogue.database import Database, newest_first
 from workers.catalogue.jobs import Jobs
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.contract.identities import canonical_hash
@@ -43,13 +43,15 @@ class UwsJobs:
         given: dict[str, Any],
         *,
         owner: str,
-        run_id: str | None = None,
-        execution_duration_s: int = 0,
-        destruction_at: float | None = None,
+        **terms: Any,
     ) -> JobRow:
-        """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it."""
+        """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it.
+
+        terms: the columns of its ``TermsRow``.
+        """
+        job_id = uuid.uuid4().hex
         row = JobRow(
-            id=uuid.uuid4().hex,
+            id=job_id,
             owner=owner,
             kind=kind,
             parameters=given,
@@ -58,14 +60,8 @@ class UwsJobs:
             queue=queue_of(kind),
             created_at=time.time(),
         )
-        terms = TermsRow(
-            job_id=row.id,
-            run_id=run_id,
-            execution_duration_s=execution_duration_s,
-            destruction_at=destruction_at,
-        )
         with self._database.writing.begin() as session:
-            session.add_all((row, terms))
+            session.add_all((row, TermsRow(job_id=job_id, **terms)))
         return row
 
     def amend(self, job_id: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> bool:
@@ -116,14 +112,13 @@ class UwsJobs:
 
     def terms(self, job_id: str) -> TermsRow:
         """The UWS terms of a job: run id, time limit, destruction time."""
-        with self._database.reading() as session:
-            return session.get(TermsRow, job_id) or TermsRow(job_id=job_id, execution_duration_s=0)
+        return self._database.row(TermsRow, job_id) or TermsRow(job_id=job_id, execution_duration_s=0)
 
     def set_terms(self, job_id: str, **values: Any) -> None:
         """Change UWS terms of a job."""
         with self._database.writing.begin() as session:
             # The lock on the job's row puts changes in order. Terms are not added to a deleted job.
-            if session.get(JobRow, job_id, with_for_update=True) is not None:
+            if _locked(session, job_id) is not None:
                 session.merge(TermsRow(job_id=job_id, **values))
 
     def end_by_terms(self) -> list[str]:
@@ -136,25 +131,22 @@ class UwsJobs:
             TermsRow.execution_duration_s > 0,
             JobRow.started_at + TermsRow.execution_duration_s < now,
         )
-        with self._database.reading() as session:
-            stopped = list(session.scalars(too_long))
-            due = list(session.scalars(select(TermsRow.job_id).where(TermsRow.destruction_at < now)))
-        for job_id in stopped:
+        for job_id in self._database.all(too_long):
             self._jobs.cancel(job_id)
+        due = self._database.all(select(TermsRow.job_id).where(TermsRow.destruction_at < now))
         return [job_id for job_id in due if self.destroy(job_id)]
 
     def lines(
         self,
         *,
         owner: str,
+        last: int,
         phases: Sequence[str] = (),
         from_time: float | None = None,
-        last: int | None = None,
     ) -> list[JobLine]:
-        """Jobs of an owner, newest first.
+        """The newest ``last`` jobs of an owner, newest first.
 
-        phases: only jobs in these phases; empty: all. from_time: only jobs created at this time or later. last: the
-        largest number of jobs.
+        phases: only jobs in these phases; empty: all. from_time: only jobs created at this time or later.
         """
         query = select(JobRow.id, JobRow.phase, JobRow.owner, JobRow.created_at, TermsRow.run_id)
         query = query.outerjoin(TermsRow, TermsRow.job_id == JobRow.id).where(JobRow.owner == owner)
@@ -162,9 +154,8 @@ class UwsJobs:
             query = query.where(JobRow.phase.in_(phases))
         if from_time is not None:
             query = query.where(JobRow.created_at >= from_time)
-        query = query.order_by(JobRow.created_at.desc(), JobRow.id.desc()).limit(last)
         with self._database.reading() as session:
-            return [JobLine(*line) for line in session.execute(query)]
+            return [JobLine(*line) for line in session.execute(newest_first(query, JobRow, last))]
 
 
 def _locked(session: Session, job_id: str) -> JobRow | None:

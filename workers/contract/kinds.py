@@ -42,7 +42,7 @@ from workers.contract.requests import (
     ResolvedReport,
     ResolvedRerun,
 )
-from workers.versions.series import INTERPOLATED
+from workers.versions import INTERPOLATED
 
 Task = Callable[[Any, Mapping[str, Any]], str]
 Assistant = Callable[[Any, Mapping[str, Any]], None]

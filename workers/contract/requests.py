@@ -18,7 +18,7 @@ from psfcore.deconvolve.box import BOX, LARGEST_ERROR, Box, region_without_discr
 from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise_figures import NoiseFigures
-from workers.versions.validity import TIME, iso, seconds
+from workers.versions import TIME, iso, seconds
 
 
 @dataclass(frozen=True)

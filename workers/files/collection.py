@@ -16,7 +16,7 @@ from typing import Any
 
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.named_files import Kept
+from workers.catalogue.owners import FileRow
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
 from workers.files.store import Blob, FileState, Store
 
@@ -67,7 +67,7 @@ def intact(store: Store, row: ProductRow | PsfRow | ReportRow) -> bool:
 class Fault:
     """A row of the catalogue with a lost or damaged file. files: SHA-256 and state of each lost or damaged file."""
 
-    row: Kept
+    row: FileRow
     files: tuple[tuple[str, FileState], ...]
 
     @property
@@ -95,7 +95,7 @@ def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iter
                 yield Fault(row, tuple(bad))
 
 
-def _files(row: Kept) -> Iterator[tuple[str, int | None]]:
+def _files(row: FileRow) -> Iterator[tuple[str, int | None]]:
     match row:
         case ImageRow() | TransitRow():
             yield row.id, row.bytes

@@ -20,7 +20,7 @@ from psfcore.instruments.model import load_instrument
 from psfcore.noise_figures import NoiseFigures
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import ResolvedDeconvolve
-from workers.versions.variants import without_variant
+from workers.versions import without_variant
 
 
 @dataclass(frozen=True)

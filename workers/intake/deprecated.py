@@ -11,8 +11,7 @@ from typing import Any
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow, PsfRow
-from workers.versions.series import INTERPOLATED
-from workers.versions.status import PsfStatus
+from workers.versions import INTERPOLATED, PsfStatus
 
 CODE = "psf-deprecated"  # the code of the error and of the warning
 SHOWN_DIGITS = 12

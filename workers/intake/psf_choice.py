@@ -20,15 +20,24 @@ from psfcore.instruments.unknown import agreement, unknown_instrument
 from psfcore.instruments.unknown import channel_of as channel_of_image
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import NOW
-from workers.catalogue.interpolated.series import Ends
 from workers.catalogue.psfs import PsfFilter
+from workers.catalogue.series import Ends
 from workers.catalogue.tables import ImageRow, PsfContextRow, PsfRow
 from workers.contract.requests import Deconvolve, PsfInterpolate, ResolvedDeconvolve
-from workers.versions.interpolation import name_of, rounded
-from workers.versions.series import TOTAL, UPLOADED, channel_of, instrument_of, series_of
-from workers.versions.status import PsfStatus
-from workers.versions.validity import iso, seconds
-from workers.versions.variants import variant_for, without_variant
+from workers.versions import (
+    TOTAL,
+    UPLOADED,
+    PsfStatus,
+    channel_of,
+    instrument_of,
+    interpolated_name,
+    interpolated_time,
+    iso,
+    seconds,
+    series_of,
+    variant_for,
+    without_variant,
+)
 
 MOST_NAMED = 20
 MOST_SEARCHED = 500
@@ -50,7 +59,7 @@ class Found:
         ends, at = self.ends, self.wanted.valid_at
         if ends is None or at is None:
             return None
-        time = rounded(ends.before_time, ends.after_time, at)
+        time = interpolated_time(ends.before_time, ends.after_time, at)
         return PsfInterpolate(
             before_psf_id=ends.before_psf_id,
             before_time=iso(ends.before_time) or "",
@@ -227,7 +236,7 @@ def reasoned_psf(
     if resolved.psf_interpolation is not None:
         before = catalogue.get(PsfRow, resolved.psf_interpolation.before_psf_id, owner)
         assert before is not None  # resolve() has found it
-        name, version = name_of(before.instrument, resolved.psf_id)
+        name, version = interpolated_name(before.instrument, resolved.psf_id)
         why = _why_interpolated(resolved.psf_interpolation, catalogue, owner) + "; the job makes it first."
         return ChosenPsf(id=resolved.psf_id, name=name, version=version, status=None, why=why)
     # resolve() has found the image and the PSF, or the recipe of the PSF

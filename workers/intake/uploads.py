@@ -10,8 +10,7 @@ from typing import Any
 from psfcore.fits.header import HeaderSummary
 from psfcore.transit.archive import ArchiveContents
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
-from workers.versions.series import UPLOADED, channel_of, instrument_of, series_of
-from workers.versions.status import PsfStatus
+from workers.versions import UPLOADED, PsfStatus, channel_of, instrument_of, series_of
 
 TEXT_LENGTH = 200
 # As in the query of an upload: the columns are indexed, and indexes have a limit.

@@ -16,7 +16,7 @@ from workers.files.collection import intact
 from workers.files.store import Store
 from workers.settings import Settings
 from workers.tasks.stage_timer import StageTimer
-from workers.versions.status import PsfStatus
+from workers.versions import PsfStatus
 
 Result = TypeVar("Result", ProductRow, PsfRow, ReportRow)
 

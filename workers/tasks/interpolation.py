@@ -20,8 +20,7 @@ from workers.intake.compatibility import of_upload
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import named_psf, psf_row
 from workers.tasks.data.reports import provenance_of
-from workers.versions.interpolation import name_of
-from workers.versions.series import INTERPOLATED, series_of
+from workers.versions import INTERPOLATED, interpolated_name, series_of
 
 STAGE = "interpolating the PSF"
 
@@ -45,7 +44,7 @@ def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
         "before": _epoch(context, request.before_psf_id, request.before_time),
         "after": _epoch(context, request.after_psf_id, request.after_time),
     }
-    name, version = name_of(ends["before"].psf.instrument, identity)
+    name, version = interpolated_name(ends["before"].psf.instrument, identity)
     # The id of the job is in the details of the row, not in the file, so that the file can be made again bit for bit.
     provenance = {"psf_id": identity, **provenance_of(context, request)}
     del provenance["job_id"]

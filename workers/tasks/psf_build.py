@@ -20,7 +20,7 @@ from workers.contract.requests import PsfBuild, PsfInterpolate, ResolvedDeconvol
 from workers.settings import library_versions
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import is_total_alone, named_psf, psf_row
-from workers.versions.series import TOTAL
+from workers.versions import TOTAL
 
 
 def psf_build(context: Context, parameters: Mapping[str, Any]) -> str:

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
-from service.cli.connection import CONTEXT, ID, Row, id_argument, on_service, print_rows, short, whole_id
+from service.cli.connection import (
+    CONTEXT,
+    ID,
+    Row,
+    id_argument,
+    on_service,
+    print_rows,
+    short,
+    whole_id,
+)
 from service.cli.options import (
     FILE,
     JSON,
@@ -24,8 +33,7 @@ from service.cli.options import (
 )
 from service.cli.psf.make import say_fit
 from service.client.operations import given
-from workers.versions.series import TOTAL
-from workers.versions.status import PsfStatus
+from workers.versions import TOTAL, PsfStatus
 
 if TYPE_CHECKING:
     from service.client.http import Client

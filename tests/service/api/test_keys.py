@@ -13,7 +13,7 @@ from tests.conftest import SMALL_INSTRUMENT
 from tests.service.conftest import refusal
 from tests.service.keyed import Keyed, bearer, keyed
 from tests.whole.stack import wait_for
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.settings import Settings
 
 DAY_S = 86_400

@@ -15,7 +15,7 @@ from tests.service.conftest import refusal
 from tests.service.vo.made import ENDED_AT, STARTED_AT, add_product
 from tests.workers.psf_examples import identity, product, psf
 from workers.catalogue.catalogue import Catalogue
-from workers.provenance import provenance, provenance_text
+from workers.lineage import provenance, provenance_text
 
 
 def read(text: str) -> ProvDocument:

@@ -16,7 +16,7 @@ from httpx import Response
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.service.conftest import job_after, refusal, result_of, upload
 from tests.service.keyed import Keyed
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER
 from workers.settings import Settings

@@ -32,7 +32,7 @@ from service.app import create_app
 from service.openapi import description
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.service.serving import serving
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.settings import Settings
 
 # The same requests each time, however slow the machine is.

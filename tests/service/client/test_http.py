@@ -19,7 +19,7 @@ from service.client.http import Client
 from tests.conftest import write_image, write_psf
 from tests.service.api.live import running
 from tests.service.keyed import Keyed
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.settings import Settings
 
 

@@ -22,7 +22,7 @@ from service.client.http import Client, ServiceError
 from service.http.state import check_can_serve
 from tests.service.conftest import upload
 from tests.service.keyed import Keyed, bearer
-from workers.catalogue.access.keys import KeyRefused, Keys, Scope
+from workers.catalogue.access import KeyRefused, Keys, Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import KeyRow
 from workers.settings import Settings

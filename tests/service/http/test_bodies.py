@@ -27,7 +27,7 @@ from tests.service.conftest import refusal, settings_in
 from tests.service.keyed import Keyed, bearer, keyed
 from tests.service.serving import serving
 from tests.whole.stack import wait_for
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.settings import Settings
 
 JSON = {"Content-Type": "application/json"}

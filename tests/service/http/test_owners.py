@@ -17,12 +17,12 @@ from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 from tests.service.conftest import refusal, upload
 from tests.service.keyed import Keyed
 from tests.transit_files import write_transit
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.catalogue.contexts import Pin
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
 from workers.files.store import Store
-from workers.versions.status import PsfStatus
+from workers.versions import PsfStatus
 
 UNKNOWN = {64: "f" * 64, 32: "f" * 32, 16: "f" * 16}
 

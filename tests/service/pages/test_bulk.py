@@ -15,7 +15,7 @@ from service.pages import bulk as bulk_pages
 from tests.conftest import write_image, write_psf
 from tests.service.conftest import upload, work_through_bulks
 from tests.service.keyed import keyed
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.settings import Settings
 
 FEW = {"method": {"name": "richardson-lucy", "steps": 2}}

@@ -16,7 +16,7 @@ from service.pages import bulk
 from tests.conftest import write_image
 from tests.service.conftest import upload, work_through_bulks
 from tests.service.keyed import keyed
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.contract.layout import FIELDS
 from workers.settings import Settings
 

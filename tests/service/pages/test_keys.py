@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from tests.service.keyed import Keyed, bearer, keyed
 from tests.service.pages.test_login import OWN_PAGE, browser
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.settings import Settings
 
 

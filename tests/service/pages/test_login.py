@@ -16,8 +16,7 @@ from service.app import create_app
 from service.pages.login import LONGEST_ADDRESS, local_address
 from tests.service.conftest import upload
 from tests.service.keyed import Keyed, bearer, keyed
-from workers.catalogue.access.keys import KeyRefused, Scope
-from workers.catalogue.access.sessions import SessionRow
+from workers.catalogue.access import KeyRefused, Scope, SessionRow
 from workers.settings import Settings
 
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}

@@ -14,7 +14,7 @@ from service.views import PsfView
 from tests.conftest import write_psf
 from tests.service.conftest import upload
 from tests.service.pages.test_login import PERSON
-from workers.versions.status import PsfStatus
+from workers.versions import PsfStatus
 
 SCALE = 0.5
 

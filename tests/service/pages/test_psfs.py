@@ -14,7 +14,7 @@ from tests.conftest import write_psf
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
 from tests.service.pages.test_login import OWN_PAGE, PERSON, browser
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.settings import Settings
 
 

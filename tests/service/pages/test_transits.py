@@ -13,7 +13,7 @@ from tests.service.conftest import upload
 from tests.service.keyed import keyed
 from tests.service.pages.test_login import PERSON, browser
 from tests.transit_files import write_transit
-from workers.catalogue.access.keys import Scope
+from workers.catalogue.access import Scope
 from workers.settings import Settings
 
 

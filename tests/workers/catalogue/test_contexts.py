@@ -14,7 +14,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
 from workers.catalogue.psfs import PsfFilter
 from workers.intake.psf_choice import look, look_for_image, picked_for_image
-from workers.versions.validity import iso, seconds
+from workers.versions import iso, seconds
 
 LINE = PsfFilter("hri_euv", "174", "total")
 

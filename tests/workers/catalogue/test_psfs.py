@@ -15,8 +15,7 @@ from tests.workers.psf_examples import OWNER, certify, deprecate, identity, psf,
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.psfs import PsfFilter, StatusAsked
 from workers.catalogue.tables import PsfRow
-from workers.versions.status import PsfStatus
-from workers.versions.validity import seconds
+from workers.versions import PsfStatus, seconds
 
 
 @pytest.fixture

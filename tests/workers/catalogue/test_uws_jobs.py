@@ -113,4 +113,8 @@ def test_terms_end_jobs(catalogue: Catalogue) -> None:
     assert catalogue.uws.end_by_terms() == []
     assert not catalogue.jobs.heartbeat(leases[slow.id]) and catalogue.jobs.heartbeat(leases[endless.id])
     assert catalogue.jobs.abort(leases[slow.id]) and job_row(catalogue, slow.id).phase == Phase.ABORTED
-    assert [line.id for line in catalogue.uws.lines(owner=DEFAULT_OWNER)] == [kept.id, slow.id, endless.id]
+    assert [line.id for line in catalogue.uws.lines(owner=DEFAULT_OWNER, last=9)] == [
+        kept.id,
+        slow.id,
+        endless.id,
+    ]

@@ -25,7 +25,7 @@ from workers.contract.requests import PsfBuild, PsfFit
 from workers.intake import requests
 from workers.intake.deprecated import details_now
 from workers.settings import Settings
-from workers.versions.status import PsfStatus
+from workers.versions import PsfStatus
 
 HRI = {"TELESCOP": "SOLO/EUI/HRI_EUV", "INSTRUME": "EUI", "DETECTOR": "HRI_EUV", "WAVELNTH": 174}
 AT = {"DATE-BEG": "2024-03-01T12:00:00"}

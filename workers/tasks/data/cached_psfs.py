@@ -30,7 +30,7 @@ from workers.contract.requests import PsfBuild
 from workers.files.store import Store
 from workers.settings import library_versions
 from workers.tasks.data.psfs import is_total_alone, psf_row
-from workers.versions.series import TOTAL
+from workers.versions import TOTAL
 
 log = logging.getLogger(__name__)
 _ROW, _TABLES, _PREVIEW, _TOTAL_ROW = "row.json", "tables.json", "preview.png", "total.row.json"

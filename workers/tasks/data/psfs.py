@@ -15,8 +15,7 @@ from workers.catalogue.tables import PsfRow
 from workers.files.store import Store
 from workers.rows import row_of
 from workers.tasks.context import Context
-from workers.versions.series import TOTAL, channel_of, series_of
-from workers.versions.status import PsfStatus
+from workers.versions import TOTAL, PsfStatus, channel_of, series_of
 
 _TOTAL_ALONE = "total_alone"  # an entry of the details of a row
 CURVE_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)

@@ -16,8 +16,7 @@ from tests.conftest import write_image, write_psf
 from tests.service.pages.browser.checks import good
 from tests.service.pages.browser.conftest import LONG_MS, PLAIN_NAME, Site, Watch
 from tests.whole.stack import Stack
-from workers.catalogue.access.keys import Scope
-from workers.catalogue.access.sessions import SessionRow
+from workers.catalogue.access import Scope, SessionRow
 from workers.settings import Settings
 
 ELSEWHERE = "http://elsewhere.test/"

@@ -1,17 +1,18 @@
 """Writes UWS 1.1 documents (job list, job, parameters, results) as XML of the IVOA schema.
 
 Citation: REC-UWS-1.1 (24 October 2016), appendix B, which also defines the order of elements. Times are UTC and end in Z.
+The models of ``vo-models`` write no element for a time that is not known, and need a class for each set of parameters;
+the schema demands these elements, and the parameters differ from kind to kind.
 """
 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable
 from datetime import UTC, datetime
-from typing import Any
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement, register_namespace, tostring
 
+from service.vo.parameters import NO_XML
 from workers.catalogue.tables import JobRow, TermsRow
 from workers.catalogue.uws_jobs import JobLine
 from workers.contract.kinds import KINDS, Result
@@ -22,20 +23,16 @@ UWS = "http://www.ivoa.net/xml/UWS/v1.0"
 XLINK = "http://www.w3.org/1999/xlink"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
 VERSION = "1.1"
-NO_XML = re.compile(
-    "[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
-)  # characters that XML 1.0 cannot contain
 
 for _prefix, _namespace in (("uws", UWS), ("xlink", XLINK), ("xsi", XSI)):
-    ElementTree.register_namespace(_prefix, _namespace)
+    register_namespace(_prefix, _namespace)
 
 
 def job_list(lines: Iterable[JobLine], jobs_url: str) -> bytes:
     """The document of a job list."""
-    root = ElementTree.Element(f"{{{UWS}}}jobs", version=VERSION)
+    root = Element(f"{{{UWS}}}jobs", version=VERSION)
     for line in lines:
-        reference = {"id": line.id, **_link(f"{jobs_url}/{line.id}")}
-        entry = ElementTree.SubElement(root, f"{{{UWS}}}jobref", reference)
+        entry = _add(root, "jobref", id=line.id, **_link(f"{jobs_url}/{line.id}"))
         _add(entry, "phase", line.phase)
         if line.run_id is not None:
             _add(entry, "runId", line.run_id)
@@ -46,7 +43,7 @@ def job_list(lines: Iterable[JobLine], jobs_url: str) -> bytes:
 
 def job(row: JobRow, terms: TermsRow, quote: float | None, base_url: str) -> bytes:
     """The document of a job."""
-    root = ElementTree.Element(f"{{{UWS}}}job", version=VERSION)
+    root = Element(f"{{{UWS}}}job", version=VERSION)
     _add(root, "jobId", row.id)
     if terms.run_id is not None:
         _add(root, "runId", terms.run_id)
@@ -63,8 +60,7 @@ def job(row: JobRow, terms: TermsRow, quote: float | None, base_url: str) -> byt
     if row.error is not None:
         error = JobError.model_validate(row.error)
         kind = "transient" if error.fault == Fault.TRANSIENT else "fatal"
-        summary = ElementTree.SubElement(root, f"{{{UWS}}}errorSummary", type=kind, hasDetail="true")
-        _add(summary, "message", error.message)
+        _add(_add(root, "errorSummary", type=kind, hasDetail="true"), "message", error.message)
     return _written(root)
 
 
@@ -82,11 +78,11 @@ def result_addresses(row: JobRow) -> dict[str, tuple[str, str]]:
     """The address and media type of each result, by its name; empty until the job is COMPLETED."""
     if row.phase != Phase.COMPLETED or row.result_id is None:
         return {}
-    made = KINDS[row.kind].result
-    media_type = "application/json" if made == Result.REPORT else "application/fits"
+    result = KINDS[row.kind].result
+    media_type = "application/json" if result == Result.REPORT else "application/fits"
     return {
-        "result": (f"{made}/{row.result_id}/file", media_type),
-        "description": (f"{made}/{row.result_id}", "application/json"),
+        "result": (f"{result}/{row.result_id}/file", media_type),
+        "description": (f"{result}/{row.result_id}", "application/json"),
     }
 
 
@@ -95,48 +91,42 @@ def time_text(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def _parameters(row: JobRow) -> ElementTree.Element:
-    found = ElementTree.Element(f"{{{UWS}}}parameters")
+def _parameters(row: JobRow) -> Element:
+    root = Element(f"{{{UWS}}}parameters")
     for name, value in {"KIND": row.kind, **row.parameters}.items():
         if value is not None:
-            _add(found, "parameter", _parameter_text(value)).set("id", name)
-    return found
+            # As a form contains it: a text is unchanged, any other value is written as JSON.
+            _add(root, "parameter", value if isinstance(value, str) else json.dumps(value), id=name)
+    return root
 
 
-def _parameter_text(value: Any) -> str:
-    """A parameter as a form contains it: a text is unchanged, any other value is written as JSON."""
-    return value if isinstance(value, str) else json.dumps(value)
-
-
-def _results(row: JobRow, base_url: str) -> ElementTree.Element:
-    found = ElementTree.Element(f"{{{UWS}}}results")
+def _results(row: JobRow, base_url: str) -> Element:
+    root = Element(f"{{{UWS}}}results")
     for name, (address, media_type) in result_addresses(row).items():
-        reference = {"id": name, "mime-type": media_type, **_link(base_url + address)}
-        ElementTree.SubElement(found, f"{{{UWS}}}result", reference)
-    return found
+        _add(root, "result", **{"id": name, "mime-type": media_type, **_link(base_url + address)})
+    return root
 
 
 def _link(address: str) -> dict[str, str]:
     return {f"{{{XLINK}}}type": "simple", f"{{{XLINK}}}href": NO_XML.sub("\ufffd", address)}
 
 
-def _add(parent: ElementTree.Element, name: str, text: str) -> ElementTree.Element:
-    element = ElementTree.SubElement(parent, f"{{{UWS}}}{name}")
-    # Parameters that were sent as JSON may contain characters that XML cannot contain. Each is written as a replacement
-    # character.
-    element.text = NO_XML.sub("\ufffd", text)
+def _add(parent: Element, name: str, text: str | None = None, **attributes: str) -> Element:
+    element = SubElement(parent, f"{{{UWS}}}{name}", attributes)
+    if text is not None:
+        # Parameters that were sent as JSON may contain characters that XML cannot contain.
+        element.text = NO_XML.sub("\ufffd", text)
     return element
 
 
-def _add_time(parent: ElementTree.Element, name: str, seconds: float | None) -> None:
+def _add_time(parent: Element, name: str, seconds: float | None) -> None:
     if seconds is None:
-        ElementTree.SubElement(parent, f"{{{UWS}}}{name}", {f"{{{XSI}}}nil": "true"})
+        _add(parent, name, **{f"{{{XSI}}}nil": "true"})
     else:
         _add(parent, name, time_text(seconds))
 
 
-def _written(root: ElementTree.Element) -> bytes:
-    text = ElementTree.tostring(root, encoding="unicode")
+def _written(root: Element) -> bytes:
     # XML parsers would read a carriage return as a line feed.
-    text = text.replace("\r", "&#13;")
+    text = tostring(root, encoding="unicode").replace("\r", "&#13;")
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + text.encode()

@@ -15,11 +15,9 @@ from sqlalchemy import Select, exists, select
 from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
-from workers.catalogue.database import Database
+from workers.catalogue.database import Queries
 from workers.catalogue.tables import PsfPinRow, PsfRow, PsfSeriesRow, SeriesChangeRow
-from workers.versions.series import TOTAL
-from workers.versions.status import PsfStatus
-from workers.versions.variants import SEPARATOR
+from workers.versions import SEPARATOR, TOTAL, PsfStatus
 
 
 @dataclass(frozen=True)
@@ -36,11 +34,8 @@ class Ends:
     after_time: float
 
 
-class Series:
-    """Series of which a PSF was certified; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Series(Queries):
+    """Series of which a PSF was certified."""
 
     def all(self, owner: str) -> dict[str, bool]:
         """All series of which a PSF was certified, sorted by name: whether the PSFs of each may be interpolated."""
@@ -52,9 +47,9 @@ class Series:
             .scalar_subquery()
         )
         query = select(PsfSeriesRow.series, latest).where(PsfSeriesRow.owner == owner)
+        query = query.order_by(PsfSeriesRow.series)
         with self._database.reading() as session:
-            rows = session.execute(query.order_by(PsfSeriesRow.series))
-            return {series: bool(interpolated) for series, interpolated in rows}
+            return {series: bool(allowed) for series, allowed in session.execute(query)}
 
     def variants(
         self, instrument: str, channel: str, kind: str, owner: str, context_id: str | None
@@ -73,13 +68,7 @@ class Series:
             table.series.startswith(start, autoescape=True),
             table.series.endswith(end, autoescape=True),
         )
-        with self._database.reading() as session:
-            return sorted(series.split("/")[1] for series in session.scalars(query.distinct()))
-
-    def interpolated(self, series: str, owner: str) -> bool:
-        """Whether the PSFs of a series may be interpolated."""
-        with self._database.reading() as session:
-            return may_interpolate(session, series, owner)
+        return sorted(series.split("/")[1] for series in self._database.all(query.distinct()))
 
     def changes(self, series: str, owner: str, limit: int = 200) -> Sequence[SeriesChangeRow]:
         """The changes of a series, latest first. Raises ``DataError`` "no-such-series"."""
@@ -88,12 +77,7 @@ class Series:
             return session.scalars(_changes(series, owner).limit(limit)).all()
 
     def set_interpolated(
-        self,
-        series: str,
-        owner: str,
-        interpolated: bool,
-        by: str,
-        reason: str = "",
+        self, series: str, owner: str, interpolated: bool, by: str, reason: str = ""
     ) -> None:
         """Say whether the PSFs of a series may be interpolated. If this changes nothing, no change is recorded.
 
@@ -109,10 +93,8 @@ class Series:
                 )
             if may_interpolate(session, series, owner) == interpolated:
                 return
-            row = SeriesChangeRow(
-                owner=owner, series=series, interpolated=interpolated, at=time.time(), by=by, reason=reason
-            )
-            session.add(row)
+            change = {"interpolated": interpolated, "at": time.time(), "by": by, "reason": reason}
+            session.add(SeriesChangeRow(owner=owner, series=series, **change))
 
     def ends(self, series: str, at: float, owner: str, context_id: str | None) -> Ends | None:
         """The PSFs between which a time lies, if the series may be interpolated.

@@ -10,9 +10,9 @@ from sqlalchemy import insert, text
 from tests.whole.many_rows import plan, statements
 from tests.workers.databases import BOTH, change, database
 from tests.workers.jobs import bulk_row
+from workers.catalogue import followed
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.followed import rows
-from workers.catalogue.followed.rows import Place
+from workers.catalogue.followed import Place
 from workers.catalogue.tables import JobRow
 
 ANY = "0" * 32
@@ -31,7 +31,7 @@ def add_jobs(catalogue: Catalogue, *jobs: dict[str, object]) -> None:
 
 
 def test_rows_are_read_by_owner_phase_and_end(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rows, "MOST", 2)
+    monkeypatch.setattr(followed, "MOST", 2)
     add_jobs(
         catalogue,
         *(job(number) for number in (1, 2, 3, 4)),

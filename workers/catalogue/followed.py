@@ -70,19 +70,18 @@ class Followed(Generic[Followable]):
 
     def now(self) -> float:
         """The time of the database's clock, s since 1970."""
-        with self._database.reading() as session:
-            return float(session.execute(select(self._database.now)).scalar_one())
+        return self._database.clock()
 
     def open(self, owner: str) -> list[State]:
         """Rows that have not ended: the newest ``MOST`` rows of each group of phases, newest first."""
-        table, found = self._table, []
+        table, states = self._table, []
         with self._database.reading() as session:
             for group in self._open_phases:
                 phase = table.phase == group[0] if len(group) == 1 else table.phase.in_(group)
                 query = select(*self._columns).where(table.owner == owner, phase, *self._conditions)
                 newest = query.order_by(table.created_at.desc(), table.id.desc()).limit(MOST)
-                found += _states(session.execute(newest))
-        return found
+                states += _states(session.execute(newest))
+        return states
 
     def ended(self, owner: str, after: Place) -> list[State]:
         """The next ``MOST`` rows that ended after a place, in the order in which they ended."""
@@ -104,8 +103,7 @@ class Followed(Generic[Followable]):
         """For each id that the owner has: the state of the row and the complete row. Pass only a few ids."""
         if not ids:
             return {}
-        with self._database.reading() as session:
-            rows = session.scalars(select(self._table).where(self._these(owner, ids))).all()
+        rows = self._database.all(select(self._table).where(self._these(owner, ids)))
         return {row.id: (self._state(row), row) for row in rows}
 
     def _these(self, owner: str, ids: Collection[str]) -> ColumnElement[bool]:

@@ -9,10 +9,10 @@ one runs. Destroying a job does not delete its result. Errors are plain text.
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Annotated, Any
 
 import anyio
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, RedirectResponse
 
@@ -21,12 +21,23 @@ from service.http.callers import Caller, Reading, Submitting
 from service.http.problems import Problem, problem
 from service.http.quotas import check_rows
 from service.http.state import Shared, State
-from service.uws import documents
-from service.uws import plain_errors as routing
-from service.uws.parameters import Form, bad, check, integer, kind_of, moment, phase, query_of, resolved
-from service.uws.uploads import SentForm, ids_of, keep
 from service.views import time_left_s
-from workers.catalogue.tables import JobRow, TermsRow
+from service.vo import job_documents as documents
+from service.vo.job_forms import SentForm, check, files_of, ids_of, keep, kind_of, resolved
+from service.vo.parameters import (
+    NO_XML,
+    Form,
+    PlainErrors,
+    bad,
+    base_url,
+    integer,
+    moment,
+    one,
+    query,
+    refuse,
+    values_of,
+)
+from workers.catalogue.tables import JobRow
 from workers.contract.phases import JobError, Phase
 from workers.rows import no_such
 
@@ -36,12 +47,35 @@ MOST_LISTED = 10_000  # largest number of jobs in one document, because the docu
 UPLOADS = "NAME,param:PART: the file in the part PART of a multipart form is the image, mask, transit or psf (NAME) of the job"
 PENDING_ONLY = "parameters can be set only while a job is PENDING"
 FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0  # a waiting request checks its job at growing intervals
+# The last four are phases of the standard. Jobs of this service are never in these phases, but clients may
+# ask for such jobs.
+PHASES = frozenset({*Phase, "HELD", "SUSPENDED", "UNKNOWN", "ARCHIVED"})
+
+
+TEXT: dict[str, Any] = {"response_class": PlainTextResponse}
+XML: dict[str, Any] = {
+    "response_class": Response,
+    "responses": {200: {"content": {documents.MEDIA_TYPE: {}}, "description": "A document of UWS 1.1"}},
+}
+TO_JOB: dict[str, Any] = {"status_code": 303, "response_class": RedirectResponse}
+
+
+def _form(*, files: bool = False, **described: str) -> dict[str, Any]:
+    """A route that reads a form and answers with the address of a job.
+
+    described: the descriptions of the fields. files: whether a multipart form may contain files.
+    """
+    fields = {name: {"type": "string", "description": text} for name, text in described.items()}
+    schema = {"type": "object", "properties": fields, "additionalProperties": {"type": "string"}}
+    media_types = ["application/x-www-form-urlencoded", *(["multipart/form-data"] if files else [])]
+    content = {name: {"schema": schema} for name in media_types}
+    return {**TO_JOB, "openapi_extra": {"requestBody": {"content": content}}}
 
 
 router = APIRouter(
     prefix="/uws/jobs",
     tags=["uws"],
-    route_class=routing.PlainErrors,
+    route_class=PlainErrors,
     responses={
         "4XX": {
             "content": {"text/plain": {}},
@@ -51,11 +85,27 @@ router = APIRouter(
 )
 
 
+def _find(job_id: str, caller: Reading, state: Shared) -> JobRow:
+    """The row of a job. Raises ``Problem`` 404 if the caller has no such job."""
+    if len(job_id) != 32 or not set(job_id) <= set("0123456789abcdef"):
+        raise problem(no_such("job", f"{job_id[:64]!a}"))
+    return find(state, caller, job_id)
+
+
+def _find_own(job_id: str, caller: Submitting, state: Shared) -> JobRow:
+    """The row of a job that the caller may change."""
+    return check_own(_find(job_id, caller, state))
+
+
+Job = Annotated[JobRow, Depends(_find)]
+OwnJob = Annotated[JobRow, Depends(_find_own)]
+
+
 @router.get(
     "",
     summary="UWS: the job list",
-    **routing.XML,
-    openapi_extra=routing.query(
+    **XML,
+    openapi_extra=query(
         PHASE="list jobs in this phase; may be repeated",
         AFTER="list jobs created after this time (ISO 8601, UTC)",
         LAST=f"list only this number of the newest jobs; at most {MOST_LISTED}, which is also the default",
@@ -63,14 +113,14 @@ router = APIRouter(
 )
 def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
     """Your jobs, newest first. /v1/jobs lists all of them in pages."""
-    query = query_of(request, "phase")
-    after, last = query.get("after"), query.get("last")
+    sent = values_of(request.query_params.multi_items(), "phase")
+    after, last = one(sent, "after"), one(sent, "last")
     # Documents show times to the millisecond. Therefore AFTER excludes the whole millisecond that the client names.
-    from_time = None if after is None else (int(moment("AFTER", after[0]) * 1000) + 1) / 1000
+    from_time = None if after is None else (int(moment("AFTER", after) * 1000) + 1) / 1000
     lines = state.catalogue.uws.lines(
-        phases=[phase(text) for text in query.get("phase", ())],
+        phases=[_phase(text) for text in sent.get("phase", ())],
         from_time=from_time,
-        last=MOST_LISTED if last is None else min(integer("LAST", last[0], 1), MOST_LISTED),
+        last=MOST_LISTED if last is None else min(integer("LAST", last, 1), MOST_LISTED),
         owner=caller.owner,
     )
     return _xml(documents.job_list(lines, _jobs_url(request)))
@@ -79,8 +129,7 @@ def list_uws_jobs(request: Request, caller: Reading, state: Shared) -> Response:
 @router.post(
     "",
     summary="UWS: create a job",
-    **routing.TO_JOB,
-    openapi_extra=routing.form(
+    **_form(
         files=True,
         KIND="kind of job, for example deconvolve",
         PHASE="RUN: start the job at once",
@@ -96,14 +145,15 @@ def create_uws_job(caller: Submitting, sent: SentForm, request: Request, state: 
     run_id, start = form.pop("runid", None), form.pop("phase", None)
     duration, destruction = form.pop("executionduration", None), form.pop("destruction", None)
     kind = kind_of(form)
-    if run_id is not None and (documents.NO_XML.search(run_id) or len(run_id) > MAX_RUN_ID):
+    if run_id is not None and (NO_XML.search(run_id) or len(run_id) > MAX_RUN_ID):
         raise bad(f"expected RUNID of at most {MAX_RUN_ID} characters that XML can hold; got {run_id[:40]!a}")
     if start not in (None, "RUN"):
         raise bad(f"expected PHASE=RUN or no PHASE; got {start[:40]!a}")
-    form |= ids_of(sent, kind)
+    files = files_of(sent, kind)
+    form |= ids_of(files)
     check(kind, form)
     check_rows(state, caller.owner)
-    keep(state, caller, sent, kind)
+    keep(state, caller, files)
     ready = resolved(state, caller.owner, kind, form) if start else None
     row = state.catalogue.uws.draft(
         kind,
@@ -121,20 +171,20 @@ def create_uws_job(caller: Submitting, sent: SentForm, request: Request, state: 
 @router.get(
     "/{job_id}",
     summary="UWS: a job",
-    **routing.XML,
-    openapi_extra=routing.query(
+    **XML,
+    openapi_extra=query(
         WAIT="seconds to wait for a change of the phase; -1: as long as the service allows",
         PHASE="with WAIT: wait only if the job is in this phase",
     ),
 )
 async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Shared) -> Response:
     """Show the job: at once, or with WAIT as soon as its phase changes."""
-    query = query_of(request)
+    sent = values_of(request.query_params.multi_items())
     most = state.settings.uws_max_wait_s
-    wait_s = integer("WAIT", query["wait"][0], -1) if "wait" in query else 0
+    wait_s = integer("WAIT", one(sent, "wait") or "0", -1)
     deadline = time.monotonic() + (most if wait_s < 0 else min(wait_s, most))
-    row = await run_in_threadpool(_find, state, caller, job_id)
-    seen = phase(query["phase"][0]) if "phase" in query else row.phase
+    row = await run_in_threadpool(_find, job_id, caller, state)
+    seen = _phase(sent["phase"][0]) if "phase" in sent else row.phase
     look_s = FIRST_LOOK_S
     while row.phase == seen and not Phase(row.phase).ended:
         left_s = deadline - time.monotonic()
@@ -142,131 +192,110 @@ async def get_uws_job(job_id: str, request: Request, caller: Reading, state: Sha
             break
         await anyio.sleep(min(look_s, left_s))
         look_s = min(look_s * 1.4, LONGEST_LOOK_S)
-        row = await run_in_threadpool(_find, state, caller, job_id)
+        row = await run_in_threadpool(_find, job_id, caller, state)
     terms = await run_in_threadpool(state.catalogue.uws.terms, job_id)
-    return _xml(documents.job(row, terms, _quote(row), _base_url(request)))
+    return _xml(documents.job(row, terms, _quote(row), base_url(request)))
 
 
-@router.delete("/{job_id}", summary="UWS: abort and destroy a job", **routing.TO_JOB)
-def delete_uws_job(job_id: str, request: Request, caller: Submitting, state: Shared) -> Response:
+@router.delete("/{job_id}", summary="UWS: abort and destroy a job", **TO_JOB)
+def delete_uws_job(row: OwnJob, request: Request, state: Shared) -> Response:
     """Delete the job in any phase. If a worker runs the job, the worker stops it. The result of the job stays in the
     catalogue."""
-    check_own(_find(state, caller, job_id))
-    state.catalogue.uws.destroy(job_id)
+    state.catalogue.uws.destroy(row.id)
     return RedirectResponse(_jobs_url(request), 303)
 
 
-@router.post(
-    "/{job_id}", summary="UWS: destroy a job", **routing.TO_JOB, openapi_extra=routing.form(ACTION="DELETE")
-)
-def post_uws_job(job_id: str, caller: Submitting, form: Form, request: Request, state: Shared) -> Response:
+@router.post("/{job_id}", summary="UWS: destroy a job", **_form(ACTION="DELETE"))
+def post_uws_job(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
     """The same as DELETE, for browsers."""
-    _find(state, caller, job_id)
     if form.get("action") != "DELETE":
         raise bad(f"expected ACTION=DELETE, got {form.get('action', '')[:40]!a}")
-    return delete_uws_job(job_id, request, caller, state)
+    return delete_uws_job(row, request, state)
 
 
-@router.get("/{job_id}/phase", summary="UWS: a job's phase", **routing.TEXT)
-def get_uws_phase(job_id: str, caller: Reading, state: Shared) -> Response:
+@router.get("/{job_id}/phase", summary="UWS: a job's phase", **TEXT)
+def get_uws_phase(row: Job) -> Response:
     """The phase as one word."""
-    return _text(_find(state, caller, job_id).phase)
+    return PlainTextResponse(row.phase)
 
 
-@router.post(
-    "/{job_id}/phase",
-    summary="UWS: start or abort a job",
-    **routing.TO_JOB,
-    openapi_extra=routing.form(PHASE="RUN or ABORT"),
-)
-def post_uws_phase(job_id: str, caller: Submitting, form: Form, request: Request, state: Shared) -> Response:
+@router.post("/{job_id}/phase", summary="UWS: start or abort a job", **_form(PHASE="RUN or ABORT"))
+def post_uws_phase(form: Form, row: OwnJob, caller: Submitting, request: Request, state: Shared) -> Response:
     """RUN queues a PENDING job. ABORT stops a job that has not ended. A repeated request changes nothing."""
-    row = check_own(_find(state, caller, job_id))
     match form.get("phase"):
         case "RUN":
             _start(state, caller, row)
         case "ABORT":
-            state.catalogue.jobs.cancel(job_id)
+            state.catalogue.jobs.cancel(row.id)
         case other:
             raise bad(f"expected PHASE=RUN or PHASE=ABORT, got {(other or '')[:40]!a}")
-    return _see(request, job_id)
+    return _see(request, row.id)
 
 
-@router.get("/{job_id}/executionduration", summary="UWS: how long a job may execute", **routing.TEXT)
-def get_uws_duration(job_id: str, caller: Reading, state: Shared) -> Response:
+@router.get("/{job_id}/executionduration", summary="UWS: how long a job may execute", **TEXT)
+def get_uws_duration(row: Job, state: Shared) -> Response:
     """Seconds; 0: unlimited."""
-    return _text(str(_terms(state, caller, job_id)[1].execution_duration_s))
+    return PlainTextResponse(str(state.catalogue.uws.terms(row.id).execution_duration_s))
 
 
 @router.post(
     "/{job_id}/executionduration",
     summary="UWS: limit how long a job may execute",
-    **routing.TO_JOB,
-    openapi_extra=routing.form(EXECUTIONDURATION="seconds; 0: unlimited"),
+    **_form(EXECUTIONDURATION="seconds; 0: unlimited"),
 )
-def post_uws_duration(
-    job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
-) -> Response:
+def post_uws_duration(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
     """Set the limit. If it exceeds the largest limit that the operator allows, the service sets that limit."""
-    check_own(_find(state, caller, job_id))
-    asked = _duration(state, _given(form, "EXECUTIONDURATION"))
-    state.catalogue.uws.set_terms(job_id, execution_duration_s=asked)
-    return _see(request, job_id)
+    limit_s = _duration(state, _field(form, "EXECUTIONDURATION"))
+    state.catalogue.uws.set_terms(row.id, execution_duration_s=limit_s)
+    return _see(request, row.id)
 
 
-@router.get("/{job_id}/destruction", summary="UWS: when a job is destroyed", **routing.TEXT)
-def get_uws_destruction(job_id: str, caller: Reading, state: Shared) -> Response:
+@router.get("/{job_id}/destruction", summary="UWS: when a job is destroyed", **TEXT)
+def get_uws_destruction(row: Job, state: Shared) -> Response:
     """A time; empty if the job is never destroyed."""
-    at = _terms(state, caller, job_id)[1].destruction_at
-    return _text("" if at is None else documents.time_text(at))
+    return _time(state.catalogue.uws.terms(row.id).destruction_at)
 
 
 @router.post(
     "/{job_id}/destruction",
     summary="UWS: set when a job is destroyed",
-    **routing.TO_JOB,
-    openapi_extra=routing.form(DESTRUCTION="a time (ISO 8601, UTC)"),
+    **_form(DESTRUCTION="a time (ISO 8601, UTC)"),
 )
-def post_uws_destruction(
-    job_id: str, caller: Submitting, form: Form, request: Request, state: Shared
-) -> Response:
+def post_uws_destruction(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
     """Set the time. If it is later than the latest time that the operator allows, the service sets that time."""
-    check_own(_find(state, caller, job_id))
-    at = _destruction(state, _given(form, "DESTRUCTION"))
-    state.catalogue.uws.set_terms(job_id, destruction_at=at)
-    return _see(request, job_id)
+    at = _destruction(state, _field(form, "DESTRUCTION"))
+    state.catalogue.uws.set_terms(row.id, destruction_at=at)
+    return _see(request, row.id)
 
 
-@router.get("/{job_id}/quote", summary="UWS: when a job is expected to end", **routing.TEXT)
-def get_uws_quote(job_id: str, caller: Reading, state: Shared) -> Response:
+@router.get("/{job_id}/quote", summary="UWS: when a job is expected to end", **TEXT)
+def get_uws_quote(row: Job) -> Response:
     """A time; empty if unknown."""
-    at = _quote(_find(state, caller, job_id))
-    return _text("" if at is None else documents.time_text(at))
+    return _time(_quote(row))
 
 
-@router.get("/{job_id}/owner", summary="UWS: the owner of a job", **routing.TEXT)
-def get_uws_owner(job_id: str, caller: Reading, state: Shared) -> Response:
+@router.get("/{job_id}/owner", summary="UWS: the owner of a job", **TEXT)
+def get_uws_owner(row: Job) -> Response:
     """The owner's name."""
-    return _text(_find(state, caller, job_id).owner)
+    return PlainTextResponse(row.owner)
 
 
-@router.get("/{job_id}/parameters", summary="UWS: a job's parameters", **routing.XML)
-def get_uws_parameters(job_id: str, caller: Reading, state: Shared) -> Response:
+@router.get("/{job_id}/parameters", summary="UWS: a job's parameters", **XML)
+def get_uws_parameters(row: Job) -> Response:
     """While the job is PENDING, the parameters as the client sent them. After its start, the parameters with every default filled in."""
-    return _xml(documents.parameters(_find(state, caller, job_id)))
+    return _xml(documents.parameters(row))
 
 
 @router.post(
     "/{job_id}/parameters",
     summary="UWS: change a pending job's parameters",
-    **routing.TO_JOB,
-    openapi_extra=routing.form(files=True, UPLOAD=UPLOADS),
+    **_form(files=True, UPLOAD=UPLOADS),
 )
 def post_uws_parameters(
     job_id: str, caller: Submitting, sent: SentForm, request: Request, state: Shared
 ) -> Response:
     """Set parameters of a PENDING job. Parameters that are not sent do not change."""
-    row, form = _find(state, caller, job_id), dict(sent.fields)
+    row, form = _find(job_id, caller, state), dict(sent.fields)
     if row.phase != Phase.PENDING:
         raise _not_now(row, PENDING_ONLY)
     if kind_of({"kind": row.kind} | form) != row.kind:
@@ -274,49 +303,55 @@ def post_uws_parameters(
             f"expected KIND={row.kind}; got {form['kind']}: the kind of a job cannot change, so create another job"
         )
     form.pop("kind", None)
-    form |= ids_of(sent, row.kind)
+    files = files_of(sent, row.kind)
+    form |= ids_of(files)
     check(row.kind, row.parameters | form)
-    keep(state, caller, sent, row.kind)
+    keep(state, caller, files)
 
     def change(given: dict[str, Any]) -> dict[str, Any]:
         check(row.kind, given | form)
         return given | form
 
-    if not state.catalogue.uws.amend(job_id, change):
-        raise _not_now(_find(state, caller, job_id), PENDING_ONLY)
-    return _see(request, job_id)
+    if not state.catalogue.uws.amend(row.id, change):
+        raise _not_now(_find(row.id, caller, state), PENDING_ONLY)
+    return _see(request, row.id)
 
 
-@router.get("/{job_id}/results", summary="UWS: a job's results", **routing.XML)
-def get_uws_results(job_id: str, request: Request, caller: Reading, state: Shared) -> Response:
+@router.get("/{job_id}/results", summary="UWS: a job's results", **XML)
+def get_uws_results(row: Job, request: Request) -> Response:
     """Addresses of the results; empty until the job is COMPLETED."""
-    return _xml(documents.results(_find(state, caller, job_id), _base_url(request)))
+    return _xml(documents.results(row, base_url(request)))
 
 
-@router.get("/{job_id}/results/{name}", summary="UWS: one of a job's results", **routing.TO_JOB)
-def get_uws_result(job_id: str, name: str, request: Request, caller: Reading, state: Shared) -> Response:
+@router.get("/{job_id}/results/{name}", summary="UWS: one of a job's results", **TO_JOB)
+def get_uws_result(job_id: str, name: str, row: Job, request: Request) -> Response:
     """Redirect to the file that the job made (``result``) or to its description (``description``)."""
-    row = _find(state, caller, job_id)
-    found = documents.result_addresses(row).get(name)
-    if found is None:
+    result = documents.result_addresses(row).get(name)
+    if result is None:
         raise Problem(
             404,
             "no-such-result",
             f"expected a result of job {job_id}; it is {row.phase} and has no result {name[:40]!a}",
         )
-    return RedirectResponse(_base_url(request) + found[0], 303)
+    return RedirectResponse(base_url(request) + result[0], 303)
 
 
-@router.get("/{job_id}/error", summary="UWS: why a job failed", **routing.TEXT)
-def get_uws_error(job_id: str, caller: Reading, state: Shared) -> Response:
+@router.get("/{job_id}/error", summary="UWS: why a job failed", **TEXT)
+def get_uws_error(row: Job) -> Response:
     """The error and its fault: user, transient or internal."""
-    row = _find(state, caller, job_id)
     if row.error is None:
         raise Problem(
-            404, "no-error", f"expected a job with an error; job {job_id} is {row.phase} and has none"
+            404, "no-error", f"expected a job with an error; job {row.id} is {row.phase} and has none"
         )
     error = JobError.model_validate(row.error)
-    return _text(f"{error.message}\n({error.code}, fault: {error.fault})\n")
+    return PlainTextResponse(f"{error.message}\n({error.code}, fault: {error.fault})\n")
+
+
+def _phase(text: str) -> str:
+    """A phase of the standard."""
+    if text not in PHASES:
+        refuse("PHASE", f"one of {', '.join(sorted(PHASES))}", text)
+    return text
 
 
 def _start(state: State, caller: Caller, row: JobRow) -> None:
@@ -327,7 +362,7 @@ def _start(state: State, caller: Caller, row: JobRow) -> None:
         ):
             state.reconciler.wake()
             return
-        row = _find(state, caller, row.id)  # another request changed the job in the meantime
+        row = _find(row.id, caller, state)  # another request changed the job in the meantime
     if Phase(row.phase).ended:
         raise _not_now(row, "PHASE=RUN can start only a PENDING job: create a new job")
 
@@ -350,7 +385,7 @@ def _destruction(state: State, text: str | None) -> float:
     return min(asked, last)
 
 
-def _given(form: dict[str, str], name: str) -> str:
+def _field(form: dict[str, str], name: str) -> str:
     if name.lower() not in form:
         raise bad(f"expected the field {name}; got none")
     return form[name.lower()]
@@ -361,23 +396,8 @@ def _quote(row: JobRow) -> float | None:
     return None if left_s is None else time.time() + left_s
 
 
-def _find(state: State, caller: Caller, job_id: str) -> JobRow:
-    """The row of a job. Raises ``Problem`` 404 if the caller has no such job."""
-    if len(job_id) != 32 or not set(job_id) <= set("0123456789abcdef"):
-        raise problem(no_such("job", f"{job_id[:64]!a}"))
-    return find(state, caller, job_id)
-
-
-def _terms(state: State, caller: Caller, job_id: str) -> tuple[JobRow, TermsRow]:
-    return _find(state, caller, job_id), state.catalogue.uws.terms(job_id)
-
-
-def _base_url(request: Request) -> str:
-    return str(request.base_url).rstrip("/")
-
-
 def _jobs_url(request: Request) -> str:
-    return f"{_base_url(request)}{router.prefix}"
+    return f"{base_url(request)}{router.prefix}"
 
 
 def _see(request: Request, job_id: str) -> Response:
@@ -388,5 +408,5 @@ def _xml(content: bytes) -> Response:
     return Response(content, media_type=documents.MEDIA_TYPE)
 
 
-def _text(content: str) -> Response:
-    return PlainTextResponse(content)
+def _time(at: float | None) -> Response:
+    return PlainTextResponse("" if at is None else documents.time_text(at))

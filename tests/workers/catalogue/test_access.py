@@ -9,8 +9,7 @@ import pytest
 from sqlalchemy import select, update
 
 from tests.workers.databases import change, rows
-from workers.catalogue.access.keys import KeyRefused, Scope, TooManyKeys
-from workers.catalogue.access.sessions import MOST_OF_A_KEY, SessionRow
+from workers.catalogue.access import MOST_SESSIONS_OF_A_KEY, KeyRefused, Scope, SessionRow, TooManyKeys
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import KeyRow
 
@@ -133,7 +132,7 @@ def test_a_key_that_ends_takes_its_sessions_along(catalogue: Catalogue, column: 
 def test_the_oldest_sessions_of_a_key_give_way(catalogue: Catalogue) -> None:
     key, other = key_of(catalogue), key_of(catalogue)
     kept = catalogue.sessions.open(other, DAY_S)
-    tokens = [catalogue.sessions.open(key, DAY_S) for _ in range(MOST_OF_A_KEY + 2)]
-    assert len(stored(catalogue)) == MOST_OF_A_KEY + 1
+    tokens = [catalogue.sessions.open(key, DAY_S) for _ in range(MOST_SESSIONS_OF_A_KEY + 2)]
+    assert len(stored(catalogue)) == MOST_SESSIONS_OF_A_KEY + 1
     assert [refusal(catalogue, token) for token in tokens[:2]] == 2 * ["session-ended"]
     assert all(catalogue.sessions.find(token) for token in (*tokens[2:], kept))

@@ -15,7 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from service.uws import routes as uws
+from service.vo import jobs as uws
 from tests.conftest import SMALL_INSTRUMENT
 from tests.service.conftest import upload
 from tests.service.serving import in_own_loop
@@ -385,8 +385,8 @@ def test_forms_of_any_kind(api: TestClient) -> None:
     for answer, status in (
         (api.post(JOBS, json=BUILD), 415),
         (api.post(JOBS, files={"KIND": ("a.txt", b"psf-build")}), 400),
-        (api.post(JOBS, content=b"x", headers={"Content-Type": "multipart/form-data"}), 400),
-        (api.post(JOBS, content=b"x", headers={"Content-Type": "multipart/form-data; boundary=b"}), 400),
+        (api.post(JOBS, files=[(f"f{n}", (None, "v")) for n in range(65)]), 400),
+        (api.post(JOBS, files={"KIND": (None, "deconvolve"), "a": (None, "b" * (2**20 + 1))}), 413),
         (api.post(JOBS, content=b"KIND=%ff", headers=form), 400),
         (api.post(JOBS, content=b"KIND=psf-build&kind=psf-build", headers=form), 400),
         (api.post(JOBS, content=b"&".join(b"a%d=1" % n for n in range(200)), headers=form), 400),

@@ -1,7 +1,11 @@
-"""API keys of owners. A key is shown once, when it is made; the database stores only the hash of its secret.
+"""Who may use the service: API keys of owners, and sessions of browsers.
 
-A key has the form ``hpsf_ID_SECRET``. The id is public: lists and logs show it. The secret consists of 256 random bits.
-A password can be guessed; these bits cannot. Therefore one round of SHA-256 is enough to protect the secret.
+A key has the form ``hpsf_ID_SECRET``. It is shown once, when it is made. The id is public: lists and logs show it. A
+session begins when a person logs in with a key, and allows what the key allows; the browser keeps the token of its
+session in a cookie. The session ends at its own time, when its key expires or is revoked, or when the person logs out.
+
+Secrets of keys and tokens of sessions consist of 256 random bits, and the database stores only their hashes. A password
+can be guessed; these bits cannot. Therefore one round of SHA-256 is enough to protect them.
 """
 
 from __future__ import annotations
@@ -14,17 +18,18 @@ import time
 from collections.abc import Collection, Sequence
 from enum import StrEnum
 
-from sqlalchemy import Select, delete, func, or_, select, tuple_, update
-from sqlalchemy.orm import Session
+from sqlalchemy import ColumnElement, Select, String, delete, func, or_, select, update
+from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from workers.catalogue.database import Database
+from workers.catalogue.database import Database, Queries, newest_first
 from workers.catalogue.owners import lock_owner
-from workers.catalogue.tables import KeyRow
+from workers.catalogue.tables import Base, KeyRow
 
 OWNER = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 OWNER_RULE = "1 to 64 characters: lower-case letters, digits, '.', '_' and '-'; the first character is a letter or a digit"
 LABEL_LENGTH = 80
 _KEY = re.compile(r"hpsf_([0-9a-f]{16})_([A-Za-z0-9_-]{43})", re.ASCII)
+MOST_SESSIONS_OF_A_KEY = 50  # a further login closes the oldest
 _USE_NOTED_EVERY_S = 60.0  # the time of use is written at most once a minute, not for every request
 _NOBODY = hashlib.sha256(b"nobody").hexdigest()
 
@@ -60,11 +65,8 @@ class TooManyKeys(Exception):
     """An owner already has the largest allowed number of valid keys."""
 
 
-class Keys:
-    """The table of keys; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Keys(Queries):
+    """The table of keys."""
 
     def make(
         self,
@@ -112,8 +114,7 @@ class Keys:
             raise KeyRefused(
                 "bad-key", "expected a key of the form hpsf_ID_SECRET; got something else: copy the whole key"
             )
-        with self._database.reading() as session:
-            row = session.get(KeyRow, parts[1])
+        row = self.get(parts[1])
         same = hmac.compare_digest(_hash(parts[2]), _NOBODY if row is None else row.secret_sha256)
         if row is None or not same:
             raise KeyRefused(
@@ -131,12 +132,13 @@ class Keys:
         if row.expires_at is not None and row.expires_at <= now:
             raise KeyRefused("key-expired", f"key {row.id} has expired: ask the operator for a new one")
         if row.last_used_at is None or row.last_used_at < now - _USE_NOTED_EVERY_S:
-            self._note_use(row.id, now)
+            unnoted = or_(KeyRow.last_used_at.is_(None), KeyRow.last_used_at < now - _USE_NOTED_EVERY_S)
+            use = update(KeyRow).where(KeyRow.id == row.id, unnoted)
+            self._database.change(use.values(last_used_at=now))
 
     def get(self, identity: str) -> KeyRow | None:
         """The row of a key, valid or not; None if there is no key with this id."""
-        with self._database.reading() as session:
-            return session.get(KeyRow, identity)
+        return self._database.row(KeyRow, identity)
 
     def page(
         self, owner: str | None, *, limit: int, after: tuple[float, str] | None = None
@@ -148,17 +150,11 @@ class Keys:
         query = select(KeyRow)
         if owner is not None:
             query = query.where(KeyRow.owner == owner)
-        if after is not None:
-            query = query.where(tuple_(KeyRow.created_at, KeyRow.id) < after)
-        with self._database.reading() as session:
-            return session.scalars(
-                query.order_by(KeyRow.created_at.desc(), KeyRow.id.desc()).limit(limit)
-            ).all()
+        return self._database.all(newest_first(query, KeyRow, limit, after))
 
     def all(self) -> Sequence[KeyRow]:
         """All keys, including revoked and expired ones, oldest first."""
-        with self._database.reading() as session:
-            return session.scalars(select(KeyRow).order_by(KeyRow.created_at, KeyRow.id)).all()
+        return self._database.all(select(KeyRow).order_by(KeyRow.created_at, KeyRow.id))
 
     def revoke(self, identity: str, *, and_made: bool = False) -> bool:
         """Revoke a key. The next request with it is refused. Returns False if there is no key with this id.
@@ -167,28 +163,90 @@ class Keys:
         """
         revoked_at = func.coalesce(KeyRow.revoked_at, time.time())
         with self._database.writing.begin() as session:
-            found = session.scalars(select(KeyRow.id).where(KeyRow.id == identity)).all()
-            ids = set(found)
-            while and_made and found:
-                made = select(KeyRow.id).where(KeyRow.made_by.in_(found), KeyRow.id.not_in(ids))
-                found = session.scalars(made).all()
-                ids.update(found)
+            newest = session.scalars(select(KeyRow.id).where(KeyRow.id == identity)).all()
+            ids = set(newest)
+            while and_made and newest:
+                made = select(KeyRow.id).where(KeyRow.made_by.in_(newest), KeyRow.id.not_in(ids))
+                newest = session.scalars(made).all()
+                ids.update(newest)
             session.execute(update(KeyRow).where(KeyRow.id.in_(ids)).values(revoked_at=revoked_at))
         return bool(ids)
 
     def any_good(self) -> bool:
         """Whether any key is valid now."""
-        with self._database.reading() as session:
-            return session.scalars(good_keys().limit(1)).first() is not None
+        return self._database.any(_good_keys())
 
     def is_good(self, identity: str) -> bool:
         """Whether the key with this id is valid now: neither revoked nor expired."""
-        with self._database.reading() as session:
-            return session.scalars(good_keys().where(KeyRow.id == identity)).first() is not None
+        return self._database.any(_good_keys().where(KeyRow.id == identity))
 
-    def _note_use(self, identity: str, now: float) -> None:
-        unnoted = or_(KeyRow.last_used_at.is_(None), KeyRow.last_used_at < now - _USE_NOTED_EVERY_S)
-        self._database.change(update(KeyRow).where(KeyRow.id == identity, unnoted).values(last_used_at=now))
+
+class SessionRow(Base):
+    """A session of a browser. The id is the SHA-256 of the token; forms of the session contain ``form_token``."""
+
+    __tablename__ = "browser_sessions"
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    key_id: Mapped[str] = mapped_column(String(16), index=True)
+    form_token: Mapped[str] = mapped_column(String(43))
+    created_at: Mapped[float]
+    expires_at: Mapped[float] = mapped_column(index=True)
+
+
+class Sessions:
+    """The table of sessions; each method is one transaction."""
+
+    def __init__(self, database: Database, keys: Keys) -> None:
+        self._database, self._keys = database, keys
+
+    def open(self, key: KeyRow, lasts_s: float) -> str:
+        """Begin a session of a valid key; returns the token.
+
+        The session lasts ``lasts_s`` seconds, but not longer than the key.
+        """
+        token, now = secrets.token_urlsafe(32), time.time()
+        until = now + lasts_s
+        row = SessionRow(
+            id=_hash(token),
+            key_id=key.id,
+            form_token=secrets.token_urlsafe(32),
+            created_at=now,
+            expires_at=until if key.expires_at is None else min(until, key.expires_at),
+        )
+        of_key = SessionRow.key_id == key.id
+        newest = select(SessionRow.id).where(of_key).order_by(SessionRow.created_at.desc(), SessionRow.id)
+        kept = newest.limit(MOST_SESSIONS_OF_A_KEY - 1)
+        with self._database.writing.begin() as session:
+            session.execute(delete(SessionRow).where(of_key, SessionRow.id.not_in(kept)))
+            session.add(row)
+        return token
+
+    def find(self, token: str) -> tuple[SessionRow, KeyRow]:
+        """The session of a token, and its key. Records the use of the key.
+
+        Raises ``KeyRefused`` with the code "session-ended", or with the reason for which the key is not valid.
+        """
+        with self._database.reading() as session:
+            row = session.get(SessionRow, _hash(token))
+            key = None if row is None else session.get(KeyRow, row.key_id)
+        if row is None or key is None or row.expires_at <= time.time():
+            # If the key is not valid either, check_valid raises the reason, which says more than "session-ended".
+            if key is not None:
+                self._keys.check_valid(key)
+            raise KeyRefused("session-ended", "expected an open session; yours has ended: log in again")
+        self._keys.check_valid(key)
+        return row, key
+
+    def is_open(self, identity: str) -> bool:
+        """Whether the session with this id and its key are valid now."""
+        return self._database.any(select(SessionRow.id).where(SessionRow.id == identity, ~_ended()))
+
+    def close(self, token: str) -> bool:
+        """End the session of a token. Returns False if there is none."""
+        return self._database.change(delete(SessionRow).where(SessionRow.id == _hash(token))) > 0
+
+    def sweep(self) -> int:
+        """Delete the sessions that have expired, and those whose key is not valid any more; returns their number."""
+        return self._database.change(delete(SessionRow).where(_ended()))
 
 
 def _make_room(session: Session, owner: str, most: int) -> None:
@@ -197,7 +255,7 @@ def _make_room(session: Session, owner: str, most: int) -> None:
     Otherwise keep only the newest ``most`` of the owner's revoked and expired keys, and delete the older ones.
     """
     lock_owner(session, owner)  # simultaneous requests are counted one after the other
-    good = good_keys().where(KeyRow.owner == owner)
+    good = _good_keys().where(KeyRow.owner == owner)
     if len(session.scalars(good.limit(most)).all()) >= most:
         raise TooManyKeys
     ended = select(KeyRow.id).where(KeyRow.owner == owner, KeyRow.id.not_in(good))
@@ -205,11 +263,15 @@ def _make_room(session: Session, owner: str, most: int) -> None:
     session.execute(delete(KeyRow).where(KeyRow.id.in_(surplus)))
 
 
-def good_keys() -> Select[str]:
+def _good_keys() -> Select[str]:
     """The ids of all keys that are valid now."""
     return select(KeyRow.id).where(
         KeyRow.revoked_at.is_(None), or_(KeyRow.expires_at.is_(None), KeyRow.expires_at > time.time())
     )
+
+
+def _ended() -> ColumnElement[bool]:
+    return or_(SessionRow.expires_at <= time.time(), SessionRow.key_id.not_in(_good_keys()))
 
 
 def _hash(secret: str) -> str:

@@ -1,0 +1,194 @@
+"""The operation of the service: ``/healthz`` (is it up?), ``/readyz`` (can it do its work?) and ``/metrics`` for Prometheus.
+
+Numbers about all processes (jobs, files, workers) are read from the database whenever Prometheus reads the
+metrics, by queries that use only indexes. Numbers about this process (its requests) are counted in the process. The numbers
+of jobs and files are gauges, because they decrease when a job is destroyed. The time that jobs spent in their stages is a
+counter, which never decreases.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any, cast
+
+from fastapi import APIRouter, Request, Response
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Metric, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
+from prometheus_client.registry import Collector
+from pydantic import BaseModel, Field
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.http.callers import Administering
+from service.http.problems import RESPONSES, Problem, ProblemDocument
+from service.http.state import Shared, State
+from workers import checks
+from workers.catalogue.census import JobTally
+from workers.contract.kinds import KINDS
+from workers.contract.phases import Phase
+from workers.contract.queues import Queue
+from workers.settings import software_version
+
+OK = "ok"
+STOPPED = "the reconciler stopped, so queued jobs are not submitted; restart the service"
+router = APIRouter(tags=["operation"])
+NOT_READY = {
+    "model": ProblemDocument,
+    "description": "A part does not answer; `parts` says which part.",
+}
+
+
+class Health(BaseModel):
+    """The process and its database answer."""
+
+    status: str
+    version: str
+
+
+class Readiness(BaseModel):
+    """All parts that the service needs answer."""
+
+    status: str
+    parts: dict[str, str] = Field(
+        description="state of the database, of the storage, and of the broker or embedded worker; `ok`: the part answers"
+    )
+
+
+@router.get("/healthz", summary="Is the service up?", responses=RESPONSES)
+def healthz(state: Shared) -> Health:
+    """200: process, reconciler and database work. 503: one of them does not work."""
+    state.catalogue.ping()
+    if not state.reconciler.alive:
+        raise Problem(503, "reconciler-stopped", STOPPED)
+    return Health(status="ok", version=software_version())
+
+
+@router.get("/readyz", summary="Can the service do its work?", responses={503: NOT_READY})
+def readyz(state: Shared) -> Readiness:
+    """200: database, storage, and broker (or embedded worker) answer. 503: one of them does not answer; `parts` says which one."""
+    parts = states(state)
+    away = faults(parts)
+    if away:
+        raise Problem(503, "not-ready", "; ".join(away), parts=parts)
+    return Readiness(status="ready", parts=parts)
+
+
+def states(state: State) -> dict[str, str]:
+    """The state of each part that the service needs, by its name: "ok", or what is wrong."""
+    parts = {}
+    for name, check in checks.needed(state.settings, state.catalogue, state.store).items():
+        try:
+            check()
+            parts[name] = OK
+        except checks.Unusable as fault:
+            parts[name] = str(fault)
+    if not state.reconciler.alive:
+        parts["reconciler"] = STOPPED
+    return parts
+
+
+def faults(parts: Mapping[str, str]) -> list[str]:
+    """What is wrong with the parts that do not answer."""
+    return [state for state in parts.values() if state != OK]
+
+
+@router.get(
+    "/metrics",
+    summary="Numbers for Prometheus",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
+def metrics(request: Request, _caller: Administering, state: Shared) -> Response:
+    """Jobs, files and workers of the whole service, and requests to this process."""
+    shared = CollectorRegistry()
+    shared.register(_Catalogued(state))
+    text = generate_latest(shared) + generate_latest(request.app.state.requests.registry)
+    return Response(text, headers={"Content-Type": CONTENT_TYPE_LATEST})
+
+
+class _Catalogued(Collector):
+    def __init__(self, state: State) -> None:
+        self._state = state
+
+    def describe(self) -> list[Metric]:
+        """Return nothing: the metrics are collected only when Prometheus reads them."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """The metrics of database, storage and streams. If the database does not answer, its metrics are left out,
+        except ``heliopsf_database_up``, which is 0."""
+        yield InfoMetricFamily("heliopsf", "The service", {"version": software_version()})
+        free = checks.free_bytes(self._state.settings.data_dir)
+        yield _gauge("storage_free_bytes", "Free space where files are stored", free)
+        streams = self._state.streams.total()
+        yield _gauge("event_streams", "Streams of events that this process sends now", streams)
+        try:
+            metrics = [*self._jobs(), *self._stages(), *self._waiting(), *self._files()]
+        except SQLAlchemyError:
+            metrics = []
+        yield _gauge("database_up", "1 if the database answers, else 0", int(bool(metrics)))
+        yield from metrics
+
+    def _jobs(self) -> Iterator[Metric]:
+        tallies = {(tally.kind, tally.phase): tally for tally in self._state.catalogue.census.tally()}
+        kinds = sorted({*KINDS, *(kind for kind, _ in tallies)})
+        jobs: dict[tuple[str, str], int] = {}
+        attempts, retries, run_s = {}, {}, {}
+        for kind in kinds:
+            of_kind = {
+                phase: tallies.get((kind, phase), JobTally(kind, phase, 0, 0, 0, 0.0)) for phase in Phase
+            }
+            jobs |= {(kind, str(phase)): tally.jobs for phase, tally in of_kind.items()}
+            attempts[kind] = sum(tally.attempts for tally in of_kind.values())
+            retries[kind] = sum(tally.retries for tally in of_kind.values())
+            run_s[kind] = of_kind[Phase.COMPLETED].run_s
+        yield _gauge("jobs", "Jobs", jobs, "kind", "phase")
+        yield _gauge("job_attempts", "Number of times that jobs were started", attempts, "kind")
+        yield _gauge("job_retries", "Number of times that jobs were started again", retries, "kind")
+        description = "Sum over COMPLETED jobs of the time from the last start to the end"
+        yield _gauge("job_run_seconds", description, run_s, "kind")
+
+    def _stages(self) -> Iterator[Metric]:
+        times = self._state.catalogue.stage_times.all()
+        name, labels = "heliopsf_job_stage", ["kind", "stage"]
+        seconds = CounterMetricFamily(
+            f"{name}_seconds", "Time that ended attempts spent in a stage", labels=labels
+        )
+        yield _filled(seconds, {stage: spent.seconds for stage, spent in times.items()})
+        steps = CounterMetricFamily(
+            f"{name}_steps", "Steps that ended attempts reported in a stage", labels=labels
+        )
+        yield _filled(steps, {stage: spent.steps for stage, spent in times.items()})
+
+    def _waiting(self) -> Iterator[Metric]:
+        catalogue, lease_s = self._state.catalogue, self._state.settings.lease_s
+        ages = {}
+        for queue in Queue:
+            oldest = catalogue.census.oldest_queued_at(queue)
+            ages[queue] = 0.0 if oldest is None else max(0.0, time.time() - oldest)
+        yield _gauge("oldest_queued_seconds", "Waiting time of the oldest queued job", ages, "queue")
+        silent = catalogue.census.count_silent(lease_s)
+        yield _gauge("jobs_silent", "Jobs whose worker did not report within its lease", silent)
+        images = catalogue.bulks.progress.open_images()
+        yield _gauge("bulk_images", "Images of bulk runs that have not ended", images, "state")
+        workers = len(catalogue.census.workers(lease_s))
+        yield _gauge("workers", "Worker processes that report", workers)
+
+    def _files(self) -> Iterator[Metric]:
+        tallies = self._state.catalogue.census.tally_files()
+        files = {(tally.kind, tally.origin): tally.files for tally in tallies}
+        sizes = {(tally.kind, tally.origin): tally.bytes for tally in tallies}
+        yield _gauge("files", "Stored files", files, "kind", "origin")
+        yield _gauge("file_bytes", "Bytes of stored files", sizes, "kind", "origin")
+
+
+def _gauge(name: str, description: str, values: float | Mapping[Any, float], *labels: str) -> Metric:
+    """A gauge. values: its value, or the values by the value of the label, or by a tuple of the values of the labels."""
+    by_label = values if isinstance(values, Mapping) else {(): values}
+    return _filled(GaugeMetricFamily(f"heliopsf_{name}", description, labels=labels), by_label)
+
+
+def _filled(family: Any, values: Mapping[Any, float]) -> Metric:
+    for key, value in values.items():
+        family.add_metric([key] if isinstance(key, str) else key, value)
+    return cast("Metric", family)

@@ -1,1 +1,0 @@
-"""Routes for operation: health, metrics, and the API page."""

@@ -1,1 +1,0 @@
-"""The IVOA UWS 1.1 interface."""

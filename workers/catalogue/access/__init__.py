@@ -1,1 +1,0 @@
-"""Who may use the service: API keys, and sessions of browsers."""

@@ -1,1 +1,0 @@
-"""Series whose PSFs may be interpolated in time."""

@@ -1,1 +1,0 @@
-"""Revisions of the catalogue's tables. ``workers.catalogue.schema`` runs them with Alembic."""
