@@ -154,13 +154,14 @@ class _FrameSimulator:
 
     def __init__(self, transit: Transit, kernel: Kernel, threads: int) -> None:
         self.transit, self.kernel = transit, kernel
-        self.optics = Optics(kernel, transit.shape, threads=threads)
-        self.scene_of = lru_cache(maxsize=SCENES_KEPT)(self._scene)
+        self.optics = optics = Optics(kernel, transit.shape, threads=threads)
 
-    def _scene(self, n: int) -> NDArray[np.float32]:
-        """x of Eq. (1), [y, x]."""
-        observed = self.optics.lanes(self.transit.frames[n].pixels)
-        return self.optics.field(self.optics.invert(observed, steps=INVERSION_STEPS))
+        # The function does not use `self`: a cycle of references would keep the scenes too long.
+        def scene(n: int) -> NDArray[np.float32]:
+            observed = optics.lanes(transit.frames[n].pixels)
+            return optics.field(optics.invert(observed, steps=INVERSION_STEPS))
+
+        self.scene_of = lru_cache(maxsize=SCENES_KEPT)(scene)  # x of Eq. (1), [y, x]
 
     def find(self, n: int) -> tuple[FoundPlace, Pixels]:
         """The position of the occulter of frame n, and its fully dark pixels."""

@@ -33,7 +33,7 @@ from psfcore.evaluation.frame import LEAST_SHARE, FrameEvaluation, half_width_px
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Inversion, Progress, Solution, labelled
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW, Vector
-from psfcore.scatter.validation.cross_validation import FoldSample, shared_step
+from psfcore.scatter.validation.cross_validation import FoldSample, held_out_folds, shared_step
 from psfcore.scatter.validation.free_shells import free_kernel, free_shares, law_light
 from psfcore.transit.transit import Kernel, folds
 
@@ -126,7 +126,7 @@ def compare_shapes_by_errors(
     draws = np.random.default_rng(seed).multinomial(
         len(images), np.full(len(images), 1 / len(images)), BOOTSTRAP_SAMPLES
     )
-    counts = np.concatenate((np.ones((1, len(images))), draws))
+    counts = np.concatenate((np.ones((1, len(images))), draws.astype(np.float64)))
     found = {
         name: _figures([evaluation[n] for n in images], counts) for name, evaluation in evaluations.items()
     }
@@ -149,19 +149,6 @@ def compare_shapes_by_errors(
 def _parameters(inversion: Inversion) -> dict[str, tuple[float, float]]:
     sigma = inversion.value_sigma
     return {name: (value, sigma[name]) for name, value in inversion.values.items()}
-
-
-def _fold_samples(images: int) -> tuple[FoldSample, ...]:
-    """One sample for each fold, without bootstrap: each fitted image counts once."""
-    parts = folds(images)
-    if not parts:
-        raise DataError(
-            "too-few-images", f"expected at least 6 images for held-out folds; got {images}: add images"
-        )
-    return tuple(
-        FoldSample(0, k, tuple(int(n in fold.fitted) for n in range(images)), fold.held_out)
-        for k, fold in enumerate(parts)
-    )
 
 
 def held_out_kernels(solution: Solution) -> KernelOf:
@@ -187,7 +174,7 @@ def _free_fold_kernels(solution: Solution, progress: Progress) -> KernelOf:
 
 def _of_folds(solution: Solution, kernel_of: Callable[[FoldSample, Vector], Kernel]) -> KernelOf:
     """For each image, the kernel of its fold, which `kernel_of` makes from the fold and its coordinates."""
-    samples, at = _fold_samples(len(solution.transit.frames)), solution.inversion.coordinates
+    samples, at = held_out_folds(len(solution.transit.frames)), solution.inversion.coordinates
     kernels = [kernel_of(sample, at + shared_step(solution, sample)) for sample in samples]
     fold_of = {n: sample.fold for sample in samples for n in sample.held_out}
     return lambda n: kernels[fold_of[n]]

@@ -1,7 +1,7 @@
 """The diffraction orders along the arms, Eq. (1) of `arms`, and the least-squares fit of Eq. (2).
 
-The fitted quantities are amplitudes, source, angles and spacing. First, amplitudes and source are fitted in turn, at fixed angles and spacing. Then Gauss-Newton steps fit all quantities
-together.
+The fitted quantities are amplitudes, source, angles and spacing. First, amplitudes and source are fitted in turn, at fixed
+angles and spacing. Then Gauss-Newton steps fit all quantities together.
 """
 
 from __future__ import annotations
@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from psfcore.errors import DataError
-from psfcore.flare.arms_search import NEEDED_ORDERS_AN_ARM, Flags, Plane
+from psfcore.flare.arms_search import NEEDED_ORDERS_AN_ARM, Flags, Indices, Plane, Vector
 
 KNOT_PX = 1.0  # distance between the knots of the spline
 ORDER_SIGMA = 5.0
@@ -46,7 +45,7 @@ class Geometry:
         knots = np.arange(-self.reach, self.reach + 1) * KNOT_PX
         return np.asarray(np.hypot(knots[:, None], knots) <= self.half_px + 0.25)
 
-    def source(self, coefficients: NDArray[np.float64]) -> Plane:
+    def source(self, coefficients: Vector) -> Plane:
         """The coefficients of S on all knots [y, x]: these coefficients on the disc, and 0 outside."""
         plane = np.zeros(self.disc.shape)
         plane[self.disc] = coefficients
@@ -61,16 +60,16 @@ class Orders:
     nearest order), value (of the difference) and sigma. number [y, x] is the index of a pixel in these lists, or -1.
     """
 
-    arm: NDArray[np.intp]
-    k: NDArray[np.float64]
-    row: NDArray[np.intp]
-    column: NDArray[np.intp]
-    nearest: NDArray[np.intp]
-    value: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    number: NDArray[np.intp]
+    arm: Indices
+    k: Vector
+    row: Indices
+    column: Indices
+    nearest: Indices
+    value: Vector
+    sigma: Vector
+    number: Indices
 
-    def planes(self) -> list[tuple[NDArray[np.intp], Plane]]:
+    def planes(self) -> list[tuple[Indices, Plane]]:
         """For each order with at least 3 pixels: the indices of its pixels, and a basis [pixel, 3].
 
         The basis is orthonormal. It spans the functions that are linear in x and y on these pixels, divided by sigma.
@@ -80,19 +79,14 @@ class Orders:
         for pixels in np.split(by_order, np.cumsum(np.bincount(self.nearest))[:-1]):
             if pixels.size < 3:
                 continue
-            flat = np.ones(pixels.size)
-            x, y = (
-                self.column[pixels] - self.column[pixels].mean(),
-                self.row[pixels] - self.row[pixels].mean(),
-            )
-            basis, _ = np.linalg.qr(np.stack((flat, x, y), axis=1) / self.sigma[pixels, None])
+            x, y = (place[pixels] - place[pixels].mean() for place in (self.column, self.row))
+            linear = np.stack((np.ones(pixels.size), x, y), axis=1)
+            basis, _ = np.linalg.qr(linear / self.sigma[pixels, None])
             found.append((pixels, basis))
         return found
 
 
-def orders_between(
-    pattern: NDArray[np.float64], radii_px: tuple[float, float]
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def orders_between(pattern: Vector, radii_px: tuple[float, float]) -> tuple[Indices, Vector]:
     """Arm index and k of all orders between two radii (px)."""
     first, last = int(np.ceil(radii_px[0] / pattern[-1])), int(radii_px[1] / pattern[-1])
     one_side = np.arange(max(first, 1), last + 1, dtype=np.float64)
@@ -102,8 +96,8 @@ def orders_between(
 
 
 def order_positions(
-    centre: tuple[float, float], pattern: NDArray[np.float64], arm: NDArray[np.intp], k: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    centre: tuple[float, float], pattern: Vector, arm: Indices, k: Vector
+) -> tuple[Vector, Vector]:
     """Eq. (1): x and y of each order, px."""
     along = k * pattern[-1]
     return centre[0] + along * np.cos(pattern[arm]), centre[1] + along * np.sin(pattern[arm])
@@ -114,9 +108,9 @@ def select_pixels(
     usable: Flags,
     sigma: Plane,
     geometry: Geometry,
-    pattern: NDArray[np.float64],
-    arm: NDArray[np.intp],
-    k: NDArray[np.float64],
+    pattern: Vector,
+    arm: Indices,
+    k: Vector,
 ) -> Orders:
     """The orders that lie on usable pixels, and the pixels around them."""
     ny, nx = difference.shape
@@ -151,7 +145,7 @@ def select_pixels(
     )
 
 
-def check_enough_orders(arm: NDArray[np.intp], arms: int) -> None:
+def check_enough_orders(arm: Indices, arms: int) -> None:
     """Raise DataError "too-few-peaks" if an arm has fewer than NEEDED_ORDERS_AN_ARM orders."""
     count = np.bincount(arm, minlength=arms)
     if count.min() < NEEDED_ORDERS_AN_ARM:
@@ -166,11 +160,11 @@ class FitState:
     pattern: the angles (radian), then the spacing (px). amplitude: A_ak. source: the coefficients of S [y, x].
     """
 
-    pattern: NDArray[np.float64]
-    amplitude: NDArray[np.float64]
+    pattern: Vector
+    amplitude: Vector
     source: Plane
 
-    def moved(self, step: NDArray[np.float64], geometry: Geometry) -> FitState:
+    def moved(self, step: Vector, geometry: Geometry) -> FitState:
         """The state after a step in all quantities, in the order pattern, amplitude, source."""
         one, two = self.pattern.size, self.pattern.size + self.amplitude.size
         return FitState(
@@ -188,10 +182,10 @@ class FitResult:
     pixel, DN. done: the number of Gauss-Newton steps. why: the reason why the fit stopped.
     """
 
-    error: NDArray[np.float64]
+    error: Vector
     chi2: float
     freedom: int
-    light: NDArray[np.float64]
+    light: Vector
     done: int
     why: str
 
@@ -201,7 +195,7 @@ def first_fit(
     usable: Flags,
     sigma: Plane,
     geometry: Geometry,
-    pattern: NDArray[np.float64],
+    pattern: Vector,
     source: Plane,
 ) -> tuple[FitState, Orders]:
     """Fit amplitudes and S at given angles and spacing; keep the significant orders.
@@ -254,7 +248,7 @@ def iterate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitSta
     return state, FitResult(error * scale, chi2, freedom, orders.value - left / weight, done, why)
 
 
-def _alternate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitState, NDArray[np.float64]]:
+def _alternate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitState, Vector]:
     """Fit amplitudes and S in turn at given angles and spacing; return the state and the errors of the amplitudes."""
     bases = _bases(orders, geometry, state.pattern)
     weight = 1 / orders.sigma
@@ -287,13 +281,13 @@ class _Bases:
     `index` [order, y, x] is the index of the pixel among the fitted pixels, or -1.
     """
 
-    index: NDArray[np.intp]
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    slope_x: NDArray[np.float64]
-    slope_y: NDArray[np.float64]
+    index: Indices
+    x: Vector
+    y: Vector
+    slope_x: Vector
+    slope_y: Vector
 
-    def stamps(self, source: Plane, *, slope: str = "") -> NDArray[np.float64]:
+    def stamps(self, source: Plane, *, slope: str = "") -> Vector:
         """The values of S on the box of each order [order, y, x]. slope: "x" or "y" for the derivative along this
         axis."""
         along_x = self.slope_x if slope == "x" else self.x
@@ -301,7 +295,7 @@ class _Bases:
         return np.asarray(along_y @ source @ along_x.transpose(0, 2, 1))
 
 
-def _bases(orders: Orders, geometry: Geometry, pattern: NDArray[np.float64]) -> _Bases:
+def _bases(orders: Orders, geometry: Geometry, pattern: Vector) -> _Bases:
     """Evaluate the splines at the pixels around each order."""
     box_px = int(np.ceil((geometry.reach + 2) * KNOT_PX))
     box = np.arange(-box_px, box_px + 1)
@@ -323,33 +317,33 @@ def _bases(orders: Orders, geometry: Geometry, pattern: NDArray[np.float64]) -> 
     return _Bases(index=number, x=lines[0], y=lines[1], slope_x=slopes[0], slope_y=slopes[1])
 
 
-def _spline(t: NDArray[np.float64]) -> NDArray[np.float64]:
+def _spline(t: Vector) -> Vector:
     """The cubic B-spline."""
     u = np.abs(t)
     near, far = 2 / 3 - u**2 + u**3 / 2, (2 - u) ** 3 / 6
     return np.where(u < 1, near, np.where(u < 2, far, 0.0))
 
 
-def _spline_slope(t: NDArray[np.float64]) -> NDArray[np.float64]:
+def _spline_slope(t: Vector) -> Vector:
     """Derivative of the cubic B-spline."""
     u = np.abs(t)
     near, far = -2 * u + 1.5 * u**2, -((2 - u) ** 2) / 2
     return np.sign(t) * np.where(u < 1, near, np.where(u < 2, far, 0.0))
 
 
-def _light(orders: Orders, bases: _Bases, state: FitState) -> NDArray[np.float64]:
+def _light(orders: Orders, bases: _Bases, state: FitState) -> Vector:
     """The sum of A_ak S in Eq. (2) at the fitted pixels."""
     return _added_up(orders, bases, state.amplitude[:, None, None] * bases.stamps(state.source))
 
 
-def _added_up(orders: Orders, bases: _Bases, stamps: NDArray[np.float64]) -> NDArray[np.float64]:
+def _added_up(orders: Orders, bases: _Bases, stamps: Vector) -> Vector:
     """The sum of the stamps of all orders, at each fitted pixel."""
     on = bases.index >= 0
     total = np.bincount(bases.index[on], weights=stamps[on], minlength=orders.value.size)
     return np.asarray(total, dtype=np.float64)
 
 
-def _columns_of_stamps(orders: Orders, bases: _Bases, stamps: NDArray[np.float64]) -> Plane:
+def _columns_of_stamps(orders: Orders, bases: _Bases, stamps: Vector) -> Plane:
     """Columns [pixel, order] of the Jacobian for the amplitudes: each column is the stamp (S) of one order."""
     columns = np.zeros((orders.value.size, orders.k.size))
     which, y, x = np.nonzero(bases.index >= 0)
@@ -357,9 +351,7 @@ def _columns_of_stamps(orders: Orders, bases: _Bases, stamps: NDArray[np.float64
     return columns
 
 
-def _columns_of_source(
-    orders: Orders, bases: _Bases, geometry: Geometry, amplitude: NDArray[np.float64]
-) -> Plane:
+def _columns_of_source(orders: Orders, bases: _Bases, geometry: Geometry, amplitude: Vector) -> Plane:
     """Columns of the Jacobian for S [pixel, coefficient of S on the disc]."""
     row, column = np.nonzero(geometry.disc)
     columns = np.zeros((orders.value.size, row.size))
@@ -386,7 +378,7 @@ def _columns_of_pattern(orders: Orders, bases: _Bases, state: FitState) -> Plane
     return np.stack((*by_angle, _added_up(orders, bases, outward)), axis=1)
 
 
-def _without_planes(orders: Orders, weighted: NDArray[np.float64]) -> NDArray[np.float64]:
+def _without_planes(orders: Orders, weighted: Vector) -> Vector:
     """Subtract from each column its best-fitting planes around the orders.
 
     weighted: the columns, or one column, already divided by sigma. With these columns the fit needs no parameters for
@@ -398,7 +390,7 @@ def _without_planes(orders: Orders, weighted: NDArray[np.float64]) -> NDArray[np
     return rest
 
 
-def _solve(columns: Plane, target: NDArray[np.float64]) -> tuple[NDArray[np.float64], Plane, int]:
+def _solve(columns: Plane, target: Vector) -> tuple[Vector, Plane, int]:
     """Solve the least-squares problem with the smallest norm; return solution, covariance and rank.
 
     Some combinations of parameters are undetermined: the planes can compensate for a constant and for slopes of S, and

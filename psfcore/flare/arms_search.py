@@ -13,6 +13,8 @@ from scipy import ndimage
 
 from psfcore.errors import DataError
 
+Vector = NDArray[np.float64]
+Indices = NDArray[np.intp]
 Plane = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
@@ -104,7 +106,7 @@ def ring_halo(
     difference: Plane,
     usable: Flags,
     centre: tuple[float, float],
-    angles_deg: NDArray[np.float64],
+    angles_deg: Vector,
     half_px: float,
 ) -> Plane:
     """The smooth light around the source: the median of each ring without the arms, interpolated linearly in radius."""
@@ -128,7 +130,7 @@ def search_arms(
     centre: tuple[float, float],
     n_arms: int,
     radii_px: tuple[float, float],
-) -> tuple[NDArray[np.float64], float]:
+) -> tuple[Vector, float]:
     """Return first values of the angles (degrees) and of the spacing (px).
 
     Along an arm, the orders are brighter than the pixels beside the arm and brighter than the pixels between the
@@ -162,7 +164,7 @@ def _along_lines(
     contrast: Plane,
     usable: Flags,
     centre: tuple[float, float],
-    degrees: NDArray[np.float64],
+    degrees: Vector,
     radii_px: tuple[float, float],
 ) -> tuple[Plane, Plane]:
     """The contrast and the number of usable pixels [angle, radius step], each summed over both sides of the centre."""
@@ -201,9 +203,7 @@ def _scores(lit: Plane, seen: Plane, spacing: float, radii_px: tuple[float, floa
     )
 
 
-def _best_angles(
-    degrees: NDArray[np.float64], score: NDArray[np.float64], n_arms: int
-) -> NDArray[np.float64]:
+def _best_angles(degrees: Vector, score: Vector, n_arms: int) -> Vector:
     """The angles with the best scores, at least _APART_DEG apart."""
     found: list[float] = []
     allowed = np.ones(degrees.size, dtype=bool)
@@ -213,6 +213,6 @@ def _best_angles(
     return np.sort(np.asarray(found))
 
 
-def _between_deg(a: NDArray[np.float64], b: float) -> NDArray[np.float64]:
+def _between_deg(a: Vector, b: float) -> Vector:
     """Angle between two lines, 0 to 90 degrees."""
     return np.asarray(np.abs((a - b + 90.0) % 180.0 - 90.0))

@@ -41,7 +41,7 @@ from psfcore.scatter.optics import Blur, pick
 from psfcore.scatter.published import AS_PUBLISHED, CORRECTED_ALONE, Published, invert_as_published
 from psfcore.scatter.published_equations import Equations, free_fit
 from psfcore.scatter.reconstruction import Inversion, Progress, Solution
-from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
+from psfcore.scatter.segments import Segments, beyond_pct, segment_sums, shells_as_published
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Vector, shape_named
 from psfcore.scatter.total_psf import CURVE_RADII_PX, curve_sigma
 from psfcore.scatter.validation.shape_comparison import ComparedShape, compare_shapes
@@ -92,8 +92,7 @@ class ShellWeightFits:
 
         The result holds percentiles of the fits to the subsets, (percentiles, shells).
         """
-        light = self.weights * self.segments.counts
-        beyond = 100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1]
+        beyond = beyond_pct(self.weights * self.segments.counts)
         return np.asarray(np.percentile(beyond, percentiles, axis=0))
 
 

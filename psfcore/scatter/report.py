@@ -8,7 +8,7 @@ from psfcore.json_values import json_attributes
 from psfcore.scatter.fit import Curve, ShellWeightFits, TransitFit
 from psfcore.scatter.published import Published
 from psfcore.scatter.shapes import stretch_of
-from psfcore.scatter.validation.cross_validation import ONE_SIGMA, TWO_SIGMA
+from psfcore.scatter.validation.cross_validation import LIMITS, limits_json
 
 SCHEMA = "psf-fit/1"
 
@@ -102,13 +102,10 @@ def _curve_json(curve: Curve) -> dict[str, list[float]]:
 
 
 def _free_json(free: ShellWeightFits) -> dict[str, Any]:
-    percentiles = (50.0, *ONE_SIGMA, *TWO_SIGMA)
-    names = ("median", "minus_1_sigma", "plus_1_sigma", "minus_2_sigma", "plus_2_sigma")
-    weights, beyond = free.weights_pct(percentiles), free.beyond_pct(percentiles)
     return {
         "edges_px": list(free.segments.edges_px),
-        "weight": dict(zip(names, weights.tolist(), strict=True)),
-        "diffuse_light_beyond_inner_edge_pct": dict(zip(names, beyond.tolist(), strict=True)),
+        "weight": limits_json(free.weights_pct(LIMITS)),
+        "diffuse_light_beyond_inner_edge_pct": limits_json(free.beyond_pct(LIMITS)),
     }
 
 

@@ -156,6 +156,14 @@ class Segments:
         return np.asarray(segment.astype(np.int32)[squares])
 
 
+def beyond_pct(light: Floats) -> Floats:
+    """The percentage of all light that lies beyond the inner edge of each segment.
+
+    light: the light in each segment, as a fraction of all light, (fits, segments).
+    """
+    return np.asarray(100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1])
+
+
 def segment_sums(
     image: NDArray[np.floating], targets: NDArray[np.integer], segments: Segments, *, threads: int = 1
 ) -> Floats:

@@ -66,7 +66,11 @@ class Gate:
     def count_members(self, count: int = 1) -> None:
         """Add members of any kind to the count. Raises DataError "archive-too-large"."""
         self._members += count
-        if self._members > self.limits.max_files:
+        self.check_members(self._members)
+
+    def check_members(self, count: int) -> None:
+        """Raise DataError "archive-too-large" if an archive must not have this number of members."""
+        if count > self.limits.max_files:
             message = (
                 f"expected at most {self.limits.max_files} members; got more: pack only {MANIFEST_NAME} and the files "
                 "that it names"

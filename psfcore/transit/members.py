@@ -177,9 +177,8 @@ class _BoundedFile:
         if len(got) > self._most:
             message = f"expected a table of contents of at most {self._most} bytes; got more"
             raise DataError("archive-too-large", message)
-        if got.startswith(_ZIP_ENTRY) and got.count(_ZIP_ENTRY) > self._gate.limits.max_files:
-            message = f"expected at most {self._gate.limits.max_files} members; got more"
-            raise DataError("archive-too-large", message)
+        if got.startswith(_ZIP_ENTRY):
+            self._gate.check_members(got.count(_ZIP_ENTRY))
         return got
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:

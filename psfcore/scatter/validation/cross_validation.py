@@ -38,7 +38,7 @@ samples.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,7 @@ from psfcore.json_values import json_attributes, json_values
 from psfcore.psf import cumulative_curve
 from psfcore.scatter.inversion import refit
 from psfcore.scatter.reconstruction import Progress, Solution
+from psfcore.scatter.segments import beyond_pct
 from psfcore.scatter.shapes import Vector
 from psfcore.scatter.validation.free_shells import FreeShares, free_shares, law_light, shells
 from psfcore.transit.transit import folds
@@ -121,26 +122,35 @@ class FoldFit:
 _FOLD_FIT = TypeAdapter(FoldFit)
 
 
-def bootstrap_samples(images: int, *, runs: int = RUNS, seed: int = 1) -> tuple[FoldSample, ...]:
-    """The samples of all runs; each run has one sample for each held-out block.
+def held_out_folds(images: int) -> tuple[FoldSample, ...]:
+    """One sample for each fold, without bootstrap: each fitted image counts once.
 
     Raises DataError "too-few-images" if the images do not suffice for two blocks.
     """
     blocks = folds(images)
     if not blocks:
         raise DataError(
-            "too-few-images", f"expected at least 6 images for held-out blocks; got {images}: add images"
+            "too-few-images", f"expected at least 6 images for held-out folds; got {images}: add images"
         )
+    return tuple(
+        FoldSample(0, k, tuple(int(n in block.fitted) for n in range(images)), block.held_out)
+        for k, block in enumerate(blocks)
+    )
+
+
+def bootstrap_samples(images: int, *, runs: int = RUNS, seed: int = 1) -> tuple[FoldSample, ...]:
+    """The samples of all runs; each run has one sample for each held-out block. Raises DataError "too-few-images"."""
+    once = held_out_folds(images)
     rng = np.random.default_rng(seed)
     samples = []
     for run in range(runs):
-        for fold, block in enumerate(blocks):
-            counts, fitted = np.zeros(images, dtype=np.int64), set(block.fitted)
-            for other in blocks:  # resample each with replacement, without the images in the guard
-                left = [image for image in other.held_out if image in fitted]
+        for sample in once:
+            counts = np.zeros(images, dtype=np.int64)
+            for block in once:  # resample each with replacement, without the held-out images and the guard
+                left = [image for image in block.held_out if sample.counts[image]]
                 if left:
                     np.add.at(counts, rng.choice(left, len(left)), 1)
-            samples.append(FoldSample(run, fold, tuple(counts.tolist()), block.held_out))
+            samples.append(replace(sample, run=run, counts=tuple(counts.tolist())))
     return tuple(samples)
 
 
@@ -295,19 +305,20 @@ class ShellBands:
         """Plain values."""
         return {
             "edges_px": self.edges_px.tolist(),
-            "weight": {"free": _limits_json(self.free_weight), "formula": _limits_json(self.law_weight)},
+            "weight": {"free": limits_json(self.free_weight), "formula": limits_json(self.law_weight)},
             "diffuse_light_beyond_inner_edge_pct": {
-                "free": _limits_json(self.free_beyond_pct),
-                "formula": _limits_json(self.law_beyond_pct),
+                "free": limits_json(self.free_beyond_pct),
+                "formula": limits_json(self.law_beyond_pct),
             },
-            "excess_within_outer_edge_points": _limits_json(self.excess_pct)
+            "excess_within_outer_edge_points": limits_json(self.excess_pct)
             | {"sigma": self.excess_sigma.tolist()},
             "excess_near_centre": vars(self.near_centre),
             "largest_excess": vars(self.largest) | {"parts": self.largest.parts},
         }
 
 
-def _limits_json(limits: NDArray[np.float64]) -> dict[str, Any]:
+def limits_json(limits: NDArray[np.float64]) -> dict[str, Any]:
+    """Percentiles at LIMITS by name."""
     return dict(zip(LIMIT_NAMES, limits.tolist(), strict=True))
 
 
@@ -364,8 +375,8 @@ class Bands:
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "light_beyond_pct": _limits_json(self.curve_pct),
-            "parameters": {name: _limits_json(limits) for name, limits in self.values.items()},
+            "light_beyond_pct": limits_json(self.curve_pct),
+            "parameters": {name: limits_json(limits) for name, limits in self.values.items()},
             "shells": None if self.shells is None else self.shells.to_json(),
             **json_attributes(self, "radii_px", "totals", "held_out", "held_out_pct"),
         }
@@ -396,15 +407,12 @@ def shell_bands(folds: Sequence[FoldShells]) -> ShellBands:
     spread = np.subtract(*np.percentile(excess, ONE_SIGMA[::-1], axis=0)) / 2
     expected = 100 * np.median([fold.excess_sigma for fold in folds], axis=0)
 
-    def beyond_pct(light: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.percentile(100 * np.cumsum(light[:, ::-1], axis=1)[:, ::-1], LIMITS, axis=0))
-
     return ShellBands(
         edges_px=np.array(shells().edges_px),
         free_weight=np.percentile(free / counts, LIMITS, axis=0),
         law_weight=np.percentile(law / counts, LIMITS, axis=0),
-        free_beyond_pct=beyond_pct(free),
-        law_beyond_pct=beyond_pct(law),
+        free_beyond_pct=np.percentile(beyond_pct(free), LIMITS, axis=0),
+        law_beyond_pct=np.percentile(beyond_pct(law), LIMITS, axis=0),
         excess_pct=np.percentile(excess, LIMITS, axis=0),
         excess_sigma=np.maximum(spread, expected),
         law_within_pct=100 * np.median(np.cumsum(law, axis=1), axis=0),
