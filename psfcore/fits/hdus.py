@@ -94,7 +94,9 @@ def read_pixels(
         skip_data(source, image, limits)
         # What follows an image is not needed to use it, so damage there is no error.
         with suppress(HeaderError):
-            further += (one for one in hdus if others and one.kind == "image" and not is_plane(one))
+            for one in hdus if others else ():
+                if one.kind == "image" and not is_plane(one):
+                    further.append(one)
     if plain is not None:
         return StoredImage(summary, plain, header, tuple(further))
     decoded = _decoded_pixels(path, summary, twice=may_hold_unwritten_memory(header))
