@@ -91,11 +91,13 @@ def read_pixels(
         hdus = walk(source, limits)
         image = first_image(hdus, limits, hdu)
         header, summary = image.header, summary_of(image, gzipped=source.gzipped)
-        plain = None if summary.codec is not None else _plain_pixels(source, header, summary)
+        plain = None if summary.codec is not None else _plain_pixels(source, image, summary)
         skip_data(source, image, limits)
         # What follows an image is not needed to use it, so damage there is no error.
         with suppress(HeaderError):
-            further += (one for one in hdus if others and one.kind == "image" and not is_plane(one))
+            for one in hdus if others else ():
+                if one.kind == "image" and not is_plane(one):
+                    further.append(one)
     if plain is not None:
         return StoredImage(summary, plain, header, tuple(further))
     decoded = _decoded_pixels(path, summary, twice=may_hold_unwritten_memory(header))
@@ -104,19 +106,20 @@ def read_pixels(
     return StoredImage(summary, decoded, header, tuple(further))
 
 
-def _plain_pixels(source: Source, header: fits.Header, summary: HeaderSummary) -> NDArray[np.float64]:
+def _plain_pixels(source: Source, image: Hdu, summary: HeaderSummary) -> NDArray[np.float64]:
     """The pixels of a plain image, from a source that stands at its data. FITS standard 4.0, Eqs. (3) and (4)."""
     ny, nx = summary.shape
-    raw = source.read(nx * ny * abs(summary.bitpix) // 8)
-    stored = np.frombuffer(raw, _TYPES[summary.bitpix])
-    if stored.size != nx * ny:
+    size = image.end - image.start
+    raw = source.read(size)
+    if len(raw) < size:
         raise HeaderError(
             "truncated-data",
             f"expected {nx} x {ny} pixels in HDU {summary.hdu}; the file ends too early: copy the file again",
         )
+    stored = np.frombuffer(raw, _TYPES[summary.bitpix])
     pixels = stored.astype(np.float64).reshape(summary.shape)
-    scale, zero = (optional_number(header, key) for key in ("BSCALE", "BZERO"))
-    blank = optional_number(header, "BLANK") if summary.bitpix > 0 else None
+    scale, zero = (optional_number(image.header, key) for key in ("BSCALE", "BZERO"))
+    blank = optional_number(image.header, "BLANK") if summary.bitpix > 0 else None
     is_blank = None if blank is None else pixels == blank
     if scale is not None and scale != 1:
         pixels *= scale

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from psfcore import build, limited
 from psfcore.diffraction import combined, fraunhofer
@@ -41,7 +42,12 @@ def read_an_image(content: bytes, folder: Path) -> str:
     """Read an image twice, with different contents of fresh memory in the process that decodes it, and write a product from it."""
     path, product = folder / "input.fits", folder / "product.fits"
     path.write_bytes(content)
-    summary = read_summary(path, LIMITS)
+    try:
+        summary = read_summary(path, LIMITS)
+    except DataError as error:
+        with pytest.raises(DataError, match=f"^{error.code}:"):
+            read_observation(path, LIMITS)
+        raise
     json.dumps(dataclasses.asdict(summary), allow_nan=False)
     assert 0 < summary.shape[0] * summary.shape[1] <= LIMITS.max_pixels
     images = []

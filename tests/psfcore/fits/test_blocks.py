@@ -12,7 +12,8 @@ from astropy.io import fits
 
 from psfcore.errors import HeaderError
 from psfcore.fits.blocks import FitsLimits
-from psfcore.fits.header import all_hdus, read_summary
+from psfcore.fits.hdus import read_pixels
+from psfcore.fits.header import FitsLimits, all_hdus, read_summary
 from tests.psfcore.fits.raw_files import block, compressed, cube, empty_primary, good, image_cards, table
 
 SMALL = FitsLimits(max_pixels=4096 * 4096, max_header_bytes=64 * 1024, max_hdus=8)
@@ -29,6 +30,7 @@ BAD = {
     "cut in the header": (good()[:400], "truncated-header"),
     "END never comes": (b"SIMPLE  =                    T".ljust(80 * 1024), "header-too-long"),
     "cut in the data": (good()[: 2880 + 500], "truncated-data"),
+    "cut in a pixel": (good()[: 2880 + 501], "truncated-data"),
     "no data at all": (good()[:2880], "truncated-data"),
     "only an empty primary": (empty_primary(), "no-image"),
     "only a table": (table(), "table-only"),
@@ -71,9 +73,10 @@ def test_a_bad_file_raises_its_error_code(tmp_path: Path, subtests: pytest.Subte
     path = tmp_path / "file.fits"
     for name, (content, code) in BAD.items():
         path.write_bytes(content)
-        with subtests.test(name), pytest.raises(HeaderError, match=f"^{code}: .*expected") as caught:
-            read_summary(path, SMALL)
-        assert len(caught.value.message) < 300, name
+        for read in (read_summary, read_pixels):
+            with subtests.test(name), pytest.raises(HeaderError, match=f"^{code}: .*expected") as caught:
+                read(path, SMALL)
+            assert len(caught.value.message) < 300, name
 
 
 def test_the_error_about_a_cube_says_how_to_write_one_plane(
