@@ -109,7 +109,7 @@ def arms(
     from psfcore.drawing.units import unit_label
     from psfcore.fits.observation import read_observation
     from psfcore.flare.arms import measure_arms
-    from psfcore.flare.arms_plot import arms_png
+    from psfcore.flare.plots import arms_png
 
     with user_errors():
         flare = read_observation(image, limits(), saturation_dn=saturation_dn)

@@ -68,8 +68,8 @@ def flare(
     """Simulate the stray light of the flare in IMAGE with a PSF, and compare it along a diffraction arm."""
     from psfcore.fits.observation import read_observation
     from psfcore.fits.psfs import read_psf
-    from psfcore.flare.arm_profile_plot import flare_png
     from psfcore.flare.judge import judge_on_flare, summary_lines
+    from psfcore.flare.plots import flare_png
     from psfcore.noise import Noise
 
     with user_errors():

@@ -15,7 +15,6 @@ from psfcore.drawing.page import DASH, render, with_error
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.report import plot
-from psfcore.gap.report.bars import MOST_EFFECTS
 from psfcore.gap.report.limits import PAIRS, limit_rows
 from psfcore.gap.report.report import (
     AXIS_WORDS,
@@ -75,7 +74,7 @@ def gap_page(found: Diagnosis, report: Report) -> str:
         optical=" and ".join(optical),
         floor_pct=f"{100 * FLOOR:g}",
         AXIS_WORDS=AXIS_WORDS,
-        MOST_EFFECTS=MOST_EFFECTS,
+        MOST_EFFECTS=plot.MOST_EFFECTS,
         MOST_HYPOTHESES=MOST_HYPOTHESES,
         ROUNDS=ROUNDS,
         SIGN_FLIPS=SIGN_FLIPS,

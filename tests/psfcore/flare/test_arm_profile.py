@@ -20,8 +20,8 @@ from psfcore.flare.arm_profile import (
     fit_flare,
     flare_centre,
 )
-from psfcore.flare.arm_profile_plot import flare_png
 from psfcore.flare.judge import judge_on_flare
+from psfcore.flare.plots import flare_png
 from psfcore.image import Image
 from psfcore.psf import Psf
 from tests.psfcore.conftest import make_psf

@@ -14,7 +14,7 @@ from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.mesh_series import order_spacing_px, rotated_mesh_kernel
 from psfcore.errors import DataError
 from psfcore.flare.arms import ArmMeasurement, measure_arms
-from psfcore.flare.arms_plot import arms_png
+from psfcore.flare.plots import arms_png
 
 ANGLE_DEG = 1.3
 SPACING_PX = order_spacing_px(

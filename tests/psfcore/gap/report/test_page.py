@@ -15,9 +15,8 @@ from matplotlib.figure import Figure
 from psfcore.drawing.page import with_error
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.report import plot as gap_plot
-from psfcore.gap.report.bars import draw_effects
 from psfcore.gap.report.page import gap_page, interval_words, unit_words
-from psfcore.gap.report.plot import cell_means, draw_cells, draw_map, gap_png, simulated_of
+from psfcore.gap.report.plot import cell_means, draw_cells, draw_effects, draw_map, gap_png, simulated_of
 from psfcore.gap.report.report import gap_report, hypothesis_words, percent_words
 from psfcore.gap.verdict.limits import Alike
 from psfcore.gap.verdict.posterior import UNKNOWN
