@@ -231,17 +231,17 @@ def _kept(context: Context, row: ProductRow, destination: Destination, *, reused
 
 def statistics_of(details: Mapping[str, Any]) -> dict[str, Any]:
     """A summary of the changes and artefacts in the details of a product."""
-    found = details["changes"]
+    artefacts, structures = details["changes"]["artefacts"], details["changes"]["structures"]
     changes = {
         row["kind"]: {"sum_pct": row["sum_pct"], "up_to_pct": row["up_to_pct"]}
-        for row in found["structures"]
+        for row in structures
         if (row["block_px"], row["tail_pct"]) == (BLOCK_PX, TAIL_PCT)
     }
     return {
         "flux_change_pct": details["flux_change_pct"],
         "bright": changes.get("bright"),
         "dark": changes.get("dark"),
-        "signs": found["artefacts"]["signs"],
+        "signs": artefacts["signs"],
         "negative_pixels": details["negative_pixels"],
         "steps_done": details["steps_done"],
         "stopped_because": details["stopped_because"],

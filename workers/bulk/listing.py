@@ -143,10 +143,10 @@ def found_files(
     first = 0 if after is None else after.pattern
     for number, files in enumerate(request.files[first:], first):
         names = after.names if after is not None and number == first else None
-        for looked in archive_files.find(files.glob, allowed, names):
-            path, image = str(looked.path), None
-            if (looked.matches or looked.error) and path not in seen:
-                image = _listed_one(allowed, limits, looked, files.where)
+        for entry in archive_files.find(files.glob, allowed, names):
+            path, image = str(entry.path), None
+            if (entry.matches or entry.error) and path not in seen:
+                image = _listed_one(allowed, limits, entry, files.where)
             if image is not None:
                 listed += 1
                 if len(request.files) > 1:
@@ -156,25 +156,25 @@ def found_files(
                     "too-many-images",
                     f"expected at most {MOST_IMAGES} images in a bulk run; the patterns match more: split the request",
                 )
-            yield Place(number, looked.place), image
+            yield Place(number, entry.place), image
 
 
 def _listed_one(
-    allowed: Sequence[Path], limits: FitsLimits, found: archive_files.Looked, where: dict[str, Condition]
+    allowed: Sequence[Path], limits: FitsLimits, entry: archive_files.Looked, where: dict[str, Condition]
 ) -> Listed | None:
-    """The found file as an image of the run, with an error if the file cannot be used; None if its header does not match."""
-    failure = found.error
+    """An entry of a folder as an image of the run, with an error if the file cannot be used; None if its header does not match."""
+    failure = entry.error
     if failure is None and where:
         try:
-            with beneath.opened(found.path, allowed) as file:
+            with beneath.opened(entry.path, allowed) as file:
                 if not archive_files.matches(beneath.reopened(file), where, limits):
                     return None
         except DataError as unusable:
             failure = unusable
         except OSError as unreadable:
             failure = archive_files.unreadable(unreadable)
-    source = archive_files.shown(found.path)
-    failure = _path_error(found.path, source) or failure
+    source = archive_files.shown(entry.path)
+    failure = _path_error(entry.path, source) or failure
     if len(source) > MOST_LETTERS:
         source = source[: MOST_LETTERS - 1] + "…"
     return Listed(source, uploaded=False, error=None if failure is None else JobError.of(failure))

@@ -56,10 +56,10 @@ def bulk_turn(context: Context, parameters: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class _Reading:
-    """An image that a thread takes and then reads. read: the image, and the time that reading took, s."""
+    """An image that a thread takes and then reads. image: the image itself, and the time that reading took, s."""
 
-    taken: Future[BulkItemRow | None]
-    read: Future[tuple[Ready | Outcome, float] | None]
+    item: Future[BulkItemRow | None]
+    image: Future[tuple[Ready | Outcome, float] | None]
 
 
 class _Stopped(Exception):
@@ -83,9 +83,9 @@ class _Turn:
         self._ahead: _Reading | None = None
         self._writing: tuple[BulkItemRow, Future[None]] | None = None
         self._listing: Future[None] | None = None
-        self._made: set[str] = set()
+        self._product_ids: set[str] = set()
         self._ends_at = time.monotonic() + TURN_S
-        self._told_s = self._told_at = 0.0
+        self._reports_s = self._reported_at = 0.0
 
     def run(self) -> None:
         """Process images until no image is left. Raises ``TurnOver`` if the turn must end before."""
@@ -94,7 +94,7 @@ class _Turn:
         while self._is_at_work() and not self._stopped_for_quota():
             ahead, self._ahead = self._ahead, None
             reading = ahead or self._read()
-            item = reading.taken.result()
+            item = reading.item.result()
             if item is not None:
                 self._do(item, reading)
             elif ahead is not None:
@@ -176,23 +176,23 @@ class _Turn:
     def _read(self) -> _Reading:
         """Let a thread take an image and read it."""
         context, bulk = self._context, self._bulk
-        taken = self._submit(self._bulks.take, bulk.id, context.lease, context.settings.max_attempts)
+        next_item = self._submit(self._bulks.take, bulk.id, context.lease, context.settings.max_attempts)
 
         def read() -> tuple[Ready | Outcome, float] | None:
-            item, began = taken.result(), time.perf_counter()
+            item, began = next_item.result(), time.perf_counter()
             if item is None:
                 return None
             return read_one(self._beside, bulk, item), time.perf_counter() - began
 
-        return _Reading(taken, self._submit(read))
+        return _Reading(next_item, self._submit(read))
 
     def _give_back(self, reading: _Reading) -> None:
-        error = reading.taken.exception()
+        error = reading.item.exception()
         if error is not None:
             log.warning("bulk run %s: could not take the next image: %s", self._bulk.id, error)
             return
-        reading.read.exception()  # waits until the thread has stopped reading; another turn meets the same error
-        item = reading.taken.result()
+        reading.image.exception()  # waits until the thread has stopped reading; another turn meets the same error
+        item = reading.item.result()
         if item is not None:
             self._bulks.release(item)
 
@@ -210,7 +210,7 @@ class _Turn:
 
     def _computed(self, item: BulkItemRow, reading: _Reading) -> Callable[[], None]:
         """Deconvolve an image. Returns the function that writes the product and records the result."""
-        read = _awaited(reading.read, lambda: self._report("reading", 0, 1))
+        read = _awaited(reading.image, lambda: self._report("reading", 0, 1))
         assert read is not None
         ready, read_s = read
         if item.attempts > 1 or self._context.settings.max_attempts == 1:
@@ -222,16 +222,16 @@ class _Turn:
         if isinstance(ready, Outcome):
             existing = ready
             return partial(self._record, item, lambda: existing, read_s)
-        self._made.add(ready.destination.identity)
-        began, told_s = time.perf_counter(), self._told_s
+        self._product_ids.add(ready.destination.identity)
+        began, reports_s = time.perf_counter(), self._reports_s
         made = compute_one(self._computing, ready)
         # without the time that was spent on reports of progress
-        kernel_s = time.perf_counter() - began - (self._told_s - told_s)
+        kernel_s = time.perf_counter() - began - (self._reports_s - reports_s)
         return partial(self._record, item, partial(self._written, ready, made, kernel_s), read_s + kernel_s)
 
     def _made_meanwhile(self, destination: Destination) -> Outcome | None:
         """The product of an image whose content this turn deconvolved after the image was read; None for another image."""
-        if destination.identity not in self._made:
+        if destination.identity not in self._product_ids:
             return None
         self._finish_writing()
         return done_before(self._context, destination)
@@ -281,10 +281,10 @@ class _Turn:
         """Count the stage of an image, and report the images that are done, at most once a second. Raises if the turn must stop."""
         with self._context.times.step(stage, step):
             began = time.perf_counter()
-            if began - self._told_at >= TELL_EVERY_S:
+            if began - self._reported_at >= TELL_EVERY_S:
                 self._context.report("images", self._bulk.done + self._bulk.failed, self._bulk.total)
-                self._told_at = time.perf_counter()
-                self._told_s += self._told_at - began
+                self._reported_at = time.perf_counter()
+                self._reports_s += self._reported_at - began
 
     def _check(self, _stage: str, _step: int, _steps: int) -> None:
         """The progress function of the other threads, whose times are not stages of the turn."""

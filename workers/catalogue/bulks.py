@@ -131,7 +131,7 @@ class Bulks:
                 BulkItemRow.error["code"].as_string().not_in((NOT_UTF_8, TOO_LONG)),
             )
             waiting = {"state": ItemState.WAITING, "attempts": 0, "ended_at": None, "error": None}
-            changed = _changed(session, again.values(**waiting))
+            changed = _execute(session, again.values(**waiting))
             bulk.failed -= changed
             if not changed or bulk.phase != BulkPhase.COMPLETED:
                 return changed
@@ -171,11 +171,11 @@ class Bulks:
             lock_owner(session, bulk.owner)
             positions = session.scalars(next_ones).all()
             if not positions:
-                _changed(session, delete(BulkRow).where(BulkRow.id == bulk.id))
+                _execute(session, delete(BulkRow).where(BulkRow.id == bulk.id))
                 return False
             batch = delete(BulkItemRow).where(here, BulkItemRow.position.between(positions[0], positions[-1]))
-            told = batch.returning(BulkItemRow.state, BulkItemRow.reused)
-            rows = session.execute(told.execution_options(synchronize_session=False)).all()
+            statement = batch.returning(BulkItemRow.state, BulkItemRow.reused)
+            rows = session.execute(statement.execution_options(synchronize_session=False)).all()
             states = [state for state, _ in rows]
             fewer = {
                 "total": BulkRow.total - len(rows),
@@ -183,7 +183,7 @@ class Bulks:
                 "reused": BulkRow.reused - sum(reused for _, reused in rows),
                 "failed": BulkRow.failed - states.count(ItemState.FAILED),
             }
-            _changed(session, update(BulkRow).where(BulkRow.id == bulk.id).values(**fewer))
+            _execute(session, update(BulkRow).where(BulkRow.id == bulk.id).values(**fewer))
             return True
 
     # Listing ------------------------------------------------------------------------------------------
@@ -244,7 +244,10 @@ class Bulks:
                 phase = session.scalar(select(BulkRow.phase).where(BulkRow.id == bulk_id))
                 if phase not in AT_WORK or not _is_held(session, lease.token):
                     return None
-                item = session.scalars(_left(bulk_id)).first() or session.scalars(_waiting(bulk_id)).first()
+                item = (
+                    session.scalars(_lost_images(bulk_id)).first()
+                    or session.scalars(_waiting_images(bulk_id)).first()
+                )
                 if item is None:
                     return None
                 if item.attempts < max_attempts:
@@ -259,7 +262,7 @@ class Bulks:
     def release(self, item: BulkItemRow) -> bool:
         """Give an image back, so that a worker can take it again. The attempt does not count."""
         values = {"state": ItemState.WAITING, "attempts": BulkItemRow.attempts - 1, "token": None}
-        return bool(self._database.change(_holding(item).values(**values)))
+        return bool(self._database.change(_update_held(item).values(**values)))
 
     def finish(self, item: BulkItemRow, *, reused: bool, **values: Any) -> bool:
         """Record that an image is done."""
@@ -272,8 +275,8 @@ class Bulks:
 
     def _end(self, item: BulkItemRow, values: Mapping[str, Any], **counts: int) -> bool:
         with self._database.writing.begin() as session:
-            ended = _holding(item).values(ended_at=time.time(), token=None, **values)
-            if not _changed(session, ended):
+            ended = _update_held(item).values(ended_at=time.time(), token=None, **values)
+            if not _execute(session, ended):
                 return False
             _count(session, item.bulk_id, **counts)
             return True
@@ -314,13 +317,13 @@ def _values(bulk_id: str, position: int, image: Listed) -> Mapping[str, Any]:
     }
 
 
-def _waiting(bulk_id: str) -> Select[BulkItemRow]:
+def _waiting_images(bulk_id: str) -> Select[BulkItemRow]:
     query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == ItemState.WAITING)
     # If two workers take an image at the same moment, they get different images.
     return query.order_by(BulkItemRow.position).limit(1).with_for_update(skip_locked=True)
 
 
-def _left(bulk_id: str) -> Select[BulkItemRow]:
+def _lost_images(bulk_id: str) -> Select[BulkItemRow]:
     """A query for an image that was taken under a lease that is now lost."""
     held = select(JobRow.id).where(
         JobRow.id == BulkItemRow.job_id, JobRow.lease == BulkItemRow.token, JobRow.phase == Phase.EXECUTING
@@ -343,7 +346,7 @@ def _listed_by(session: Session, bulk_id: str, lease: Lease) -> BulkRow | None:
     return bulk if bulk and bulk.phase == BulkPhase.LISTING and bulk.lister == lease.token else None
 
 
-def _holding(item: BulkItemRow) -> Update:
+def _update_held(item: BulkItemRow) -> Update:
     """An update of an image that changes it only if the worker still has the right to work on it."""
     return update(BulkItemRow).where(
         BulkItemRow.bulk_id == item.bulk_id,
@@ -353,7 +356,8 @@ def _holding(item: BulkItemRow) -> Update:
     )
 
 
-def _changed(session: Session, statement: Update | Delete) -> int:
+def _execute(session: Session, statement: Update | Delete) -> int:
+    """Change rows; returns their number."""
     result = session.execute(statement.execution_options(synchronize_session=False))
     assert isinstance(result, CursorResult)
     return result.rowcount
@@ -362,7 +366,7 @@ def _changed(session: Session, statement: Update | Delete) -> int:
 def _count(session: Session, bulk_id: str, **counts: int) -> None:
     """Add to the counts of a run, and end it if no image is left."""
     more = {name: getattr(BulkRow, name) + count for name, count in counts.items()}
-    _changed(session, update(BulkRow).where(BulkRow.id == bulk_id).values(**more))
+    _execute(session, update(BulkRow).where(BulkRow.id == bulk_id).values(**more))
     _end_if_done(session, bulk_id)
 
 
@@ -374,4 +378,4 @@ def _end_if_done(session: Session, bulk_id: str) -> None:
         BulkRow.listed,
         BulkRow.done + BulkRow.failed == BulkRow.total,
     )
-    _changed(session, done.values(phase=BulkPhase.COMPLETED, ended_at=time.time()))
+    _execute(session, done.values(phase=BulkPhase.COMPLETED, ended_at=time.time()))
