@@ -11,7 +11,6 @@ import pytest
 from astropy.io import fits
 
 from psfcore.errors import HeaderError
-from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.hdus import read_pixels
 from psfcore.fits.header import FitsLimits, all_hdus, read_summary
 from tests.psfcore.fits.raw_files import block, compressed, cube, empty_primary, good, image_cards, table
