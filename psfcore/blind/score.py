@@ -1,4 +1,4 @@
-"""The score of a blind set: a table of figures that judge the diagnosis, the confusion matrix, and the power.
+"""The score of a blind set: a table of figures that judge the diagnosis, the confusion matrix, and the power, with a picture.
 
 Each row of the table (`figures`) has its own selection of cases. "Left" is the residual that the effects leave in the discs after
 the refit of the PSF. The answer of a report is the set of effects that the verdict `attributed` or `tie` names. An effect is
@@ -21,8 +21,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from statistics import mean, median
 from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from psfcore.blind.case_set import BlindSet
 from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE
@@ -52,6 +58,7 @@ from psfcore.blind.scoring import (
     true_label,
     verdict_is_right,
 )
+from psfcore.drawing.plots import INK, write_png
 
 SCHEMA = "gap-blind/1"
 LEVEL_PCT = 2.0
@@ -61,6 +68,7 @@ SEEN = 30.0
 KIND_WORDS = {CLEAN: "clean", SINGLE: "one effect", PAIR: "two effects", FOREIGN: "not in the library"}
 POWER_EDGES_PCT = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)
 Z95 = 1.959963984540054
+_VERDICTS = (NONE, UNKNOWN_VERDICT, INCONCLUSIVE)
 Holds = Callable[[Judged], float]  # 1 if a case meets a condition, 0 if not; 0.5 counts as half a case
 
 
@@ -368,13 +376,117 @@ def table(found: Score) -> str:
     )
 
 
+def score_png(found: Score, path: str | Path) -> None:
+    """Draw two panels: the truth against the first effect named, and the power with Wilson intervals. path: a PNG file."""
+    figure = Figure(figsize=(17, 9.5), dpi=90, facecolor="white", layout="constrained")
+    figure.suptitle(
+        f"Blind set: {found.judged} cases judged, {len(found.failures)} failed",
+        fontsize=13,
+        color=INK,
+        weight="bold",
+        x=0.01,
+        ha="left",
+    )
+    matrix, power = figure.subplots(1, 2, width_ratios=(1.9, 1))
+    _draw_matrix(matrix, found)
+    _draw_power(power, found)
+    write_png(figure, path)
+
+
+def _draw_matrix(axes: Axes, found: Score) -> None:
+    rows = list(found.confusion)
+    said = {name for row in found.confusion.values() for name in row}
+    columns = [name for name in (*_VERDICTS, *KNOWN) if name in said or name in _VERDICTS or name in rows]
+    columns += sorted(said - set(columns))
+    counts = np.array([[found.confusion[row].get(column, 0) for column in columns] for row in rows])
+    if not counts.size:
+        axes.text(0.5, 0.5, "no case was judged", ha="center", transform=axes.transAxes)
+        return
+    shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    axes.imshow(shares, cmap="Blues", vmin=0, vmax=1.3, aspect="auto")
+    for (row, column), count in np.ndenumerate(counts):
+        if count:
+            axes.text(column, row, str(count), ha="center", va="center", fontsize=9, color=INK)
+    for row, name in enumerate(rows):  # frame the correct columns of each row
+        right = _right_columns(name)
+        for column in (n for n, label in enumerate(columns) if label in right):
+            corner = (column - 0.5, row - 0.5)
+            axes.add_patch(_frame(corner))
+    axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right", fontsize=9)
+    axes.set_yticks(
+        range(len(rows)), [f"{name} *" if _is_foreign(name) else name for name in rows], fontsize=9
+    )
+    axes.set(
+        xlabel="first effect named, or verdict",
+        ylabel="truth (* not in the library)",
+        title="Number of cases; frames mark correct verdicts",
+    )
+
+
+def _right_columns(truth: str) -> tuple[str, ...]:
+    if truth == "clean":
+        return (NONE,)
+    return (UNKNOWN_VERDICT, INCONCLUSIVE) if _is_foreign(truth) else (truth,)
+
+
+def _is_foreign(truth: str) -> bool:
+    """Whether a row is of an effect that is not in the library; a simulator may have effects with any names."""
+    return truth not in (*KNOWN, CLEAN, PAIR)
+
+
+def _frame(corner: tuple[float, float]) -> Rectangle:
+    return Rectangle(corner, 1, 1, fill=False, edgecolor="#c73e2b", linewidth=1.2, clip_on=False)
+
+
+def _draw_power(axes: Axes, found: Score) -> None:
+    labels = []
+    for bin_of in found.power:
+        low, high = bin_of["left_after_refit_pct"]
+        labels.append(f"{low:g} -\n{high:g}" if high is not None else f"> {low:g}")
+    at = np.arange(len(labels))
+    for offset, count, hits, interval, colour, name in (
+        (-0.08, "n", "noticed", "noticed_wilson95", "#1b4f91", "noticed (the verdict is not “none”)"),
+        (
+            0.08,
+            "n_known",
+            "contains_truth",
+            "contains_wilson95",
+            "#2b8a6e",
+            "the named effects include the true ones",
+        ),
+    ):
+        shown = [n for n, row in enumerate(found.power) if row[count]]
+        share = np.array([found.power[n][hits] / found.power[n][count] for n in shown])
+        ends = np.array([found.power[n][interval] for n in shown]).reshape(-1, 2)
+        errors = np.abs(np.stack([share - ends[:, 0], ends[:, 1] - share])) if shown else None
+        axes.errorbar(at[shown] + offset, share, yerr=errors, fmt="o-", color=colour, capsize=3, label=name)
+        for n, value in zip(shown, share, strict=True):
+            axes.annotate(
+                f"{found.power[n][hits]}/{found.power[n][count]}",
+                (n + offset, value),
+                textcoords="offset points",
+                xytext=(-24 if offset < 0 else 6, 6),
+                fontsize=8,
+                color=colour,
+            )
+    axes.set_xticks(at, labels)
+    axes.set(
+        xlabel="residual left in the discs after the refit (%, rms over images)",
+        ylabel="fraction of cases, with 95 % Wilson interval",
+        ylim=(-0.03, 1.08),
+    )
+    axes.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.03), ncols=2)
+    axes.grid(color="#dddddd", linewidth=0.7)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
 def write_score(made: BlindSet, numbers: Sequence[int], not_made: Mapping[int, str]) -> str:
     """Open the seals of a diagnosed set, compare reports and truths, and write score.json, score.txt and score.png into its folder.
 
     numbers: the cases to score. not_made: the reason for each case that could not be made. Returns the table as text.
     """
-    from psfcore.blind.plot import score_png
-
     judged, failures = judged_cases(made, numbers)
     found = score(judged, dict(not_made) | failures)
     text = table(found)

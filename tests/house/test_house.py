@@ -86,6 +86,9 @@ def test_what_people_import_stands_on_the_core_the_client_the_folder_of_the_cach
 # Of psfcore the service reads what shows without a pixel: FITS headers, and a transit's archive and manifest, whose
 # table of contents is checked at upload as headers are. None of these loads numerics.
 LIGHT = (
+    "psfcore.fits.blocks",
+    "psfcore.fits.cards",
+    "psfcore.fits.frame",
     "psfcore.fits.header",
     "psfcore.fits.stored_psf",
     "psfcore.fits.viewing",  # its modules of pixels are loaded by the first request for pixels

@@ -10,8 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from psfcore.blind.bounds import LEVEL
-from psfcore.blind.plot import score_png
-from psfcore.blind.score import score, set_figures, share, table, wilson
+from psfcore.blind.score import score, score_png, set_figures, share, table, wilson
 from psfcore.blind.scoring import (
     Judged,
     covers,
