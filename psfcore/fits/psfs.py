@@ -13,8 +13,9 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from psfcore.errors import DataError
 from psfcore.fits.compression import read_columns
-from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels, readable_pixels, write_hdus
+from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels, write_hdus
 from psfcore.fits.header import (
     FitsLimits,
     all_hdus,
@@ -193,21 +194,23 @@ def _read_extras(
     # Any file can have a card PSFNAME. Therefore the size limits are checked for all HDUs. HDUs that write_psf never
     # writes are ignored: compressed components, and components of another shape.
     all_hdus(path, limits)
-    with (
-        readable_pixels(path, "the extensions"),
-        fits.open(path, memmap=False, disable_image_compression=True) as hdus,
-    ):
-        provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
-        for hdu in hdus[1:]:
-            if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
-                components[hdu.name] = np.array(hdu.data, dtype=np.float64)
-            elif not _is_plain_table(hdu):
-                continue
-            elif hdu.name == "INSTRUMENT":
-                text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
-                provenance["instrument_toml"] = text.decode("utf-8")
-            elif hdu.name == "FIT":
-                fitted = _read_fitted(hdu)
+    try:
+        with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+            provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
+            for hdu in hdus[1:]:
+                if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
+                    components[hdu.name] = np.array(hdu.data, dtype=np.float64)
+                elif not _is_plain_table(hdu):
+                    continue
+                elif hdu.name == "INSTRUMENT":
+                    text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
+                    provenance["instrument_toml"] = text.decode("utf-8")
+                elif hdu.name == "FIT":
+                    fitted = _read_fitted(hdu)
+    except PIXEL_TROUBLE as error:
+        wanted = f"expected readable extensions in {Path(path).name}"
+        message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
+        raise DataError("unreadable-pixels", message) from None
     return components, provenance, fitted
 
 
