@@ -28,7 +28,7 @@ from psfcore.errors import DataError, HeaderError
 from psfcore.fits.blocks import FitsLimits, Hdu, Source, first_image, open_source, skip_data, walk
 from psfcore.fits.cards import optional_number
 from psfcore.fits.compression import may_hold_unwritten_memory
-from psfcore.fits.header import HeaderSummary, is_plane, summary_of
+from psfcore.fits.header import HeaderSummary, is_plane, optional_number, shape_of, summary_of
 from psfcore.limited import fill_new_memory, run_limited
 from psfcore.whole_files import probe
 
@@ -68,13 +68,13 @@ PIXEL_TROUBLE = (
 class StoredImage:
     """Pixels [y, x] (float64) and header of an image, as its file has them.
 
-    others: the images that follow in the file, without planes of products, if they were asked for.
+    others: the images that follow in the file, with their shapes, if they were asked for; without planes of products.
     """
 
     summary: HeaderSummary
     pixels: NDArray[np.float64]
     header: fits.Header
-    others: tuple[Hdu, ...] = ()
+    others: tuple[tuple[Hdu, tuple[int, int]], ...] = ()
 
 
 def read_pixels(
@@ -86,7 +86,7 @@ def read_pixels(
     process of its own, and its header is that of the image. Raises HeaderError, DataError "unreadable-pixels", and OSError
     if the disk fails.
     """
-    further: list[Hdu] = []
+    further: list[tuple[Hdu, tuple[int, int]]] = []
     with open_source(Path(path), limits) as source:
         hdus = walk(source, limits)
         image = first_image(hdus, limits, hdu)
@@ -97,7 +97,7 @@ def read_pixels(
         with suppress(HeaderError):
             for one in hdus if others else ():
                 if one.kind == "image" and not is_plane(one):
-                    further.append(one)
+                    further.append((one, shape_of(one.header)))
     if plain is not None:
         return StoredImage(summary, plain, header, tuple(further))
     decoded = _decoded_pixels(path, summary, twice=may_hold_unwritten_memory(header))

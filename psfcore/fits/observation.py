@@ -30,7 +30,6 @@ from psfcore.fits.header import (
     content_of,
     known_instrument,
     optional_exposure_s,
-    shape_of,
 )
 from psfcore.fits.saturation import with_saturation
 from psfcore.fits.units import check_linear, unit_of
@@ -63,9 +62,7 @@ def read_observation(
     stored = read_pixels(path, limits, hdu=hdu, others=True)
     summary, pixels = stored.summary, stored.pixels
     masks = [
-        one.number
-        for one in stored.others
-        if one.name.upper() == "MASK" and shape_of(one.header) == summary.shape
+        one.number for one, shape in stored.others if one.name.upper() == "MASK" and shape == summary.shape
     ]
     if summary.content == IMAGE and masks:  # as CCDData writes it
         pixels[read_pixels(path, limits, hdu=masks[-1]).pixels != 0] = np.nan
@@ -81,7 +78,7 @@ def _unused_images(stored: StoredImage) -> dict[str, str]:
     """The warning about images of a file that are not used."""
     others = [
         f"{one.number} ({one.name})" if one.name else str(one.number)
-        for one in stored.others
+        for one, _ in stored.others
         if one.name.upper() not in _PLANES
     ]
     if not others:

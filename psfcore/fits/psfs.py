@@ -13,12 +13,21 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import optional_number, optional_text
 from psfcore.fits.compression import read_columns
 from psfcore.fits.frame import plate_scale_arcsec
-from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels, readable_pixels, write_hdus
-from psfcore.fits.header import all_hdus, origin_of, wavelength_angstrom
+from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels, write_hdus
+from psfcore.fits.header import (
+    FitsLimits,
+    all_hdus,
+    optional_number,
+    optional_text,
+    origin_of,
+    plate_scale_arcsec,
+    wavelength_angstrom,
+)
 from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy, radial_profile
 
 _STATED = re.compile(r"psf_id: ([0-9a-f]{64})")
@@ -188,21 +197,23 @@ def _read_extras(
     # Any file can have a card PSFNAME. Therefore the size limits are checked for all HDUs. HDUs that write_psf never
     # writes are ignored: compressed components, and components of another shape.
     all_hdus(path, limits)
-    with (
-        readable_pixels(path, "the extensions"),
-        fits.open(path, memmap=False, disable_image_compression=True) as hdus,
-    ):
-        provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
-        for hdu in hdus[1:]:
-            if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
-                components[hdu.name] = np.array(hdu.data, dtype=np.float64)
-            elif not _is_plain_table(hdu):
-                continue
-            elif hdu.name == "INSTRUMENT":
-                text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
-                provenance["instrument_toml"] = text.decode("utf-8")
-            elif hdu.name == "FIT":
-                fitted = _read_fitted(hdu)
+    try:
+        with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+            provenance["history"] = [str(line) for line in hdus[0].header.get("HISTORY", [])]
+            for hdu in hdus[1:]:
+                if isinstance(hdu, fits.ImageHDU) and hdu.shape == shape:
+                    components[hdu.name] = np.array(hdu.data, dtype=np.float64)
+                elif not _is_plain_table(hdu):
+                    continue
+                elif hdu.name == "INSTRUMENT":
+                    text = np.asarray(hdu.data["TOML"][0], dtype=np.uint8).tobytes()
+                    provenance["instrument_toml"] = text.decode("utf-8")
+                elif hdu.name == "FIT":
+                    fitted = _read_fitted(hdu)
+    except PIXEL_TROUBLE as error:
+        wanted = f"expected readable extensions in {Path(path).name}"
+        message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
+        raise DataError("unreadable-pixels", message) from None
     return components, provenance, fitted
 
 
