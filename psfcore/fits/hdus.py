@@ -28,7 +28,7 @@ from psfcore.errors import DataError, HeaderError
 from psfcore.fits.blocks import FitsLimits, Hdu, Source, first_image, open_source, skip_data, walk
 from psfcore.fits.cards import optional_number
 from psfcore.fits.compression import may_hold_unwritten_memory
-from psfcore.fits.header import HeaderSummary, is_plane, optional_number, shape_of, summary_of
+from psfcore.fits.header import HeaderSummary, is_plane, shape_of, summary_of
 from psfcore.limited import fill_new_memory, run_limited
 from psfcore.whole_files import probe
 

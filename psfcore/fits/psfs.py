@@ -19,15 +19,7 @@ from psfcore.fits.cards import optional_number, optional_text
 from psfcore.fits.compression import read_columns
 from psfcore.fits.frame import plate_scale_arcsec
 from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels, write_hdus
-from psfcore.fits.header import (
-    FitsLimits,
-    all_hdus,
-    optional_number,
-    optional_text,
-    origin_of,
-    plate_scale_arcsec,
-    wavelength_angstrom,
-)
+from psfcore.fits.header import all_hdus, origin_of, wavelength_angstrom
 from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy, radial_profile
 
 _STATED = re.compile(r"psf_id: ([0-9a-f]{64})")
