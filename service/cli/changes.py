@@ -105,7 +105,7 @@ def _one_by_one(
 ) -> Callable[[str], Treated]:
     """A function that deconvolves one image with the service and measures what changed. The function adds the ids of
     the products to ``products``."""
-    from psfcore.deconvolve.assess.from_product import changes_in_product
+    from psfcore.deconvolve.assess.contact_sheet import changes_in_product
 
     def one(name: str) -> Treated:
         with TemporaryDirectory(prefix="heliopsf-") as folder:

@@ -5,10 +5,11 @@ A job of a kind that is not in this module runs with its parameters in ``workers
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
+from psfcore.deconvolve.box import Box
 from workers.contract.requests import (
     CrossValidate,
     Deconvolve,
@@ -21,6 +22,10 @@ from workers.contract.requests import (
     Rerun,
 )
 
+if TYPE_CHECKING:
+    from psfcore.deconvolve.run import Options
+    from psfcore.noise import Noise
+
 
 class ResolvedDeconvolve(Deconvolve):
     """A deconvolution with the id of its PSF. If the PSF may still have to be built or interpolated, the parameters
@@ -32,6 +37,25 @@ class ResolvedDeconvolve(Deconvolve):
     psf_interpolation: PsfInterpolate | None = None
     picked_for: str | None = None  # the instrument of the image, if the service chose the PSF
     context_id: str | None = None  # the context from which the service chose the PSF
+
+
+def options_of(request: Deconvolve, noise: Noise | None, threads: int) -> Options:
+    """The options of psfcore for a request. noise: of the request, or else of the instrument that took the image."""
+    # A request is checked without numerical libraries.
+    from psfcore.deconvolve.run import Options
+
+    method = request.method
+    return Options(
+        method=method.name,
+        parameters=method.model_dump(exclude={"name", "edges", "margin_px"}),
+        edges=method.edges,
+        margin_px=method.margin_px,
+        noise=noise,
+        error_draws=request.error_draws,
+        region=None if request.region is None else Box.parse(request.region),
+        region_error=request.region_error,
+        threads=threads,
+    )
 
 
 class ResolvedPsfFit(PsfFit):

@@ -29,8 +29,8 @@ from workers.run.attempt import Assistance, Attempt, Cancelled, Progress, TookTo
 from workers.run.child import MARGIN, Child, allowed_mib, is_out_of_memory
 from workers.run.stopping import Stopping
 from workers.settings import Settings
+from workers.stage_timer import StageTimer
 from workers.tasks.context import Context, TurnOver
-from workers.tasks.stage_timer import StageTimer
 
 log = logging.getLogger(__name__)
 FAILED = "job %s: %s (%s)"  # log line about a failed job: its id, and the message and the code of its error
@@ -61,19 +61,15 @@ class Runner:
         stopping: Stopping | None = None,
         submit: Callable[[str, Queue], bool] = lambda job_id, queue: False,
         child: Child | None = None,
-        previews: bool = True,
-        compile_beside: bool = False,
-        total_psfs: bool = False,
     ) -> None:
         """submit: a function that sends an unfinished job to the broker again; if it returns False, the reconciler
         does so. child: this process, if the runner may limit the memory of the process and end it; None if it may do
-        neither. previews, compile_beside, total_psfs: see ``Context``.
+        neither.
         """
         self._settings, self._catalogue, self._store = settings, catalogue, store
         self._call_for_help, self._submit = call_for_help, submit
         self._stopping = stopping or Stopping()
         self._child = child
-        self._previews, self._compile_beside, self._total_psfs = previews, compile_beside, total_psfs
         self._pausing = False  # a job pauses while this process runs a short one
 
     def run(self, job_id: str, on_progress: Progress | None = None) -> None:
@@ -211,9 +207,6 @@ class Runner:
             others_wait=lambda: self._stopping.asked or self._catalogue.jobs.others_wait(job.kind),
             lease=lease,
             times=attempt.times,
-            previews=self._previews,
-            compile_beside=self._compile_beside,
-            total_psfs=self._total_psfs,
         )
         try:
             self._check_room(job)
