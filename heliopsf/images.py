@@ -12,11 +12,10 @@ import numpy as np
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
-from heliopsf.inputs import header_of, image_of, is_many, shape_of
+from heliopsf.inputs import box_of, cut, header_of, image_of, is_many, shape_of
 from heliopsf.outputs import Deconvolution, in_form_of
 from heliopsf.progress import Steps, Told, told
 from heliopsf.psfs import BUILDING, Psf, built_psf, read_psf
-from heliopsf.regions import box_of, cut
 from psfcore.deconvolve import run
 from psfcore.deconvolve.box import EXPECTED_RIM_PX, LARGEST_ERROR
 from psfcore.deconvolve.conditions import PreparedPsfs

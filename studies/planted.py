@@ -202,7 +202,7 @@ FAULTS = (
           "else start + exposure_s / DAY_S", "else start + exposure_s",
           ("tests/service/vo",), ("tests/whole/test_vo.py",)),
     # heliopsf
-    Fault("heliopsf-axes-of-reference-pixel-swapped", "heliopsf/regions.py",
+    Fault("heliopsf-axes-of-reference-pixel-swapped", "heliopsf/inputs.py",
           '(columns if name[5:6] == "1" else rows).start', '(rows if name[5:6] == "1" else columns).start',
           ("tests/heliopsf/test_forms.py",), ("tests/heliopsf",)),
 )  # fmt: skip

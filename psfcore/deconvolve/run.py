@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.quality import MEANINGS
 from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_errors
-from psfcore.deconvolve.conditions import Conditions, EngineFor, Progress, new_engine
+from psfcore.deconvolve.conditions import Conditions, Deconvolved, EngineFor, Progress, new_engine
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.methods.registry import may_be_negative, method_names
 from psfcore.deconvolve.region import BoxWork, box_work
-from psfcore.deconvolve.result import Deconvolved
 from psfcore.deconvolve.whole import Assessed, Work
 from psfcore.drawing.units import unit_label
 from psfcore.errors import DataError
@@ -202,14 +201,17 @@ def deconvolve(
     )
     if options.error_draws and options.noise is None:
         raise no_noise_figures()
-    work: Work | BoxWork = Work(image, psf, options.method, conditions, options.parameters)
+    whole = Work(image, psf, options.method, conditions, options.parameters)
+    work: Work | BoxWork = whole
     progress = begin(DECONVOLVING, int(options.parameters.get("steps") or 1))
-    if isinstance(work, Work) and options.region is not None:
-        work = box_work(work, options.region, largest_error=options.region_error)
+    if options.region is not None:
+        work = box_work(whole, options.region, largest_error=options.region_error)
         check_plane(work.rim.shape)
         image = work.image
     result = work.run(progress=progress)
-    errors = work.errors(result, options.error_draws, possible_psfs=possible_psfs, begin=begin)
+    errors = None
+    if options.error_draws:
+        errors = whole.errors(result, options.error_draws, possible_psfs=possible_psfs, begin=begin)
     return Product(**vars(result), image=image, psf=psf, errors=errors, warnings=warnings, work=work)
 
 

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.changes import Changes, measure_changes
 from psfcore.deconvolve.assess.quality import quality_plane
-from psfcore.deconvolve.conditions import Conditions, Progress
+from psfcore.deconvolve.conditions import Conditions, Deconvolved, Progress
 from psfcore.deconvolve.methods.registry import method_named
-from psfcore.deconvolve.result import Deconvolved
-from psfcore.fits.gain import no_noise_figures
 from psfcore.image import Image
 from psfcore.psf import Psf
 
@@ -62,18 +60,15 @@ class Work:
         *,
         possible_psfs: Callable[[], Sequence[Psf]] = lambda: (),
         begin: Callable[[str, int], Progress | None] = lambda stage, steps: None,
-    ) -> ErrorPlanes | None:
-        """The error planes from `draws` noise realisations; None for 0 realisations.
+    ) -> ErrorPlanes:
+        """The error planes from `draws` noise realisations (2 or more). The conditions contain the noise.
 
         possible_psfs: function that returns variants of the PSF within its errors, on the image's pixels. It returns no
         PSF if the errors are not known. begin(stage, steps) is called when a stage begins, and returns the progress
-        function of the stage. Raises DataError "no-noise-figures".
+        function of the stage.
         """
-        if not draws:
-            return None
         noise = self.conditions.noise
-        if noise is None:
-            raise no_noise_figures()
+        assert noise is not None
         # Most deconvolutions compute no errors, and do not load SciPy.
         from psfcore.deconvolve.assess.error_planes import error_planes, psf_error_plane, with_psf_error
 

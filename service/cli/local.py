@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import TypeAdapter, ValidationError
@@ -222,16 +223,9 @@ class Local(Operations):
                 if not done and progress is not None:
                     progress(COMPILING, 0, 1)
 
-        compute: dict[str, Callable[[Any, str, _Report], str]] = {
-            "deconvolve": self._deconvolve,
-            "psf-build": self._build,
-            "psf-fit": self._fit,
-            "cross-validate": self._cross_validate,
-            "report": self._report_on,
-            "gap-diagnose": self._diagnose,
-        }
+        compute: Callable[[Any, str, _Report], str] = getattr(self, f"_{job['kind'].replace('-', '_')}")
         with listening(compiling):
-            address = compute[job["kind"]](self._jobs.pop(job["id"]), job["id"], report)
+            address = compute(self._jobs.pop(job["id"]), job["id"], report)
         return job | {"result": address}
 
     def get(self, address: str) -> dict[str, Any]:
@@ -276,11 +270,22 @@ class Local(Operations):
         from workers.intake.requests import resolve
 
         effects = Settings.apart(self.folder, gap_effects=self.gap_effects).added_effects
-        rows = cast(Catalogue, _Rows(self._images, self._psfs, self._transits))
+        rows = cast(Catalogue, SimpleNamespace(get=self._row))
         fields, identity = resolve(request, rows, "", added_effects=effects)
         model = KINDS[kind].resolved
         assert model is not None
         return model.model_validate(fields), identity
+
+    def _row(self, table: type[Any], identity: str, owner: str) -> Any:
+        """The row that a catalogue with the files of the command would have; None if no file has this id."""
+        from workers.catalogue.tables import TransitRow
+        from workers.intake.uploads import image_row, transit_row
+
+        if table is TransitRow:
+            transit = self._transits[identity]
+            return transit_row(owner, identity, transit.bytes, transit.path.name, transit.contents)
+        file = self._images.get(identity) or self._psfs.get(identity)
+        return file and image_row(owner, identity, 0, file.path.name, file.summary)
 
     def _resolved_deconvolution(self, request: Deconvolve) -> ResolvedDeconvolve:
         summary = self._images[request.image_id].summary
@@ -360,7 +365,7 @@ class Local(Operations):
             changes=lambda path: run.draw_changes(product, used, path),
         )
 
-    def _build(self, request: PsfBuild, _job_id: str, report: _Report) -> str:
+    def _psf_build(self, request: PsfBuild, _job_id: str, report: _Report) -> str:
         from psfcore.drawing.plots import psf_png
         from psfcore.fits.images import read_plane
 
@@ -381,7 +386,7 @@ class Local(Operations):
             preview=partial(psf_png, psf),
         )
 
-    def _fit(self, request: ResolvedPsfFit, job_id: str, report: _Report) -> str:
+    def _psf_fit(self, request: ResolvedPsfFit, job_id: str, report: _Report) -> str:
         from psfcore.fits.psfs import write_psf
         from psfcore.scatter.fit_plot import fit_png
         from workers.tasks import psf_fit
@@ -422,7 +427,7 @@ class Local(Operations):
             fits = tuple(found)
         return self._add_report(crossval.report_of(request, transit, fits, job_id=job_id))
 
-    def _report_on(self, request: ResolvedReport, job_id: str, report: _Report) -> str:
+    def _report(self, request: ResolvedReport, job_id: str, report: _Report) -> str:
         from workers.tasks import report as task
 
         psf = None if request.psf_id is None else self._psf(request.psf_id, parts=True)
@@ -431,7 +436,7 @@ class Local(Operations):
             task.make(request, *transit, psf, job_id=job_id, threads=cores(), progress=report)
         )
 
-    def _diagnose(self, request: ResolvedGapDiagnose, job_id: str, report: _Report) -> str:
+    def _gap_diagnose(self, request: ResolvedGapDiagnose, job_id: str, report: _Report) -> str:
         from psfcore.fits.psfs import write_psf
         from psfcore.gap.library.added import added_effects
         from workers.tasks.gap import diagnosis_of
@@ -498,27 +503,6 @@ class Local(Operations):
         self._results[address] = {"id": address.rpartition("/")[2], **described, **addresses}
         self._writers |= {addresses[name]: write for name, write in files.items()}
         return address
-
-
-class _Rows:
-    """The rows that a catalogue with the files of a command would have."""
-
-    def __init__(
-        self, images: dict[str, _Image], psfs: dict[str, _NamedPsf], transits: dict[str, _NamedTransit]
-    ) -> None:
-        self._images, self._psfs, self._transits = images, psfs, transits
-
-    def get(self, table: type[Any], identity: str, owner: str) -> Any:
-        from workers.catalogue.tables import TransitRow
-        from workers.intake.uploads import image_row, transit_row
-
-        if table is TransitRow:
-            transit = self._transits.get(identity)
-            if transit is None:
-                return None
-            return transit_row(owner, identity, transit.bytes, transit.path.name, transit.contents)
-        found = self._images.get(identity) or self._psfs.get(identity)
-        return found and image_row(owner, identity, 0, found.path.name, found.summary)
 
 
 def _no_such_psf(identity: str) -> DataError:
