@@ -1,4 +1,5 @@
-"""The task ``psf-build``: builds a PSF version from an instrument file."""
+"""The tasks ``psf-build``, which builds a PSF version from an instrument file, and ``psf-tables``, which makes the tables and the
+picture of a PSF that has none yet, for example an uploaded PSF."""
 
 from __future__ import annotations
 
@@ -11,14 +12,15 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.images import read_plane
+from psfcore.fits.psfs import read_psf
 from psfcore.instruments.model import Instrument, parse_instrument
 from workers.catalogue.tables import PsfRow
 from workers.contract.identities import interpolated_psf_identity, recipe_of
-from workers.contract.requests import PsfBuild, PsfInterpolate
+from workers.contract.requests import PsfBuild, PsfInterpolate, PsfTables
 from workers.contract.resolved import ResolvedDeconvolve
 from workers.settings import library_versions
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import keep_psf, named_psf
+from workers.tasks.data.psfs import keep_psf, keep_tables, named_psf
 from workers.versions.series import TOTAL
 
 
@@ -114,3 +116,26 @@ def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> N
             "file and give its id",
         )
     return read_plane(context.store.verified(build.mask_id), context.limits)
+
+
+def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Make the tables of a PSF of the catalogue, and its picture if it is missing; returns the PSF's id."""
+    request = PsfTables.model_validate(parameters)
+    row = named_psf(context, request.psf_id)
+    from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
+
+    context.report("reading", 0, 3)
+    psf = read_psf(context.store.verified(row.file_sha256), context.limits)
+    context.report("making tables", 1, 3)
+    tables_sha256 = keep_tables(psf, context.store, context.settings.threads)
+    context.report("drawing", 2, 3)
+    with context.store.temporary() as picture:
+        preview_sha256 = row.preview_sha256
+        if preview_sha256 is None or context.store.size(preview_sha256) is None:
+            psf_png(psf, picture)
+            preview_sha256 = context.store.keep(picture)
+    context.report("drawing", 3, 3)
+    context.catalogue.psfs.describe(
+        row.id, context.owner, tables_sha256=tables_sha256, preview_sha256=preview_sha256
+    )
+    return row.id
