@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
@@ -15,28 +16,21 @@ from numpy.typing import NDArray
 from heliopsf.inputs import box_of, cut, header_of, image_of, is_many, shape_of
 from heliopsf.outputs import Deconvolution, in_form_of
 from heliopsf.progress import Steps, Told, told
-from heliopsf.psfs import BUILDING, Psf, built_psf, read_psf
-from psfcore.deconvolve import run
-from psfcore.deconvolve.box import EXPECTED_RIM_PX, LARGEST_ERROR
+from heliopsf.psfs import Psf, built_psf, read_psf
+from psfcore.deconvolve.box import LARGEST_ERROR
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.kernels import compiling_beside
-from psfcore.deconvolve.memory import Asked, check_memory, product_bytes
 from psfcore.deconvolve.methods.registry import may_be_negative
-from psfcore.deconvolve.run import DECONVOLVING, Options, input_warnings, possible_psfs
+from psfcore.deconvolve.run import BUILDING, DECONVOLVING, Options, input_warnings, read_and_deconvolve
 from psfcore.errors import DataError, DataWarning
-from psfcore.fits.channel import check_channel
 from psfcore.fits.frame import frame_of
-from psfcore.fits.gain import no_noise_figures, noise_for
-from psfcore.fits.header import known_instrument, seen_by
-from psfcore.fits.observation import check_exposure_of_sun
+from psfcore.fits.header import seen_by
 from psfcore.image import Image
-from psfcore.instruments.model import load_instrument
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.noise import Noise
-from psfcore.psf import REACH_GRID_PX
 from psfcore.psf import Psf as CorePsf
-from psfcore.psf_sampling import psf_for_image, with_scale
+from psfcore.psf_sampling import psf_for_image
+from psfcore.scatter.samples import possible_on_pixels
 from workers.machine import cores, free_bytes
 
 if TYPE_CHECKING:
@@ -144,20 +138,23 @@ def deconvolve(
 
     def one(image: Any) -> Any:
         box = None if region is None else box_of(region, image)
-        result, _ = deconvolved(
-            image,
+        product, _ = read_and_deconvolve(
+            lambda: image_of(image, saturation_dn=saturation_dn, hdu=hdu),
+            shape_of(image, hdu),
             given,
             options if box is None else replace(options, region=box),
+            build=partial(_built_for, threads=options.threads, parts=False),
+            possible_psfs=partial(possible_on_pixels, threads=options.threads),
             prepared=prepared,
+            free_bytes=free_bytes(),
             plate_scale_arcsec=plate_scale_arcsec,
-            clip_negative=clip_negative,
-            saturation_dn=saturation_dn,
-            hdu=hdu,
             other_channel=other_channel,
             again=again,
+            clip=partial(_clipped, clip_negative=clip_negative, method=method),
             begin=begin,
             say=lambda code, message: warnings.warn(DataWarning(code, message), stacklevel=5),
         )
+        result = Deconvolution(**vars(product) | {"psf": Psf.of(product.psf)})
         return result if full else in_form_of(image if box is None else cut(image, box), result)
 
     if not is_many(smap):
@@ -186,87 +183,13 @@ def psf_for(
     Raises ``DataError`` "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch".
     """
     header = header_of(image)
-    psf = _built_for(header, threads or cores(), told(progress is True, BUILDING), parts=True)
+    psf = _built_for(header, told(progress is True, BUILDING), threads=threads or cores(), parts=True)
     for code, message in input_warnings(psf, _header_only(header), None, other_channel=False).items():
         warnings.warn(DataWarning(code, message), stacklevel=2)
     return Psf.of(psf_for_image(psf, header))
 
 
-def deconvolved(
-    image: Any,
-    psf: CorePsf | None,
-    options: Options,
-    *,
-    prepared: PreparedPsfs,
-    plate_scale_arcsec: float | None = None,
-    clip_negative: bool | None = None,
-    saturation_dn: float | None = None,
-    hdu: int | None = None,
-    other_channel: bool = False,
-    again: bool = False,
-    seen_as: Callable[[CorePsf], CorePsf] = lambda psf: psf,
-    begin: Callable[[str, int], Steps | None],
-    say: Callable[[str, str], object],
-) -> tuple[Deconvolution, CorePsf]:
-    """One deconvolved image, also for commands with ``--local``; and its PSF as it was built.
-
-    psf: None: the PSF of the telescope. prepared: keeps PSFs and engines between images. seen_as: adds to a PSF the instrument
-    and wavelength that its file does not name. begin: as for ``psfcore.deconvolve.run.deconvolve``. say(code, message):
-    called for each warning before the work begins. The other parameters and the errors are those of ``deconvolve``.
-    """
-    shape, box = shape_of(image, hdu), options.region
-
-    def check_plane(plane: tuple[int, int]) -> None:
-        psf_shape = (REACH_GRID_PX, REACH_GRID_PX) if psf is None else psf.kernel.shape
-        asked = Asked(
-            options.method,
-            plane,
-            (psf_shape[0], psf_shape[1]),
-            edges=options.edges,
-            margin_px=options.margin_px,
-            draws=options.error_draws,
-        )
-        check_memory(plane, product_bytes(asked, shape[0] * shape[1]), free_bytes())
-
-    def read() -> CorePsf:
-        if psf is not None:
-            return with_scale(psf, plate_scale_arcsec)
-        with compiling_beside(options.method, (observed.pixels.shape[0], observed.pixels.shape[1])):
-            built = _built_for(header, options.threads, begin(BUILDING, 1), parts=False)
-        return with_scale(built, plate_scale_arcsec)
-
-    check_plane(shape if box is None else box.wider(EXPECTED_RIM_PX, shape).shape)
-    observed = image_of(image, saturation_dn=saturation_dn, hdu=hdu)
-    header = observed.header
-    if not again:
-        check_exposure_of_sun(header)
-    instrument, turn_deg = known_instrument(header), frame_of(header).turn_to_build_deg
-    # The pixels of a turned image are interpolated, so they do not have the noise of the camera.
-    if options.noise is None and psf is None and instrument is not None and not turn_deg:
-        options = replace(options, noise=noise_for(load_instrument(instrument), header))
-    if options.error_draws and options.noise is None and (psf is not None or instrument is not None):
-        raise no_noise_figures()
-    of = id(psf) if psf is not None else (instrument, turn_deg)
-    whole = prepared.as_built((of, plate_scale_arcsec), read)
-    check_channel(seen_as(whole), header, other_channel=other_channel)
-    fitted = prepared.on_pixels_of(header, (of, plate_scale_arcsec), read)
-    said = input_warnings(seen_as(fitted), observed, options.method, other_channel=other_channel)
-    for code, message in said.items():
-        say(code, message)
-    product = run.deconvolve(
-        _clipped(observed, clip_negative, options.method),
-        fitted,
-        options,
-        warnings=said,
-        engine_for=prepared.engine_for,
-        possible_psfs=lambda: possible_psfs(whole, header, options.threads),
-        begin=begin,
-        check_plane=check_plane,
-    )
-    return Deconvolution(**vars(product) | {"psf": Psf.of(fitted)}), whole
-
-
-def _built_for(header: Header, threads: int, progress: Steps | None, *, parts: bool) -> Psf:
+def _built_for(header: Header, progress: Steps | None, *, threads: int, parts: bool) -> Psf:
     """The PSF of the shipped instrument file that the header names. parts: whether it needs its components.
 
     Raises ``DataError`` "no-psf-for-instrument".
@@ -301,7 +224,7 @@ def _given(psf: AnyPsf) -> Psf:
     )
 
 
-def _clipped(image: Image, clip_negative: bool | None, method: str) -> Image:
+def _clipped(image: Image, *, clip_negative: bool | None, method: str) -> Image:
     """The image; if ``clip_negative`` is true, with pixels below 0 set to 0. Raises ``DataError`` "negative-pixels"."""
     negative = image.valid & (image.pixels < 0)
     if clip_negative is None or not negative.any():

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from heliopsf.progress import Steps, Told, told
-from psfcore.built.cache import kept_psf, sha256_of_file
-from psfcore.built.recipe import Recipe
+from psfcore.deconvolve.run import BUILDING
 from psfcore.errors import module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.header import FitsLimits
@@ -18,7 +17,9 @@ from psfcore.instruments.files import instrument_path, turned_text
 from psfcore.instruments.model import load_instrument, read_instrument_text
 from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
+from psfcore.psf_cache import kept_psf, sha256_of_file
 from psfcore.psf_sampling import rebinned
+from psfcore.recipe import Recipe
 from psfcore.scatter.utc_time import utc_time
 from workers.cache_folder import psf_cache
 from workers.machine import cores
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 LIMITS = FitsLimits(max_pixels=2**26)
-BUILDING = "building the PSF"
 
 
 class Psf(CorePsf):

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.built.recipe import Recipe
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.combined import DIFFRACTION, available_parts, diffraction_patterns
 from psfcore.errors import DataError
@@ -28,6 +27,7 @@ from psfcore.fits.product.version import software_version
 from psfcore.instruments.model import Instrument, parse_instrument
 from psfcore.instruments.workload import LARGEST_SIZE_PX, check_workload
 from psfcore.psf import REACH_GRID_PX, Psf, crop_centred
+from psfcore.recipe import Recipe
 from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel
 
 SMALLEST_SIZE_PX = 64

@@ -17,9 +17,18 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.quality import MEANINGS
-from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_errors
-from psfcore.deconvolve.conditions import Conditions, Deconvolved, EngineFor, Progress, new_engine
+from psfcore.deconvolve.box import EXPECTED_RIM_PX, LARGEST_ERROR, Box, region_without_errors
+from psfcore.deconvolve.conditions import (
+    Conditions,
+    Deconvolved,
+    EngineFor,
+    PreparedPsfs,
+    Progress,
+    new_engine,
+)
 from psfcore.deconvolve.edges import Edges
+from psfcore.deconvolve.kernels import compiling_beside
+from psfcore.deconvolve.memory import Asked, check_memory, product_bytes
 from psfcore.deconvolve.methods.registry import may_be_negative, method_names
 from psfcore.deconvolve.region import BoxWork, box_work
 from psfcore.deconvolve.whole import Assessed, Work
@@ -27,19 +36,24 @@ from psfcore.drawing.units import unit_label
 from psfcore.errors import DataError
 from psfcore.fits.channel import check_channel
 from psfcore.fits.doubts import doubts
-from psfcore.fits.gain import no_noise_figures
-from psfcore.fits.header import optional_text
+from psfcore.fits.frame import frame_of
+from psfcore.fits.gain import no_noise_figures, noise_for
+from psfcore.fits.header import known_instrument, optional_text, seen_by
 from psfcore.fits.images import write_image
+from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.fits.product.cards import described
 from psfcore.fits.product.version import software_version
 from psfcore.image import Image, MaskBit
+from psfcore.instruments.model import load_instrument
+from psfcore.instruments.unknown import unknown_instrument
 from psfcore.noise import Noise
-from psfcore.psf import Psf
-from psfcore.psf_sampling import frame_warnings, psf_for_image
+from psfcore.psf import REACH_GRID_PX, Psf
+from psfcore.psf_sampling import frame_warnings, with_scale
 
 if TYPE_CHECKING:
     from psfcore.deconvolve.assess.error_planes import ErrorPlanes
 
+BUILDING = "building the PSF"
 DECONVOLVING = "deconvolving"  # the stage whose steps are the steps of the method
 LARGEST_CLIPPED = 0.01  # share of the light of an image; a product's total is accurate to about this share
 MOST_DRAWS = 64
@@ -215,6 +229,89 @@ def deconvolve(
     return Product(**vars(result), image=image, psf=psf, errors=errors, warnings=warnings, work=work)
 
 
+def read_and_deconvolve(
+    read: Callable[[], Image],
+    shape: tuple[int, int],
+    psf: Psf | None,
+    options: Options,
+    *,
+    build: Callable[[Header, Progress | None], Psf],
+    possible_psfs: Callable[[Psf, Header], Sequence[Psf]],
+    prepared: PreparedPsfs,
+    free_bytes: int,
+    plate_scale_arcsec: float | None = None,
+    other_channel: bool = False,
+    again: bool = False,
+    seen_as: Callable[[Psf], Psf] = lambda psf: psf,
+    clip: Callable[[Image], Image] = lambda image: image,
+    begin: Callable[[str, int], Progress | None],
+    say: Callable[[str, str], object] = lambda code, message: None,
+) -> tuple[Product, Psf]:
+    """Check an image and its PSF, and deconvolve the image in this process. Returns also the PSF as it was built.
+
+    read: reads the image; shape: its shape (ny, nx), known from its header. psf: None: build(header, progress) returns that of
+    the telescope. possible_psfs(psf, header): variants of the PSF within its errors, on the pixels of the image. prepared: keeps
+    PSFs and engines between images. free_bytes: the free memory. plate_scale_arcsec: of a PSF that gives none. other_channel:
+    see `input_warnings`. again: also deconvolve a product or a PSF. seen_as: adds to a PSF the instrument and wavelength that
+    its file does not name. clip: changes the pixels after the warnings were found; the product contains the unchanged image.
+    begin: see `deconvolve`. say(code, message): called for each warning before the work begins.
+
+    Raises DataError "too-much-memory", "no-psf-for-instrument", "plate-scale-known", "plate-scale-mismatch", "channel-mismatch"
+    and the errors of `check_exposure_of_sun` and `deconvolve`.
+    """
+    box = options.region
+
+    def check_plane(plane: tuple[int, int]) -> None:
+        psf_shape = (REACH_GRID_PX, REACH_GRID_PX) if psf is None else psf.kernel.shape
+        asked = Asked(
+            options.method,
+            plane,
+            (psf_shape[0], psf_shape[1]),
+            edges=options.edges,
+            margin_px=options.margin_px,
+            draws=options.error_draws,
+        )
+        check_memory(plane, product_bytes(asked, shape[0] * shape[1]), free_bytes)
+
+    def as_built() -> Psf:
+        if psf is not None:
+            return with_scale(psf, plate_scale_arcsec)
+        with compiling_beside(options.method, shape):
+            return with_scale(build(header, begin(BUILDING, 1)), plate_scale_arcsec)
+
+    check_plane(shape if box is None else box.wider(EXPECTED_RIM_PX, shape).shape)
+    image = read()
+    header = image.header
+    if not again:
+        check_exposure_of_sun(header)
+    instrument, turn_deg = known_instrument(header), frame_of(header).turn_to_build_deg
+    if psf is None and instrument is None:
+        raise unknown_instrument(seen_by(header))
+    # The pixels of a turned image are interpolated, so they do not have the noise of the camera.
+    if options.noise is None and psf is None and instrument is not None and not turn_deg:
+        options = replace(options, noise=noise_for(load_instrument(instrument), header))
+    if options.error_draws and options.noise is None:
+        raise no_noise_figures()
+    key = (id(psf) if psf is not None else (instrument, turn_deg), plate_scale_arcsec)
+    whole = prepared.as_built(key, as_built)
+    check_channel(seen_as(whole), header, other_channel=other_channel)
+    fitted = prepared.on_pixels_of(header, key, as_built)
+    warnings = input_warnings(seen_as(fitted), image, options.method, other_channel=other_channel)
+    for code, message in warnings.items():
+        say(code, message)
+    product = deconvolve(
+        clip(image),
+        fitted,
+        options,
+        warnings=warnings,
+        engine_for=prepared.engine_for,
+        possible_psfs=lambda: possible_psfs(whole, header),
+        begin=begin,
+        check_plane=check_plane,
+    )
+    return (product if box is not None else replace(product, image=image)), whole
+
+
 def write(product: Product, path: Path, psf: UsedPsf, ids: Identities) -> None:
     """Write a product as a FITS file. psf: as the cards name it."""
     own = described(
@@ -321,18 +418,6 @@ def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel:
         warnings |= {} if may_be_negative(method) else _negative_warning(image)
         warnings |= doubts(image, psf.kernel)
     return warnings
-
-
-def possible_psfs(psf: Psf, header: Header, threads: int) -> list[Psf]:
-    """Variants of a PSF within its errors, on the pixels of an image; empty if the errors are not known.
-
-    psf: with its errors, as it was fitted.
-    """
-    if psf.fitted is None:
-        return []
-    from psfcore.scatter import samples  # most deconvolutions compute no errors
-
-    return [psf_for_image(one, header) for one in samples.possible_psfs(psf, threads=threads)]
 
 
 def _negative_warning(image: Image) -> dict[str, str]:

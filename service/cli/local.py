@@ -1,5 +1,5 @@
-"""Commands with ``--local``: the requests to a service, answered in this process by the functions of heliopsf, without
-catalogue and store.
+"""Commands with ``--local``: the requests to a service, answered in this process by the functions that a service and
+Python use too, without catalogue and store.
 
 `Local` reads the user's files where they are and gives them the ids that a service would give. A result is written only when
 the command asks for a file of it.
@@ -18,23 +18,24 @@ from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
+from astropy.io.fits import Header
 from pydantic import TypeAdapter, ValidationError
 
-from heliopsf.psfs import BUILDING, LIMITS
 from psfcore import limited
-from psfcore.built.cache import built_file, sha256_of_file
 from psfcore.compiled import listening
 from psfcore.deconvolve import run
 from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import PreparedPsfs
-from psfcore.deconvolve.run import Identities, UsedPsf
+from psfcore.deconvolve.run import BUILDING, Identities, UsedPsf
 from psfcore.errors import DataError
 from psfcore.fits.frame import frame_of
-from psfcore.fits.header import HeaderSummary, check_not_deconvolved, optional_text, read_summary
+from psfcore.fits.header import FitsLimits, HeaderSummary, check_not_deconvolved, optional_text, read_summary
+from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf, stated_id
 from psfcore.fits.weights import check_is_psf
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.psf import Kernel, Psf, light_beyond_pct
+from psfcore.psf_cache import built_file, kept_psf, sha256_of_file
 from psfcore.transit.archive import ArchiveContents, list_archive, unpack
 from psfcore.transit.in_place import transit_in
 from service.client.errors import ServiceError
@@ -61,7 +62,7 @@ from workers.contract.resolved import (
 )
 from workers.contract.suggestions import explained
 from workers.files.archive import safe_name
-from workers.machine import cores
+from workers.machine import cores, free_bytes
 from workers.settings import Settings, software_version
 from workers.stage_timer import StageTimer
 from workers.versions.series import channel_of, instrument_of, name_of_upload
@@ -71,6 +72,7 @@ if TYPE_CHECKING:
     from psfcore.transit.prepare import Prepared
     from psfcore.transit.transit import Transit
 
+LIMITS = FitsLimits(max_pixels=2**26)  # the memory is checked before an image is deconvolved
 COMPILING = "compiling kernels (only once)"
 _NOW = "now"  # the context that a service without contexts has too
 _Report = Callable[[str, int, int], None]
@@ -317,9 +319,6 @@ class Local(Operations):
         return self._read_psfs[identity, parts]
 
     def _deconvolve(self, request: ResolvedDeconvolve, _job_id: str, report: _Report) -> str:
-        # Other commands do not load the methods of deconvolution.
-        from heliopsf.images import deconvolved
-
         image, named = self._images[request.image_id], self._psfs.get(request.psf_id)
         report("reading", 0, request.method.steps)
         image.files.check()
@@ -331,19 +330,32 @@ class Local(Operations):
                 report(stage, 0, steps)
             return lambda step, steps: report(stage, step, steps)
 
-        product, psf = deconvolved(
-            image.path,
+        def build(_header: Header, progress: Callable[[int, int], None] | None) -> Psf:
+            assert request.psf_recipe is not None  # otherwise the request names a PSF
+            recipe = recipe_of(request.psf_recipe)
+            return kept_psf(psf_cache(), recipe, LIMITS, parts=False, threads=cores(), progress=progress)
+
+        def possible_psfs(psf: Psf, header: Header) -> list[Psf]:
+            from psfcore.scatter.samples import possible_on_pixels  # most deconvolutions compute no errors
+
+            return possible_on_pixels(psf, header, threads=cores())
+
+        product, psf = run.read_and_deconvolve(
+            lambda: read_observation(
+                image.path, LIMITS, saturation_dn=request.saturation_dn, hdu=request.hdu
+            ),
+            read_summary(image.path, LIMITS, hdu=request.hdu).shape,
             None if named is None else self._psf(request.psf_id, parts=request.error_draws > 0),
             options_of(request, None if request.noise is None else request.noise.noise(), cores()),
+            build=build,
+            possible_psfs=possible_psfs,
             prepared=self._prepared,
+            free_bytes=free_bytes(),
             plate_scale_arcsec=request.plate_scale_arcsec,
-            saturation_dn=request.saturation_dn,
-            hdu=request.hdu,
             other_channel=request.other_channel,
             again=request.again,
-            begin=begin,
-            say=lambda code, message: None,  # the command says the warnings of its product
             seen_as=(lambda psf: psf) if named is None else named.seen_as,
+            begin=begin,
         )
         report("saving", 0, 1)
         image.files.check()

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from psfcore.built.recipe import Recipe
-from psfcore.built.recipe import canonical_hash as canonical_hash
 from psfcore.gap.effect_sources import library_sha256
 from psfcore.instruments.files import instrument_path, turned_text
+from psfcore.recipe import Recipe
+from psfcore.recipe import canonical_hash as canonical_hash
 from workers.contract.methods import Parameters
 from workers.contract.requests import PsfBuild
 from workers.contract.resolved import (

@@ -10,11 +10,11 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from psfcore.built.recipe import BUILD_VERSION
 from psfcore.deconvolve.box import BOX, LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise_figures import NoiseFigures
+from psfcore.recipe import BUILD_VERSION
 from workers.contract.methods import Method, Parameters, RichardsonLucy
 from workers.contract.option import Option
 from workers.versions.validity import TIME, iso, seconds

@@ -91,7 +91,7 @@ def make(
         options_of(request, None if figures is None else figures.noise(), threads),
         warnings=_warnings(context, request, psf_row, psf, image),
         engine_for=prepared.engine_for,
-        possible_psfs=lambda: run.possible_psfs(read(parts=True), image.header, threads),
+        possible_psfs=lambda: _possible_psfs(read(parts=True), image, threads),
         begin=begin,
     )
     context.report("saving", 0, 1)
@@ -102,6 +102,13 @@ def make(
         details = details_of(context, request, product)
         preview_sha256 = picture() if preview else None
     return Made(context, request, psf_row, product, details, preview_sha256)
+
+
+def _possible_psfs(psf: Psf, image: Image, threads: int) -> list[Psf]:
+    # Most deconvolutions compute no errors, and do not load what follows.
+    from psfcore.scatter.samples import possible_on_pixels
+
+    return possible_on_pixels(psf, image.header, threads=threads)
 
 
 def _warnings(

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from psfcore.built.cache import PROVENANCE, CachedPsf, PsfCache
+from psfcore.psf_cache import PROVENANCE, CachedPsf, PsfCache
 from service.cli.connection import short
 from service.cli.options import user_errors
 from workers.cache_folder import psf_cache

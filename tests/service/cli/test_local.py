@@ -208,4 +208,4 @@ def test_the_command_loads_neither_servers_nor_what_only_other_commands_need(tmp
     loaded = set(json.loads(done.stdout.splitlines()[-1]))
     unwanted = {"fastapi", "matplotlib", "sqlalchemy", "alembic", "celery", "httpx"}
     unwanted |= {f"scipy.{part}" for part in ("fft", "integrate", "ndimage", "optimize")}
-    assert "heliopsf.images" in loaded and loaded & unwanted == set()
+    assert "service.cli.local" in loaded and loaded & unwanted == set()

@@ -1,6 +1,6 @@
 """A folder of built PSFs, so that a PSF is built only once: `kept_psf` reads a PSF from it, or builds and keeps it.
 
-The name of a file is IDENTITY.SHA256.PART: the identity of the PSF (`psfcore.built.recipe`), the hash of the file, and
+The name of a file is IDENTITY.SHA256.PART: the identity of the PSF (`psfcore.recipe`), the hash of the file, and
 the content of the file, such as "fits". A file is written under a temporary name and then renamed. Its hash is checked
 when it is read. If the files need more space than allowed, the files of the least recently used PSF are removed.
 
@@ -25,8 +25,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from psfcore.built.recipe import Recipe
 from psfcore.errors import DataError
+from psfcore.recipe import Recipe
 from psfcore.whole_files import PARTIAL
 
 if TYPE_CHECKING:
