@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -83,6 +83,12 @@ class _Files:
 
     def __init__(self, *files: Path) -> None:
         self._seen = {file: _state(file) for file in files}
+
+    def only(self, files: Iterable[Path]) -> _Files:
+        """Some of these files, with the state that was recorded first."""
+        some = _Files()
+        some._seen = {file: self._seen[file] for file in files}
+        return some
 
     def check(self) -> None:
         for file, state in self._seen.items():
@@ -181,6 +187,7 @@ class Local(Operations):
             path = path.resolve()
             files = _Files(*(file for file in path.iterdir() if file.is_file()))
             found = transit_in(path)
+            files = files.only(path / name for name in found.contents.files)
             transit = _NamedTransit(path, files, found.sha256, found.bytes, found.contents)
         else:
             files = _Files(path)
