@@ -171,15 +171,15 @@ def test_lineage_and_rerun(sun: Client, tmp_path: Path) -> None:
 def test_a_rerun_that_differs_ends_with_status_1(
     sun: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from workers.tasks.data import product as product_task
+    from psfcore.deconvolve import run
 
     write_image(tmp_path / "i.fits")
     write_psf(tmp_path / "p.fits")
     product = sun.deconvolve(tmp_path / "i.fits", psf_id=sun.upload_psf(tmp_path / "p.fits")["id"], steps=2)
-    real = product_task.write_image
+    real = run.write_image
 
     def off(path: Path, image: Any, **how: Any) -> None:
         real(path, type(image)(**{**vars(image), "pixels": image.pixels * 1.001}), **how)
 
-    monkeypatch.setattr(product_task, "write_image", off)
+    monkeypatch.setattr(run, "write_image", off)
     assert "differs by at most 0.001" in ask("psf", "rerun", product["id"], "--product", code=1)
