@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 import heliopsf
 from benchmarks.timing import THREADS
 from psfcore.convolution.engine import Engine
-from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.methods.registry import method_named, method_names
 from psfcore.image import Image
 from psfcore.psf import Psf
@@ -116,7 +116,7 @@ def made(instrument: str, size: int) -> Case:
         scene, psf, exposure_s=1.0, photon_gain_dn=PHOTON_GAIN_DN, read_noise_dn=2.0, seed=1, threads=THREADS
     )
     image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN", 1.0)
-    return Case(image, scene, psf, Conditions(threads=THREADS, engine_for=EngineCache(8)))
+    return Case(image, scene, psf, Conditions(threads=THREADS, engine_for=PreparedPsfs().engine_for))
 
 
 def fewest(case: Case, way: Way, target: float) -> int | None:

@@ -20,7 +20,7 @@ from benchmarks.figures import tell
 from benchmarks.race import fft_libraries
 from benchmarks.timing import THREADS, peak_gib, reference, seconds
 from psfcore.build import build_psf
-from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.diffraction.fraunhofer import FEWEST_SAMPLES, far_field
@@ -155,7 +155,7 @@ def main() -> None:
         results = []
         published_s = seconds(lambda: results.append(richardson_lucy(image, psf, threads=THREADS)))
         row("Richardson-Lucy as published, 2048 px image and PSF", published_s, f_s)
-        conditions = Conditions(threads=THREADS, engine_for=EngineCache())
+        conditions = Conditions(threads=THREADS, engine_for=PreparedPsfs().engine_for)
         default = method_named("richardson-lucy")
         default(image, psf, conditions, steps=1)
         core_s = seconds(lambda: default(image, psf, conditions))

@@ -105,16 +105,16 @@ def measure(case: dict[str, Any], folder: Path) -> None:
 
     The first case that needs a file makes it in the folder; later cases use it again.
     """
-    from service.local import LocalService
+    from tests.in_process import InProcess
     from workers.catalogue.tables import DEFAULT_OWNER
     from workers.intake import estimates
     from workers.settings import Settings
 
     with TemporaryDirectory(dir=folder) as data:
-        service = LocalService(Settings.apart(Path(data)).model_copy(update={"worker_threads": 1}))
+        service = InProcess(Settings.apart(Path(data)).model_copy(update={"worker_threads": 1}))
         kind, parameters = case["kind"], asked(case, folder, service)
         job = service.submit(kind, **parameters)
-        said = estimates.estimate(kind, job["parameters"], service._catalogue, DEFAULT_OWNER, threads=1)
+        said = estimates.estimate(kind, job["parameters"], service.catalogue, DEFAULT_OWNER, threads=1)
         started = time.process_time()
         service.wait(job)
         took_s, peak = time.process_time() - started, memory_bytes("VmHWM") / 2**20

@@ -32,7 +32,7 @@ from benchmarks.figures import tell
 from benchmarks.timing import THREADS, reference, seconds
 from psfcore.build import build_psf
 from psfcore.convolution.fft_kernels import LANES
-from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.lucy_ratio import _ratio_rows
 from psfcore.deconvolve.methods.registry import method_named
 from psfcore.deconvolve.methods.richardson_lucy import EDGES, MARGIN_SHARE, _RichardsonLucy, _update_rows
@@ -106,7 +106,7 @@ def main() -> None:
     psf = build_psf(load_instrument("hri_euv"), threads=THREADS)
     pixels = np.random.default_rng(0).gamma(2.0, 400.0, (size, size))
     image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN/s", 1.0)
-    conditions = Conditions(threads=THREADS, engine_for=EngineCache())
+    conditions = Conditions(threads=THREADS, engine_for=PreparedPsfs().engine_for)
     method = method_named("richardson-lucy")
     method(image, psf, conditions, steps=1)  # compiles the kernels and prepares the PSF
     f_s, moved, computed = reference(), bandwidth(), rate()

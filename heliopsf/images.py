@@ -4,39 +4,33 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
-from heliopsf.inputs import header_of, image_of, is_many, shape_of
+from heliopsf.inputs import box_of, cut, header_of, image_of, is_many, shape_of
 from heliopsf.outputs import Deconvolution, in_form_of
-from heliopsf.progress import Told, told
+from heliopsf.progress import Steps, Told, told
 from heliopsf.psfs import Psf, built_psf, read_psf
-from heliopsf.regions import box_of, cut
-from psfcore.deconvolve.box import EXPECTED_RIM_PX, LARGEST_ERROR, Box, region_without_errors
-from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.box import LARGEST_ERROR
+from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.kernels import compiling_beside
-from psfcore.deconvolve.memory import Asked, check_memory, deconvolution_bytes
 from psfcore.deconvolve.methods.registry import may_be_negative
-from psfcore.deconvolve.region import BoxWork, box_work
-from psfcore.deconvolve.result import Deconvolved
-from psfcore.deconvolve.whole import Work, input_warnings, known_noise
+from psfcore.deconvolve.run import BUILDING, DECONVOLVING, Options, input_warnings, read_and_deconvolve
 from psfcore.errors import DataError, DataWarning
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import seen_by
-from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.image import Image
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.noise import Noise
-from psfcore.psf import REACH_GRID_PX
 from psfcore.psf import Psf as CorePsf
-from psfcore.psf_sampling import psf_for_image, with_scale
-from psfcore.scatter.total_psf import possible_psfs
+from psfcore.psf_sampling import psf_for_image
+from psfcore.scatter.total_psf import possible_on_pixels
 from workers.machine import cores, free_bytes
 
 if TYPE_CHECKING:
@@ -126,35 +120,52 @@ def deconvolve(
     "plate-scale-mismatch", "channel-mismatch" or "unknown-method". Gives a ``DataWarning`` with its ``code`` for
     everything that may make the result wrong (docs/products.md lists them).
     """
-    options: dict[str, Any] = {
-        "iterations": iterations,
-        "clip_negative": clip_negative,
-        "method": method,
-        "noise": noise,
-        "error_draws": error_draws,
-        "saturation_dn": saturation_dn,
-        "hdu": hdu,
-        "plate_scale_arcsec": plate_scale_arcsec,
-        "edges": edges,
-        "region_error": region_error,
-        "other_channel": other_channel,
-        "again": again,
-        "threads": threads or cores(),
-        "progress": progress,
-        "parameters": parameters,
-    }
-    options["engines"] = EngineCache()
-    if not is_many(smap):
-        return _in_form(smap, psf, region, full, options)
-    images = list(smap)
+    options = Options(
+        method=method,
+        parameters=_with_steps(parameters, iterations),
+        edges=edges,
+        noise=None if noise is None else Noise(*noise),
+        error_draws=error_draws,
+        region_error=region_error,
+        threads=threads or cores(),
+    )
+
+    def begin(stage: str, _steps: int) -> Steps | None:
+        return told(progress if stage == DECONVOLVING else progress is True, stage)
+
+    prepared = PreparedPsfs()
     given = None if psf is None else _given(psf)
-    results = []
+
+    def one(image: Any) -> Any:
+        box = None if region is None else box_of(region, image)
+        product, _ = read_and_deconvolve(
+            lambda: image_of(image, saturation_dn=saturation_dn, hdu=hdu),
+            shape_of(image, hdu),
+            given,
+            options if box is None else replace(options, region=box),
+            build=partial(_built_for, threads=options.threads, parts=False),
+            possible_psfs=partial(possible_on_pixels, threads=options.threads),
+            prepared=prepared,
+            free_bytes=free_bytes(),
+            plate_scale_arcsec=plate_scale_arcsec,
+            other_channel=other_channel,
+            again=again,
+            clip=partial(_clipped, clip_negative=clip_negative, method=method),
+            begin=begin,
+            say=lambda code, message: warnings.warn(DataWarning(code, message), stacklevel=5),
+        )
+        result = Deconvolution(**vars(product) | {"psf": Psf.of(product.psf)})
+        return result if full else in_form_of(image if box is None else cut(image, box), result)
+
+    if not is_many(smap):
+        return one(smap)
+    images, results = list(smap), []
     for number, image in enumerate(images, start=1):
         try:
-            results.append(_in_form(image, given, region, full, options))
+            results.append(one(image))
         except DataError as error:
-            told_which = f"image {number} of {len(images)}: {error.message}"
-            raise type(error)(error.code, told_which, error.fields) from error
+            message = f"image {number} of {len(images)}: {error.message}"
+            raise type(error)(error.code, message, error.fields) from error
     return results
 
 
@@ -172,106 +183,13 @@ def psf_for(
     Raises ``DataError`` "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch".
     """
     header = header_of(image)
-    psf = _built_for(header, threads or cores(), progress, parts=True)
+    psf = _built_for(header, told(progress is True, BUILDING), threads=threads or cores(), parts=True)
     for code, message in input_warnings(psf, _header_only(header), None, other_channel=False).items():
         warnings.warn(DataWarning(code, message), stacklevel=2)
-    return _on_pixels(psf, header)
+    return Psf.of(psf_for_image(psf, header))
 
 
-def _in_form(image: Any, psf: AnyPsf | None, region: Any, full: bool, options: dict[str, Any]) -> Any:
-    """The deconvolved image or region, in the form of the image or as a ``Deconvolution``."""
-    box = None if region is None else box_of(region, image)
-    result = _deconvolved(image, psf, box=box, **options)
-    if full:
-        return result
-    return in_form_of(image if box is None else cut(image, box), result)
-
-
-def _deconvolved(
-    image: Any,
-    psf: AnyPsf | None,
-    *,
-    box: Box | None,
-    region_error: float,
-    iterations: int | None,
-    clip_negative: bool | None,
-    method: str,
-    noise: tuple[float, float] | None,
-    error_draws: int,
-    saturation_dn: float | None,
-    hdu: int | None,
-    plate_scale_arcsec: float | None,
-    edges: Edges | None,
-    other_channel: bool,
-    again: bool,
-    threads: int,
-    progress: Told,
-    engines: EngineCache,
-    parameters: Mapping[str, Any],
-) -> Deconvolution:
-    if box is not None and error_draws:
-        raise region_without_errors(error_draws)
-    given = None if psf is None else cast(Psf, with_scale(_given(psf), plate_scale_arcsec))
-    shape = shape_of(image, hdu)
-    asked = Asked(
-        method,
-        shape if box is None else box.wider(EXPECTED_RIM_PX, shape).shape,
-        (REACH_GRID_PX, REACH_GRID_PX) if given is None else (given.kernel.shape[0], given.kernel.shape[1]),
-        edges=edges,
-        draws=error_draws,
-    )
-    check_memory(asked.image, deconvolution_bytes(asked), free_bytes())
-    observed = image_of(image, saturation_dn=saturation_dn, hdu=hdu)
-    if not again:
-        check_exposure_of_sun(observed.header)
-    if given is None:
-        with compiling_beside(method, (observed.pixels.shape[0], observed.pixels.shape[1])):
-            found = _built_for(observed.header, threads, progress, parts=False)
-    else:
-        found = given
-    said = input_warnings(found, observed, method, other_channel=other_channel)
-    for code, message in said.items():
-        warnings.warn(DataWarning(code, message), stacklevel=3)
-    fitted = _on_pixels(found, observed.header)
-    known = found.instrument if psf is None else None
-    whole = Work(
-        _clipped(observed, clip_negative, method),
-        fitted,
-        method,
-        Conditions(
-            edges=edges,
-            noise=known_noise(known, observed.header) if noise is None else Noise(*noise),
-            threads=threads,
-            engine_for=engines,
-        ),
-        _with_steps(parameters, iterations),
-    )
-    work: Work | BoxWork = whole
-    if box is not None:
-        work = box_work(whole, box, largest_error=region_error)
-        # The width of the rim is known only now.
-        asked = replace(asked, image=work.rim.shape)
-        check_memory(asked.image, deconvolution_bytes(asked), free_bytes())
-        observed = work.image
-    result = work.run(progress=told(progress, "deconvolving"))
-    _check_draws(error_draws)
-    errors = work.errors(
-        result,
-        error_draws,
-        possible_psfs=lambda: _possible(found, observed.header, threads),
-        begin=lambda stage, _: told(progress is True, stage),
-    )
-    return Deconvolution(
-        **{one.name: getattr(result, one.name) for one in fields(Deconvolved)},
-        image=observed,
-        psf=fitted,
-        errors=errors,
-        warnings=said,
-        work=work,
-    )
-
-
-def _built_for(header: Header, threads: int, progress: Told, *, parts: bool) -> Psf:
+def _built_for(header: Header, progress: Steps | None, *, threads: int, parts: bool) -> Psf:
     """The PSF of the shipped instrument file that the header names. parts: whether it needs its components.
 
     Raises ``DataError`` "no-psf-for-instrument".
@@ -279,9 +197,12 @@ def _built_for(header: Header, threads: int, progress: Told, *, parts: bool) -> 
     summary = seen_by(header)
     if summary["instrument"] is None:
         raise unknown_instrument(summary)
-    turn_deg = frame_of(header).turn_to_build_deg
     return built_psf(
-        summary["instrument"], turn_deg=turn_deg, parts=parts, threads=threads, progress=progress is True
+        summary["instrument"],
+        turn_deg=frame_of(header).turn_to_build_deg,
+        parts=parts,
+        threads=threads,
+        progress=progress,
     )
 
 
@@ -303,17 +224,7 @@ def _given(psf: AnyPsf) -> Psf:
     )
 
 
-def _on_pixels(psf: Psf, header: Header) -> Psf:
-    return cast(Psf, psf_for_image(psf, header))  # a changed copy has the class of the original
-
-
-def _possible(psf: Psf, header: Header, threads: int) -> list[CorePsf]:
-    if psf.fitted is None:
-        return []
-    return [psf_for_image(one, header) for one in possible_psfs(psf, threads=threads)]
-
-
-def _clipped(image: Image, clip_negative: bool | None, method: str) -> Image:
+def _clipped(image: Image, *, clip_negative: bool | None, method: str) -> Image:
     """The image; if ``clip_negative`` is true, with pixels below 0 set to 0. Raises ``DataError`` "negative-pixels"."""
     negative = image.valid & (image.pixels < 0)
     if clip_negative is None or not negative.any():
@@ -337,11 +248,6 @@ def _with_steps(parameters: Mapping[str, Any], iterations: int | None) -> dict[s
             "bad-steps", "expected iterations or steps; got both, which mean the same: give only one of them"
         )
     return {**parameters, "steps": iterations}
-
-
-def _check_draws(draws: int) -> None:
-    if draws and not 2 <= draws <= 64:
-        raise DataError("bad-draws", f"error_draws: expected 0, or 2 to 64; got {draws}")
 
 
 def _header_only(header: Header) -> Image:

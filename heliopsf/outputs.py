@@ -5,8 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import re
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,15 +15,9 @@ from numpy.typing import NDArray
 
 from heliopsf.inputs import is_map, is_nddata
 from heliopsf.psfs import Psf
-from psfcore.deconvolve.assess.error_planes import ErrorPlanes
-from psfcore.deconvolve.cards import UsedPsf, deconvolution_cards, deconvolution_history
-from psfcore.deconvolve.region import BoxWork
-from psfcore.deconvolve.result import Deconvolved
-from psfcore.deconvolve.whole import Assessed, Work
+from psfcore.deconvolve.run import Product, UsedPsf, deconvolution_cards, deconvolution_history
 from psfcore.errors import module_of_extra
-from psfcore.fits.cards import optional_text
 from psfcore.fits.images import CARD_OF_PASS, passes_of
-from psfcore.image import Image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,7 +28,7 @@ _STATISTICS = re.compile(r"data(min|max|mean|medn|rms|std|skew|kurt|cent|p\d\d)"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deconvolution(Deconvolved):
+class Deconvolution(Product):
     """A deconvolved image: ``pixels`` [y, x] in the unit of the image, and the inputs, errors and warnings that
     belong to it.
 
@@ -44,11 +37,7 @@ class Deconvolution(Deconvolved):
     each pixel, if they were asked for. warnings: sentences by their codes.
     """
 
-    image: Image
     psf: Psf
-    errors: ErrorPlanes | None
-    warnings: dict[str, str]
-    work: Work | BoxWork = field(repr=False)
 
     @property
     def mask(self) -> NDArray[np.bool_]:
@@ -65,16 +54,12 @@ class Deconvolution(Deconvolved):
     @property
     def quality(self) -> NDArray[np.uint8]:
         """The plane QUALITY of products (docs/products.md): 0 for a good pixel, [y, x]."""
-        return self._assessed.quality
+        return self.assessed.quality
 
     @property
     def changes(self) -> dict[str, Any]:
         """What the deconvolution changed: flux, bright and dark structures, signs of artefacts."""
-        return self._assessed.found.as_json()
-
-    @cached_property
-    def _assessed(self) -> Assessed:
-        return self.work.assess(self, self.errors)
+        return self.assessed.found.as_json()
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the deconvolved image. Needs the extra "plot". axes None: new axes."""
@@ -152,19 +137,11 @@ def _describe(meta: Any, result: Deconvolution) -> None:
     is_header = isinstance(meta, Header)
     for key in [key for key in meta if _STATISTICS.fullmatch(str(key))]:
         del meta[key]
-    cards: dict[str, tuple[Any, str]] = dict(
-        deconvolution_cards(
-            used,
-            result,
-            saturation=result.image.saturation,
-            amplification=None if result.errors is None else result.errors.amplification,
-            warnings=result.warnings,
-        )
-    )
+    cards = deconvolution_cards(result, used)
     cards[CARD_OF_PASS] = (passes_of(result.image.header) + 1, "deconvolutions of this image, with this one")
     for key, (value, comment) in cards.items():
         meta[key] = (value, comment) if is_header else value
-    lines = deconvolution_history(used, result, result.warnings)
+    lines = deconvolution_history(result, used)
     if is_header:
         for line in lines:
             meta.add_history(line)
@@ -172,11 +149,3 @@ def _describe(meta: Any, result: Deconvolution) -> None:
         # sunpy keeps HISTORY as one text with a line for each card.
         before = [str(meta[key]) for key in ("history",) if key in meta]
         meta["history"] = "\n".join([*before, *lines])
-
-
-def title_of(result: Deconvolution) -> str:
-    """The telescope, the time and the PSF, for the title of a figure."""
-    header = result.image.header
-    seen_by = optional_text(header, "DETECTOR", "INSTRUME") or "image"
-    date = optional_text(header, "DATE-BEG", "DATE-OBS")
-    return f"{seen_by}{f' {date}' if date else ''}   PSF {result.psf.name} {result.psf.version}"

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from heliopsf.outputs import Deconvolution, title_of
+from heliopsf.outputs import Deconvolution, used_psf
 from psfcore.drawing.plots import (
     CHANGE,
     CHANGE_LIMIT_PCT,
@@ -71,7 +71,7 @@ def draw_image(result: Deconvolution, axes: Axes | None) -> Axes:
     axes = _axes(axes)
     stretch = square_root_stretch(result.image.pixels, result.pixels)
     _draw(axes, result.pixels, GOLD, stretch, unit_label(result.image))
-    axes.set_title(title_of(result))
+    axes.set_title(result.title(used_psf(result.psf)))
     return axes
 
 
@@ -80,14 +80,17 @@ def draw_change(result: Deconvolution, axes: Axes | None) -> Axes:
     axes = _axes(axes)
     change = change_pct(result.image.pixels, result.pixels)
     _draw(axes, change, CHANGE, Normalize(-CHANGE_LIMIT_PCT, CHANGE_LIMIT_PCT), "Change (% of before)")
-    axes.set_title(title_of(result))
+    axes.set_title(result.title(used_psf(result.psf)))
     return axes
 
 
 def before_and_after(result: Deconvolution) -> Figure:
     """Three panels: before, after, change."""
     return preview_figure(
-        result.image.pixels, result.pixels, title=title_of(result), unit=unit_label(result.image)
+        result.image.pixels,
+        result.pixels,
+        title=result.title(used_psf(result.psf)),
+        unit=unit_label(result.image),
     )
 
 

@@ -7,10 +7,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from heliopsf.kept import kept_psf
-from heliopsf.progress import Told, told
-from psfcore.built.cache import sha256_of_file
-from psfcore.built.recipe import Recipe
+from heliopsf.progress import Steps, Told, told
+from psfcore.deconvolve.run import BUILDING
 from psfcore.errors import module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.blocks import FitsLimits
@@ -20,8 +18,11 @@ from psfcore.instruments.files import instrument_path, turned_text
 from psfcore.instruments.model import load_instrument, read_instrument_text
 from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
+from psfcore.psf_cache import kept_psf, sha256_of_file
 from psfcore.psf_sampling import rebinned
+from psfcore.recipe import Recipe
 from psfcore.scatter.interpolation import Epoch, interpolated_psf
+from workers.cache_folder import psf_cache
 from workers.machine import cores
 
 if TYPE_CHECKING:
@@ -96,7 +97,9 @@ def build_psf(
     Raises ``DataError`` "bad-size", "unknown-component" or "bad-mount", and the errors of
     ``psfcore.instruments.model.load_instrument``.
     """
-    return built_psf(instrument, size=size, component=component, threads=threads, progress=progress)
+    return built_psf(
+        instrument, size=size, component=component, threads=threads, progress=told(progress, BUILDING)
+    )
 
 
 def built_psf(
@@ -107,7 +110,7 @@ def built_psf(
     turn_deg: float = 0.0,
     parts: bool = True,
     threads: int | None = None,
-    progress: Told = None,
+    progress: Steps | None = None,
 ) -> Psf:
     """As ``build_psf``. turn_deg: for images of a known instrument that are turned by this angle against its detector. parts:
     False: without the components, which a deconvolution does not need."""
@@ -131,12 +134,13 @@ def built_psf(
     )
     return Psf.of(
         kept_psf(
+            psf_cache(),
             recipe,
             LIMITS,
             parts=parts,
             mount_image=mask,
             threads=threads or cores(),
-            progress=told(progress, f"building the PSF of {known.name}"),
+            progress=progress,
         )
     )
 
@@ -175,6 +179,8 @@ def interpolate_psf(
     Raises ``DataError``: "bad-time", "psf-not-fitted", "shapes-differ", "psfs-differ", "diffraction-differs",
     "psf-not-of-its-shape", "epochs-not-in-order", "time-outside-epochs", and the errors of ``read_psf``.
     """
+    # Other functions do not load what an interpolation needs.
+
     first, second = (
         Epoch(one if isinstance(one, CorePsf) else read_psf(one), utc_time(at, name))
         for one, at, name in ((before, before_time, "before_time"), (after, after_time, "after_time"))

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore import software_version
-from psfcore.built.recipe import Recipe
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.combined import DIFFRACTION, available_parts, diffraction_patterns
 from psfcore.errors import DataError
@@ -29,6 +28,7 @@ from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import Instrument, load_instrument, parse_instrument
 from psfcore.instruments.workload import LARGEST_SIZE_PX, check_workload
 from psfcore.psf import REACH_GRID_PX, Psf, crop_centred
+from psfcore.recipe import Recipe
 from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel
 
 SMALLEST_SIZE_PX = 64

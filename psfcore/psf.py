@@ -23,6 +23,7 @@ from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
 from psfcore.instruments.workload import REACH_GRID_PX as REACH_GRID_PX
 
+SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 Kernel = NDArray[np.float64]
 
 LARGEST_SUM = 1 + 1e-3
@@ -223,6 +224,12 @@ def cumulative_curve(kernel: Kernel, radii_px: ArrayLike) -> NDArray[np.float64]
     The result is never below 0, although an array larger than the full reach may sum to more than 1.
     """
     return np.asarray(100.0 * np.maximum(1.0 - encircled_energy(kernel, radii_px), 0.0))
+
+
+def light_beyond_pct(kernel: Kernel) -> dict[str, float]:
+    """The light beyond each of SHOWN_RADII_PX in percent, by the radius as text."""
+    curve = cumulative_curve(kernel, np.array(SHOWN_RADII_PX, dtype=float))
+    return {str(radius): float(pct) for radius, pct in zip(SHOWN_RADII_PX, curve, strict=True)}
 
 
 def radial_profile(kernel: Kernel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

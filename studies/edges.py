@@ -21,7 +21,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import linear_convolve
-from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.conditions import Conditions, EngineFor, PreparedPsfs
 from psfcore.deconvolve.edges import EDGES
 from psfcore.deconvolve.methods.registry import method_named, method_names
 from psfcore.image import Image
@@ -59,7 +59,7 @@ def study_psf() -> Psf:
 
 
 def rows(
-    seed: int, psf: Psf, cache: EngineCache, *, methods: tuple[str, ...], ways: tuple[str | None, ...]
+    seed: int, psf: Psf, cache: EngineFor, *, methods: tuple[str, ...], ways: tuple[str | None, ...]
 ) -> Iterator[Row]:
     """One row for every method and every treatment of edges, on one scene. None: the default treatment of the method."""
     scene = solar_scene((SCENE_PX, SCENE_PX), seed)
@@ -100,7 +100,7 @@ def _image(pixels: NDArray[np.float64]) -> Image:
 
 def main() -> None:
     seeds = tuple(map(int, sys.argv[1:])) or SEEDS
-    psf, cache = study_psf(), EngineCache(8)
+    psf, cache = study_psf(), PreparedPsfs().engine_for
     print(
         f"{'method':<30}{'edges':<12}{'seed':>5}   "
         "bias, % (0-2, 2-20, 20-64 px from the edge)    deviation, % (same bands)"

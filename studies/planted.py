@@ -152,9 +152,9 @@ FAULTS = (
     Fault("blind-half-of-a-pair-counts", "psfcore/blind/scoring.py",
           "return set(case.required_names) <= set(hypothesis)", "return bool(set(case.required_names) & set(hypothesis))",
           ("tests/psfcore/blind",)),
-    Fault("built-damaged-psf-used", "psfcore/built/cache.py",
+    Fault("built-damaged-psf-used", "psfcore/psf_cache.py",
           "if sha256_of_file(path) == sha256:", "if path.is_file():",
-          ("tests/psfcore/built",)),
+          ("tests/psfcore/test_psf_cache.py",)),
     # workers
     Fault("catalogue-claim-without-compare", "workers/catalogue/jobs.py",
           "update(JobRow).where(JobRow.id == job_id, JobRow.phase == Phase.QUEUED)", "update(JobRow).where(JobRow.id == job_id)",
@@ -202,7 +202,7 @@ FAULTS = (
           "else start + exposure_s / DAY_S", "else start + exposure_s",
           ("tests/service/vo",), ("tests/whole/test_vo.py",)),
     # heliopsf
-    Fault("heliopsf-axes-of-reference-pixel-swapped", "heliopsf/regions.py",
+    Fault("heliopsf-axes-of-reference-pixel-swapped", "heliopsf/inputs.py",
           '(columns if name[5:6] == "1" else rows).start', '(rows if name[5:6] == "1" else columns).start',
           ("tests/heliopsf/test_forms.py",), ("tests/heliopsf",)),
 )  # fmt: skip

@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter
 
 import heliopsf
 from psfcore.deconvolve.box import Box
-from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.region import box_work
 from psfcore.deconvolve.whole import Work
 from psfcore.image import Image
@@ -60,7 +60,7 @@ def main() -> None:
         )
         image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN", 1.0)
         for method in METHODS:
-            work = Work(image, psf, method, Conditions(threads=cores(), engine_for=EngineCache(8)))
+            work = Work(image, psf, method, Conditions(threads=cores(), engine_for=PreparedPsfs().engine_for))
             whole = work.run().pixels
             for name, box in boxes(image).items():
                 mean = image.pixels[box.slices].mean() / 100

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from psfcore.scatter.inversion import invert
-from service.local import LocalService
+from tests.in_process import InProcess
 from tests.once_a_run import once_a_run
 from tests.transit_files import write_simulated
 from workers.catalogue.catalogue import Catalogue
@@ -72,7 +72,7 @@ def _made(out: Path) -> Path:
     catalogue.upgrade()  # a server opens only a database that has a revision
     catalogue.close()
     with counted_inversions(inversions):
-        local = LocalService(settings)
+        local = InProcess(settings)
         psf = local.fit_psf(
             transit,
             out / "psf.fits",

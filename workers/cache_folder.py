@@ -10,8 +10,8 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
-from psfcore.built.cache import PsfCache
 from psfcore.errors import DataError
+from psfcore.psf_cache import PsfCache
 
 FOLDER, LARGEST = "HELIOPSF_CACHE_DIR", "HELIOPSF_CACHE_MIB"
 DEFAULT_MIB = 2048  # about 15 PSFs of 2048 px with their components

@@ -29,10 +29,18 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
+from pathlib import PurePath
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.header import FILTER_CARDS, bad_time, optional_text, plate_scale_arcsec, utc_time
+from psfcore.fits.header import (
+    FILTER_CARDS,
+    HeaderSummary,
+    bad_time,
+    optional_text,
+    plate_scale_arcsec,
+    utc_time,
+)
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE
 from psfcore.instruments.unknown import channel_of as channel_of
 
@@ -251,3 +259,18 @@ def interpolated_time(start: float, end: float, at: float) -> float:
     if step in (0, steps):
         return end if step else start
     return min(max(float(round(start + step * (end - start) / steps)), start), end)
+
+
+# As in the query of an upload: the columns are indexed, and indexes have a limit.
+NAME_LENGTH, VERSION_LENGTH = 80, 40
+
+
+def name_of_upload(summary: HeaderSummary, filename: str | None, sha256: str) -> tuple[str, str]:
+    """The name and the version of an uploaded PSF: from its header, or else from its file. Longer texts are cut."""
+    name = label(summary.psf_name or PurePath(filename or "").stem, NAME_LENGTH) or "uploaded"
+    return name, label(summary.psf_version, VERSION_LENGTH) or f"0.0.0+{sha256[:8]}"
+
+
+def label(text: str | None, most: int) -> str:
+    """The printable characters of a text that a file or a client chose, at most ``most`` of them."""
+    return "".join(c for c in (text or "")[: 2 * most] if c.isprintable())[:most].strip()

@@ -1,20 +1,30 @@
-"""Options that all deconvolution methods have in common, and a cache of prepared PSFs."""
+"""What all deconvolution methods have in common: their options, their result, and a cache of prepared PSFs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from psfcore.convolution.engine import Engine
+from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.edges import Edges
 from psfcore.errors import DataError
+from psfcore.fits.cards import Cards
+from psfcore.image import Image
 from psfcore.noise import Noise
 from psfcore.psf import Psf
+from psfcore.psf_sampling import AS_BUILT, sampling_of
 
 Progress = Callable[[int, int], None]
 Shape = tuple[int, int]
 # (psf, shape of the plane, span within which the convolution is exact, threads)
 EngineFor = Callable[[Psf, Shape, Shape, int], Engine]
+Thing = TypeVar("Thing", Psf, tuple[Psf, Engine])
 
 
 def new_engine(psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
@@ -31,7 +41,7 @@ class Conditions:
     margin. noise: noise of the camera; required if the stopping rule is "discrepancy".
     threads: number of threads; it does not change the result.
     progress(step, steps) is called after each step; its exceptions are not caught.
-    engine_for: function that makes the engine; an `EngineCache` keeps engines between images.
+    engine_for: function that makes the engine; `PreparedPsfs.engine_for` keeps engines between images.
     """
 
     edges: Edges | None = None
@@ -46,24 +56,111 @@ class Conditions:
             raise DataError("bad-margin", f"expected a margin of at least 0 px; got {self.margin_px}")
 
 
-class EngineCache:
-    """A cache of engines by PSF, shape, span and threads. If it is full, it drops the least recently used engine.
+@dataclass(frozen=True)
+class OfBox:
+    """How a box of an image was deconvolved alone (`psfcore.deconvolve.region`).
 
-    An engine processes one image at a time, so threads must not share a cache. An engine is used again only if the same
-    `Psf` object is passed again; an equal copy of the object gets a new engine.
+    box: the box in the pixels of the whole image. rim_px: largest width of the rim around it. error: bound of the
+    difference from the deconvolution of the whole image, in the unit of the image; 0: there is no difference.
     """
 
-    def __init__(self, capacity: int = 2) -> None:
-        self.capacity = capacity
-        self._kept: list[tuple[Psf, tuple[Shape, Shape, int], Engine]] = []
+    box: Box
+    rim_px: int
+    error: float
 
-    def __call__(self, psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
-        asked = (shape, span, threads)
-        for n, (kept_psf, kept, engine) in enumerate(self._kept):
-            if kept_psf is psf and kept == asked:
-                self._kept.append(self._kept.pop(n))
-                return engine
-        engine = new_engine(psf, shape, span, threads)
-        self._kept.append((psf, asked, engine))
-        del self._kept[: -self.capacity]
-        return engine
+
+@dataclass(frozen=True)
+class Deconvolved:
+    """An estimate of the scene, and how the method reached it.
+
+    pixels: estimate [y, x] in the image's unit; NaN where the image has no finite value.
+    stopped_because: reason why the iteration ended.
+    flux_in: sum of the image over its valid pixels. Negative pixels are included.
+    flux_out: sum of the estimate over the same pixels. negative_pixels: number of valid pixels below 0 in the image.
+    last_change: rms of the change in the last step, divided by the rms of the estimate.
+    edges, margin_px: assumption about the scene beyond the field, and width of the margin.
+    edge_band_px: width of the band along the edges in which the result depends on light from beyond the field.
+    noise_amplification: rms noise of the estimate divided by the rms noise of the image, for uncorrelated noise; None if
+    the method is not linear. chi2_per_pixel: chi2 of the fit divided by the number of judged pixels
+    (`psfcore.deconvolve.stopping`); None if the noise is not known. of_box: how the box was deconvolved, if the result is a
+    box of an image; None for a whole image.
+    """
+
+    pixels: NDArray[np.float64]
+    method: str
+    steps_done: int
+    stopped_because: str
+    flux_in: float
+    flux_out: float
+    negative_pixels: int
+    last_change: float
+    edges: Edges
+    margin_px: int
+    edge_band_px: int
+    noise_amplification: float | None = None
+    chi2_per_pixel: float | None = None
+    of_box: OfBox | None = None
+
+    @property
+    def flux_change_pct(self) -> float:
+        """Change of the flux, percent of the absolute value of the flux before; 0 if that is 0."""
+        return 100 * (self.flux_out - self.flux_in) / abs(self.flux_in) if self.flux_in else 0.0
+
+
+def fluxes(image: Image, pixels: NDArray[np.float64]) -> tuple[float, float, int]:
+    """`flux_in`, `flux_out` and `negative_pixels` of a `Deconvolved` with these pixels."""
+    # The sums use no copies of planes: here most of the memory of a deconvolution is in use.
+    counted = image.valid
+    negative = image.pixels < 0
+    negative &= counted
+    return (
+        float(image.pixels.sum(where=counted)),
+        float(pixels.sum(where=counted)),
+        int(np.count_nonzero(negative)),
+    )
+
+
+class PreparedPsfs:
+    """A cache of PSFs for later images: read, resampled to the pixels of an image, and Fourier-transformed as an engine.
+
+    It keeps what was used last, up to ``max_bytes`` together, and always the newest. Only one thread at a time may use it,
+    because all calls of an engine share its buffers.
+    """
+
+    def __init__(self, max_bytes: int = 2**29) -> None:
+        self.max_bytes = max_bytes
+        self._kept: OrderedDict[Hashable, tuple[object, int]] = OrderedDict()
+
+    def as_built(self, key: Hashable, read: Callable[[], Psf]) -> Psf:
+        """The PSF that `read` returns; repeated calls with the same key return the same object."""
+        return self._once(key, read, _kernel_bytes)
+
+    def on_pixels_of(self, header: Cards, key: Hashable, read: Callable[[], Psf]) -> Psf:
+        """The PSF of `as_built` on the pixels of an image with this header; repeated calls return the same object."""
+        whole = self.as_built(key, read)
+        sampling = sampling_of(whole, header)
+        if sampling == AS_BUILT:
+            return whole
+        return self._once((key, sampling), lambda: sampling.of(whole), _kernel_bytes)
+
+    def engine_for(self, psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
+        """The engine for a PSF and a shape. Pass the same PSF object again: the cache compares identity, not content."""
+
+        def make() -> tuple[Psf, Engine]:
+            return psf, new_engine(psf, shape, span, threads)
+
+        # The PSF is kept together with its engine, so that Python cannot give the id() of the PSF to another object.
+        return self._once((id(psf), shape, span, threads), make, lambda pair: pair[1].nbytes)[1]
+
+    def _once(self, key: Hashable, make: Callable[[], Thing], size: Callable[[Thing], int]) -> Thing:
+        if key not in self._kept:
+            thing = make()
+            self._kept[key] = (thing, size(thing))
+        self._kept.move_to_end(key)
+        while len(self._kept) > 1 and sum(nbytes for _, nbytes in self._kept.values()) > self.max_bytes:
+            self._kept.popitem(last=False)
+        return self._kept[key][0]  # type: ignore[return-value]  # the object that was stored under this key above
+
+
+def _kernel_bytes(psf: Psf) -> int:
+    return int(psf.kernel.nbytes)

@@ -46,6 +46,10 @@ WORKING_BYTES = {
 IMAGE_BYTES = 20.0  # the image and the result in float64, the mask, and a comparison of both
 ERRORS_BYTES = 240.0  # further bytes for each pixel of the image, if errors are estimated
 PSF_BYTES = 8.0
+ASSESSED_BYTES = (
+    100.0  # for each pixel of an image: to measure the changes, and to draw the pictures of a product
+)
+READ_BYTES = 25.0  # for each pixel of the image beyond the region that is deconvolved
 MIB = 2**20
 
 Shape = tuple[int, int]
@@ -104,6 +108,12 @@ def deconvolution_bytes(asked: Asked) -> float:
         + image_bytes * math.prod(asked.image)
         + PSF_BYTES * math.prod(asked.psf)
     )
+
+
+def product_bytes(asked: Asked, image_px: int) -> float:
+    """The memory of a deconvolution whose changes are measured, in bytes. image_px: pixels of the whole image."""
+    part_px = math.prod(asked.image)
+    return deconvolution_bytes(asked) + ASSESSED_BYTES * part_px + READ_BYTES * (image_px - part_px)
 
 
 def check_memory(image: Shape, needed_bytes: float, free_bytes: int) -> None:

@@ -1,4 +1,4 @@
-"""The parts that all methods share: prepare an image for a method, and turn the method's estimate into a result."""
+"""The parts that all methods share: prepare an image for a method, run its iteration, and make the result."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.engine import Engine
-from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.conditions import Conditions, Deconvolved, fluxes
 from psfcore.deconvolve.edges import (
     FLAGGED_SHARE,
     Domain,
@@ -18,8 +18,7 @@ from psfcore.deconvolve.edges import (
     margin_for,
     share_from_beyond,
 )
-from psfcore.deconvolve.result import Deconvolved, fluxes
-from psfcore.deconvolve.stopping import Ended, Iteration, Judgement, Stop, check_steps, judgement, run
+from psfcore.deconvolve.stopping import Iteration, Judgement, Stop, check_steps, judgement, run
 from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.psf_sampling import check_compatible
@@ -41,16 +40,35 @@ class Problem:
     judgement: Judgement
     edge_band_px: int
 
-    def solve(self, iteration: Iteration, *, steps: int, stop: Stop) -> Ended:
-        """Run a method's iteration until it stops. The planes of the domain are released before."""
-        self.domain.release()
-        return run(
+    def solve(self, iteration: Iteration, *, method: str, steps: int, stop: Stop) -> Deconvolved:
+        """Run a method's iteration until it stops, and turn its estimate into the result for the image."""
+        image, domain = self.image, self.domain
+        domain.release()  # the iteration holds what it needs of the planes of the domain
+        ended = run(
             iteration,
             self.judgement,
             steps=steps,
             stop=stop,
             noise_known=self.conditions.noise is not None,
             progress=self.conditions.progress,
+        )
+        x = iteration.x
+        pixels = domain.cut([(0, x)] if x.ndim == 2 else self.engine.row_blocks_of(x))
+        flux_in, flux_out, negative_pixels = fluxes(image, pixels)
+        pixels[~image.finite] = np.nan
+        return Deconvolved(
+            pixels=pixels,
+            method=method,
+            steps_done=ended.steps_done,
+            stopped_because=ended.because,
+            flux_in=flux_in,
+            flux_out=flux_out,
+            negative_pixels=negative_pixels,
+            last_change=iteration.change,
+            edges=domain.edges,
+            margin_px=domain.margin_px,
+            edge_band_px=self.edge_band_px,
+            chi2_per_pixel=ended.chi2,
         )
 
 
@@ -102,34 +120,3 @@ def first_estimate(problem: Problem) -> NDArray[np.float32]:
             near > _ENOUGH_NEIGHBOURS, gathered / np.maximum(near, _ENOUGH_NEIGHBOURS), everywhere
         )
     return estimate
-
-
-def solution(
-    problem: Problem,
-    estimate: NDArray[np.float32],
-    ended: Ended,
-    *,
-    method: str,
-    last_change: float,
-    noise_amplification: float | None = None,
-) -> Deconvolved:
-    """Turn an estimate on the domain into the result for the image. estimate: a plane [y, x], or in the engine's layout."""
-    image, domain = problem.image, problem.domain
-    pixels = domain.cut([(0, estimate)] if estimate.ndim == 2 else problem.engine.row_blocks_of(estimate))
-    flux_in, flux_out, negative_pixels = fluxes(image, pixels)
-    pixels[~image.finite] = np.nan
-    return Deconvolved(
-        pixels=pixels,
-        method=method,
-        steps_done=ended.steps_done,
-        stopped_because=ended.because,
-        flux_in=flux_in,
-        flux_out=flux_out,
-        negative_pixels=negative_pixels,
-        last_change=last_change,
-        edges=domain.edges,
-        margin_px=domain.margin_px,
-        edge_band_px=problem.edge_band_px,
-        noise_amplification=noise_amplification,
-        chi2_per_pixel=ended.chi2,
-    )

@@ -38,7 +38,6 @@ steps than the default, the difference near bright pixels may be larger than the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -47,17 +46,15 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.changes import measure_changes
 from psfcore.deconvolve.assess.quality import QualityBit, quality_plane
-from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
-from psfcore.deconvolve.conditions import Progress
+from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_discrepancy
+from psfcore.deconvolve.conditions import Deconvolved, OfBox, Progress, fluxes
 from psfcore.deconvolve.edges import Edges, margin_for, share_from_beyond
 from psfcore.deconvolve.methods.registry import defaults_of, keeps_flux
-from psfcore.deconvolve.result import Deconvolved, OfBox, fluxes
 from psfcore.deconvolve.whole import Assessed, Work
 from psfcore.errors import DataError
 from psfcore.fits.viewing.regions import moved_header
 from psfcore.image import Image
 from psfcore.noise import Noise
-from psfcore.psf import Psf
 from psfcore.psf_sampling import check_compatible, rebinned_kernel
 
 if TYPE_CHECKING:
@@ -115,19 +112,6 @@ class BoxWork:
             edges=self.edges,
             of_box=OfBox(self.box, self.rim_px, self.error),
         )
-
-    def errors(
-        self,
-        result: Deconvolved,
-        draws: int,
-        *,
-        possible_psfs: Callable[[], Sequence[Psf]] = lambda: (),
-        begin: Callable[[str, int], Progress | None] = lambda stage, steps: None,
-    ) -> None:
-        """No errors. Raises DataError "region-errors" if they are requested: the noise of the subtracted light would be
-        missing in them."""
-        if draws:
-            raise region_without_errors(draws)
 
     def assess(self, result: Deconvolved, errors: ErrorPlanes | None = None) -> Assessed:
         """Measure the changes in the box, and make its quality plane."""

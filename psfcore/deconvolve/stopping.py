@@ -113,7 +113,16 @@ class Iteration:
       `update` in the spectrum.
     - `update` computes the next x from this input. If `last` is false, it leaves the transformed rows of the next x in
       the spectrum.
+
+    x: the estimate, a plane [y, x] or in the engine's layout.
     """
+
+    x: NDArray[np.float32]
+
+    @property
+    def change(self) -> float:
+        """Rms of the change in the last step, divided by the rms of x."""
+        raise NotImplementedError
 
     def measure(self) -> None:
         """Compute H x and chi2."""

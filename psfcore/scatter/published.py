@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.convolution.engine import Engine
-from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.methods.richardson_lucy import deconvolve
 from psfcore.errors import DataError
 from psfcore.image import Image
@@ -212,7 +212,9 @@ class _Recipe:
     def _deconvolved(self, kernel: Kernel, n: int) -> list[NDArray[np.float32]]:
         """Step (d): the scenes of all images, deconvolved with Richardson-Lucy."""
         psf = Psf(kernel, name="round", version=str(n), instrument=None, status="draft")
-        conditions = Conditions(edges="zero", margin_px=0, threads=self.threads, engine_for=EngineCache())
+        conditions = Conditions(
+            edges="zero", margin_px=0, threads=self.threads, engine_for=PreparedPsfs().engine_for
+        )
         scenes = []
         for k, frame in enumerate(self.transit.frames):
             self.progress(f"round {n + 1}: deconvolving", k, len(self.transit.frames))

@@ -15,12 +15,14 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
+from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.assess.error_planes import sigma_points
 from psfcore.errors import DataError
 from psfcore.psf import REACH_GRID_PX, FittedShape, Psf, encircled_energy
+from psfcore.psf_sampling import psf_for_image
 from psfcore.scatter.shapes import Shape, Vector, shape_named
 
 Kernel = NDArray[np.float64]
@@ -107,3 +109,10 @@ def possible_psfs(psf: Psf, *, threads: int = 1) -> list[Psf]:
         )
         for point in points
     ]
+
+
+def possible_on_pixels(psf: Psf, header: Header, *, threads: int = 1) -> list[Psf]:
+    """The PSFs of `possible_psfs` on the pixels of an image; empty if the errors of the PSF are not known."""
+    if psf.fitted is None:
+        return []
+    return [psf_for_image(one, header) for one in possible_psfs(psf, threads=threads)]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psfcore.built.cache import sha256_of_file
 from psfcore.errors import DataError
+from psfcore.psf_cache import sha256_of_file
 from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
 from service.cli.fields import options_of
 from service.cli.options import (
@@ -104,7 +104,7 @@ def _one_by_one(
 ) -> Callable[[str], Treated]:
     """A function that deconvolves one image with the service and measures what changed. The function adds the ids of
     the products to ``products``."""
-    from psfcore.deconvolve.assess.from_product import changes_in_product
+    from psfcore.deconvolve.assess.contact_sheet import changes_in_product
 
     def one(name: str) -> Treated:
         with TemporaryDirectory(prefix="heliopsf-") as folder:

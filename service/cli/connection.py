@@ -146,21 +146,16 @@ def print_rows(rows: Iterable[Row], line: Callable[[Row], str], *, if_none: str)
 
 
 @contextmanager
-def connection(
-    server: str | None, local: bool, *, gap_effects: str = "", previews: bool = True
-) -> Iterator[Operations]:
-    """A service over HTTP, or with ``local`` a service in this process.
-
-    gap_effects: further effects of the local service. previews: False if the command downloads no preview of a product.
-    """
+def connection(server: str | None, local: bool, *, gap_effects: str = "") -> Iterator[Operations]:
+    """A service over HTTP, or with ``local`` this process. gap_effects: further effects for a local diagnosis."""
     if not local:
         with remote(server) as service:
             service.health()
             yield service
         return
-    from service.local import local_service
+    from service.cli import local as in_this_process
 
-    with local_service(gap_effects=gap_effects, previews=previews) as here:
+    with in_this_process.local(gap_effects=gap_effects) as here:
         yield here
 
 

@@ -93,7 +93,7 @@ def deconvolve(
             check_outputs((output.path, plot, changes), inputs=[*files, *psf_files], overwrite=overwrite)
     with (
         user_errors(),
-        connection(server, local, previews=plot is not None) as service,
+        connection(server, local) as service,
         progress_bar() as report,
     ):
         parameters |= {"psf_id": named_psf(service, psf), "overwrite": overwrite}
@@ -113,10 +113,10 @@ def deconvolve(
 
 def _timings(service: Operations) -> list[str]:
     """The lines that say how long each stage took: the stages of the job, and the rest of the command."""
-    from service.local import LocalService  # already loaded: the option needs --local
+    from service.cli.local import Local  # already loaded: the option needs --local
 
-    assert isinstance(service, LocalService)
-    spent = service.stage_seconds()
+    assert isinstance(service, Local)
+    spent = {stage: one.seconds for stage, one in service.times.end().items()}
     whole = time.perf_counter() - STARTED
     rows = [
         *sorted(spent.items(), key=lambda row: -row[1]),

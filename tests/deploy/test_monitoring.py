@@ -20,8 +20,8 @@ from service.app import create_app
 from tests.conftest import write_image
 from tests.service.conftest import upload
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.stage_times import Spent
 from workers.settings import Settings
+from workers.stage_timer import Spent
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 DASHBOARD = json.loads((DEPLOY / "grafana" / "heliopsf.json").read_text("utf-8"))

@@ -13,7 +13,7 @@ from astropy.io import fits
 
 import heliopsf
 from psfcore.instruments import files
-from service.local import local_service
+from service.cli.local import local
 from tests.conftest import SMALL_INSTRUMENT, write_image
 from workers.cache_folder import psf_cache
 from workers.contract.identities import psf_identity
@@ -51,7 +51,7 @@ def test_the_psf_is_that_of_the_service(small: Path, tmp_path: Path) -> None:
     psf = heliopsf.psf_for(image)
     assert psf.provenance["psf_id"] == psf_identity(PsfBuild(instrument="small"))
     mine = heliopsf.deconvolve(image, full=True)
-    with local_service() as service:
+    with local() as service:
         product = service.deconvolve(image, tmp_path / "product.fits")
     assert product["psf_id"] == psf.provenance["psf_id"] and product["psf_version"] == psf.version
     with fits.open(tmp_path / "product.fits") as hdus:
@@ -129,7 +129,7 @@ def test_a_built_psf_is_kept_and_the_same_afterwards(small_toml: Path) -> None:
     assert kept.identity == first.provenance["psf_id"]
     told.clear()
     again = heliopsf.build_psf(small_toml, size=64, progress=progress)
-    assert told == [1]
+    assert told == [], "nothing was built"
     np.testing.assert_array_equal(again.kernel, first.kernel)
     assert again.provenance == first.provenance and again.version == first.version
     assert set(again.components) == set(first.components)

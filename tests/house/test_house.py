@@ -136,7 +136,6 @@ def test_the_web_process_carries_no_numerics_and_no_task() -> None:
         "psfcore.fits.viewing.windows",  # loaded by the first request for pixels
         "psfcore.fits.images",
         "psfcore.fits.psfs",
-        "service.local",
         "service.client.http",
         "httpx",
     }

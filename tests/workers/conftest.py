@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 from sqlalchemy import text
 
-from service.local import LocalService
 from tests.blank_figures import blank_unless_told
+from tests.in_process import InProcess
 from tests.tables import copied_tables
 from tests.whole.stack import Missing, postgres_database
 from tests.workers.databases import change
+from workers import stage_timer
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import Base
 from workers.settings import Settings
-from workers.tasks import stage_timer
 
 
 @pytest.fixture(scope="package", autouse=True)
@@ -37,8 +37,8 @@ def settings(tmp_path: Path) -> Settings:
 
 
 @pytest.fixture
-def local(settings: Settings) -> Iterator[LocalService]:
-    service = LocalService(settings)
+def local(settings: Settings) -> Iterator[InProcess]:
+    service = InProcess(settings)
     yield service
     service.close()
 

@@ -26,9 +26,9 @@ from workers.bulk.listing import list_files
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.contract.bulk import AT_WORK, BulkPhase, BulkWork
 from workers.contract.phases import Fault, JobError
+from workers.stage_timer import STARTING
 from workers.tasks.context import Context, TurnOver
 from workers.tasks.data.product import Made
-from workers.tasks.stage_timer import STARTING
 
 TELL_EVERY_S = 1.0  # interval at which a turn reports its progress and checks whether it must stop
 BETWEEN = "between images"  # the stage between two images: the worker checks whether the run continues

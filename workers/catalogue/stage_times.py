@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import select
@@ -12,16 +11,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from workers.catalogue.database import Database
 from workers.catalogue.tables import JobRow, StageTimeRow
 from workers.contract.phases import Phase
-
-MOST_LETTERS = 64  # longest name of a stage
-
-
-@dataclass
-class Spent:
-    """Seconds spent in a stage, and the number of steps reported."""
-
-    seconds: float = 0.0
-    steps: int = 0
+from workers.stage_timer import Spent
 
 
 class KeptStageTimes:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from psfcore.built.recipe import Recipe
-from psfcore.built.recipe import canonical_hash as canonical_hash
 from psfcore.gap.effect_sources import library_sha256
-from psfcore.instruments.files import instrument_path
+from psfcore.instruments.files import instrument_path, turned_text
+from psfcore.recipe import Recipe
+from psfcore.recipe import canonical_hash as canonical_hash
 from workers.contract.requests import (
     Parameters,
     PsfBuild,
@@ -31,6 +31,13 @@ def instrument_text(build: PsfBuild) -> str:
         return build.instrument_file
     assert build.instrument is not None
     return instrument_path(build.instrument).read_text("utf-8")
+
+
+def build_for(instrument: str, turn_deg: float) -> PsfBuild:
+    """The build of the PSF of a known instrument at full size, for images that are turned by this angle against it."""
+    if turn_deg:
+        return PsfBuild(instrument_file=turned_text(instrument, turn_deg))
+    return PsfBuild(instrument=instrument)
 
 
 def psf_identity(build: PsfBuild) -> str:

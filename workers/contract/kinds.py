@@ -162,7 +162,7 @@ _ROWS = (
     ),
     Kind(
         "psf-tables",
-        task="workers.tasks.tables:psf_tables",
+        task="workers.tasks.psf_build:psf_tables",
         result=Result.PSF,
         parameters=PsfTables,
         resolved=PsfTables,

@@ -9,16 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from psfcore.built.recipe import BUILD_VERSION
 from psfcore.deconvolve.box import BOX, LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES
 from psfcore.noise_figures import NoiseFigures
+from psfcore.recipe import BUILD_VERSION
 from workers.versions import TIME, iso, seconds
+
+if TYPE_CHECKING:
+    from psfcore.deconvolve.run import Options
+    from psfcore.noise import Noise
 
 
 @dataclass(frozen=True)
@@ -474,3 +478,22 @@ class ResolvedRerun(Rerun):
 
 # Jobs on an uploaded transit.
 ResolvedOnTransit = ResolvedPsfFit | ResolvedCrossValidate | ResolvedReport | ResolvedGapDiagnose
+
+
+def options_of(request: Deconvolve, noise: Noise | None, threads: int) -> Options:
+    """The options of psfcore for a request. noise: of the request, or else of the instrument that took the image."""
+    # A request is checked without numerical libraries.
+    from psfcore.deconvolve.run import Options
+
+    method = request.method
+    return Options(
+        method=method.name,
+        parameters=method.model_dump(exclude={"name", "edges", "margin_px"}),
+        edges=method.edges,
+        margin_px=method.margin_px,
+        noise=noise,
+        error_draws=request.error_draws,
+        region=None if request.region is None else Box.parse(request.region),
+        region_error=request.region_error,
+        threads=threads,
+    )

@@ -27,7 +27,7 @@ from weakref import WeakKeyDictionary
 from pydantic import BaseModel, ConfigDict, Field
 
 from psfcore.deconvolve.box import EXPECTED_RIM_PX, Box
-from psfcore.deconvolve.memory import MIB, Asked, deconvolution_bytes, of_method
+from psfcore.deconvolve.memory import MIB, Asked, of_method, product_bytes
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import workload
@@ -38,10 +38,6 @@ from workers.contract.kinds import KINDS
 from workers.contract.requests import PsfBuild
 from workers.settings import Settings
 
-ASSESSED_BYTES = (
-    100.0  # for each pixel of an image: to measure the changes, and to draw the pictures of a product
-)
-READ_BYTES = 25.0  # for each pixel of the image beyond the region that is deconvolved
 BYTES_A_PIXEL = 4.0  # assumed for the files of a transit, because only their length is known here
 
 # Number of completed jobs of a kind from which the factor is computed, as a median.
@@ -248,7 +244,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     cpu_s += runs * method["steps"] * of_method(cost.step_ns, method["name"]) * 1e-9 * plane
     return cpu_s, max(
         built_mib,
-        (deconvolution_bytes(asked) + ASSESSED_BYTES * ny * nx + READ_BYTES * (whole_px - ny * nx)) / MIB,
+        product_bytes(asked, whole_px) / MIB,
     )
 
 

@@ -11,13 +11,14 @@ from psfcore.errors import DataError
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
-from psfcore.instruments.files import instrument_names, turned_text
+from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
 from psfcore.noise_figures import NoiseFigures
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
 from workers.contract.identities import (
+    build_for,
     canonical_hash,
     instrument_text,
     interpolated_psf_identity,
@@ -199,13 +200,7 @@ def _psf_for(catalogue: Catalogue, header: dict[str, Any], wanted: Deconvolve, o
         }
     if header["instrument"] is None:
         raise no_psf(catalogue, header, owner)
-    # The shipped instrument file at full size.
-    turn_deg = frame_of(header["cards"]).turn_to_build_deg
-    recipe = (
-        PsfBuild(instrument_file=turned_text(header["instrument"], turn_deg))
-        if turn_deg
-        else PsfBuild(instrument=header["instrument"])
-    )
+    recipe = build_for(header["instrument"], frame_of(header["cards"]).turn_to_build_deg)
     identity = psf_identity(recipe)
     check_not_deprecated(
         catalogue,

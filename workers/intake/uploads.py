@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from pathlib import PurePath
 from typing import Any
 
 from psfcore.fits.header import HeaderSummary
 from psfcore.transit.archive import ArchiveContents
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
-from workers.versions import UPLOADED, PsfStatus, channel_of, instrument_of, series_of
+from workers.versions import UPLOADED, PsfStatus, channel_of, instrument_of, label, name_of_upload, series_of
 
 TEXT_LENGTH = 200
-# As in the query of an upload: the columns are indexed, and indexes have a limit.
-NAME_LENGTH, VERSION_LENGTH = 80, 40
 
 
 def image_row(
@@ -77,12 +74,13 @@ def uploaded_psf_row(
     instrument = instrument or instrument_of(header)
     channel = channel or channel_of(instrument, summary.wavelnth)
     kind = kind or UPLOADED
+    named = name_of_upload(summary, filename, sha256)
     return PsfRow(
         owner=owner,
         id=sha256,
         created_at=time.time(),
-        name=name or label(summary.psf_name or PurePath(filename or "").stem, NAME_LENGTH) or "uploaded",
-        version=version or label(summary.psf_version, VERSION_LENGTH) or f"0.0.0+{sha256[:8]}",
+        name=name or named[0],
+        version=version or named[1],
         instrument=instrument,
         channel=channel,
         kind=kind,
@@ -100,11 +98,6 @@ def uploaded_psf_row(
             "cards": header["cards"],
         },
     )
-
-
-def label(text: str | None, most: int) -> str:
-    """The printable characters of a text that a file or a client chose, at most ``most`` of them."""
-    return "".join(c for c in (text or "")[: 2 * most] if c.isprintable())[:most].strip()
 
 
 def _summary(summary: HeaderSummary) -> dict[str, Any]:

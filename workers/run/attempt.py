@@ -17,7 +17,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
 from workers.contract.phases import Fault, JobError, Phase
 from workers.run.child import Child, Stopping
-from workers.tasks.stage_timer import StageTimer
+from workers.stage_timer import StageTimer
 
 log = logging.getLogger(__name__)
 

@@ -29,8 +29,8 @@ from workers.files.store import NO_ROOM, STORAGE_FULL, Store, is_disk_full
 from workers.run.attempt import Assistance, Attempt, Cancelled, Progress, TookTooLong
 from workers.run.child import MARGIN, Child, Stopping, allowed_mib, is_out_of_memory
 from workers.settings import Settings
+from workers.stage_timer import StageTimer
 from workers.tasks.context import Context, TurnOver
-from workers.tasks.stage_timer import StageTimer
 
 log = logging.getLogger(__name__)
 FAILED = "job %s: %s (%s)"  # log line about a failed job: its id, and the message and the code of its error
@@ -70,19 +70,15 @@ class Runner:
         stopping: Stopping | None = None,
         submit: Callable[[str, Queue], bool] = lambda job_id, queue: False,
         child: Child | None = None,
-        previews: bool = True,
-        compile_beside: bool = False,
-        total_psfs: bool = False,
     ) -> None:
         """submit: a function that sends an unfinished job to the broker again; if it returns False, the reconciler
         does so. child: this process, if the runner may limit the memory of the process and end it; None if it may do
-        neither. previews, compile_beside, total_psfs: see ``Context``.
+        neither.
         """
         self._settings, self._catalogue, self._store = settings, catalogue, store
         self._call_for_help, self._submit = call_for_help, submit
         self._stopping = stopping or Stopping()
         self._child = child
-        self._previews, self._compile_beside, self._total_psfs = previews, compile_beside, total_psfs
         self._pausing = False  # a job pauses while this process runs a short one
 
     def run(self, job_id: str, on_progress: Progress | None = None) -> None:
@@ -209,9 +205,6 @@ class Runner:
             job_id=job.id,
             report=work.report,
             times=work.times,
-            previews=self._previews,
-            compile_beside=self._compile_beside,
-            total_psfs=self._total_psfs,
             **functions,
         )
 

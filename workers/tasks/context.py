@@ -15,7 +15,7 @@ from workers.contract.phases import JobError
 from workers.files.collection import intact
 from workers.files.store import Store
 from workers.settings import Settings
-from workers.tasks.stage_timer import StageTimer
+from workers.stage_timer import StageTimer
 from workers.versions import PsfStatus
 
 Result = TypeVar("Result", ProductRow, PsfRow, ReportRow)
@@ -41,10 +41,6 @@ class Context:
     lease: the lease under which a job takes its pieces.
     times: measures the time of the reported stages. If the pieces of a job report their own stages, the time of these
     stages is measured instead.
-    previews: False if nobody looks at the previews of products; the thumbnail then takes the place of the preview.
-    compile_beside: True if this process runs nothing else: kernels are then compiled by another process while a PSF is built.
-    total_psfs: True if nobody looks at the PSF that a deconvolution builds: it is built without components, tables and
-    picture.
     anew: True for a rerun: compute everything again, and use no solution that an earlier job kept.
     """
 
@@ -59,9 +55,6 @@ class Context:
     others_wait: Callable[[], bool] = lambda: False
     lease: Lease | None = None
     times: StageTimer = field(default_factory=StageTimer)
-    previews: bool = True
-    compile_beside: bool = False
-    total_psfs: bool = False
     anew: bool = False
 
     @property

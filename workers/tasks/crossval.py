@@ -34,7 +34,7 @@ from workers.catalogue.tables import ReportRow
 from workers.contract.identities import psf_fit_identity
 from workers.contract.requests import ResolvedCrossValidate
 from workers.tasks.context import Context
-from workers.tasks.data.reports import keep_report, provenance_of, write_json
+from workers.tasks.data.reports import Finished, keep_report, provenance_of
 from workers.tasks.data.solutions import solved
 from workers.tasks.transits import load_transit
 
@@ -55,7 +55,8 @@ def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
         fits = shared_fits(solution, wanted, progress=context.report)
     else:
         fits = _exact(context, identity, solution, wanted)
-    _save(context, request, identity, transit, fits)
+    report = report_of(request, transit, fits, job_id=context.job_id)
+    keep_report(context, identity, "cross-validation", report, transit_id=request.transit_id)
     return identity
 
 
@@ -130,15 +131,11 @@ def _heartbeat(context: Context, part: Part, done: int, folds: int) -> Callable[
     return report
 
 
-def _save(
-    context: Context,
-    request: ResolvedCrossValidate,
-    identity: str,
-    transit: Transit,
-    fits: tuple[FoldFit, ...],
-) -> None:
-    radii = np.array(CURVE_RADII_PX[: len(fits[0].curve_pct)])
-    found = bands(fits, radii)
+def report_of(
+    request: ResolvedCrossValidate, transit: Transit, fits: tuple[FoldFit, ...], *, job_id: str
+) -> Finished:
+    """The report on the fits of all folds."""
+    found = bands(fits, np.array(CURVE_RADII_PX[: len(fits[0].curve_pct)]))
     said = {
         "schema": "cross-validation/2",
         "sentence": sentence(found, len(fits)),
@@ -148,20 +145,14 @@ def _save(
         "files": {str(n): frame.file for n, frame in enumerate(transit.frames)},
         "folds": [fit.to_json() for fit in fits],
         "inputs_sha256": transit.sha256,
-        "provenance": provenance_of(context, request),
+        "provenance": provenance_of(job_id, request),
     }
-    with context.store.temporary() as text, context.store.temporary() as picture:
-        write_json(text, said)
-        cross_validation_png(found, fits, [frame.pointing for frame in transit.frames], picture)
-        keep_report(
-            context,
-            identity,
-            "cross-validation",
-            transit_id=request.transit_id,
-            text=text,
-            picture=picture,
-            details={"sentence": said["sentence"], "held_out": found.held_out, "folds": len(fits)},
-        )
+    pointings = [frame.pointing for frame in transit.frames]
+    return Finished(
+        said,
+        {"sentence": said["sentence"], "held_out": found.held_out, "folds": len(fits)},
+        draw=lambda path: cross_validation_png(found, fits, pointings, path),
+    )
 
 
 def sentence(found: Bands, folds: int) -> str:

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from psfcore.drawing.plots import psf_png
 from psfcore.errors import DataError
-from psfcore.fits.psfs import write_psf
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
 from psfcore.gap.effect_sources import library_sha256
@@ -22,13 +22,15 @@ from psfcore.gap.report.page import gap_page
 from psfcore.gap.report.plot import gap_png
 from psfcore.gap.report.report import gap_report
 from psfcore.psf import Psf
+from psfcore.scatter.inversion import Inverter, Progress
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
+from psfcore.transit.transit import Transit
 from workers.catalogue.tables import ReportRow
 from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
 from workers.contract.requests import ResolvedGapDiagnose
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import given_psf, psf_row
-from workers.tasks.data.reports import keep_report, provenance_of, write_json
+from workers.tasks.data.psfs import given_psf, keep_psf
+from workers.tasks.data.reports import Finished, keep_report, provenance_of
 from workers.tasks.data.solutions import solver
 from workers.tasks.transits import load_transit
 
@@ -43,8 +45,51 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
         return identity
     added = _added(context, request)
     parent = given_psf(context, request.psf_id)
-    shape, start = (SOFTENED_POWER_LAW, None) if parent is None else start_of(parent)
     transit, _ = load_transit(context, request)
+    report, corrected = diagnosis_of(
+        request,
+        transit,
+        parent,
+        added,
+        job_id=context.job_id,
+        threads=context.settings.threads,
+        progress=context.report,
+        solution=solver(context, request),
+    )
+    if corrected is not None:
+        parents = corrected.provenance["parents"]
+        keep_psf(
+            context,
+            corrected,
+            corrected.provenance["psf_id"],
+            origin="fitted",
+            draw=partial(psf_png, corrected),
+            details={
+                "transit_id": parents["transit"],
+                "parents": parents,
+                "diffraction_psf_id": corrected.provenance["diffraction_psf_id"],
+            },
+        )
+    keep_report(context, identity, KIND, report, transit_id=request.transit_id)
+    return identity
+
+
+def diagnosis_of(
+    request: ResolvedGapDiagnose,
+    transit: Transit,
+    parent: Psf | None,
+    added: tuple[Added, ...],
+    *,
+    job_id: str,
+    threads: int,
+    progress: Progress,
+    solution: Inverter | None = None,
+) -> tuple[Finished, Psf | None]:
+    """Diagnose a transit as a request says: the report, and the corrected PSF if it was asked for and effects were found.
+
+    parent: the PSF with which the fit starts. added: effects that are added to the library. solution: see `diagnose`.
+    """
+    shape, start = (SOFTENED_POWER_LAW, None) if parent is None else start_of(parent)
     found = diagnose(
         transit,
         library=library_with(added),
@@ -52,21 +97,33 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
         start=start,
         seed=request.seed,
         coverage=request.coverage,
-        threads=context.settings.threads,
-        progress=context.report,
-        solution=solver(context, request),
+        threads=threads,
+        progress=progress,
+        solution=solution,
     )
-    provenance = _provenance(context, request, identity, parent, added)
+    provenance = _provenance(request, parent, added, job_id)
     corrected = None
     if request.correct and found.corrected:
         try:
-            corrected = _save_psf(context, identity, found, provenance)
+            corrected = _corrected(found, provenance)
         except DataError as error:
             # An added effect may be defined for images but not for a point source. The diagnosis itself remains valid.
             caution = f"The corrected PSF could not be made: {error.message}"
             found = replace(found, cautions=(*found.cautions, caution))
-    _save(context, request, identity, found, provenance, corrected)
-    return identity
+    corrected_id = None if corrected is None else corrected.provenance["psf_id"]
+    said = gap_report(found) | {"provenance": provenance | {"corrected_psf_id": corrected_id}}
+    report = Finished(
+        said,
+        {
+            **{name: said[name] for name in ("sentence", "verdict", "answer", "gap", "cautions")},
+            "strongest_axis": said["where"][0]["axis"],
+            "psf_id": request.psf_id,
+            "corrected_psf_id": corrected_id,
+        },
+        draw=lambda path: path.write_bytes(gap_png(found, said)),
+        page=gap_page(found, said),
+    )
+    return report, corrected
 
 
 def _added(context: Context, request: ResolvedGapDiagnose) -> tuple[Added, ...]:
@@ -97,90 +154,31 @@ def _short(hashes: tuple[str, ...]) -> str:
 
 
 def _provenance(
-    context: Context,
-    request: ResolvedGapDiagnose,
-    identity: str,
-    parent: Psf | None,
-    added: tuple[Added, ...],
+    request: ResolvedGapDiagnose, parent: Psf | None, added: tuple[Added, ...], job_id: str
 ) -> dict[str, Any]:
     started = (
         None if parent is None else {"name": parent.name, "version": parent.version, "id": request.psf_id}
     )
     return {
-        "report_id": identity,
+        "report_id": gap_identity(request),
         "started_from_psf": started,
         "diffraction_psf_id": diffraction_identity(request),
         "seed": request.seed,
         "library_sha256": library_sha256(),
         "added_effects": {one.source: one.sha256 for one in added},
-        **provenance_of(context, request),
+        **provenance_of(job_id, request),
     }
 
 
-def _save_psf(context: Context, report_id: str, found: Diagnosis, provenance: dict[str, Any]) -> str:
-    """Save the corrected PSF, its tables and its picture as a new draft; returns its id."""
+def _corrected(found: Diagnosis, provenance: dict[str, Any]) -> Psf:
+    report_id = provenance["report_id"]
     identity = corrected_psf_identity(report_id)
     parents = {"transit": provenance["transit_sha256"], "report": report_id}
     if provenance["started_from_psf"] is not None:
         parents["psf"] = provenance["started_from_psf"]["id"]
-    psf = corrected_psf(
+    return corrected_psf(
         found,
         name=f"{found.solution.transit.instrument or 'transit'}-gap-corrected",
         version=f"0.1.0+{identity[:8]}",
         provenance={"psf_id": identity, "parents": parents, **provenance},
     )
-    with context.store.temporary() as file, context.store.temporary() as picture:
-        write_psf(file, psf)
-        psf_png(psf, picture)
-        row = psf_row(
-            psf,
-            identity,
-            context.owner,
-            origin="fitted",
-            file_sha256=context.store.keep(file),
-            store=context.store,
-            preview_sha256=context.store.keep(picture),
-            details={
-                "transit_id": parents["transit"],
-                "parents": parents,
-                "diffraction_psf_id": provenance["diffraction_psf_id"],
-            },
-            threads=context.settings.threads,
-        )
-    context.add(row)
-    return identity
-
-
-def _save(
-    context: Context,
-    request: ResolvedGapDiagnose,
-    identity: str,
-    found: Diagnosis,
-    provenance: dict[str, Any],
-    corrected: str | None,
-) -> None:
-    """Write JSON, HTML page and picture into the store, and add the row to the catalogue."""
-    said = gap_report(found) | {"provenance": provenance | {"corrected_psf_id": corrected}}
-    with (
-        context.store.temporary() as text,
-        context.store.temporary() as page,
-        context.store.temporary() as picture,
-    ):
-        write_json(text, said)
-        page.write_text(gap_page(found, said), "utf-8")
-        picture.write_bytes(gap_png(found, said))
-        keep_report(
-            context,
-            identity,
-            KIND,
-            transit_id=request.transit_id,
-            text=text,
-            page=page,
-            picture=picture,
-            details={
-                **{name: said[name] for name in ("sentence", "verdict", "answer", "gap", "cautions")},
-                "strongest_axis": said["where"][0]["axis"],
-                "psf_id": request.psf_id,
-                "corrected_psf_id": corrected,
-            },
-        )

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from psfcore.fits.psfs import read_psf, write_psf
+from psfcore.fits.psfs import read_psf
 from psfcore.psf import Psf, cumulative_curve
 from psfcore.scatter.interpolation import Epoch, curve_sigma, interpolated_psf, parameters_of
 from psfcore.scatter.total_psf import CURVE_RADII_PX
@@ -18,9 +19,9 @@ from workers.contract.identities import interpolated_psf_identity
 from workers.contract.requests import PsfInterpolate
 from workers.intake.compatibility import of_upload
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import named_psf, psf_row
+from workers.tasks.data.psfs import keep_psf, named_psf
 from workers.tasks.data.reports import provenance_of
-from workers.versions import INTERPOLATED, interpolated_name, series_of
+from workers.versions import INTERPOLATED, interpolated_name
 
 STAGE = "interpolating the PSF"
 
@@ -39,6 +40,8 @@ def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
     made = context.made(PsfRow, identity)
     if made is not None:
         return made
+    from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
+
     context.report(STAGE, 0, 2)
     ends = {
         "before": _epoch(context, request.before_psf_id, request.before_time),
@@ -46,7 +49,7 @@ def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
     }
     name, version = interpolated_name(ends["before"].psf.instrument, identity)
     # The id of the job is in the details of the row, not in the file, so that the file can be made again bit for bit.
-    provenance = {"psf_id": identity, **provenance_of(context, request)}
+    provenance = {"psf_id": identity, **provenance_of(context.job_id, request)}
     del provenance["job_id"]
     psf = interpolated_psf(
         ends["before"],
@@ -58,11 +61,22 @@ def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
         threads=context.settings.threads,
     )
     context.report(STAGE, 1, 2)
-    row = _saved(context, identity, psf)
-    # The files of the ends do not name the variant of the channel; their rows do.
-    row.channel = named_psf(context, request.before_psf_id).channel or row.channel
-    row.series = series_of(row.instrument, row.channel, row.kind)
-    return context.add(row)
+    parents = psf.provenance["interpolated_between"]
+    return keep_psf(
+        context,
+        psf,
+        identity,
+        origin=INTERPOLATED,
+        draw=partial(psf_png, psf),
+        # The files of the ends do not name the variant of the channel; their rows do.
+        channel=named_psf(context, request.before_psf_id).channel,
+        details={
+            "parents": {name: end["psf_id"] for name, end in zip(("before", "after"), parents, strict=True)},
+            "weights": {end["psf_id"]: end["weight"] for end in parents},
+            "job_id": context.job_id,
+            "fit": _fit_of(psf, context.settings.threads),
+        },
+    )
 
 
 def _epoch(context: Context, psf_id: str, time: str) -> Epoch:
@@ -75,32 +89,6 @@ def _epoch(context: Context, psf_id: str, time: str) -> Epoch:
         psf, name=row.name, version=row.version, instrument=instrument, wavelength_angstrom=angstrom
     )
     return Epoch(psf, datetime.fromisoformat(time), {"psf_id": row.id, "file_sha256": row.file_sha256})
-
-
-def _saved(context: Context, identity: str, psf: Psf) -> PsfRow:
-    """The row of the PSF; its file, picture and tables are in the store."""
-    from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
-
-    ends = psf.provenance["interpolated_between"]
-    with context.store.temporary() as file, context.store.temporary() as picture:
-        write_psf(file, psf)
-        psf_png(psf, picture)
-        return psf_row(
-            psf,
-            identity,
-            context.owner,
-            origin=INTERPOLATED,
-            file_sha256=context.store.keep(file),
-            store=context.store,
-            preview_sha256=context.store.keep(picture),
-            details={
-                "parents": {name: end["psf_id"] for name, end in zip(("before", "after"), ends, strict=True)},
-                "weights": {end["psf_id"]: end["weight"] for end in ends},
-                "job_id": context.job_id,
-                "fit": _fit_of(psf, context.settings.threads),
-            },
-            threads=context.settings.threads,
-        )
 
 
 def _fit_of(psf: Psf, threads: int) -> dict[str, Any]:

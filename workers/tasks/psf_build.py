@@ -1,9 +1,10 @@
-"""The task ``psf-build``: builds a PSF version from an instrument file."""
+"""The tasks ``psf-build``, which builds a PSF version from an instrument file, and ``psf-tables``, which makes the tables and the
+picture of a PSF that has none yet, for example an uploaded PSF."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,14 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.fits.images import read_plane
-from psfcore.fits.psfs import write_psf
+from psfcore.fits.psfs import read_psf
 from psfcore.instruments.model import Instrument, parse_instrument
-from psfcore.psf import Psf
-from workers.catalogue.tables import ImageRow, PsfRow
+from workers.catalogue.tables import PsfRow
 from workers.contract.identities import interpolated_psf_identity, recipe_of
-from workers.contract.requests import PsfBuild, PsfInterpolate, ResolvedDeconvolve
+from workers.contract.requests import PsfBuild, PsfInterpolate, PsfTables, ResolvedDeconvolve
 from workers.settings import library_versions
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import is_total_alone, named_psf, psf_row
+from workers.tasks.data.psfs import keep_psf, keep_tables, named_psf
 from workers.versions import TOTAL
 
 
@@ -43,8 +43,7 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
     if request.psf_interpolation is not None:
         return _interpolated(context, request.psf_id, request.psf_interpolation)
     assert request.psf_recipe is not None
-    with _compiling_beside(context, request) if context.compile_beside else nullcontext():
-        row = built_psf(context, request.psf_recipe, whole=not context.total_psfs)
+    row = built_psf(context, request.psf_recipe)
     if row.id != request.psf_id:
         raise DataError(
             "instrument-changed",
@@ -52,17 +51,6 @@ def requested_psf(context: Context, request: ResolvedDeconvolve) -> PsfRow:
             "file changed after the job was submitted; submit the job again",
         )
     return row
-
-
-def _compiling_beside(context: Context, request: ResolvedDeconvolve) -> AbstractContextManager[None]:
-    upload = context.catalogue.get(ImageRow, request.image_id, context.owner)
-    if upload is None:  # the task raises the error when it loads the image
-        return nullcontext()
-    # A job that builds no PSF does not load the kernels here.
-    from psfcore.deconvolve.kernels import compiling_beside
-
-    ny, nx = upload.summary["shape"]
-    return compiling_beside(request.method.name, (ny, nx))
 
 
 def _interpolated(context: Context, psf_id: str, asked: PsfInterpolate) -> PsfRow:
@@ -78,53 +66,33 @@ def _interpolated(context: Context, psf_id: str, asked: PsfInterpolate) -> PsfRo
     return interpolated_row(context, asked)
 
 
-def built_psf(context: Context, build: PsfBuild, *, whole: bool = True) -> PsfRow:
-    """The row of the PSF of a recipe. If the catalogue does not contain this PSF, build it and add it.
-
-    whole: False: without components, tables and picture, for a deconvolution. If the whole PSF is asked for later, it is
-    built then, and its files replace those of the total PSF.
-    """
+def built_psf(context: Context, build: PsfBuild) -> PsfRow:
+    """The row of the PSF of a recipe. If the catalogue does not contain this PSF, build it and add it."""
     recipe = recipe_of(build)
-    identity = recipe.identity
-    there = context.made(PsfRow, identity)
-    if there is not None and not (whole and is_total_alone(there)):
+    there = context.made(PsfRow, recipe.identity)
+    if there is not None:
         return there
     instrument = parse_instrument(recipe.text, recipe.name or "instrument_file")
-    # A deconvolution with a PSF that is already built does not load the libraries of the diffraction.
+    # A deconvolution with a PSF that is already built does not load the libraries of the diffraction and of pictures.
     from psfcore.build import build_recipe
+    from psfcore.drawing.plots import psf_png
 
     psf = build_recipe(
         recipe,
-        parts=whole,
         mount_image=_mount_image(context, build, instrument),
         threads=context.settings.threads,
         progress=lambda step, steps: context.report("building the PSF", step, steps),
     )
-    with context.store.temporary() as path:
-        write_psf(path, psf, instrument_file=recipe.text.encode())
-        row = psf_row(
-            psf,
-            identity,
-            context.owner,
-            origin="built",
-            file_sha256=context.store.keep(path),
-            store=context.store,
-            preview_sha256=_picture(context, psf) if whole else None,
-            kind=build.component or TOTAL,
-            details={"job_id": context.job_id, "libraries": library_versions()},
-            threads=context.settings.threads,
-            whole=whole,
-        )
-    return context.add(row) if there is None else context.catalogue.refile(row)
-
-
-def _picture(context: Context, psf: Psf) -> str:
-    """Draw a PSF into the store; returns the SHA-256 of the picture."""
-    from psfcore.drawing import plots  # matplotlib is loaded only if a picture is drawn
-
-    with context.store.temporary() as picture:
-        plots.psf_png(psf, picture)
-        return context.store.keep(picture)
+    return keep_psf(
+        context,
+        psf,
+        recipe.identity,
+        origin="built",
+        draw=partial(psf_png, psf),
+        kind=build.component or TOTAL,
+        instrument_file=recipe.text.encode(),
+        details={"job_id": context.job_id, "libraries": library_versions()},
+    )
 
 
 def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> NDArray[np.float64] | None:
@@ -147,3 +115,26 @@ def _mount_image(context: Context, build: PsfBuild, instrument: Instrument) -> N
             "file and give its id",
         )
     return read_plane(context.store.verified(build.mask_id), context.limits)
+
+
+def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:
+    """Make the tables of a PSF of the catalogue, and its picture if it is missing; returns the PSF's id."""
+    request = PsfTables.model_validate(parameters)
+    row = named_psf(context, request.psf_id)
+    from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
+
+    context.report("reading", 0, 3)
+    psf = read_psf(context.store.verified(row.file_sha256), context.limits)
+    context.report("making tables", 1, 3)
+    tables_sha256 = keep_tables(psf, context.store, context.settings.threads)
+    context.report("drawing", 2, 3)
+    with context.store.temporary() as picture:
+        preview_sha256 = row.preview_sha256
+        if preview_sha256 is None or context.store.size(preview_sha256) is None:
+            psf_png(psf, picture)
+            preview_sha256 = context.store.keep(picture)
+    context.report("drawing", 3, 3)
+    context.catalogue.psfs.describe(
+        row.id, context.owner, tables_sha256=tables_sha256, preview_sha256=preview_sha256
+    )
+    return row.id

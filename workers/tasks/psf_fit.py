@@ -3,21 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from psfcore.fits.psfs import write_psf
+from psfcore.psf import Psf
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
 from psfcore.scatter.fit_plot import fit_png
+from psfcore.scatter.inversion import Inverter, Progress
 from psfcore.scatter.report import fit_json
 from psfcore.transit.prepare import Prepared
+from psfcore.transit.transit import Transit
 from workers.catalogue.tables import PsfRow
 from workers.contract.identities import diffraction_identity, psf_fit_identity
 from workers.contract.requests import ResolvedPsfFit
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import psf_row
+from workers.tasks.data.psfs import keep_psf
 from workers.tasks.data.reports import provenance_of, write_json
 from workers.tasks.data.solutions import solver
 from workers.tasks.transits import load_transit
+
+_SHOWN = ("sentence", "shape", "parameters", "curve", "chi2_per_pixel", "converged", "limits")
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fit and its PSF. report: the fit as JSON."""
+
+    fit: TransitFit
+    psf: Psf
+    report: dict[str, Any]
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """The main figures of the fit, as JSON."""
+        return {key: self.report[key] for key in _SHOWN}
 
 
 def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
@@ -27,64 +47,61 @@ def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
     if context.made(PsfRow, identity) is not None:
         return identity
     transit, prepared = load_transit(context, request)
-    fit = fit_transit(
+    fitted = fit(
+        request,
         transit,
-        shape=request.shape,
-        as_published=request.as_published,
-        seed=request.seed,
+        prepared,
+        job_id=context.job_id,
         threads=context.settings.threads,
         progress=context.report,
         solution=solver(context, request),
     )
-    _save(context, request, identity, fit, prepared)
+    _save(context, request, identity, fitted)
     return identity
 
 
-def _save(
-    context: Context, request: ResolvedPsfFit, identity: str, fit: TransitFit, prepared: Prepared
-) -> None:
-    """Write the file, report and picture of the PSF into the store, and add the PSF's row to the catalogue."""
+def fit(
+    request: ResolvedPsfFit,
+    transit: Transit,
+    prepared: Prepared,
+    *,
+    job_id: str,
+    threads: int,
+    progress: Progress,
+    solution: Inverter | None = None,
+) -> Fitted:
+    """Fit a transit as a request says. solution: see `fit_transit`."""
+    found = fit_transit(
+        transit,
+        shape=request.shape,
+        as_published=request.as_published,
+        seed=request.seed,
+        threads=threads,
+        progress=progress,
+        solution=solution,
+    )
+    identity = psf_fit_identity(request)
     provenance = {
         "psf_id": identity,
-        "inputs_sha256": fit.transit.sha256,
-        **provenance_of(context, request),
+        "inputs_sha256": transit.sha256,
+        **provenance_of(job_id, request),
     }
-    name = f"{fit.transit.instrument or 'transit'}-fitted"
-    psf = fitted_psf(fit, name=name, version=f"0.1.0+{identity[:8]}", provenance=provenance)
-    said = fit_json(fit) | {"prepared": prepared.to_json(), "provenance": provenance}
-    with (
-        context.store.temporary() as file,
-        context.store.temporary() as picture,
-        context.store.temporary() as text,
-    ):
-        write_psf(file, psf)
-        fit_png(fit, picture)
-        write_json(text, said)
-        row = psf_row(
-            psf,
-            identity,
-            context.owner,
-            origin="fitted",
-            file_sha256=context.store.keep(file),
-            store=context.store,
-            preview_sha256=context.store.keep(picture),
-            details={
-                "transit_id": request.transit_id,
-                "diffraction_psf_id": diffraction_identity(request),
-                "report_sha256": context.store.keep(text),
-                "fit": {
-                    key: said[key]
-                    for key in (
-                        "sentence",
-                        "shape",
-                        "parameters",
-                        "curve",
-                        "chi2_per_pixel",
-                        "converged",
-                        "limits",
-                    )
-                },
-            },
-            threads=context.settings.threads,
-        )
-    context.add(row)
+    name = f"{transit.instrument or 'transit'}-fitted"
+    psf = fitted_psf(found, name=name, version=f"0.1.0+{identity[:8]}", provenance=provenance)
+    report = fit_json(found) | {"prepared": prepared.to_json(), "provenance": provenance}
+    return Fitted(found, psf, report)
+
+
+def _save(context: Context, request: ResolvedPsfFit, identity: str, fitted: Fitted) -> None:
+    """Write the file, report and picture of the PSF into the store, and add the PSF's row to the catalogue."""
+    with context.store.temporary() as text:
+        write_json(text, fitted.report)
+        details = {
+            "transit_id": request.transit_id,
+            "diffraction_psf_id": diffraction_identity(request),
+            "report_sha256": context.store.keep(text),
+            "fit": fitted.details,
+        }
+    keep_psf(
+        context, fitted.psf, identity, origin="fitted", draw=partial(fit_png, fitted.fit), details=details
+    )

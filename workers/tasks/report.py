@@ -9,15 +9,18 @@ import numpy as np
 
 from psfcore.evaluation.plot import evaluation_png
 from psfcore.evaluation.shapes import compare_shapes_by_errors
+from psfcore.psf import Psf
 from psfcore.report.page import report_page
-from psfcore.report.report import PsfReport, make_report, report_json
-from psfcore.transit.transit import Kernel
+from psfcore.report.report import make_report, report_json
+from psfcore.scatter.inversion import Inverter, Progress
+from psfcore.transit.prepare import Prepared
+from psfcore.transit.transit import Kernel, Transit
 from workers.catalogue.tables import ReportRow
 from workers.contract.identities import report_identity
 from workers.contract.requests import ResolvedReport
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import given_psf
-from workers.tasks.data.reports import keep_report, provenance_of, write_json
+from workers.tasks.data.reports import Finished, keep_report, provenance_of
 from workers.tasks.data.solutions import solver
 from workers.tasks.transits import load_transit
 
@@ -32,23 +35,22 @@ def report(context: Context, parameters: Mapping[str, Any]) -> str:
     if context.made(ReportRow, identity) is not None:
         return identity
     psf = given_psf(context, request.psf_id)
-    transit, prepared = load_transit(context, request, diffraction=None if psf is None else _point())
-    made = make_report(
+    transit, prepared = load_transit(context, request, diffraction=None if psf is None else point())
+    finished = make(
+        request,
         transit,
         prepared,
-        psf=psf,
-        dark_offsets=request.dark_offsets,
-        seed=request.seed,
+        psf,
+        job_id=context.job_id,
         threads=context.settings.threads,
         progress=context.report,
         solution=solver(context, request),
     )
-    shapes = _shapes(context, request, made) if request.shapes else None
-    _save(context, request, identity, made, shapes)
+    keep_report(context, identity, KIND, finished, transit_id=request.transit_id)
     return identity
 
 
-def _point() -> Kernel:
+def point() -> Kernel:
     """A diffraction PSF that changes nothing (a point).
 
     This PSF is used with a given PSF that already contains the diffraction.
@@ -58,46 +60,48 @@ def _point() -> Kernel:
     return point
 
 
-def _shapes(context: Context, request: ResolvedReport, report: PsfReport) -> dict[str, Any]:
-    """The comparison of the scatter shapes by their residuals on held-out images."""
-    assert report.fit is not None  # a request that compares shapes names no PSF, so the transit was fitted
-    return compare_shapes_by_errors(report.fit.solution, seed=request.seed, progress=context.report).to_json()
-
-
-def _save(
-    context: Context,
+def make(
     request: ResolvedReport,
-    identity: str,
-    report: PsfReport,
-    shapes: dict[str, Any] | None,
-) -> None:
-    """Write JSON, page and picture into the store, and the row into the catalogue."""
-    provenance = {"report_id": identity, **provenance_of(context, request)}
+    transit: Transit,
+    prepared: Prepared,
+    psf: Psf | None,
+    *,
+    job_id: str,
+    threads: int,
+    progress: Progress,
+    solution: Inverter | None = None,
+) -> Finished:
+    """Make the report that a request describes. psf: the PSF to test; None: fit one. solution: see `make_report`."""
+    report = make_report(
+        transit,
+        prepared,
+        psf=psf,
+        dark_offsets=request.dark_offsets,
+        seed=request.seed,
+        threads=threads,
+        progress=progress,
+        solution=solution,
+    )
+    provenance = {"report_id": report_identity(request), **provenance_of(job_id, request)}
     said = report_json(report, provenance)
-    if shapes is not None:
-        said["shapes"] = shapes
-    with (
-        context.store.temporary() as text,
-        context.store.temporary() as page,
-        context.store.temporary() as picture,
-    ):
-        write_json(text, said)
-        page.write_text(report_page(report, provenance), "utf-8")
-        evaluation_png(report.evaluation, picture, title=report.how_judged, study=report.study)
-        keep_report(
-            context,
-            identity,
-            KIND,
-            transit_id=request.transit_id,
-            text=text,
-            page=page,
-            picture=picture,
-            details={
-                "sentence": said["sentence"],
-                "psf_id": request.psf_id,
-                "held_out": report.held_out,
-                "residuals": said["evaluation"]["all"],
-                "not_shown": said["not_shown"],
-                "limits": said["fit"]["limits"] if report.fit is not None else [],
-            },
-        )
+    if request.shapes:
+        assert (
+            report.fit is not None
+        )  # a request that compares shapes names no PSF, so the transit was fitted
+        shapes = compare_shapes_by_errors(report.fit.solution, seed=request.seed, progress=progress)
+        said["shapes"] = shapes.to_json()
+    return Finished(
+        said,
+        {
+            "sentence": said["sentence"],
+            "psf_id": request.psf_id,
+            "held_out": report.held_out,
+            "residuals": said["evaluation"]["all"],
+            "not_shown": said["not_shown"],
+            "limits": said["fit"]["limits"] if report.fit is not None else [],
+        },
+        draw=lambda path: evaluation_png(
+            report.evaluation, path, title=report.how_judged, study=report.study
+        ),
+        page=report_page(report, provenance),
+    )

@@ -26,7 +26,7 @@ from workers.lineage import Made, lineage
 from workers.rows import row_of
 from workers.tasks.context import Context
 from workers.tasks.data.psfs import named_psf
-from workers.tasks.data.reports import keep_report, write_json
+from workers.tasks.data.reports import add_report, write_json
 
 KIND = "rerun"
 SCHEMA = 1
@@ -143,7 +143,7 @@ def _save(context: Context, identity: str, request: ResolvedRerun, first: Thing,
         context.report(
             "comparing", 1, 1
         )  # raises an exception if the job was cancelled, so that no report is kept
-        keep_report(context, identity, KIND, text=text, details=details, about_id=request.id)
+        add_report(context, identity, KIND, text=text, details=details, about_id=request.id)
 
 
 def _made(context: Context, row: Thing) -> dict[str, Any]:

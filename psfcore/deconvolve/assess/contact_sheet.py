@@ -2,7 +2,8 @@
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Effects on HRI_EUV images", deconvolved a catalogue
 at a daily cadence "to visually inspect for artifacts". This module sorts the images by artefact score, so that a person
-inspects the most doubtful images first. Only thumbnails of the images are kept in memory.
+inspects the most doubtful images first. Only thumbnails of the images are kept in memory. The images are deconvolved
+elsewhere: `changes_in_product` reads the numbers from the details of a product, and the suspected pixels from its plane QUALITY.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.changes import Changes, measure_changes
-from psfcore.deconvolve.conditions import Conditions
-from psfcore.deconvolve.methods.registry import method_named
+from psfcore.deconvolve.assess.artefacts import Artefacts
+from psfcore.deconvolve.assess.changes import Changes, Range, Structure
+from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.drawing.plots import (
     CHANGE,
     CHANGE_LIMIT_PCT,
@@ -32,12 +33,13 @@ from psfcore.drawing.plots import (
 )
 from psfcore.errors import DataError
 from psfcore.fits.cards import optional_text
-from psfcore.image import Image
-from psfcore.psf import Psf
-from psfcore.psf_sampling import psf_for_image
+from psfcore.fits.header import FitsLimits
+from psfcore.fits.images import read_planes
+from psfcore.fits.observation import read_observation
 
 THUMBNAIL_PX = 256
 MOST_ON_SHEET = 60
+DATE_KEYS = ("DATE-BEG", "DATE-OBS", "T_OBS")
 # Each image is represented by these rows of psfcore.deconvolve.assess.changes: blocks of 4 px, tails of 1 %.
 BLOCK_PX, TAIL_PCT = 4, 1.0
 LOOK_FROM = 1.0
@@ -47,7 +49,6 @@ _DOUBTFUL, _CLEAN = "#b3261e", "#2b8a6e"
 _CELL_IN, _TEXT_IN, _TITLE_IN = 2.0, 0.62, 0.75
 
 Plane = NDArray[np.float64]
-Deconvolve = Callable[[Image, Psf], "Treated"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,42 +106,40 @@ class Failure:
     reason: str
 
 
-def treat(
-    name: str,
-    image: Image,
-    psf: Psf,
-    *,
-    method: str = "richardson-lucy",
-    conditions: Conditions | None = None,
-    **parameters: Any,
+def changes_in_product(
+    name: str, before: str | Path, product: str | Path, details: dict[str, Any], limits: FitsLimits
 ) -> Treated:
-    """Deconvolve one image and measure the changes.
+    """Make the row of one image. ``before``, ``product``: the FITS files of the image and of its product.
 
-    Raises DataError "plate-scale-mismatch" and the errors of the method.
+    details: the product's details, with "changes", "steps_done" and "stopped_because". Raises the errors of
+    ``read_observation``.
     """
-    conditions = conditions or Conditions()
-    fitting = psf_for_image(psf, image.header)
-    result = method_named(method)(image, fitting, conditions, **parameters)
-    edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
-    found = measure_changes(
-        image,
-        result.pixels,
-        fitting,
-        noise=conditions.noise,
-        edge_px=edge_px,
-        threads=conditions.threads,
-    )
+    image, after = read_observation(before, limits), read_observation(product, limits)
+    suspected = (read_planes(product)["QUALITY"] & QualityBit.ARTEFACT) > 0
     step = max(1, -(-max(image.pixels.shape) // THUMBNAIL_PX))
     return Treated(
         name=name,
-        taken=optional_text(image.header, "DATE-BEG", "DATE-OBS", "T_OBS"),
-        psf=f"{fitting.name} {fitting.version}",
-        found=found,
-        steps_done=result.steps_done,
-        stopped_because=result.stopped_because,
+        taken=optional_text(image.header, *DATE_KEYS),
+        psf=f"{optional_text(after.header, 'PSFNAME')} {optional_text(after.header, 'PSFVERS')}",
+        found=changes_from_json(details["changes"], suspected),
+        steps_done=details["steps_done"],
+        stopped_because=details["stopped_because"],
         before=binned(image.pixels, step),
-        after=binned(result.pixels, step),
-        suspected=np.unique(np.argwhere(found.artefacts.suspected) // step, axis=0),
+        after=binned(after.pixels, step),
+        suspected=np.unique(np.argwhere(suspected) // step, axis=0),
+    )
+
+
+def changes_from_json(figures: dict[str, Any], suspected: NDArray[np.bool_]) -> Changes:
+    """Make a ``Changes`` from the numbers that ``Changes.as_json`` wrote and the plane of suspected pixels [y, x]."""
+    artefacts = figures["artefacts"]
+    return Changes(
+        **figures
+        | {
+            "structures": tuple(Structure(**row) for row in figures["structures"]),
+            "ranges": tuple(Range(**row) for row in figures["ranges"]),
+            "artefacts": Artefacts(suspected, artefacts["signs"], artefacts["sources"], artefacts["score"]),
+        }
     )
 
 

@@ -23,16 +23,17 @@ abs(1 - T) > 1.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from psfcore.compiled import compiled
 from psfcore.convolution.engine import buffer_from_spectrum, spectrum_from_buffer
 from psfcore.convolution.fft_kernels import LANES, forward, inverse
-from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.additive import check_converges, noise_amplification, transfer_sample
+from psfcore.deconvolve.conditions import Conditions, Deconvolved
 from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.frequencies import check_converges, noise_amplification, transfer_sample
-from psfcore.deconvolve.problem import Problem, first_estimate, pose, solution
-from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.problem import Problem, first_estimate, pose
 from psfcore.deconvolve.stopping import Iteration, Stop
 from psfcore.image import Image
 from psfcore.psf import Psf
@@ -54,16 +55,9 @@ def deconvolve(
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
     sample = transfer_sample(problem.engine)
     check_converges(sample, steps)
-    iteration = _BasicIterative(problem)
-    ended = problem.solve(iteration, steps=steps, stop=stop)
-    return solution(
-        problem,
-        iteration.x,
-        ended,
-        method=METHOD,
-        last_change=iteration.change,
-        noise_amplification=noise_amplification(sample, np.ones_like(sample.values), ended.steps_done),
-    )
+    result = problem.solve(_BasicIterative(problem), method=METHOD, steps=steps, stop=stop)
+    amplification = noise_amplification(sample, np.ones_like(sample.values), result.steps_done)
+    return replace(result, noise_amplification=amplification)
 
 
 class _BasicIterative(Iteration):

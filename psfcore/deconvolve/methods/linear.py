@@ -22,16 +22,16 @@ its neighbours.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.engine import Engine
-from psfcore.deconvolve.additive import Additive
-from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.additive import Additive, noise_amplification, transfer_sample
+from psfcore.deconvolve.conditions import Conditions, Deconvolved
 from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.frequencies import noise_amplification, transfer_sample
-from psfcore.deconvolve.problem import pose, solution
-from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.problem import pose
 from psfcore.deconvolve.stopping import Stop
 from psfcore.image import Image
 from psfcore.psf import Psf
@@ -51,18 +51,12 @@ def deconvolve(
     The result may be negative. It is NaN where the image is not finite. Raises the same errors as `problem.pose`.
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
-    iteration = Additive(problem, inverse_filter(problem.engine))
-    ended = problem.solve(iteration, steps=steps, stop=stop)
+    result = problem.solve(
+        Additive(problem, inverse_filter(problem.engine)), method=METHOD, steps=steps, stop=stop
+    )
     sample = transfer_sample(problem.engine)
     g = np.conj(sample.values) / np.maximum(np.abs(sample.values) ** 2, LEAST_TRANSFER**2)
-    return solution(
-        problem,
-        iteration.x,
-        ended,
-        method=METHOD,
-        last_change=iteration.change,
-        noise_amplification=noise_amplification(sample, g, ended.steps_done),
-    )
+    return replace(result, noise_amplification=noise_amplification(sample, g, result.steps_done))
 
 
 def inverse_filter(engine: Engine) -> NDArray[np.float32]:

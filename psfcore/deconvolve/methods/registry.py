@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import Any
 
 import psfcore.deconvolve.methods
+from psfcore.deconvolve.conditions import Deconvolved
 from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.result import Deconvolved
 from psfcore.errors import DataError
 
 Method = Callable[..., Deconvolved]

@@ -34,11 +34,10 @@ from numpy.typing import NDArray
 from psfcore.compiled import compiled
 from psfcore.convolution.engine import buffer_from_spectrum, spectrum_from_buffer
 from psfcore.convolution.fft_kernels import LANES, forward, inverse
-from psfcore.deconvolve.conditions import Conditions, Progress
+from psfcore.deconvolve.conditions import Conditions, Deconvolved, Progress
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
-from psfcore.deconvolve.problem import Problem, pose, solution
-from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.problem import Problem, pose
 from psfcore.deconvolve.stopping import Iteration, Stop
 from psfcore.image import Image
 from psfcore.psf import Psf
@@ -62,15 +61,7 @@ def deconvolve(
     estimate from the surrounding pixels. Raises the errors of `problem.pose`, and DataError "no-signal".
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
-    iteration = _RichardsonLucy(problem)
-    ended = problem.solve(iteration, steps=steps, stop=stop)
-    return solution(
-        problem,
-        iteration.x,
-        ended,
-        method=METHOD,
-        last_change=iteration.change,
-    )
+    return problem.solve(_RichardsonLucy(problem), method=METHOD, steps=steps, stop=stop)
 
 
 def richardson_lucy(

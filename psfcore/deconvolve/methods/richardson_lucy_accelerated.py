@@ -19,12 +19,11 @@ from __future__ import annotations
 import numpy as np
 
 from psfcore.compiled import compiled
-from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.conditions import Conditions, Deconvolved
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
 from psfcore.deconvolve.methods.richardson_lucy import agreed
-from psfcore.deconvolve.problem import Problem, pose, solution
-from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.problem import Problem, pose
 from psfcore.deconvolve.stopping import Iteration, Stop
 from psfcore.errors import DataError
 from psfcore.image import Image
@@ -55,19 +54,13 @@ def deconvolve(
     if order not in (1, 2):
         raise DataError("bad-order", f"expected an order of 1 or 2; got {order}")
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
-    iteration = _Accelerated(problem, order)
-    ended = problem.solve(iteration, steps=steps, stop=stop)
-    return solution(
-        problem,
-        iteration.prediction,
-        ended,
-        method=METHOD,
-        last_change=iteration.change,
-    )
+    return problem.solve(_Accelerated(problem, order), method=METHOD, steps=steps, stop=stop)
 
 
 class _Accelerated(Iteration):
-    """The iteration of Eq. (1) to (3). `measure` convolves `prediction`; after the last step, `prediction` is x."""
+    """The iteration of Eq. (1) to (3). Its `x` is the prediction, which `measure` convolves; after the last step it is x."""
+
+    change = 0.0
 
     def __init__(self, problem: Problem, order: int) -> None:
         estimate = light_above_floor(problem)
@@ -75,14 +68,13 @@ class _Accelerated(Iteration):
         self._ratio = Ratio(problem, agreed(problem), float(estimate.max()))
         self._dark = self._ratio.floor * np.float32(DARK_OF_FLOOR)
         self._order = order
-        self.prediction = problem.engine.to_lanes(estimate)
-        self._x, self._before = self.prediction.copy(), self.prediction.copy()
+        self.x = problem.engine.to_lanes(estimate)
+        self._x, self._before = self.x.copy(), self.x.copy()
         # Order 1 does not need x_(k-2), so the array of x_(k-1) takes its role.
-        self._earlier = self.prediction.copy() if order == 2 else self._before
+        self._earlier = self.x.copy() if order == 2 else self._before
         self._gradient = np.zeros_like(self._x)
         self._corrected = np.zeros_like(self._x)
-        self.change = 0.0
-        self._engine.rows_forward(self.prediction)
+        self._engine.rows_forward(self.x)
 
     def measure(self) -> None:
         self._ratio.measure()
@@ -92,10 +84,10 @@ class _Accelerated(Iteration):
         self._engine.rows_inverse(self._corrected)
         acceleration = self._correct()
         if last:
-            self.prediction = self._x
+            self.x = self._x
         else:
             self._predict(acceleration)
-            self._engine.rows_forward(self.prediction)
+            self._engine.rows_forward(self.x)
 
     def _correct(self) -> float:
         """Compute Eq. (2); the new estimate replaces the oldest one. Returns a_k of Eq. (3)."""
@@ -103,9 +95,7 @@ class _Accelerated(Iteration):
         sums = np.zeros((self._engine.row_blocks, 4))
 
         def work(first: int, end: int, _: object) -> None:
-            _correct(
-                new, self.prediction, self._corrected, self._x, self._gradient, self._dark, sums, first, end
-            )
+            _correct(new, self.x, self._corrected, self._x, self._gradient, self._dark, sums, first, end)
 
         self._engine.run(work, self._engine.row_blocks)
         self._before, self._x = self._x, new
@@ -120,9 +110,7 @@ class _Accelerated(Iteration):
         curvature = np.float32(acceleration**2 / 2 if self._order == 2 else 0)
 
         def work(first: int, end: int, _: object) -> None:
-            _predict(
-                self.prediction, self._x, self._before, self._earlier, a, curvature, self._dark, first, end
-            )
+            _predict(self.x, self._x, self._before, self._earlier, a, curvature, self._dark, first, end)
 
         self._engine.run(work, self._engine.row_blocks)
 

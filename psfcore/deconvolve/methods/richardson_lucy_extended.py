@@ -24,11 +24,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.conditions import Conditions, Deconvolved
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
-from psfcore.deconvolve.problem import Problem, pose, solution
-from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.problem import Problem, pose
 from psfcore.deconvolve.stopping import Iteration, Stop
 from psfcore.image import Image
 from psfcore.psf import Psf
@@ -50,19 +49,13 @@ def deconvolve(
     Raises the errors of `problem.pose`, and DataError "no-signal".
     """
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
-    iteration = _Extended(problem)
-    ended = problem.solve(iteration, steps=steps, stop=stop)
-    return solution(
-        problem,
-        iteration.x,
-        ended,
-        method=METHOD,
-        last_change=iteration.change,
-    )
+    return problem.solve(_Extended(problem), method=METHOD, steps=steps, stop=stop)
 
 
 class _Extended(Iteration):
     """The iteration of Eq. (1)."""
+
+    change = 0.0
 
     def __init__(self, problem: Problem) -> None:
         engine = problem.engine
@@ -76,7 +69,6 @@ class _Extended(Iteration):
         self._gain = engine.to_lanes(gain)
         self.x = engine.to_lanes(np.where(known, estimate, np.float32(0)))
         self._correction = np.zeros_like(self.x)
-        self.change = 0.0
         engine.rows_forward(self.x)
 
     def measure(self) -> None:

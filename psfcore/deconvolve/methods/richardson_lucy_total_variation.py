@@ -26,12 +26,11 @@ from __future__ import annotations
 import numpy as np
 
 from psfcore.compiled import compiled
-from psfcore.deconvolve.conditions import Conditions
+from psfcore.deconvolve.conditions import Conditions, Deconvolved
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
 from psfcore.deconvolve.methods.richardson_lucy import agreed
-from psfcore.deconvolve.problem import Problem, pose, solution
-from psfcore.deconvolve.result import Deconvolved
+from psfcore.deconvolve.problem import Problem, pose
 from psfcore.deconvolve.stopping import Iteration, Stop
 from psfcore.errors import DataError
 from psfcore.image import Image
@@ -63,20 +62,14 @@ def deconvolve(
     if not 0 <= smoothing <= MOST_SMOOTHING:
         raise DataError("bad-smoothing", f"expected smoothing of 0 to {MOST_SMOOTHING}; got {smoothing}")
     problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
-    iteration = _TotalVariation(problem, smoothing)
-    ended = problem.solve(iteration, steps=steps, stop=stop)
-    return solution(
-        problem,
-        iteration.x,
-        ended,
-        method=METHOD,
-        last_change=iteration.change,
-    )
+    return problem.solve(_TotalVariation(problem, smoothing), method=METHOD, steps=steps, stop=stop)
 
 
 class _TotalVariation(Iteration):
     """The iteration of Eq. (1). x is a plane [y, x], because the differences connect pixels of different blocks of the
     engine."""
+
+    change = 0.0
 
     def __init__(self, problem: Problem, smoothing: float) -> None:
         self.x = light_above_floor(problem)
@@ -87,7 +80,6 @@ class _TotalVariation(Iteration):
         self._smoothing = np.float32(smoothing)
         self._softening = np.float32(SOFTENING)
         self._lanes = problem.engine.to_lanes(self.x)
-        self.change = 0.0
         self._engine.rows_forward(self._lanes)
 
     def measure(self) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psfcore.built.cache import PROVENANCE, CachedPsf, PsfCache
+from psfcore.psf_cache import PROVENANCE, CachedPsf, PsfCache
 from psfcore.tables import lookup
 from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_file, remote, short, whole_id
 from service.cli.options import JSON, OUTPUT, limits, user_errors, write_json, writes_files

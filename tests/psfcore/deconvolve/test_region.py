@@ -16,6 +16,7 @@ from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.deconvolve.region import BoxWork, box_work
+from psfcore.deconvolve.run import Options
 from psfcore.deconvolve.whole import Work
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
@@ -180,7 +181,7 @@ def test_what_depends_on_the_whole_image_is_refused(image: Image, psf: Psf) -> N
     assert refused(changed=replace(image, mask=masked)) == "all-masked"
     alone: BoxWork = box_work(Work(image, psf, "linear", Conditions()), BRIGHT)
     with pytest.raises(DataError, match="region-errors"):
-        alone.errors(alone.run(), 4)
+        Options(region=alone.box, error_draws=4)
 
 
 def test_a_text_becomes_a_box_and_a_text_again() -> None:

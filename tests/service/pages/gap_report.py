@@ -17,7 +17,7 @@ from workers.catalogue.tables import DEFAULT_OWNER
 from workers.files.store import Store
 from workers.settings import Settings
 from workers.tasks.context import Context
-from workers.tasks.data.reports import keep_report, write_json
+from workers.tasks.data.reports import add_report, write_json
 
 GAP_ID = "9a" * 32
 
@@ -34,7 +34,8 @@ def keep_gap_report(settings: Settings, owner: str = DEFAULT_OWNER) -> dict[str,
     with store.temporary() as text, store.temporary() as page:
         write_json(text, said)
         page.write_text(html, "utf-8")
-        keep_report(context, GAP_ID, "gap", text=text, page=page, details={"sentence": said["sentence"]})
+        details = {"sentence": said["sentence"], "page_sha256": store.keep(page)}
+        add_report(context, GAP_ID, "gap", text=text, details=details)
     catalogue.close()
     return said
 

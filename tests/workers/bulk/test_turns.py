@@ -87,7 +87,7 @@ class Run:
     def turn(self) -> None:
         keep_turns(self.catalogue, self.settings)
         for job in self.catalogue.jobs.of_kind("bulk"):
-            Runner(self.settings, self.catalogue, self._store, previews=False).run(job.id)
+            Runner(self.settings, self.catalogue, self._store).run(job.id)
 
     def turns(self) -> int:
         """Run turns until the run stops; returns their number."""
@@ -327,7 +327,7 @@ def test_as_many_turns_as_workers_process_images_while_one_lists(
     keep_turns(run.catalogue, run.settings)
     others = [job for job in run.catalogue.jobs.of_kind("bulk") if job.id != lease.job_id]
     assert len(others) == IN_FOLDER - 1
-    Runner(run.settings, run.catalogue, Store(run.settings.data_dir), previews=False).run(others[0].id)
+    Runner(run.settings, run.catalogue, Store(run.settings.data_dir)).run(others[0].id)
     now = run.now()
     assert (now["phase"], now["images"]["done"], now["images"]["waiting"]) == ("LISTING", IN_FOLDER, 0)
 

@@ -16,14 +16,13 @@ from tests.workers.conftest import Clock
 from tests.workers.databases import BOTH, change
 from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.stage_times import Spent
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
 from workers.contract.phases import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
+from workers.stage_timer import STARTING, Spent
 from workers.tasks.context import Context
-from workers.tasks.stage_timer import STARTING
 
 Task = Callable[[Context, Mapping[str, Any]], str]
 

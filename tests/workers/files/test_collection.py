@@ -15,7 +15,7 @@ from sqlalchemy import text
 
 from psfcore.errors import DataError
 from service.cli.main import main
-from service.local import LocalService
+from tests.in_process import InProcess
 from tests.s3 import client_of, digests, elsewhere, kept, key_of, opened_store, root_of
 from tests.workers.databases import change
 from workers.catalogue.catalogue import Catalogue
@@ -269,7 +269,7 @@ def test_files_aside_stay_if_the_database_seems_wrong(remote: Store, catalogue: 
 def test_a_collection_beside_a_running_service_loses_no_file(
     settings: Settings, tmp_path: Path, image_file: Path, psf_file: Path
 ) -> None:
-    local = LocalService(settings)
+    local = InProcess(settings)
     psf = local.upload_psf(psf_file)
     product = local.deconvolve(image_file, psf_id=psf["id"], steps=1, changes=tmp_path / "e.png")
     local.answer([psf["id"]], "curve", {})  # has tables and a picture made

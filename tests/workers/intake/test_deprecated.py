@@ -11,8 +11,8 @@ from astropy.io import fits
 from pydantic import TypeAdapter
 
 from psfcore.errors import DataError
-from service.local import LocalService
 from tests.conftest import write_image
+from tests.in_process import InProcess
 from tests.workers.psf_examples import OWNER, identity, psf
 from workers.bulk.image import statistics_of
 from workers.catalogue.catalogue import Catalogue
@@ -38,7 +38,7 @@ def change(catalogue: Catalogue, status: PsfStatus, reason: str = "", **more: An
 
 
 @pytest.fixture
-def catalogue(local: LocalService, settings: Settings, psf_file: Path, tmp_path: Path) -> Iterator[Catalogue]:
+def catalogue(local: InProcess, settings: Settings, psf_file: Path, tmp_path: Path) -> Iterator[Catalogue]:
     """The catalogue holds the PSF that is built for HRI_EUV, with other pixels, as a certified PSF."""
     write_image(tmp_path / "i.fits", **HRI, **AT)
     found = Catalogue(settings.catalogue_url)
@@ -53,7 +53,7 @@ def catalogue(local: LocalService, settings: Settings, psf_file: Path, tmp_path:
 
 
 def test_the_service_does_not_choose_a_psf_that_was_deprecated(
-    local: LocalService, catalogue: Catalogue, tmp_path: Path
+    local: InProcess, catalogue: Catalogue, tmp_path: Path
 ) -> None:
     assert local.deconvolve(tmp_path / "i.fits", **FEW)["psf_id"] == BUILT
     change(catalogue, PsfStatus.DEPRECATED, "wrong mesh")
@@ -64,7 +64,7 @@ def test_the_service_does_not_choose_a_psf_that_was_deprecated(
         assert told in caught.value.message
 
 
-def test_the_error_names_the_successor(local: LocalService, catalogue: Catalogue, tmp_path: Path) -> None:
+def test_the_error_names_the_successor(local: InProcess, catalogue: Catalogue, tmp_path: Path) -> None:
     catalogue.add(psf("better"))
     asked = StatusAsked(PsfStatus.CERTIFIED, "", version="2.0.0", supersedes=(BUILT,))
     catalogue.psfs.change(identity("better"), OWNER, asked, "tester")
@@ -76,7 +76,7 @@ def test_the_error_names_the_successor(local: LocalService, catalogue: Catalogue
 
 
 def test_a_named_deprecated_psf_is_used_with_a_warning_also_for_a_product_made_before(
-    local: LocalService, catalogue: Catalogue, tmp_path: Path
+    local: InProcess, catalogue: Catalogue, tmp_path: Path
 ) -> None:
     before = local.deconvolve(tmp_path / "i.fits", psf_id=BUILT, **FEW)
     assert "psf-deprecated" not in str(before["details"]["warnings"])
@@ -95,7 +95,7 @@ def test_a_named_deprecated_psf_is_used_with_a_warning_also_for_a_product_made_b
 
 
 def test_a_context_of_an_earlier_moment_still_chooses_it(
-    local: LocalService, catalogue: Catalogue, tmp_path: Path
+    local: InProcess, catalogue: Catalogue, tmp_path: Path
 ) -> None:
     catalogue.contexts.create("old", OWNER, "tester", pins=[Pin(BUILT)])
     change(catalogue, PsfStatus.DEPRECATED)

@@ -18,8 +18,8 @@ from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
 from service.client.http import ServiceError
-from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT
+from tests.in_process import InProcess
 from tests.workers.databases import add, change
 from tests.workers.psf_examples import psf as psf_row
 from workers.catalogue.catalogue import Catalogue
@@ -254,7 +254,7 @@ def test_a_job_that_executes_too_long_ends_with_its_next_step(
         return "0" * 64
 
     monkeypatch.setattr("workers.tasks.deconvolve.deconvolve", slow)
-    service = LocalService(settings.model_copy(update={"max_job_s": 0.3}))
+    service = InProcess(settings.model_copy(update={"max_job_s": 0.3}))
     with pytest.raises(ServiceError) as ended:
         service.deconvolve(image_file, psf_id=service.upload_psf(psf_file)["id"])
     service.close()

@@ -12,8 +12,8 @@ from astropy.io import fits
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names
-from service.local import LocalService
 from tests.conftest import write_image, write_psf
+from tests.in_process import InProcess
 from tests.workers.psf_examples import OWNER, certify, deprecate, header_of, identity, psf, refused, years
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.contexts import Pin
@@ -287,14 +287,14 @@ def test_only_a_draft_becomes_a_variant_of_its_channel(variants: Catalogue) -> N
 AIA = {"TELESCOP": "SDO", "INSTRUME": "AIA_3", "WAVELNTH": 171, "CDELT1": 0.6, "CDELT2": 0.6}
 
 
-def upload(local: LocalService, path: Path, size: int, **cards: object) -> str:
+def upload(local: InProcess, path: Path, size: int, **cards: object) -> str:
     """A PSF of its own size, so that each has an id of its own."""
     write_psf(path, size=size)
     fits.writeto(path, fits.getdata(path), fits.Header(cards), overwrite=True)
     return str(local.upload_psf(path, name=path.stem)["id"])
 
 
-def refused_image(local: LocalService, tmp_path: Path, **cards: object) -> DataError:
+def refused_image(local: InProcess, tmp_path: Path, **cards: object) -> DataError:
     tmp_path.mkdir(exist_ok=True)
     write_image(tmp_path / "i.fits", **cards)
     with pytest.raises(DataError) as caught:
@@ -303,7 +303,7 @@ def refused_image(local: LocalService, tmp_path: Path, **cards: object) -> DataE
     return caught.value
 
 
-def test_the_error_names_instruments_psfs_and_ways(local: LocalService, tmp_path: Path) -> None:
+def test_the_error_names_instruments_psfs_and_ways(local: InProcess, tmp_path: Path) -> None:
     of_telescope = upload(local, tmp_path / "aia.fits", 32, INSTRUME="AIA_3", WAVELNTH=171)
     of_scale = upload(local, tmp_path / "scale.fits", 34, CDELT1=0.602)
     upload(local, tmp_path / "channel.fits", 36, INSTRUME="AIA_2", WAVELNTH=193, CDELT1=0.6)
@@ -321,7 +321,7 @@ def test_the_error_names_instruments_psfs_and_ways(local: LocalService, tmp_path
     assert "hri_euv" not in error.message
 
 
-def test_what_does_not_agree_is_told_too(local: LocalService, tmp_path: Path) -> None:
+def test_what_does_not_agree_is_told_too(local: InProcess, tmp_path: Path) -> None:
     upload(local, tmp_path / "aia.fits", 32, INSTRUME="AIA_3", CDELT1=0.6)
     error = refused_image(local, tmp_path, **{**AIA, "WAVELNTH": 1600, "CDELT1": 2.4, "CDELT2": 2.4})
     instruments = {one["name"]: one["told"] for one in error.fields["instruments"]}
@@ -338,14 +338,14 @@ def test_what_does_not_agree_is_told_too(local: LocalService, tmp_path: Path) ->
     assert error.fields["image"] == "SDO AIA_3"
 
 
-def test_an_image_without_any_name_gets_the_ways_too(local: LocalService, tmp_path: Path) -> None:
+def test_an_image_without_any_name_gets_the_ways_too(local: InProcess, tmp_path: Path) -> None:
     error = refused_image(local, tmp_path, TELESCOP="")
     assert error.fields["psfs"] == [] and len(error.fields["ways"]) == 3
     assert "an unnamed instrument" in error.message
 
 
 def test_instruments_that_agree_most_come_first_also_in_another_process(
-    local: LocalService, tmp_path: Path
+    local: InProcess, tmp_path: Path
 ) -> None:
     error = refused_image(local, tmp_path, **AIA)
     names = [one["name"] for one in error.fields["instruments"]]
@@ -362,7 +362,7 @@ PUBLISHED: tuple[tuple[dict[str, object], str, str], ...] = (
 )
 
 
-def test_the_ways_name_what_is_published_for_the_telescope(local: LocalService, tmp_path: Path) -> None:
+def test_the_ways_name_what_is_published_for_the_telescope(local: InProcess, tmp_path: Path) -> None:
     for number, (cards, way, published) in enumerate(PUBLISHED):
         error = refused_image(local, tmp_path / str(number), **cards)
         texts = {one["way"]: one["text"] for one in error.fields["ways"]}

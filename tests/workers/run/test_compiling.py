@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from psfcore.compiled import KernelFiles, listening
-from service.local import LocalService
+from tests.in_process import InProcess
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER
 from workers.files.store import Store
@@ -62,7 +62,7 @@ def test_only_the_thread_that_listens_is_told(tmp_path: Path) -> None:
 
 
 def test_noise_realisations_are_a_stage_of_their_own(
-    local: LocalService, image_file: Path, psf_file: Path
+    local: InProcess, image_file: Path, psf_file: Path
 ) -> None:
     told: list[tuple[str, int, int]] = []
     local.deconvolve(

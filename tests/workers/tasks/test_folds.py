@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
-from service.local import LocalService
+from tests.in_process import InProcess
 from tests.transit_files import write_transit
 from tests.workers.databases import change
 from tests.workers.jobs import job_row
@@ -45,14 +45,14 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def job_id(local: LocalService, tmp_path: Path) -> str:
+def job_id(local: InProcess, tmp_path: Path) -> str:
     """A cross-validation of three runs of three folds that waits."""
     transit_id = local.upload_transit(write_transit(tmp_path / "transit"))["id"]
     return str(local.submit("cross-validate", transit_id=transit_id, scheme="exact", runs=3)["id"])
 
 
 @pytest.fixture
-def catalogue(local: LocalService, settings: Settings) -> Iterator[Catalogue]:
+def catalogue(local: InProcess, settings: Settings) -> Iterator[Catalogue]:
     """With the tables that the local service made."""
     catalogue = Catalogue(settings.catalogue_url)
     yield catalogue

@@ -14,9 +14,9 @@ from psfcore.errors import DataError
 from psfcore.gap.verdict.calibration import COVERAGE, shipped_calibration
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from service.client.http import ServiceError
-from service.local import LocalService
 from tests.gap_files import EDGE_GLOW, REACH_PX, answer_at_once, small_reach, write_gap
 from tests.html_page import check_stands_alone
+from tests.in_process import InProcess
 from tests.psfcore.gap import small_gaps
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, PsfRow, ReportRow
@@ -36,8 +36,8 @@ def settings_of(folder: Path, gap_effects: str = "") -> Settings:
     return Settings(data_dir=folder, database_url=None, broker_url="filesystem://", gap_effects=gap_effects)
 
 
-def service_in(folder: Path, gap_effects: str = "") -> LocalService:
-    return LocalService(settings_of(folder, gap_effects))
+def service_in(folder: Path, gap_effects: str = "") -> InProcess:
+    return InProcess(settings_of(folder, gap_effects))
 
 
 @pytest.fixture(scope="module")
@@ -51,14 +51,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def service(folder: Path) -> Iterator[LocalService]:
+def service(folder: Path) -> Iterator[InProcess]:
     local = service_in(folder)
     yield local
     local.close()
 
 
 @pytest.fixture(scope="module")
-def catalogue(service: LocalService, folder: Path) -> Iterator[Catalogue]:
+def catalogue(service: InProcess, folder: Path) -> Iterator[Catalogue]:
     """That of the service."""
     catalogue = Catalogue(settings_of(folder).catalogue_url)
     yield catalogue
@@ -70,7 +70,7 @@ def ids(catalogue: Catalogue, table: type[PsfRow] | type[ReportRow]) -> list[str
 
 
 @pytest.fixture(scope="module")
-def made(service: LocalService, transit: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def made(service: InProcess, transit: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The job round a diagnosis that was made before, and all of its files; `heliopsf gap`'s tests do it for real."""
     out = tmp_path_factory.mktemp("made")
     with pytest.MonkeyPatch.context() as patched:
@@ -110,7 +110,7 @@ def test_the_report_names_the_effect_its_size_and_the_inputs(made: dict[str, Any
 
 
 def test_the_corrected_psf_is_a_new_draft_that_names_its_parents_effects_and_the_gap(
-    service: LocalService, made: dict[str, Any]
+    service: InProcess, made: dict[str, Any]
 ) -> None:
     row, report = made["row"], made["json"]
     psf = service.get(f"/v1/psfs/{row['details']['corrected_psf_id']}")
@@ -132,7 +132,7 @@ def test_the_corrected_psf_is_a_new_draft_that_names_its_parents_effects_and_the
 
 
 def test_an_identical_request_gets_the_existing_report_and_a_rerun_adds_no_second_psf(
-    service: LocalService,
+    service: InProcess,
     catalogue: Catalogue,
     made: dict[str, Any],
     transit: Path,
@@ -151,7 +151,7 @@ def test_an_identical_request_gets_the_existing_report_and_a_rerun_adds_no_secon
 
 
 def test_a_job_whose_worker_was_lost_after_the_psf_was_saved_gives_one_result(
-    service: LocalService,
+    service: InProcess,
     catalogue: Catalogue,
     transit: Path,
     asked: list[dict[str, Any]],
@@ -172,7 +172,7 @@ def test_a_job_whose_worker_was_lost_after_the_psf_was_saved_gives_one_result(
 
 
 def test_a_given_psf_is_the_start_of_the_fit_and_a_parent_of_the_corrected_psf(
-    service: LocalService, made: dict[str, Any], transit: Path, asked: list[dict[str, Any]], tmp_path: Path
+    service: InProcess, made: dict[str, Any], transit: Path, asked: list[dict[str, Any]], tmp_path: Path
 ) -> None:
     parent = made["row"]["details"]["corrected_psf_id"]
     row = service.diagnose_gap(transit, tmp_path / "r.json", psf_id=parent)
@@ -188,7 +188,7 @@ def test_a_given_psf_is_the_start_of_the_fit_and_a_parent_of_the_corrected_psf(
 
 
 def test_a_request_chooses_the_coverage_and_whether_a_psf_is_made(
-    service: LocalService, catalogue: Catalogue, transit: Path, asked: list[dict[str, Any]]
+    service: InProcess, catalogue: Catalogue, transit: Path, asked: list[dict[str, Any]]
 ) -> None:
     before = ids(catalogue, PsfRow)
     row = service.diagnose_gap(transit, coverage=0.5, correct=False)
@@ -198,7 +198,7 @@ def test_a_request_chooses_the_coverage_and_whether_a_psf_is_made(
 
 
 def test_a_psf_that_was_not_fitted_or_is_unknown_is_refused(
-    service: LocalService, transit: Path, asked: list[dict[str, Any]]
+    service: InProcess, transit: Path, asked: list[dict[str, Any]]
 ) -> None:
     unfitted = service.upload_psf(transit / "diffraction.fits")["id"]
     with pytest.raises(ServiceError) as caught:
@@ -250,7 +250,7 @@ def test_changed_effect_files_make_another_diagnosis_and_an_earlier_job_refuses_
 
 
 def test_a_diagnosis_is_valid_without_its_corrected_psf(
-    service: LocalService,
+    service: InProcess,
     transit: Path,
     asked: list[dict[str, Any]],
     tmp_path: Path,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from astropy.io import fits
 
-from service.local import LocalService
 from tests.conftest import write_image
+from tests.in_process import InProcess
 from workers.settings import Settings, software_version
 
 OF_INPUT = {
@@ -24,11 +24,11 @@ OF_INPUT = {
 
 
 def test_a_product_does_not_pass_for_its_input_and_equal_requests_give_equal_bytes(
-    local: LocalService, psf_file: Path, tmp_path: Path
+    local: InProcess, psf_file: Path, tmp_path: Path
 ) -> None:
     write_image(tmp_path / "image.fits", **OF_INPUT)
     (tmp_path / "other name.fits").write_bytes((tmp_path / "image.fits").read_bytes())
-    second = LocalService(Settings.apart(tmp_path / "second"))
+    second = InProcess(Settings.apart(tmp_path / "second"))
     for name, service in (("image", local), ("other name", second)):
         psf_id = service.upload_psf(psf_file)["id"]
         output = tmp_path / f"{name}.out.fits"

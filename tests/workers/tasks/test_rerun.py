@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from psfcore.deconvolve import run
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.images import read_plane
-from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image
+from tests.in_process import InProcess
 from tests.workers.databases import add
 from tests.workers.psf_examples import OWNER, identity, product, psf
 from workers import lineage
@@ -24,7 +25,6 @@ from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
 from workers.contract import identities
 from workers.lineage import Ancestor, made_by
 from workers.settings import Settings
-from workers.tasks.data import product as product_task
 
 ON_TRANSIT = {"transit_id": "1" * 64, "seed": 5}
 LIMITS = FitsLimits(max_pixels=2**24)
@@ -34,7 +34,7 @@ MASKED = (
 
 
 @pytest.fixture
-def there(local: LocalService, settings: Settings) -> Iterator[Catalogue]:
+def there(local: InProcess, settings: Settings) -> Iterator[Catalogue]:
     """The catalogue of the local service."""
     catalogue = Catalogue(settings.catalogue_url)
     yield catalogue
@@ -42,14 +42,14 @@ def there(local: LocalService, settings: Settings) -> Iterator[Catalogue]:
 
 
 @pytest.fixture
-def made(local: LocalService, psf_file: Path, tmp_path: Path) -> dict[str, Any]:
+def made(local: InProcess, psf_file: Path, tmp_path: Path) -> dict[str, Any]:
     """A product of an uploaded PSF."""
     psf_id, noise = local.upload_psf(psf_file)["id"], {"noise": (6.0, 2.0), "error_draws": 4}
     write_image(tmp_path / "image.fits", shape=(64, 64))
     return local.deconvolve(tmp_path / "image.fits", tmp_path / "first.fits", psf_id=psf_id, steps=3, **noise)
 
 
-def again(local: LocalService, of: str, identity: str, output: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def again(local: InProcess, of: str, identity: str, output: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """The description of a rerun's report and its JSON."""
     row = local.get(local.wait(local.submit("rerun", of=of, id=identity))["result"])
     local.download(row["file"], output)
@@ -57,7 +57,7 @@ def again(local: LocalService, of: str, identity: str, output: Path) -> tuple[di
 
 
 def test_a_product_made_again_is_the_same_bit_for_bit_and_changes_nothing(
-    local: LocalService, there: Catalogue, made: dict[str, Any], tmp_path: Path
+    local: InProcess, there: Catalogue, made: dict[str, Any], tmp_path: Path
 ) -> None:
     before = local.get(f"/v1/products/{made['id']}")
     row, report = again(local, "product", made["id"], tmp_path / "r.json")
@@ -80,7 +80,7 @@ def test_a_product_made_again_is_the_same_bit_for_bit_and_changes_nothing(
 
 
 def test_a_product_of_an_earlier_version_is_made_again_although_the_new_one_exists(
-    local: LocalService, there: Catalogue, made: dict[str, Any], tmp_path: Path
+    local: InProcess, there: Catalogue, made: dict[str, Any], tmp_path: Path
 ) -> None:
     """The earlier version gave the product another id. Deconvolving the image again makes the new product."""
     old_id = "f" * 64
@@ -93,9 +93,9 @@ def test_a_product_of_an_earlier_version_is_made_again_although_the_new_one_exis
 
 
 def test_a_rerun_finds_software_that_gives_other_values(
-    local: LocalService, made: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    local: InProcess, made: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = product_task.write_image
+    real = run.write_image
     first = read_plane(tmp_path / "first.fits", LIMITS)
 
     def off(path: Path, image: Any, **how: Any) -> None:
@@ -103,7 +103,7 @@ def test_a_rerun_finds_software_that_gives_other_values(
         pixels[5, 7] += 0.25 * np.nanmax(first)
         real(path, type(image)(**{**vars(image), "pixels": pixels}), **how)
 
-    monkeypatch.setattr(product_task, "write_image", off)
+    monkeypatch.setattr(run, "write_image", off)
     row, report = again(local, "product", made["id"], tmp_path / "r.json")
     assert row["details"]["same"] is False and row["details"]["same_file"] is False
     assert report["arrays"]["IMAGE"]["largest_relative"] == pytest.approx(0.25, rel=1e-5)
@@ -116,7 +116,7 @@ def test_a_rerun_finds_software_that_gives_other_values(
     assert read_plane(tmp_path / "again.fits", LIMITS)[5, 7] != first[5, 7]
 
 
-def test_uploaded_and_unknown_psfs_cannot_be_rerun(local: LocalService, psf_file: Path) -> None:
+def test_uploaded_and_unknown_psfs_cannot_be_rerun(local: InProcess, psf_file: Path) -> None:
     psf_id = local.upload_psf(psf_file)["id"]
     for of, named, code in (
         ("psf", psf_id, "not-made-here"),
@@ -129,7 +129,7 @@ def test_uploaded_and_unknown_psfs_cannot_be_rerun(local: LocalService, psf_file
 
 
 def test_a_psf_built_with_a_mask_can_be_rerun_and_its_lineage_names_the_mask(
-    local: LocalService, there: Catalogue, tmp_path: Path
+    local: InProcess, there: Catalogue, tmp_path: Path
 ) -> None:
     file, mask = tmp_path / "small.toml", tmp_path / "mask.fits"
     file.write_text(MASKED)
@@ -152,7 +152,7 @@ def test_a_psf_built_with_a_mask_can_be_rerun_and_its_lineage_names_the_mask(
 
 
 def test_a_rerun_uses_the_instrument_file_of_the_first_run(
-    local: LocalService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    local: InProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its text is in the PSF's file; that of today is not asked."""
     file = tmp_path / "aia_171.toml"

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.deconvolve import whole
+from psfcore.deconvolve import conditions, run, whole
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.errors import DataError
 from service.client.http import ServiceError
-from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from tests.in_process import InProcess
 from tests.workers.jobs import job_row
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
@@ -29,7 +29,7 @@ from workers.tasks import deconvolve as deconvolve_task
 
 
 def test_a_product_names_its_inputs_and_keeps_the_header(
-    local: LocalService, image_file: Path, psf_file: Path, tmp_path: Path
+    local: InProcess, image_file: Path, psf_file: Path, tmp_path: Path
 ) -> None:
     psf, steps = local.upload_psf(psf_file), []
     product = local.deconvolve(
@@ -55,11 +55,11 @@ def test_a_product_names_its_inputs_and_keeps_the_header(
 
 
 def test_an_identical_request_is_not_computed_again(
-    local: LocalService, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
+    local: InProcess, image_file: Path, psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     psf_id = local.upload_psf(psf_file)["id"]
     first = local.deconvolve(image_file, psf_id=psf_id)
-    monkeypatch.delattr(deconvolve_task, "Work")
+    monkeypatch.delattr(deconvolve_task, "make")
     assert local.deconvolve(image_file, psf_id=psf_id) == first
 
 
@@ -79,16 +79,16 @@ def test_a_worker_with_one_thread_draws_in_that_thread(
 
         monkeypatch.setattr(where, name, wrapped)
 
-    noted(deconvolve_task, "save_preview")
+    noted(run, "draw_preview")
     noted(whole, "measure_changes")
-    local = LocalService(settings.model_copy(update={"worker_threads": threads}))
+    local = InProcess(settings.model_copy(update={"worker_threads": threads}))
     local.deconvolve(image_file, psf_id=local.upload_psf(psf_file)["id"])
     local.close()
-    assert (of_threads["save_preview"] == of_threads["measure_changes"]) == (threads == 1)
+    assert (of_threads["draw_preview"] == of_threads["measure_changes"]) == (threads == 1)
 
 
 def test_a_job_redelivered_after_its_end_does_nothing(
-    local: LocalService, settings: Settings, image_file: Path, psf_file: Path
+    local: InProcess, settings: Settings, image_file: Path, psf_file: Path
 ) -> None:
     image_id, psf_id = local.upload_image(image_file)["id"], local.upload_psf(psf_file)["id"]
     job = local.wait(local.submit("deconvolve", image_id=image_id, psf_id=psf_id))
@@ -99,7 +99,7 @@ def test_a_job_redelivered_after_its_end_does_nothing(
 
 
 def test_files_that_cannot_be_used_are_the_users_error(
-    local: LocalService, psf_file: Path, tmp_path: Path
+    local: InProcess, psf_file: Path, tmp_path: Path
 ) -> None:
     psf_id = local.upload_psf(psf_file)["id"]
     for code, value in (("all-nan", np.nan), ("no-signal", 0.0)):
@@ -112,7 +112,7 @@ def test_files_that_cannot_be_used_are_the_users_error(
         local.upload_psf(tmp_path / "three.fits")
 
 
-def test_a_built_psf_carries_its_provenance(local: LocalService, tmp_path: Path) -> None:
+def test_a_built_psf_carries_its_provenance(local: InProcess, tmp_path: Path) -> None:
     file = tmp_path / "small.toml"
     file.write_text(SMALL_INSTRUMENT)
     psf = local.build_psf(file, tmp_path / "psf.fits", size=256, preview=tmp_path / "psf.png")
@@ -127,7 +127,7 @@ def test_a_built_psf_carries_its_provenance(local: LocalService, tmp_path: Path)
 
 
 def test_a_cancelled_job_stops_at_its_next_step(
-    local: LocalService, settings: Settings, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    local: InProcess, settings: Settings, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(attempt, "REPORT_EVERY_S", 0.0)
     write_image(tmp_path / "i.fits")
@@ -150,7 +150,7 @@ def test_a_cancelled_job_stops_at_its_next_step(
 
 
 def test_a_transient_failure_is_retried_a_limited_number_of_times(
-    local: LocalService, settings: Settings, monkeypatch: pytest.MonkeyPatch
+    local: InProcess, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def away(*_: object) -> str:
         raise ConnectionError("storage away")
@@ -169,7 +169,7 @@ def test_a_transient_failure_is_retried_a_limited_number_of_times(
 
 
 def test_an_unexpected_exception_is_an_internal_error_and_is_logged(
-    local: LocalService, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    local: InProcess, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def broken(*_: object) -> str:
         raise ZeroDivisionError("ours")
@@ -182,7 +182,7 @@ def test_an_unexpected_exception_is_an_internal_error_and_is_logged(
 
 
 def test_every_method_of_the_contract_runs_and_says_what_it_did(
-    local: LocalService, psf_file: Path, tmp_path: Path
+    local: InProcess, psf_file: Path, tmp_path: Path
 ) -> None:
     assert sorted(METHODS) == method_names(), "the contract holds the methods that psfcore has"
     psf_id = local.upload_psf(psf_file)["id"]
@@ -210,7 +210,7 @@ def with_card(path: Path, card: bytes, **cards: object) -> Path:
 
 @pytest.mark.filterwarnings("ignore")
 def test_a_formula_as_a_name_and_a_damaged_card_do_not_lose_the_product(
-    local: LocalService, tmp_path: Path
+    local: InProcess, tmp_path: Path
 ) -> None:
     image = with_card(tmp_path / "image.fits", b"INSTRUME= 3 2 x", DETECTOR="$\\frac{$")
     write_psf(tmp_path / "psf.fits")
@@ -221,3 +221,15 @@ def test_a_formula_as_a_name_and_a_damaged_card_do_not_lose_the_product(
     assert product["id"] and all(path.stat().st_size > 0 for path in pictures.values())
     damaged = with_card(tmp_path / "damaged.fits", b"DETECTOR= 'open")
     assert local.deconvolve(damaged, psf_id=psf_id, steps=2)["id"]
+
+
+def test_jobs_share_prepared_psfs(local: InProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    engines: list[object] = []
+    real = conditions.new_engine
+    monkeypatch.setattr(conditions, "new_engine", lambda *given: engines.append(given) or real(*given))
+    write_psf(tmp_path / "psf.fits", size=62)  # of a size that no other test uses: a process shares them
+    psf_id = local.upload_psf(tmp_path / "psf.fits")["id"]
+    for seed in range(2):
+        write_image(tmp_path / f"{seed}.fits", seed=seed)
+        local.deconvolve(tmp_path / f"{seed}.fits", psf_id=psf_id, steps=2)
+    assert len(engines) == 1

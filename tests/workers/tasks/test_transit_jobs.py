@@ -19,10 +19,10 @@ from psfcore.fits.psfs import read_psf
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.simulate.scatter_truth import total_kernel
 from service.client.http import ServiceError
-from service.local import LocalService
 from tests.conftest import write_image
 from tests.fitted_transit import copied_data, counted_inversions, fitted_transit
 from tests.html_page import check_stands_alone, read_page
+from tests.in_process import InProcess
 from tests.transit_files import TRUTH, diffraction
 from workers.tasks import report as report_task
 
@@ -45,8 +45,8 @@ def transit(made: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def service(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalService]:
-    local = LocalService(copied_data(made, tmp_path_factory.mktemp("service") / "data"))
+def service(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[InProcess]:
+    local = InProcess(copied_data(made, tmp_path_factory.mktemp("service") / "data"))
     yield local
     local.close()
 
@@ -68,7 +68,7 @@ def fitted(made: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def folds(
-    service: LocalService,
+    service: InProcess,
     transit: Path,
     fitted: dict[str, Any],
     inversions: list[int],
@@ -87,7 +87,7 @@ def folds(
 
 @pytest.fixture(scope="module")
 def report(
-    service: LocalService, transit: Path, inversions: list[int], tmp_path_factory: pytest.TempPathFactory
+    service: InProcess, transit: Path, inversions: list[int], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Any]:
     """One report of a fit without the slow dark offsets, all of its files, and what the comparison of shapes was given."""
     out, given = tmp_path_factory.mktemp("report"), []
@@ -144,7 +144,7 @@ def test_the_product_says_what_it_was_made_of(fitted: dict[str, Any]) -> None:
 
 
 def test_an_identical_request_gets_the_existing_result(
-    service: LocalService, fitted: dict[str, Any], report: dict[str, Any], transit: Path
+    service: InProcess, fitted: dict[str, Any], report: dict[str, Any], transit: Path
 ) -> None:
     again = service.fit_psf(transit)
     assert again["id"] == fitted["psf"]["id"] and again["created_at"] == fitted["psf"]["created_at"]
@@ -154,7 +154,7 @@ def test_an_identical_request_gets_the_existing_result(
 
 @pytest.mark.slow
 def test_a_rerun_inverts_anew_and_gives_the_same_fit_bit_for_bit(
-    service: LocalService, fitted: dict[str, Any], inversions: list[int]
+    service: InProcess, fitted: dict[str, Any], inversions: list[int]
 ) -> None:
     before, psf_id = list(inversions), fitted["psf"]["id"]
     row = service.get(service.wait(service.submit("rerun", of="psf", id=psf_id))["result"])
@@ -165,7 +165,7 @@ def test_a_rerun_inverts_anew_and_gives_the_same_fit_bit_for_bit(
 
 
 def test_a_deconvolution_with_it_carries_the_psfs_own_error(
-    service: LocalService, fitted: dict[str, Any], tmp_path: Path
+    service: InProcess, fitted: dict[str, Any], tmp_path: Path
 ) -> None:
     image = tmp_path / "image.fits"
     write_image(image, shape=(64, 64), CDELT1=0.492, CDELT2=0.492, DETECTOR="HRI_EUV")
@@ -186,7 +186,7 @@ def changed(transit: Path, folder: Path, **changes: Any) -> Path:
 
 
 def test_a_transit_that_cannot_be_fitted_is_an_error_of_its_user(
-    service: LocalService, transit: Path, tmp_path: Path
+    service: InProcess, transit: Path, tmp_path: Path
 ) -> None:
     images = json.loads((transit / "transit.json").read_text())["images"]
     elsewhere = [image | {"x": 64.0, "y": 110.0} for image in images]
@@ -196,9 +196,7 @@ def test_a_transit_that_cannot_be_fitted_is_an_error_of_its_user(
 
 
 @pytest.mark.slow
-def test_a_transit_of_one_pointing_states_a_limit(
-    service: LocalService, transit: Path, tmp_path: Path
-) -> None:
+def test_a_transit_of_one_pointing_states_a_limit(service: InProcess, transit: Path, tmp_path: Path) -> None:
     images = json.loads((transit / "transit.json").read_text())["images"]
     two = [image for image in images if image["fov"] < 3]
     psf = service.fit_psf(changed(transit, tmp_path / "t", images=two))
@@ -266,7 +264,7 @@ def test_its_page_stands_alone_and_shows_every_image(report: dict[str, Any]) -> 
 
 
 def test_a_given_psf_is_evaluated_without_a_fit_and_without_diffraction(
-    service: LocalService, transit: Path, tmp_path: Path
+    service: InProcess, transit: Path, tmp_path: Path
 ) -> None:
     folder = changed(transit, tmp_path / "t", known_psf=None, instrument=None)
     fits.PrimaryHDU(total_kernel(TRUTH, diffraction(), REACH_GRID_PX)).writeto(tmp_path / "true.fits")

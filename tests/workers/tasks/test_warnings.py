@@ -13,14 +13,14 @@ from psfcore.deconvolve.assess import plots as assess_plots
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.drawing import plots
 from psfcore.errors import DataError
-from service.local import LocalService
 from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
+from tests.in_process import InProcess
 
 AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171}
 FEW = {"steps": 2}
 
 
-def psf_of(local: LocalService, path: Path, **cards: object) -> str:
+def psf_of(local: InProcess, path: Path, **cards: object) -> str:
     write_psf(path)
     fits.writeto(path, fits.getdata(path), fits.Header(cards), overwrite=True)
     return str(local.upload_psf(path)["id"])
@@ -37,7 +37,7 @@ def clipped(path: Path, level: float, **cards: object) -> None:
 
 
 def test_saturation_seen_in_the_pixels_is_in_quality_header_and_details(
-    local: LocalService, psf_file: Path, tmp_path: Path
+    local: InProcess, psf_file: Path, tmp_path: Path
 ) -> None:
     clipped(tmp_path / "i.fits", 120.0)
     product = local.deconvolve(
@@ -56,7 +56,7 @@ def test_saturation_seen_in_the_pixels_is_in_quality_header_and_details(
 
 
 def test_an_unsure_saturation_is_a_warning_in_header_and_details(
-    local: LocalService, psf_file: Path, tmp_path: Path
+    local: InProcess, psf_file: Path, tmp_path: Path
 ) -> None:
     write_image(tmp_path / "i.fits", **AIA, NSATPIX=7)
     product = local.deconvolve(
@@ -67,7 +67,7 @@ def test_an_unsure_saturation_is_a_warning_in_header_and_details(
     assert "WARNING (saturation): NSATPIX counts 7 saturated pixels" in history
 
 
-def test_a_psf_of_another_channel_is_refused_unless_told(local: LocalService, tmp_path: Path) -> None:
+def test_a_psf_of_another_channel_is_refused_unless_told(local: InProcess, tmp_path: Path) -> None:
     write_image(tmp_path / "i.fits", **{**AIA, "WAVELNTH": 193})
     psf_id = psf_of(local, tmp_path / "p.fits", **AIA)
     with pytest.raises(DataError) as caught:
@@ -82,7 +82,7 @@ def test_a_psf_of_another_channel_is_refused_unless_told(local: LocalService, tm
 
 
 def test_a_psf_that_does_not_say_its_channel_is_taken_with_a_warning_and_one_of_its_channel_without(
-    local: LocalService, psf_file: Path, tmp_path: Path
+    local: InProcess, psf_file: Path, tmp_path: Path
 ) -> None:
     write_image(tmp_path / "i.fits", **AIA)
     product = local.deconvolve(tmp_path / "i.fits", psf_id=local.upload_psf(psf_file)["id"], **FEW)
@@ -94,7 +94,7 @@ def test_a_psf_that_does_not_say_its_channel_is_taken_with_a_warning_and_one_of_
 
 
 def test_pictures_name_the_unit_of_the_image(
-    local: LocalService, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    local: InProcess, psf_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     units: list[str] = []
     for module, name in ((plots, "preview_png"), (assess_plots, "changes_png")):

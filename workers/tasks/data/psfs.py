@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from psfcore.fits.psfs import read_psf
-from psfcore.psf import Psf, cumulative_curve
+from psfcore.fits.psfs import read_psf, write_psf
+from psfcore.psf import Psf, light_beyond_pct
 from workers.catalogue.tables import PsfRow
 from workers.files.store import Store
 from workers.rows import row_of
 from workers.tasks.context import Context
 from workers.versions import TOTAL, PsfStatus, channel_of, series_of
-
-_TOTAL_ALONE = "total_alone"  # an entry of the details of a row
-CURVE_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 def named_psf(context: Context, psf_id: str) -> PsfRow:
@@ -36,29 +32,30 @@ def given_psf(context: Context, psf_id: str | None) -> Psf | None:
     return read_psf(context.store.verified(named_psf(context, psf_id).file_sha256), context.limits)
 
 
-def psf_row(
+def keep_psf(
+    context: Context,
     psf: Psf,
     identity: str,
-    owner: str,
     *,
     origin: str,
-    file_sha256: str,
-    store: Store,
-    preview_sha256: str | None,
+    draw: Callable[[Path], object],
     kind: str = TOTAL,
-    details: Mapping[str, Any] | None = None,
-    threads: int = 1,
-    whole: bool = True,
+    channel: str | None = None,
+    instrument_file: bytes | None = None,
+    details: Mapping[str, Any],
 ) -> PsfRow:
-    """The catalogue's row of a draft PSF whose file is in the store. Writes the PSF's tables into the store too.
+    """Write a draft PSF, its picture and its tables into the store, and add its row to the catalogue.
 
-    details: further entries for the details of the row. whole: False if the file holds the total PSF alone, although the
-    PSF has components; no tables are made then.
+    draw: draws the picture into a PNG file. channel: None: as the PSF says. details: further entries for the details of the row.
     """
-    channel = channel_of(psf.instrument, psf.wavelength_angstrom)
-    curve = cumulative_curve(psf.kernel, np.array(CURVE_RADII_PX, dtype=float))
-    return PsfRow(
-        owner=owner,
+    store = context.store
+    with store.temporary() as file, store.temporary() as picture:
+        write_psf(file, psf, instrument_file=instrument_file)
+        draw(picture)
+        file_sha256, preview_sha256 = store.keep(file), store.keep(picture)
+    channel = channel or channel_of(psf.instrument, psf.wavelength_angstrom)
+    row = PsfRow(
+        owner=context.owner,
         id=identity,
         created_at=time.time(),
         name=psf.name,
@@ -78,17 +75,13 @@ def psf_row(
             "plate_scale_arcsec": psf.plate_scale_arcsec,
             "wavelength_angstrom": psf.wavelength_angstrom,
             "components": sorted(psf.components),
-            "cumulative_curve_pct": {str(r): float(c) for r, c in zip(CURVE_RADII_PX, curve, strict=True)},
+            "cumulative_curve_pct": light_beyond_pct(psf.kernel),
             "provenance": psf.provenance,
-            **({"tables_sha256": keep_tables(psf, store, threads)} if whole else {_TOTAL_ALONE: True}),
-            **(details or {}),
+            "tables_sha256": keep_tables(psf, store, context.settings.threads),
+            **details,
         },
     )
-
-
-def is_total_alone(row: PsfRow) -> bool:
-    """Whether the file of a PSF was written without the components that the PSF has."""
-    return bool(row.details.get(_TOTAL_ALONE))
+    return context.add(row)
 
 
 def keep_tables(psf: Psf, store: Store, threads: int) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,21 @@ from workers.settings import library_versions, software_version
 from workers.tasks.context import Context
 
 
-def provenance_of(context: Context, request: Parameters) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Finished:
+    """A finished report whose files are not yet written.
+
+    content: the report as JSON. details: the entry "sentence" and the main figures; lists of reports show them. draw: draws its
+    picture into a PNG file. page: the report as HTML; None if it has no page.
+    """
+
+    content: dict[str, Any]
+    details: dict[str, Any]
+    draw: Callable[[Path], object]
+    page: str | None = None
+
+
+def provenance_of(job_id: str, request: Parameters) -> dict[str, Any]:
     """The inputs, parameters and software versions with which a job makes its result. request: the resolved parameters."""
     transit_id = getattr(request, "transit_id", None)
     return {
@@ -23,29 +38,48 @@ def provenance_of(context: Context, request: Parameters) -> dict[str, Any]:
         "algorithm_version": request.algorithm_version,
         "software_version": software_version(),
         "libraries": library_versions(),
-        "job_id": context.job_id,
+        "job_id": job_id,
     }
 
 
-def keep_report(
+def keep_report(context: Context, identity: str, kind: str, report: Finished, *, transit_id: str) -> None:
+    """Write the files of a report on a transit into the store, and add its row to the catalogue."""
+    store = context.store
+    with store.temporary() as text, store.temporary() as page, store.temporary() as picture:
+        write_json(text, report.content)
+        report.draw(picture)
+        of_page = {}
+        if report.page is not None:
+            page.write_text(report.page, "utf-8")
+            of_page = {"page_sha256": store.keep(page)}
+        add_report(
+            context,
+            identity,
+            kind,
+            text=text,
+            details=report.details | of_page,
+            preview_sha256=store.keep(picture),
+            transit_id=transit_id,
+        )
+
+
+def add_report(
     context: Context,
     identity: str,
     kind: str,
     *,
     text: Path,
-    details: Mapping[str, Any],
-    picture: Path | None = None,
-    page: Path | None = None,
+    details: dict[str, Any],
+    preview_sha256: str | None = None,
     transit_id: str | None = None,
     about_id: str | None = None,
 ) -> None:
-    """Move the written files of a report into the store, and add a row with these details to the catalogue.
+    """Move the written JSON of a report into the store, and add its row to the catalogue.
 
-    text: the report as JSON. details: the entry "sentence" and the main figures; lists of reports show them. transit_id,
-    about_id: the transit, or the PSF or product, that the report is about; reports can be listed by these ids.
+    details: see `Finished`. transit_id, about_id: the transit, or the PSF or product, that the report is about; reports can be
+    listed by these ids.
     """
     file_sha256 = context.store.keep(text)
-    of_page = {} if page is None else {"page_sha256": context.store.keep(page)}
     context.add(
         ReportRow(
             owner=context.owner,
@@ -56,8 +90,8 @@ def keep_report(
             about_id=about_id,
             file_sha256=file_sha256,
             bytes=context.store.path(file_sha256).stat().st_size,
-            preview_sha256=None if picture is None else context.store.keep(picture),
-            details={**details, **of_page},
+            preview_sha256=preview_sha256,
+            details=details,
         )
     )
 

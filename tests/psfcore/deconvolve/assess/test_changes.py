@@ -22,7 +22,7 @@ from psfcore.deconvolve.assess.artefacts import (
     ringing_pct,
 )
 from psfcore.deconvolve.assess.changes import BLOCKS_PX, block_means, measure_changes
-from psfcore.deconvolve.assess.from_product import changes_from_json
+from psfcore.deconvolve.assess.contact_sheet import changes_from_json
 from psfcore.deconvolve.assess.plots import changes_png
 from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.errors import DataError

@@ -12,20 +12,23 @@ import pytest
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from psfcore.deconvolve import run as one_run
 from psfcore.deconvolve.assess.contact_sheet import (
     BLOCK_PX,
     TAIL_PCT,
     THUMBNAIL_PX,
     Failure,
     Treated,
+    changes_in_product,
     contact_sheet_png,
     table,
-    treat,
     treat_many,
 )
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
+from psfcore.deconvolve.run import Identities, Options, UsedPsf
 from psfcore.errors import DataError
+from psfcore.fits.header import FitsLimits
 from psfcore.image import Image
 from psfcore.psf import Psf
 from psfcore.scatter.power_law import scatter_kernel
@@ -56,20 +59,26 @@ def images(psf: Psf) -> dict[str, Image]:
     return out
 
 
-def reader(images: dict[str, Image], psf: Psf) -> Callable[[str], Treated]:
+def reader(images: dict[str, Image], psf: Psf, folder: Path) -> Callable[[str], Treated]:
     def one(name: str) -> Treated:
         if name == "gone":
             raise FileNotFoundError(2, "No such file or directory", name)
         if name == "empty":
             raise DataError("no-signal", "expected pixels above zero; the largest is 0")
-        return treat(name, images[name], psf, steps=8)
+        image, before, after = images[name], folder / f"{name}.fits", folder / f"{name}-after.fits"
+        fits.PrimaryHDU(image.pixels, fits.Header({"BUNIT": "DN/s", "XPOSURE": 1.4})).writeto(before)
+        product = one_run.deconvolve(image, psf, Options(parameters={"steps": 8}), warnings={})
+        used = UsedPsf("0" * 64, psf.name, psf.version, psf.status)
+        one_run.write(product, after, used, Identities("1" * 64, "2" * 64, 1, "after.fits"))
+        return changes_in_product(name, before, after, product.details(), FitsLimits(max_pixels=SIZE**2))
 
     return one
 
 
 @pytest.fixture(scope="module")
-def run(images: dict[str, Image], psf: Psf) -> Run:
-    return treat_many(["gone", "clean", "dead", "empty", "other"], reader(images, psf))
+def run(images: dict[str, Image], psf: Psf, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("products")
+    return treat_many(["gone", "clean", "dead", "empty", "other"], reader(images, psf, folder))
 
 
 def test_the_most_doubtful_come_first_and_failures_do_not_stop_the_run(run: Run) -> None:
@@ -136,10 +145,3 @@ def test_a_run_in_which_all_images_failed_has_a_sheet(tmp_path: Path) -> None:
     contact_sheet_png([], failures, tmp_path / "none.png")
     assert drawn(tmp_path / "none.png").std() > 0.02
     assert table([], failures)["summary"] == {"images": 0, "failures": 30, "to_look_at": 0}
-
-
-def test_an_image_of_other_pixels_is_refused(psf: Psf, images: dict[str, Image]) -> None:
-    clean = images["clean"]
-    scaled = Image(clean.pixels, clean.mask, fits.Header({"CDELT1": 0.7, "CDELT2": 0.7}), "DN/s", 1.0)
-    with pytest.raises(DataError, match="plate-scale-mismatch"):
-        treat("scaled", scaled, psf)

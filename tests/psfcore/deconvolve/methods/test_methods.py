@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.deconvolve.conditions import Conditions, EngineCache
+from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
 from psfcore.deconvolve.edges import edge_band_px, share_from_beyond
 from psfcore.deconvolve.methods import registry
 from psfcore.deconvolve.methods.registry import may_be_negative, method_named, method_names
@@ -197,7 +197,7 @@ def test_the_result_does_not_depend_on_scale_threads_or_a_cached_engine(seen: Pl
         for scale in (1e-300, 1e-30, 1e37, 1e300):
             scaled = deconvolve(make_image(seen * scale), psf, Conditions(), steps=5).pixels
             np.testing.assert_allclose(scaled / scale, one.pixels, rtol=0, atol=1e-5 * one.pixels.max())
-        kept = Conditions(engine_for=EngineCache())
+        kept = Conditions(engine_for=PreparedPsfs().engine_for)
         deconvolve(make_image(seen[::-1]), psf, kept, steps=5)
         again = deconvolve(make_image(seen), psf, kept, steps=5).pixels
         np.testing.assert_array_equal(again, one.pixels, err_msg=name)
@@ -280,7 +280,7 @@ def test_twenty_steps_fit_noise_and_discrepancy_and_total_variation_do_not(psf: 
     scene = solar_scene((384, 384), 1)
     observed = observe(scene, psf, exposure_s=1.4, photon_gain_dn=6.0, read_noise_dn=2.0, seed=1)
     image = dataclasses.replace(make_image(observed), exposure_s=1.4)
-    conditions = Conditions(noise=Noise(6.0, 2.0), threads=2, engine_for=EngineCache())
+    conditions = Conditions(noise=Noise(6.0, 2.0), threads=2, engine_for=PreparedPsfs().engine_for)
     inside = (slice(64, -64),) * 2
 
     def error(name: str, **options: object) -> float:
@@ -294,16 +294,6 @@ def test_twenty_steps_fit_noise_and_discrepancy_and_total_variation_do_not(psf: 
     smooth = [error("richardson-lucy-total-variation", steps=steps) for steps in (10, 20, 40)]
     assert max(smooth) < min(errors.values()) and max(smooth) < 0.8 * errors[20]
     assert max(smooth) < 1.1 * min(smooth)
-
-
-def test_the_cache_drops_the_least_recently_used_engine(psf: Psf) -> None:
-    cache = EngineCache(2)
-    first = cache(psf, (32, 32), (32, 32), 1)
-    second = cache(psf, (48, 32), (48, 32), 1)
-    assert cache(psf, (32, 32), (32, 32), 1) is first
-    cache(psf, (64, 64), (64, 64), 1)
-    assert cache(psf, (32, 32), (32, 32), 1) is first
-    assert cache(psf, (48, 32), (48, 32), 1) is not second
 
 
 def test_the_edge_band_follows_from_the_psf() -> None:
@@ -379,7 +369,7 @@ def test_any_shape_mask_and_type_gives_finite_light(
 @pytest.mark.slow
 def test_the_default_is_close_to_a_run_without_edges() -> None:
     """The errors near edges that README and methods state: 2.5, 2 and 1 % in the bands of the edge study."""
-    psf, cache = edge_study.study_psf(), EngineCache(8)
+    psf, cache = edge_study.study_psf(), PreparedPsfs().engine_for
     for seed in edge_study.SEEDS:
         (row,) = edge_study.rows(seed, psf, cache, methods=("richardson-lucy",), ways=(None,))
         assert row.edges == "symmetric"

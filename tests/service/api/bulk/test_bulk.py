@@ -15,6 +15,7 @@ import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
+from psfcore.deconvolve import run
 from tests.conftest import write_image, write_psf
 from tests.service.api.bulk.conftest import FEW, failures, now, results, started
 from tests.service.conftest import refusal, upload
@@ -279,10 +280,10 @@ def test_a_cancelled_run_stops_at_the_next_reported_step(
     bulk = started(api, files=files, psf_id=psf_id, parameters=long)
     monkeypatch.setattr("workers.run.attempt.REPORT_EVERY_S", 0.0)
     monkeypatch.setattr("workers.bulk.task.TELL_EVERY_S", 0.0)
-    real = deconvolve_task._Asked.progress
+    real = run.deconvolve
 
-    def counted(work: Any, stage: str) -> Callable[[int, int], None]:
-        inner = real(work, stage)
+    def counted(*given: Any, begin: Callable[..., Any], **more: Any) -> run.Product:
+        inner = begin(run.DECONVOLVING, 0)
 
         def report(step: int, of: int) -> None:
             steps.append(step)
@@ -290,9 +291,9 @@ def test_a_cancelled_run_stops_at_the_next_reported_step(
                 assert api.post(f"/v1/bulk/{bulk['id']}/cancel").json()["phase"] == "CANCELLED"
             inner(step, of)
 
-        return report
+        return real(*given, begin=lambda stage, _: report if stage == run.DECONVOLVING else None, **more)
 
-    monkeypatch.setattr(deconvolve_task._Asked, "progress", counted)
+    monkeypatch.setattr(run, "deconvolve", counted)
     work()
     assert steps == [1, 2, 3]
     bulk = now(api, bulk)

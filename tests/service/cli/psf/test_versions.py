@@ -149,19 +149,19 @@ def test_lineage_and_rerun(command: Command, client: Client, tmp_path: Path) -> 
 def test_a_rerun_that_differs_ends_with_status_1(
     command: Command, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from workers.tasks.data import product as product_task
+    from psfcore.deconvolve import run
 
     write_image(tmp_path / "i.fits")
     write_psf(tmp_path / "p.fits")
     product = client.deconvolve(
         tmp_path / "i.fits", psf_id=client.upload_psf(tmp_path / "p.fits")["id"], steps=2
     )
-    real = product_task.write_image
+    real = run.write_image
 
     def off(path: Path, image: Any, **how: Any) -> None:
         real(path, type(image)(**{**vars(image), "pixels": image.pixels * 1.001}), **how)
 
-    monkeypatch.setattr(product_task, "write_image", off)
+    monkeypatch.setattr(run, "write_image", off)
     assert "differs by at most 0.001" in command("psf", "rerun", product["id"], "--product", code=1)
 
 

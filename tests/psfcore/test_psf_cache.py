@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from psfcore.built import cache as cache_module
-from psfcore.built.cache import PsfCache
+from psfcore import psf_cache as cache_module
 from psfcore.errors import DataError
+from psfcore.psf_cache import PsfCache
 
 ONE, OTHER, THIRD = "1" * 64, "2" * 64, "3" * 64
 

@@ -15,13 +15,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from threading import Lock
 
-from workers.catalogue.stage_times import MOST_LETTERS, Spent
-
 STARTING = "starting"  # the stage before the first report
 # The number of stages of one attempt is limited, because the names of an operator's own effects may be stages too.
 # The time of further stages counts for OTHERS.
 MOST_STAGES, OTHERS = 64, "others"
+MOST_LETTERS = 64  # longest name of a stage
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?")
+
+
+@dataclass
+class Spent:
+    """Seconds spent in a stage, and the number of steps reported."""
+
+    seconds: float = 0.0
+    steps: int = 0
 
 
 @dataclass

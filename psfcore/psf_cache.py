@@ -1,6 +1,6 @@
-"""A folder of built PSFs, so that a PSF is built only once.
+"""A folder of built PSFs, so that a PSF is built only once: `kept_psf` reads a PSF from it, or builds and keeps it.
 
-The name of a file is IDENTITY.SHA256.PART: the identity of the PSF (`psfcore.built.recipe`), the hash of the file, and
+The name of a file is IDENTITY.SHA256.PART: the identity of the PSF (`psfcore.recipe`), the hash of the file, and
 the content of the file, such as "fits". A file is written under a temporary name and then renamed. Its hash is checked
 when it is read. If the files need more space than allowed, the files of the least recently used PSF are removed.
 
@@ -10,17 +10,30 @@ Other users have no access to the folder, because the files in it are used witho
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
+import shutil
 import time
 import uuid
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError
+from psfcore.recipe import Recipe
 from psfcore.whole_files import PARTIAL
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from psfcore.fits.blocks import FitsLimits
+    from psfcore.psf import Psf
 
 FITS, PROVENANCE = "fits", "provenance.json"  # parts that every builder keeps
 # The same for a PSF that was built for a deconvolution: its kernel is equal, but it has no components.
@@ -87,20 +100,20 @@ class PsfCache:
         if self.max_bytes == 0:
             return None
         self._make_private()
-        partial = self.folder / f".{uuid.uuid4().hex}{PARTIAL}"
+        unfinished = self.folder / f".{uuid.uuid4().hex}{PARTIAL}"
         try:
-            partial.touch(mode=0o600)
-            write(partial)
-            partial.chmod(0o600)
-            with partial.open("rb") as written:
+            unfinished.touch(mode=0o600)
+            write(unfinished)
+            unfinished.chmod(0o600)
+            with unfinished.open("rb") as written:
                 os.fsync(written.fileno())
-            if partial.stat().st_size > self.max_bytes:
+            if unfinished.stat().st_size > self.max_bytes:
                 return None
-            sha256 = sha256_of_file(partial)
+            sha256 = sha256_of_file(unfinished)
             kept = self.folder / f"{identity}.{sha256}.{part}"
-            partial.replace(kept)
+            unfinished.replace(kept)
         finally:
-            partial.unlink(missing_ok=True)
+            unfinished.unlink(missing_ok=True)
         self._shrink(identity)
         return CachedFile(kept, sha256)
 
@@ -126,8 +139,8 @@ class PsfCache:
         removed = self.psfs()
         for psf in removed:
             _remove(psf)
-        for partial in self._partials():
-            partial.unlink(missing_ok=True)
+        for leftover in self._partials():
+            leftover.unlink(missing_ok=True)
         return sum(psf.bytes for psf in removed)
 
     def _files(self) -> list[Path]:
@@ -154,10 +167,10 @@ class PsfCache:
             if psf.identity != last:
                 _remove(psf)
                 total -= psf.bytes
-        for partial in self._partials():  # killed processes leave such files
+        for leftover in self._partials():  # killed processes leave such files
             with suppress(FileNotFoundError):
-                if time.time() - partial.stat().st_mtime > _ABANDONED_S:
-                    partial.unlink()
+                if time.time() - leftover.stat().st_mtime > _ABANDONED_S:
+                    leftover.unlink()
 
     def _of_another_user(self) -> bool:
         return self.folder.stat().st_uid != os.geteuid()
@@ -183,3 +196,60 @@ def sha256_of_file(path: Path) -> str:
     """SHA-256 of a file. Raises OSError."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def built_file(
+    cache: PsfCache,
+    recipe: Recipe,
+    *,
+    parts: bool = True,
+    mount_image: NDArray[Any] | None = None,
+    threads: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The file of the PSF of a recipe and its provenance: from the cache, or built and kept there.
+
+    parts: False: the PSF without its components, which is built in less time. If the components are asked for later, the PSF is
+    built again; its kernel is the same. progress is called while the PSF is built. If the cache cannot be used, the PSF is
+    built in every call, with a warning.
+    """
+    names = (FITS, PROVENANCE)
+    fits = cache.find(recipe.identity, FITS)
+    if fits is None and not parts:
+        names = (TOTAL_FITS, TOTAL_PROVENANCE)
+        fits = cache.find(recipe.identity, TOTAL_FITS)
+    if fits is not None:
+        kept = cache.find(recipe.identity, names[1])
+        yield (
+            fits.path,
+            {"psf_id": recipe.identity} if kept is None else json.loads(kept.path.read_bytes()),
+        )
+        return
+    # A command that finds its PSF does not load the libraries of the diffraction.
+    from psfcore.build import build_recipe
+    from psfcore.fits.psfs import write_psf
+
+    psf = build_recipe(recipe, parts=parts, mount_image=mount_image, threads=threads, progress=progress)
+    text = json.dumps(psf.provenance, allow_nan=False)
+    with TemporaryDirectory(prefix="heliopsf-") as folder:
+        path = Path(folder) / "psf.fits"
+        write_psf(path, psf, instrument_file=recipe.text.encode())
+        try:
+            cache.keep(recipe.identity, names[1], lambda part: part.write_text(text))
+            cache.keep(recipe.identity, names[0], partial(shutil.copyfile, path))
+        except (OSError, DataError) as error:
+            warnings.warn(f"the PSF is not kept and will be built again: {error}", stacklevel=4)
+        yield path, psf.provenance
+
+
+def kept_psf(cache: PsfCache, recipe: Recipe, limits: FitsLimits, *, parts: bool = True, **how: Any) -> Psf:
+    """The PSF in the file of `built_file`, whose parameters it takes.
+
+    A PSF that was just built is read from its file too, so that it is always the same to the last bit.
+    """
+    from psfcore.fits.psfs import read_psf
+
+    with built_file(cache, recipe, parts=parts, **how) as (path, own):
+        psf = read_psf(path, limits, parts=parts)
+    return replace(psf, provenance=own | {"instrument_toml": recipe.text})

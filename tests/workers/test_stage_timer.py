@@ -6,8 +6,7 @@ import pytest
 
 from psfcore.errors import DataError
 from tests.workers.conftest import Clock
-from workers.catalogue.stage_times import Spent
-from workers.tasks.stage_timer import MOST_STAGES, OTHERS, STARTING, StageTimer, short
+from workers.stage_timer import MOST_STAGES, OTHERS, STARTING, Spent, StageTimer, short
 
 
 def test_time_before_a_step_counts_for_its_stage_and_time_before_a_beginning_for_the_previous_one(

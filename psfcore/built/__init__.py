@@ -1,1 +1,0 @@
-"""PSFs built from instrument files: their recipes and identities, and the cache that keeps them."""

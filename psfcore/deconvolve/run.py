@@ -1,0 +1,438 @@
+"""One deconvolution, from an image and its PSF to the product: pixels, planes, cards, history, warnings and details.
+
+The worker, the Python functions and the commands all run `deconvolve`, so that they give the same product for the same image,
+PSF and options. `write` writes it as a FITS file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy.io.fits import Header
+from numpy.typing import NDArray
+
+from psfcore import software_version
+from psfcore.deconvolve.assess.quality import MEANINGS
+from psfcore.deconvolve.box import EXPECTED_RIM_PX, LARGEST_ERROR, Box, region_without_errors
+from psfcore.deconvolve.conditions import (
+    Conditions,
+    Deconvolved,
+    EngineFor,
+    PreparedPsfs,
+    Progress,
+    new_engine,
+)
+from psfcore.deconvolve.edges import Edges
+from psfcore.deconvolve.kernels import compiling_beside
+from psfcore.deconvolve.memory import Asked, check_memory, product_bytes
+from psfcore.deconvolve.methods.registry import may_be_negative, method_names
+from psfcore.deconvolve.region import BoxWork, box_work
+from psfcore.deconvolve.whole import Assessed, Work
+from psfcore.drawing.units import unit_label
+from psfcore.errors import DataError
+from psfcore.fits.channel import check_channel
+from psfcore.fits.doubts import doubts
+from psfcore.fits.frame import frame_of
+from psfcore.fits.gain import no_noise_figures, noise_for
+from psfcore.fits.header import known_instrument, optional_text, seen_by
+from psfcore.fits.images import described, write_image
+from psfcore.fits.observation import check_exposure_of_sun
+from psfcore.image import Image, MaskBit
+from psfcore.instruments.model import load_instrument
+from psfcore.instruments.unknown import unknown_instrument
+from psfcore.noise import Noise
+from psfcore.psf import REACH_GRID_PX, Psf
+from psfcore.psf_sampling import frame_warnings, with_scale
+
+if TYPE_CHECKING:
+    from psfcore.deconvolve.assess.error_planes import ErrorPlanes
+
+BUILDING = "building the PSF"
+DECONVOLVING = "deconvolving"  # the stage whose steps are the steps of the method
+LARGEST_CLIPPED = 0.01  # share of the light of an image; a product's total is accurate to about this share
+MOST_DRAWS = 64
+
+Cards = dict[str, tuple[str | int | float, str]]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How an image is deconvolved. Raises DataError "bad-draws" and "region-errors".
+
+    method: name of the method; parameters: its own parameters, such as steps and stop. edges, margin_px, noise, threads: see
+    `Conditions`. error_draws: number of noise realisations (2 to 64) for the planes of errors; 0: no such planes. region:
+    deconvolve only this box of the image, with a rim that is so wide that the bound of its error is at most `region_error`.
+    """
+
+    method: str = "richardson-lucy"
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    edges: Edges | None = None
+    margin_px: int | None = None
+    noise: Noise | None = None
+    error_draws: int = 0
+    region: Box | None = None
+    region_error: float = LARGEST_ERROR
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if self.region is not None and self.error_draws:
+            raise region_without_errors(self.error_draws)
+        if self.error_draws and not 2 <= self.error_draws <= MOST_DRAWS:
+            raise DataError(
+                "bad-draws", f"error_draws: expected 0, or 2 to {MOST_DRAWS}; got {self.error_draws}"
+            )
+
+
+@dataclass(frozen=True)
+class UsedPsf:
+    """The PSF of a deconvolution, as cards name it."""
+
+    id: str
+    name: str
+    version: str
+    status: str
+
+
+@dataclass(frozen=True)
+class Identities:
+    """What a product file says about its origin.
+
+    product: id of the product. input_sha256: hash of the file of the image. algorithm_version: version of the method.
+    filename: name of the product.
+    """
+
+    product: str
+    input_sha256: str
+    algorithm_version: int
+    filename: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Product(Deconvolved):
+    """A deconvolved image or box, with its inputs, its errors and its warnings.
+
+    image: the input, with its mask. psf: the PSF on the pixels of the image. errors: planes with the standard deviation of each
+    pixel, if they were asked for. warnings: sentences by their codes, the most harmful first.
+    """
+
+    image: Image
+    psf: Psf
+    errors: ErrorPlanes | None
+    warnings: Mapping[str, str]
+    work: Work | BoxWork = field(repr=False)
+
+    @cached_property
+    def assessed(self) -> Assessed:
+        """The measured changes, and the plane QUALITY."""
+        return self.work.assess(self, self.errors)
+
+    @property
+    def amplification(self) -> float | None:
+        """Noise of the result divided by the noise of the input, if errors were asked for."""
+        return None if self.errors is None else self.errors.amplification
+
+    @property
+    def planes(self) -> dict[str, NDArray[Any]]:
+        """The planes of the product file by their names."""
+        planes: dict[str, NDArray[Any]] = {"QUALITY": self.assessed.quality}
+        if self.errors is not None:
+            planes["ERROR"] = self.errors.error
+            if self.errors.psf_error is not None:
+                planes["PSF_ERROR"] = self.errors.psf_error
+        return planes
+
+    def title(self, psf: UsedPsf) -> str:
+        """The telescope, the time and the PSF, for the title of a picture."""
+        header = self.image.header
+        seen_by = optional_text(header, "DETECTOR", "INSTRUME") or "image"
+        date = optional_text(header, "DATE-BEG", "DATE-OBS", "DATE_OBS")
+        return f"{seen_by}{f' {date}' if date else ''}   PSF {psf.name} {psf.version}"
+
+    def details(self) -> dict[str, Any]:
+        """How the image was deconvolved, the measured changes, and the warnings, as JSON values.
+
+        A bright pixel is at or above the 99th percentile of the input; a dark pixel is at or below the first percentile.
+        """
+        image, box, saturation = self.image, self.of_box, self.image.saturation
+        before, after = image.pixels[image.valid], self.pixels[image.valid]
+        low, high = np.percentile(before, [1, 99])
+        dark, bright = before <= low, before >= high
+        return {
+            "steps_done": self.steps_done,
+            "stopped_because": self.stopped_because,
+            "last_step_change": self.last_change,
+            "edges": self.edges,
+            "edge_band_px": self.edge_band_px,
+            "noise_amplification": self.noise_amplification if self.errors is None else self.amplification,
+            "chi2_per_pixel": self.chi2_per_pixel,
+            # The bound of the error is in the unit of the image, as is the saturation level.
+            "region": box and {"box": str(box.box), "rim_px": box.rim_px, "error": box.error},
+            "flux_change_pct": self.flux_change_pct,
+            "bright_change_pct": _change_pct(before[bright], after[bright]),
+            "dark_change_pct": _change_pct(before[dark], after[dark]),
+            "negative_pixels": self.negative_pixels,
+            "masked_pixels": {
+                str(bit.name).lower(): int(np.count_nonzero(image.mask & bit.value)) for bit in MaskBit
+            },
+            "saturation": saturation
+            and {"level": saturation.level, "unit": image.unit, "found": saturation.found},
+            "warnings": [{"code": code, "message": message} for code, message in self.warnings.items()],
+            "changes": self.assessed.found.as_json(),
+        }
+
+
+def deconvolve(
+    image: Image,
+    psf: Psf,
+    options: Options,
+    *,
+    warnings: Mapping[str, str],
+    engine_for: EngineFor = new_engine,
+    possible_psfs: Callable[[], Sequence[Psf]] = lambda: (),
+    begin: Callable[[str, int], Progress | None] = lambda stage, steps: None,
+    check_plane: Callable[[tuple[int, int]], None] = lambda shape: None,
+) -> Product:
+    """Deconvolve an image, or the box of it that the options name.
+
+    psf: the PSF on the pixels of the image. warnings: those of `input_warnings`, and others about the inputs. engine_for: see
+    `Conditions`. possible_psfs, begin: see `Work.errors`. check_plane: called with the shape (ny, nx) of box and rim, which is
+    known only after the image is read; it may raise.
+
+    Raises DataError "no-noise-figures", and the errors of `box_work` and of the method.
+    """
+    conditions = Conditions(
+        edges=options.edges,
+        margin_px=options.margin_px,
+        noise=options.noise,
+        threads=options.threads,
+        engine_for=engine_for,
+    )
+    if options.error_draws and options.noise is None:
+        raise no_noise_figures()
+    whole = Work(image, psf, options.method, conditions, options.parameters)
+    work: Work | BoxWork = whole
+    progress = begin(DECONVOLVING, int(options.parameters.get("steps") or 1))
+    if options.region is not None:
+        work = box_work(whole, options.region, largest_error=options.region_error)
+        check_plane(work.rim.shape)
+        image = work.image
+    result = work.run(progress=progress)
+    errors = None
+    if options.error_draws:
+        errors = whole.errors(result, options.error_draws, possible_psfs=possible_psfs, begin=begin)
+    return Product(**vars(result), image=image, psf=psf, errors=errors, warnings=warnings, work=work)
+
+
+def read_and_deconvolve(
+    read: Callable[[], Image],
+    shape: tuple[int, int],
+    psf: Psf | None,
+    options: Options,
+    *,
+    build: Callable[[Header, Progress | None], Psf],
+    possible_psfs: Callable[[Psf, Header], Sequence[Psf]],
+    prepared: PreparedPsfs,
+    free_bytes: int,
+    plate_scale_arcsec: float | None = None,
+    other_channel: bool = False,
+    again: bool = False,
+    seen_as: Callable[[Psf], Psf] = lambda psf: psf,
+    clip: Callable[[Image], Image] = lambda image: image,
+    begin: Callable[[str, int], Progress | None],
+    say: Callable[[str, str], object] = lambda code, message: None,
+) -> tuple[Product, Psf]:
+    """Check an image and its PSF, and deconvolve the image in this process. Returns also the PSF as it was built.
+
+    read: reads the image; shape: its shape (ny, nx), known from its header. psf: None: build(header, progress) returns that of
+    the telescope. possible_psfs(psf, header): variants of the PSF within its errors, on the pixels of the image. prepared: keeps
+    PSFs and engines between images. free_bytes: the free memory. plate_scale_arcsec: of a PSF that gives none. other_channel:
+    see `input_warnings`. again: also deconvolve a product or a PSF. seen_as: adds to a PSF the instrument and wavelength that
+    its file does not name. clip: changes the pixels after the warnings were found; the product contains the unchanged image.
+    begin: see `deconvolve`. say(code, message): called for each warning before the work begins.
+
+    Raises DataError "too-much-memory", "no-psf-for-instrument", "plate-scale-known", "plate-scale-mismatch", "channel-mismatch"
+    and the errors of `check_exposure_of_sun` and `deconvolve`.
+    """
+    box = options.region
+
+    def check_plane(plane: tuple[int, int]) -> None:
+        psf_shape = (REACH_GRID_PX, REACH_GRID_PX) if psf is None else psf.kernel.shape
+        asked = Asked(
+            options.method,
+            plane,
+            (psf_shape[0], psf_shape[1]),
+            edges=options.edges,
+            margin_px=options.margin_px,
+            draws=options.error_draws,
+        )
+        check_memory(plane, product_bytes(asked, shape[0] * shape[1]), free_bytes)
+
+    def as_built() -> Psf:
+        if psf is not None:
+            return with_scale(psf, plate_scale_arcsec)
+        with compiling_beside(options.method, shape):
+            return with_scale(build(header, begin(BUILDING, 1)), plate_scale_arcsec)
+
+    check_plane(shape if box is None else box.wider(EXPECTED_RIM_PX, shape).shape)
+    image = read()
+    header = image.header
+    if not again:
+        check_exposure_of_sun(header)
+    instrument, turn_deg = known_instrument(header), frame_of(header).turn_to_build_deg
+    if psf is None and instrument is None:
+        raise unknown_instrument(seen_by(header))
+    # The pixels of a turned image are interpolated, so they do not have the noise of the camera.
+    if options.noise is None and psf is None and instrument is not None and not turn_deg:
+        options = replace(options, noise=noise_for(load_instrument(instrument), header))
+    if options.error_draws and options.noise is None:
+        raise no_noise_figures()
+    key = (id(psf) if psf is not None else (instrument, turn_deg), plate_scale_arcsec)
+    whole = prepared.as_built(key, as_built)
+    check_channel(seen_as(whole), header, other_channel=other_channel)
+    fitted = prepared.on_pixels_of(header, key, as_built)
+    warnings = input_warnings(seen_as(fitted), image, options.method, other_channel=other_channel)
+    for code, message in warnings.items():
+        say(code, message)
+    product = deconvolve(
+        clip(image),
+        fitted,
+        options,
+        warnings=warnings,
+        engine_for=prepared.engine_for,
+        possible_psfs=lambda: possible_psfs(whole, header),
+        begin=begin,
+        check_plane=check_plane,
+    )
+    return (product if box is not None else replace(product, image=image)), whole
+
+
+def write(product: Product, path: Path, psf: UsedPsf, ids: Identities) -> None:
+    """Write a product as a FITS file. psf: as the cards name it."""
+    own = described(
+        product.image.header,
+        filename=ids.filename,
+        creator=f"heliopsf {software_version()}",
+        sha256=ids.input_sha256,
+    )
+    # The order of the cards must not change, because equal requests must give equal bytes.
+    cards: Cards = {"PRODID": (ids.product, "")}
+    for key, card in deconvolution_cards(product, psf).items():
+        if key == "SWHELIO":
+            cards["DCNVALGV"] = (ids.algorithm_version, "algorithm version")
+        cards[key] = card
+        if key == "SWHELIO":
+            cards["INPSHA"] = (ids.input_sha256, "")
+    write_image(
+        path,
+        replace(product.image, pixels=product.pixels, header=own.header),
+        cards=own.cards | cards,
+        history=deconvolution_history(product, psf) + own.history,
+        planes=product.planes,
+        plane_bits={"QUALITY": MEANINGS},
+    )
+
+
+def draw_preview(product: Product, psf: UsedPsf, path: Path) -> None:
+    """Draw the image before and after, and the change, into a PNG file."""
+    from psfcore.drawing import plots  # matplotlib is loaded only if a picture is drawn
+
+    before = product.image.pixels
+    plots.preview_png(before, product.pixels, path, title=product.title(psf), unit=unit_label(product.image))
+
+
+def draw_changes(product: Product, psf: UsedPsf, path: Path) -> None:
+    """Draw difference, ratio and histograms into a PNG file."""
+    from psfcore.deconvolve.assess.plots import changes_png
+
+    before, found = product.image.pixels, product.assessed.found
+    changes_png(before, product.pixels, found, path, title=product.title(psf), unit=unit_label(product.image))
+
+
+def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
+    """The cards that say how an image was deconvolved. Cards name the warnings by their codes; HISTORY has the sentences."""
+    # A hash fills the whole card, so cards with a hash have no comment.
+    cards: Cards = {
+        "PSFID": (psf.id, ""),
+        "PSFVERS": (psf.version, "PSF version"),
+        "PSFNAME": (psf.name, "PSF name"),
+        "PSFSTAT": (psf.status, "PSF status"),
+        "DCNVMETH": (product.method, "deconvolution method"),
+        "DCNVITER": (product.steps_done, "deconvolution steps done"),
+        "DCNVSTOP": (product.stopped_because, "why the iteration stopped"),
+        "DCNVEDGE": (product.edges, "assumed scene beyond the edges"),
+        "DCNVBAND": (product.edge_band_px, "[px] width of band affected by DCNVEDGE"),
+        "SWHELIO": (software_version(), "heliopsf version"),
+    }
+    if product.of_box is not None:
+        cards["DCNVBOX"] = (str(product.of_box.box), "[px] box of the input, x0:x1,y0:y1 from 0")
+        cards["DCNVRIM"] = (product.of_box.rim_px, "[px] width of the rim that was also used")
+        cards["DCNVBERR"] = (product.of_box.error, "bound of the difference from whole image")
+    saturation = product.image.saturation
+    if saturation is not None and saturation.found is not None and saturation.level is not None:
+        cards["DCNVSATL"] = (saturation.level, "saturation level, in the unit of the image")
+        cards["DCNVSATF"] = (saturation.found, "where the saturation level was found")
+    if product.amplification is not None:
+        cards["DCNVAMPL"] = (product.amplification, "noise of result / noise of input")
+    for number, code in enumerate(product.warnings, start=1):
+        cards[f"DCNVWRN{number}"] = (code, "warning, see HISTORY")
+    return cards
+
+
+def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
+    """The lines of HISTORY that say how an image was deconvolved."""
+    box = product.of_box
+    return [
+        f"heliopsf {software_version()}: {product.method}, {product.steps_done} steps, "
+        f"edges {product.edges}, PSF {psf.name} {psf.version} ({psf.status})",
+        *(
+            []
+            if box is None
+            else [
+                f"box {box.box} of the input alone, with a rim of {box.rim_px} px: differs from the same box of the whole "
+                f"image by at most {box.error:.3g} (estimated bound, in the unit of the image)"
+            ]
+        ),
+        *(f"WARNING ({code}): {message}" for code, message in product.warnings.items()),
+    ]
+
+
+def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel: bool) -> dict[str, str]:
+    """Warnings about the inputs: sentences by their codes, the most harmful first.
+
+    method: the method of the deconvolution; None: none was chosen yet. other_channel: whether the PSF may be of another
+    channel than the image. If it is of another channel and this is not allowed, raises DataError "channel-mismatch".
+    """
+    channel = check_channel(psf, image.header, other_channel=other_channel)
+    warnings = frame_warnings(psf, image.header)
+    warnings |= {} if channel is None else {"channel": channel}
+    warnings |= image.warnings
+    if image.saturation is not None and image.saturation.warning is not None:
+        warnings["saturation"] = image.saturation.warning
+    if method is not None:
+        warnings |= {} if may_be_negative(method) else _negative_warning(image)
+        warnings |= doubts(image, psf.kernel)
+    return warnings
+
+
+def _negative_warning(image: Image) -> dict[str, str]:
+    """The warning if a method that counts negative pixels as 0 adds more than LARGEST_CLIPPED to the light of the image."""
+    light = float(image.pixels.sum(where=image.valid))
+    clipped = -float(image.pixels.sum(where=image.valid & (image.pixels < 0)))
+    if clipped <= LARGEST_CLIPPED * abs(light):
+        return {}
+    share = f"{100 * clipped / abs(light):.3g} % of the light" if light else "all of the light"
+    kept = ", ".join(name for name in method_names() if may_be_negative(name))
+    return {
+        "negative-pixels": f"negative pixels count as 0, which adds {share}: use a method that keeps them ({kept})"
+    }
+
+
+def _change_pct(before: NDArray[np.float64], after: NDArray[np.float64]) -> float | None:
+    """Change of the summed intensity, in percent; None if the sum of the input is not positive."""
+    total = float(before.sum())
+    return 100 * (float(after.sum()) / total - 1) if total > 0 else None
