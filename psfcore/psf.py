@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from psfcore.errors import DataError
 from psfcore.instruments.files import PLATE_SCALE_TOLERANCE as PLATE_SCALE_TOLERANCE
-from psfcore.instruments.workload import REACH_GRID_PX as REACH_GRID_PX
+from psfcore.recipe import REACH_GRID_PX as REACH_GRID_PX
 
 SHOWN_RADII_PX = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 Kernel = NDArray[np.float64]

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from psfcore.errors import DataError
 from psfcore.instruments.model import Instrument, Mesh
 
-REACH_GRID_PX = 2048  # light is counted over this grid: the full reach
 LARGEST_SIZE_PX = 4096
 PERIOD_PX = 4096  # size of the transform: light wraps around at 4096 px, not at the 2048 px that are kept
 MOST_MASK_SAMPLES = 32  # a mask that needs more samples per pixel is replaced by an analytic pattern

@@ -38,7 +38,10 @@ class NewKey(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     label: str = Field(
-        "", max_length=LABEL_LENGTH, description="a note for lists, such as the purpose of the key"
+        "",
+        pattern=r"^[^\x00-\x1f\x7f]*$",
+        max_length=LABEL_LENGTH,
+        description="a note for lists, such as the purpose of the key",
     )
     scopes: list[Scope] = Field(
         min_length=1,

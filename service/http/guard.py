@@ -130,6 +130,14 @@ def _may_have_files(path: str, content_type: str) -> bool:
     return UPLOADS.fullmatch(path) is not None or (form and UWS_FORMS.fullmatch(path) is not None)
 
 
+def _host_of(origin: str) -> str | None:
+    """The host and port of an origin; None for a text that is no address."""
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return None
+
+
 def _check_origin(method: str, headers: Headers) -> None:
     """Refuse changes that a web page of another site requests, because the browser would add its stored HTTP Basic password or cookie."""
     if method in SAFE_METHODS:
@@ -138,7 +146,7 @@ def _check_origin(method: str, headers: Headers) -> None:
     if site is not None:
         foreign = site not in ("same-origin", "none")
     else:  # an older browser, or a program
-        foreign = origin is not None and urlsplit(origin).netloc.lower() != headers.get("host", "").lower()
+        foreign = origin is not None and _host_of(origin) != headers.get("host", "").lower()
     if foreign:
         raise Problem(
             403,

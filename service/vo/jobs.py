@@ -206,7 +206,7 @@ def delete_uws_job(row: OwnJob, request: Request, state: Shared) -> Response:
 
 
 @router.post("/{job_id}", summary="UWS: destroy a job", **_form(ACTION="DELETE"))
-def post_uws_job(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
+def post_uws_job(row: OwnJob, form: Form, request: Request, state: Shared) -> Response:
     """The same as DELETE, for browsers."""
     if form.get("action") != "DELETE":
         raise bad(f"expected ACTION=DELETE, got {form.get('action', '')[:40]!a}")
@@ -220,7 +220,7 @@ def get_uws_phase(row: Job) -> Response:
 
 
 @router.post("/{job_id}/phase", summary="UWS: start or abort a job", **_form(PHASE="RUN or ABORT"))
-def post_uws_phase(form: Form, row: OwnJob, caller: Submitting, request: Request, state: Shared) -> Response:
+def post_uws_phase(row: OwnJob, form: Form, caller: Submitting, request: Request, state: Shared) -> Response:
     """RUN queues a PENDING job. ABORT stops a job that has not ended. A repeated request changes nothing."""
     match form.get("phase"):
         case "RUN":
@@ -243,7 +243,7 @@ def get_uws_duration(row: Job, state: Shared) -> Response:
     summary="UWS: limit how long a job may execute",
     **_form(EXECUTIONDURATION="seconds; 0: unlimited"),
 )
-def post_uws_duration(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
+def post_uws_duration(row: OwnJob, form: Form, request: Request, state: Shared) -> Response:
     """Set the limit. If it exceeds the largest limit that the operator allows, the service sets that limit."""
     limit_s = _duration(state, _field(form, "EXECUTIONDURATION"))
     state.catalogue.uws.set_terms(row.id, execution_duration_s=limit_s)
@@ -261,7 +261,7 @@ def get_uws_destruction(row: Job, state: Shared) -> Response:
     summary="UWS: set when a job is destroyed",
     **_form(DESTRUCTION="a time (ISO 8601, UTC)"),
 )
-def post_uws_destruction(form: Form, row: OwnJob, request: Request, state: Shared) -> Response:
+def post_uws_destruction(row: OwnJob, form: Form, request: Request, state: Shared) -> Response:
     """Set the time. If it is later than the latest time that the operator allows, the service sets that time."""
     at = _destruction(state, _field(form, "DESTRUCTION"))
     state.catalogue.uws.set_terms(row.id, destruction_at=at)

@@ -252,7 +252,8 @@ class Sessions:
 def _make_room(session: Session, owner: str, most: int) -> None:
     """Raise ``TooManyKeys`` if an owner already has ``most`` valid keys.
 
-    Otherwise keep only the newest ``most`` of the owner's revoked and expired keys, and delete the older ones.
+    Otherwise keep only the newest ``most`` of the owner's revoked and expired keys, and delete the older ones. The keys that
+    a deleted key made then count as made by the key that had made it, so that ``revoke`` still reaches them.
     """
     lock_owner(session, owner)  # simultaneous requests are counted one after the other
     good = _good_keys().where(KeyRow.owner == owner)
@@ -260,6 +261,9 @@ def _make_room(session: Session, owner: str, most: int) -> None:
         raise TooManyKeys
     ended = select(KeyRow.id).where(KeyRow.owner == owner, KeyRow.id.not_in(good))
     surplus = session.scalars(ended.order_by(KeyRow.created_at.desc()).offset(most)).all()
+    for identity in surplus:
+        maker = session.scalar(select(KeyRow.made_by).where(KeyRow.id == identity))
+        session.execute(update(KeyRow).where(KeyRow.made_by == identity).values(made_by=maker))
     session.execute(delete(KeyRow).where(KeyRow.id.in_(surplus)))
 
 

@@ -136,6 +136,7 @@ def test_a_key_goes_as_a_bearer_token_or_as_a_password(shared_service: Keyed) ->
     broken = (
         {"Authorization": "Basic %%%"},
         {"Authorization": "Digest x"},
+        {"Authorization": b"Basic \xff\xfe"},
         bearer("nonsense"),
         basic("nonsense"),
     )

@@ -63,6 +63,7 @@ SITES: list[tuple[dict[str, str], bool]] = [
     ({"Origin": "http://evil.example"}, True),
     ({"Origin": "http://testserver:81"}, True),
     ({"Origin": "null"}, True),
+    ({"Origin": "http://["}, True),
     ({"Sec-Fetch-Site": "cross-site"}, True),
     ({"Sec-Fetch-Site": "same-site", "Origin": "http://testserver"}, True),
 ]

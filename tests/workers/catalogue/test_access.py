@@ -62,6 +62,22 @@ def test_old_keys_that_ended_are_forgotten(catalogue: Catalogue) -> None:
     assert {row.id for row in catalogue.keys.all()} == {*ids[3:], bobs, new}
 
 
+def test_a_forgotten_key_does_not_hide_the_keys_that_it_made(catalogue: Catalogue) -> None:
+    """Whoever revokes a stolen key also reaches what was made with keys that it made and that are forgotten."""
+    stolen = made(catalogue)
+    second = made(catalogue, made_by=stolen)
+    third = made(catalogue, made_by=second)
+    fourth = made(catalogue, "bob", made_by=third)
+    for identity in (second, third):
+        catalogue.keys.revoke(identity)
+    for _ in range(2):
+        catalogue.keys.revoke(made(catalogue, most=1 + len(valid(catalogue))))
+    made(catalogue, most=2)
+    assert not {second, third} & {row.id for row in catalogue.keys.all()}
+    catalogue.keys.revoke(stolen, and_made=True)
+    assert fourth not in valid(catalogue)
+
+
 DAY_S = 86_400.0
 
 
