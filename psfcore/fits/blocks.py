@@ -46,6 +46,7 @@ _MANY_AXES = 10  # if an image has this number of axes or more, the message does
 END_CARD = b"END" + b" " * 77
 # astropy also ends a header at a card such as "END x". astropy would then read the file in another way than
 # this module.
+_SIMPLE = re.compile(rb"SIMPLE  = *[TF] *(/[ -~]*)?")
 _DAMAGED_END = re.compile(rb"END[^A-Z0-9_-]")
 _KNOWN_STARTS = (
     (b"\x00\x00\x00\x0cjP", "a JPEG 2000 file"),
@@ -297,6 +298,10 @@ def _find_end(block: bytes) -> int | None:
 
 def _check_start(block: bytes) -> None:
     if block.startswith(b"SIMPLE  ="):
+        card = block[:CARD_BYTES]
+        # With another value astropy calls the HDU corrupted, and then reads on without an end.
+        if len(card) == CARD_BYTES and not _SIMPLE.fullmatch(card):
+            raise bad_card("SIMPLE = T", f"{card.rstrip()!r:.100}")
         return
     if not block:
         raise HeaderError(

@@ -24,6 +24,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::astropy.utils.exceptions.Astrop
 BAD = {
     "empty": (b"", "empty-file"),
     "text": (b"hello, I am an image\n" * 200, "not-fits"),
+    "SIMPLE with other bytes": (b"SIMPLE  =       \x1f>\xde\x0b!        T".ljust(80) + good()[80:], "bad-card"),
     "jpeg 2000": (b"\x00\x00\x00\x0cjP  \r\n\x87\n" + bytes(5000), "not-fits"),
     "five bytes": (b"SIMPL", "truncated-header"),
     "cut in the header": (good()[:400], "truncated-header"),
