@@ -191,6 +191,9 @@ def walk(source: Source, limits: FitsLimits) -> Iterator[Hdu]:
         if number == limits.max_hdus:
             break
         header_bytes += len(raw)
+        # With another value astropy calls the HDU corrupted, and then reads on without an end.
+        if number == 0 and not _SIMPLE.fullmatch(raw[:CARD_BYTES]):
+            raise bad_card("SIMPLE = T", f"{raw[:CARD_BYTES].rstrip()!r:.100}")
         header = _parse(raw, number)
         hdu = Hdu(header, number, _kind(header, number), source.position)
         if hdu.kind != "image":  # the size of an image is checked by its pixels first
@@ -298,10 +301,6 @@ def _find_end(block: bytes) -> int | None:
 
 def _check_start(block: bytes) -> None:
     if block.startswith(b"SIMPLE  ="):
-        card = block[:CARD_BYTES]
-        # With another value astropy calls the HDU corrupted, and then reads on without an end.
-        if len(card) == CARD_BYTES and not _SIMPLE.fullmatch(card):
-            raise bad_card("SIMPLE = T", f"{card.rstrip()!r:.100}")
         return
     if not block:
         raise HeaderError(

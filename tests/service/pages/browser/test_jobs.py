@@ -26,7 +26,7 @@ KEPT_STEPS = "Object.keys(sessionStorage).filter((key) => key.startsWith('step '
 
 
 def test_a_job_is_followed_to_its_product_without_a_reload(page: Page, submit: Submit) -> None:
-    job = submit("large", 41)
+    job = submit("large", 141)
     listed = page.context.new_page()
     listed.goto("/jobs")
     listed.evaluate(MARK)
@@ -34,7 +34,7 @@ def test_a_job_is_followed_to_its_product_without_a_reload(page: Page, submit: S
     page.goto(f"/jobs/{job['id']}")
     page.evaluate(MARK)
     expect(page.locator("[data-part=phase]")).to_have_text("EXECUTING", timeout=LONG_MS)
-    expect(page.locator("#job [data-part=progress]")).to_contain_text("of 41")
+    expect(page.locator("#job [data-part=progress]")).to_contain_text("of 141")
     assert page.evaluate(NOT_RELOADED)
     page.evaluate(KEEP_STEPS)
     expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=LONG_MS)
