@@ -20,6 +20,7 @@ from service.http.problems import RESPONSES, Problem, problem
 from service.http.state import Shared
 from workers.catalogue.access import LABEL_LENGTH, OWNER, Scope, TooManyKeys
 from workers.catalogue.tables import KeyRow
+from workers.contract.requests import PRINTABLE_OR_EMPTY
 from workers.rows import no_such
 
 MOST_KEYS = 100  # an owner with this number of valid keys cannot make more
@@ -39,7 +40,7 @@ class NewKey(BaseModel):
 
     label: str = Field(
         "",
-        pattern=r"^[^\x00-\x1f\x7f]*$",
+        pattern=PRINTABLE_OR_EMPTY,
         max_length=LABEL_LENGTH,
         description="a note for lists, such as the purpose of the key",
     )

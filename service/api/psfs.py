@@ -22,7 +22,7 @@ from service.views import PsfView
 from workers.catalogue.contexts import NOW
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, PsfRow
-from workers.contract.requests import Identity
+from workers.contract.requests import PRINTABLE, Identity
 from workers.files.collection import remove_unnamed
 from workers.intake.psf_choice import MOST_NAMED, Found, look, look_for_image
 from workers.versions import TIME, TOTAL, WORD, PsfStatus, iso, seconds
@@ -31,7 +31,6 @@ log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/psfs", tags=["PSFs"], responses=RESPONSES)
 choosing = APIRouter(tags=["PSFs"], responses=RESPONSES)
 
-PRINTABLE = r"^[^\x00-\x1f\x7f]+$"
 TEXT = r"^[^\x00-\x08\x0b-\x1f\x7f]*$"  # for free text: PostgreSQL cannot store NUL
 Text = Annotated[str | None, Query(max_length=80, pattern=PRINTABLE)]
 Time = Annotated[

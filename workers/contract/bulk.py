@@ -23,12 +23,11 @@ from pydantic import (
 )
 
 from workers.contract.layout import FIELDS, check_layout
-from workers.contract.requests import Identity, Treatment
+from workers.contract.requests import PRINTABLE, PRINTABLE_OR_EMPTY, Identity, Treatment
 
 MOST_UPLOADED = 100_000
 MOST_SETS = 100
 MOST_CONDITIONS = 16
-TEXT = r"^[^\x00-\x1f\x7f]+$"
 
 
 class BulkPhase(StrEnum):
@@ -81,7 +80,7 @@ class FileSet(_Strict):
     glob: str = Field(
         min_length=2,
         max_length=1000,
-        pattern=TEXT,
+        pattern=PRINTABLE,
         description="an absolute path; * ? [ab] match parts of a name, ** matches any number of folders",
     )
     where: Where = Field(
@@ -96,7 +95,7 @@ class Output(_Strict):
     folder: str = Field(
         min_length=2,
         max_length=1000,
-        pattern=TEXT,
+        pattern=PRINTABLE,
         description="absolute path below a folder that the operator allows; the folder is created if it does not exist",
     )
     only: bool = Field(False, description="true: write products only to the folder; the service keeps none")
@@ -118,9 +117,7 @@ class Output(_Strict):
 class BulkWork(_Strict):
     """The part of a request for a bulk run that is stored with the run: all except the ids of uploaded images."""
 
-    name: str = Field(
-        "", max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$", description="a name to show in lists"
-    )
+    name: str = Field("", max_length=80, pattern=PRINTABLE_OR_EMPTY, description="a name to show in lists")
     files: list[FileSet] = Field(default_factory=list, max_length=MOST_SETS)
     psf_id: Identity | None = Field(None, description="a PSF of the catalogue")
     context: str | None = Field(

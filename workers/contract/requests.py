@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from psfcore.deconvolve.run import Options
     from psfcore.noise import Noise
 
+# Texts of one line from outside: without control characters, of which PostgreSQL cannot store NUL.
+PRINTABLE, PRINTABLE_OR_EMPTY = r"^[^\x00-\x1f\x7f]+$", r"^[^\x00-\x1f\x7f]*$"
+
 
 @dataclass(frozen=True)
 class Option:
