@@ -167,7 +167,8 @@ class _Turn:
         This wait does not count towards the time limit of a job.
         """
         self._finish_writing()
-        self._context.guarded(lambda: self._context.report(LISTING, 0, 1))
+        error = self._context.guarded(lambda: self._context.report(LISTING, 0, 1))
+        assert error is None, error
         self._news.wait(TELL_EVERY_S or 0.1)
         self._news.clear()
 
