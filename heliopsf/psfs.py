@@ -18,10 +18,11 @@ from psfcore.instruments.files import instrument_path, turned_text
 from psfcore.instruments.model import load_instrument, read_instrument_text
 from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
-from psfcore.psf_cache import kept_psf, sha256_of_file
+from psfcore.psf_cache import kept_psf
 from psfcore.psf_sampling import rebinned
 from psfcore.recipe import Recipe
 from psfcore.scatter.interpolation import Epoch, interpolated_psf
+from psfcore.whole_files import sha256_of
 from workers.cache_folder import psf_cache
 from workers.machine import cores
 
@@ -124,7 +125,7 @@ def built_psf(
     mask, mask_id = None, None
     if known.mount is not None and known.mount.mask_image is not None:
         file = Path(instrument).parent / known.mount.mask_image.file
-        mask, mask_id = read_mask_image(file), sha256_of_file(file)
+        mask, mask_id = read_mask_image(file), sha256_of(file)
     recipe = Recipe(
         text=text,
         name=None if own or turn_deg else str(instrument),
@@ -153,7 +154,7 @@ def read_psf(path: str | Path) -> Psf:
     """
     psf = Psf.of(psfs.read_psf(path, LIMITS))
     # The id that a service would give to this file after an upload: a built PSF keeps the id that its file states.
-    identity = psfs.stated_id(path, LIMITS) or sha256_of_file(Path(path))
+    identity = psfs.stated_id(path, LIMITS) or sha256_of(Path(path))
     return replace(psf, provenance={**psf.provenance, "psf_id": identity})
 
 

@@ -9,7 +9,6 @@ Other users have no access to the folder, because the files in it are used witho
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -27,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError
 from psfcore.recipe import Recipe
-from psfcore.whole_files import PARTIAL
+from psfcore.whole_files import PARTIAL, sha256_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -81,7 +80,7 @@ class PsfCache:
             if (of, found_part) != (identity, part):
                 continue
             try:
-                if sha256_of_file(path) == sha256:
+                if sha256_of(path) == sha256:
                     # The access time of the file is set to now: it records the last use. The modification time is not
                     # changed, because other running commands use it to notice that a file was replaced.
                     os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
@@ -109,7 +108,7 @@ class PsfCache:
                 os.fsync(written.fileno())
             if unfinished.stat().st_size > self.max_bytes:
                 return None
-            sha256 = sha256_of_file(unfinished)
+            sha256 = sha256_of(unfinished)
             kept = self.folder / f"{identity}.{sha256}.{part}"
             unfinished.replace(kept)
         finally:
@@ -190,12 +189,6 @@ class PsfCache:
 def _remove(psf: CachedPsf) -> None:
     for path in psf.files:
         path.unlink(missing_ok=True)
-
-
-def sha256_of_file(path: Path) -> str:
-    """SHA-256 of a file. Raises OSError."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @contextmanager

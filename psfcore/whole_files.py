@@ -1,7 +1,8 @@
-"""Writes files completely or not at all, even if the process is killed or the power fails."""
+"""Writes files completely or not at all, even if the process is killed or the power fails; and the hash of a whole file."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import uuid
 from collections.abc import Iterator
@@ -60,3 +61,9 @@ def write_whole(target: Path, text: str) -> None:
 
 def _partial(target: Path) -> Path:
     return target.with_name(f".{target.name}.{uuid.uuid4().hex}{PARTIAL}")
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal. Raises OSError."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -29,9 +29,9 @@ import httpx
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import OperationalError
 
+from psfcore.whole_files import sha256_of
 from tests.conftest import write_image, write_psf
 from tests.whole.stack import QUICK, Missing, free_port, wait_for
-from workers.files.store import sha256_of
 
 ENDED = ("COMPLETED", "ERROR", "ABORTED")
 LONGEST_S = 1800.0

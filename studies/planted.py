@@ -153,7 +153,7 @@ FAULTS = (
           "return set(case.required_names) <= set(hypothesis)", "return bool(set(case.required_names) & set(hypothesis))",
           ("tests/psfcore/blind",)),
     Fault("built-damaged-psf-used", "psfcore/psf_cache.py",
-          "if sha256_of_file(path) == sha256:", "if path.is_file():",
+          "if sha256_of(path) == sha256:", "if path.is_file():",
           ("tests/psfcore/test_psf_cache.py",)),
     # workers
     Fault("catalogue-claim-without-compare", "workers/catalogue/jobs.py",

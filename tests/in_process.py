@@ -14,6 +14,7 @@ from psfcore.fits.psfs import stated_id
 from psfcore.fits.stored_psf import check_is_psf
 from psfcore.tables import lookup
 from psfcore.transit.archive import list_archive, pack
+from psfcore.whole_files import sha256_of
 from service.client.errors import ServiceError
 from service.client.operations import Operations, Progress
 from service.client.outputs import written
@@ -22,7 +23,7 @@ from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, ProductRow, PsfRow, ReportRow
 from workers.contract.kinds import JobRequest
 from workers.contract.phases import Phase
-from workers.files.store import Store, sha256_of
+from workers.files.store import Store
 from workers.intake.deprecated import details_now
 from workers.intake.requests import resolve
 from workers.intake.uploads import image_row, transit_row, uploaded_psf_row

@@ -6,7 +6,6 @@ Pixels are kept as float32: 126 images of 2048 px take 2.1 GiB.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +24,7 @@ from psfcore.psf import CENTRE_TOLERANCE
 from psfcore.transit.manifest import MANIFEST_NAME, ImageEntry, TransitManifest, read_manifest
 from psfcore.transit.prepare import Exposure, Prepared, exposure_of, prepare
 from psfcore.transit.transit import Kernel, Place, Transit, check_reaches_in
+from psfcore.whole_files import sha256_of
 
 KNOWN_PSF_SUM_TOLERANCE = 1e-3
 SMALLEST_KNOWN_PSF_PX = 16
@@ -110,7 +110,7 @@ def read_prepared(
         noise=noise,
         instrument=instrument,
         plate_scale_arcsec=next((scale for _, scale in exposures if scale is not None), None),
-        sha256={name: _sha256(folder / name) for name in (MANIFEST_NAME, *manifest.files)},
+        sha256={name: sha256_of(folder / name) for name in (MANIFEST_NAME, *manifest.files)},
     )
     return transit, prepared
 
@@ -177,11 +177,6 @@ def times_s(headers: Sequence[HeaderSummary]) -> list[float]:
         return [float(index) for index in range(len(headers))]
     first = min(known)
     return [(start - first).total_seconds() for start in known]
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 # --- noise and the known PSF ------------------------------------------------------------------------------

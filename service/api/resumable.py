@@ -21,13 +21,13 @@ from fastapi.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from psfcore.errors import DataError
+from psfcore.whole_files import sha256_of
 from service.http import uploads
 from service.http.callers import Caller, Submitting
 from service.http.problems import RESPONSES, Problem
 from service.http.quotas import Allowed, check_length
 from service.http.state import Shared, State
 from workers.files.partial_uploads import PartialUpload, PartialUploads
-from workers.files.store import sha256_of
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"], responses=RESPONSES)
 UploadId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from psfcore.errors import DataError
-from psfcore.psf_cache import sha256_of_file
+from psfcore.whole_files import sha256_of
 from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf
 from service.cli.fields import options_of
 from service.cli.options import (
@@ -83,7 +83,7 @@ def changes(
             _one_by_one(service, parameters, products),
             progress=lambda done, of: report("images", done, of),
         )
-        inputs = {row.name: sha256_of_file(Path(row.name)) for row in treated}
+        inputs = {row.name: sha256_of(Path(row.name)) for row in treated}
         content = table(treated, failures) | {
             "method": {"name": parameters["method"], "steps": parameters["steps"]},
             "products": products,

@@ -35,8 +35,9 @@ from psfcore.fits.psfs import read_psf, stated_id
 from psfcore.fits.stored_psf import check_is_psf
 from psfcore.instruments.unknown import channel_of, unknown_instrument
 from psfcore.psf import Kernel, Psf, light_beyond_pct
-from psfcore.psf_cache import built_file, kept_psf, sha256_of_file
+from psfcore.psf_cache import built_file, kept_psf
 from psfcore.transit.archive import ArchiveContents, list_archive, transit_in, unpack
+from psfcore.whole_files import sha256_of
 from service.client.errors import ServiceError
 from service.client.operations import Operations, Progress
 from service.client.outputs import written
@@ -169,7 +170,7 @@ class Local(Operations):
         if summary.codec is not None:
             limited.prepare()
         files = _Files(Path(path))
-        image = _Image(Path(path), files, sha256_of_file(Path(path)), summary)
+        image = _Image(Path(path), files, sha256_of(Path(path)), summary)
         self._images[image.sha256] = image
         return {"id": image.sha256}
 
@@ -190,7 +191,7 @@ class Local(Operations):
         else:
             files = _Files(path)
             contents = list_archive(path, Settings.apart(self.folder).archive_limits)
-            transit = _NamedTransit(path, files, sha256_of_file(path), path.stat().st_size, contents)
+            transit = _NamedTransit(path, files, sha256_of(path), path.stat().st_size, contents)
         self._transits[transit.sha256] = transit
         return {"id": transit.sha256}
 
@@ -201,7 +202,7 @@ class Local(Operations):
         summary = read_summary(path, LIMITS)
         check_is_psf(path, summary, LIMITS)
         files = _Files(path)
-        sha256 = sha256_of_file(path)
+        sha256 = sha256_of(path)
         identity = stated_id(path, LIMITS) or sha256
         used = UsedPsf(identity, *name_of_upload(summary, path.name, sha256), PsfStatus.DRAFT)
         self._psfs[identity] = _NamedPsf(path, files, sha256, summary, used)
@@ -327,6 +328,9 @@ class Local(Operations):
         image, named = self._images[request.image_id], self._psfs.get(request.psf_id)
         report("reading", 0, request.method.steps)
         image.files.check()
+        summary = image.summary
+        if request.hdu is not None:
+            summary = read_summary(image.path, LIMITS, hdu=request.hdu)
 
         def begin(stage: str, steps: int) -> Callable[[int, int], None]:
             if stage == run.DECONVOLVING:
@@ -349,7 +353,7 @@ class Local(Operations):
             lambda: read_observation(
                 image.path, LIMITS, saturation_dn=request.saturation_dn, hdu=request.hdu
             ),
-            read_summary(image.path, LIMITS, hdu=request.hdu).shape,
+            summary.shape,
             None if named is None else self._psf(request.psf_id, parts=request.error_draws > 0),
             options_of(request, None if request.noise is None else request.noise.noise(), cores()),
             build=build,

@@ -16,6 +16,7 @@ from typing import Any
 
 from psfcore.fits.header import read_summary
 from psfcore.image import Image
+from psfcore.whole_files import sha256_of
 from workers.bulk import outputs
 from workers.bulk.runs import resolved_image
 from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
@@ -25,7 +26,7 @@ from workers.contract.identities import product_identity
 from workers.contract.requests import ResolvedDeconvolve
 from workers.files import archive as archive_files
 from workers.files import beneath
-from workers.files.store import is_disk_full, sha256_of
+from workers.files.store import is_disk_full
 from workers.intake import estimates
 from workers.intake.deprecated import details_now
 from workers.rows import row_of

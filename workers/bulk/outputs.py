@@ -10,11 +10,12 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, first_image_header, optional_text
+from psfcore.whole_files import sha256_of
 from workers.contract.bulk import Output
 from workers.contract.layout import MOST_IN_PATH, Value, laid_out
 from workers.files import archive as archive_files
 from workers.files import beneath
-from workers.files.store import is_disk_full, sha256_of
+from workers.files.store import is_disk_full
 from workers.settings import Settings
 from workers.versions import seconds
 

@@ -17,7 +17,8 @@ import aiohttp
 import s3fs
 from botocore.exceptions import BotoCoreError
 
-from workers.files.store import DAMAGED, BadFile, Blob, Store, StoreAway, is_disk_full, sha256_of, sync
+from psfcore.whole_files import sha256_of
+from workers.files.store import DAMAGED, BadFile, Blob, Store, StoreAway, is_disk_full, sync
 
 LOOK_AFTER_S = 10.0  # shortest time between two measurements of the size of the copies
 IN_USE_S = 60.0  # a copy that was requested in the last minute is not removed: it may be opened soon

@@ -7,7 +7,6 @@ File names are hashes; they never come from a client.
 from __future__ import annotations
 
 import errno
-import hashlib
 import math
 import os
 import shutil
@@ -23,6 +22,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from psfcore.errors import DataError, module_of_extra
 from psfcore.transit.archive import ArchiveLimits, unpack
+from psfcore.whole_files import sha256_of
 from workers.settings import Settings
 
 ADVICE = (
@@ -256,12 +256,6 @@ def open_store(settings: Settings) -> Store:
 def lost(digest: str) -> BadFile:
     """The error for a file that is not in the store, although the catalogue refers to it."""
     return BadFile("file-lost", f"expected the file {digest} in the store; it is not there: {ADVICE}")
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sync(path: Path) -> None:

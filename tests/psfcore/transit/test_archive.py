@@ -32,8 +32,8 @@ from psfcore.transit.archive import (
     transit_in,
     unpack,
 )
+from psfcore.whole_files import sha256_of
 from tests.transit_files import write_transit
-from workers.files.store import sha256_of
 
 LIMITS = ArchiveLimits()
 SMALL = ArchiveLimits(max_files=100, max_bytes=2**20, max_member_bytes=2**19)

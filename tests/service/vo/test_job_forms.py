@@ -15,6 +15,7 @@ from vo_models.uws import Jobs, JobSummary, Parameter, Results
 from vo_models.uws.types import ExecutionPhase
 
 from psfcore.transit.archive import pack
+from psfcore.whole_files import sha256_of
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
 from tests.service.vo.made import add_product
@@ -22,7 +23,6 @@ from tests.service.vo.test_jobs import BUILD, JOBS, created, document, parameter
 from tests.transit_files import write_transit
 from workers.catalogue.access import Scope
 from workers.catalogue.tables import ImageRow
-from workers.files.store import sha256_of
 from workers.settings import Settings
 
 Files = dict[str, tuple[str, bytes]]
