@@ -28,6 +28,7 @@ Kernel = NDArray[np.float64]
 
 LARGEST_SUM = 1 + 1e-3
 SMALLEST_SUM = 0.05
+SMALLEST_SIDE_PX = 3  # a PSF of one pixel changes no image
 # Because of rounding, the central weight may be below the largest weight by this fraction.
 CENTRE_TOLERANCE = 1e-3
 LARGEST_OFFSET_PX = 0.05  # a PSF moves every image by the offset of its core
@@ -54,7 +55,7 @@ class Psf:
     kernel: a weight is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx // 2].
     components: kernels with the same centre ("DIFFRACTION", "SCATTER"). provenance: texts and numbers for JSON.
     fitted: the fitted formula of SCATTER. turn_deg: the angle from the +x axis of the detector to that of the kernel. cards: texts of the file's cards TELESCOP, INSTRUME, DETECTOR and FILTER,
-    which say for which images the PSF is valid. Raises DataError: "psf-not-2d", "psf-nonfinite", "psf-negative",
+    which say for which images the PSF is valid. Raises DataError: "psf-not-2d", "psf-too-small", "psf-nonfinite", "psf-negative",
     "psf-sum", "psf-not-centred", "psf-off-centre".
     """
 
@@ -90,8 +91,12 @@ class Psf:
 
 
 def _check_weights(kernel: Kernel) -> None:
-    if kernel.ndim != 2 or min(kernel.shape, default=0) < 1:
+    if kernel.ndim != 2:
         raise DataError("psf-not-2d", f"expected weights with two axes; got shape {kernel.shape}")
+    if min(kernel.shape) < SMALLEST_SIDE_PX:
+        raise DataError(
+            "psf-too-small", f"expected at least {SMALLEST_SIDE_PX} px per side; got shape {kernel.shape}"
+        )
     if not np.isfinite(kernel).all():
         bad = int(np.count_nonzero(~np.isfinite(kernel)))
         raise DataError(

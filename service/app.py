@@ -76,7 +76,7 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         catalogue.upgrade()
         store = open_store(settings)
         store.sweep()
-        reconciler = Reconciler(catalogue, queue.make_app(settings), settings)
+        reconciler = Reconciler(catalogue, store, queue.make_app(settings), settings)
         streams = AtOnce(settings.streams_per_caller, "too-many-streams", "streams of events")
         requests = AtOnce(settings.requests_per_caller, "too-many-requests-at-once", "requests")
         app.state.heliopsf = State(

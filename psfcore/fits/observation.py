@@ -39,6 +39,7 @@ from psfcore.instruments.model import load_instrument
 
 # Names of images that describe another image: its mask, its errors, the quality of its pixels.
 _PLANES = ("MASK", "UNCERT", "UNCERTAINTY", "DQF", "DQ", "ERR", "ERROR", "QUALITY", "VARIANCE")
+LARGEST_PIXEL = 1e30  # products are single precision, and methods square the pixels
 FAR = 3.0
 _FILLED_WITH = (-32768.0, -32767.0, -2147483648.0, -2147483647.0, -9999.0, -999.0, -99999.0, -1e30, -1e31)
 # Cards that name the kind of a frame, and the words of frames without the light of the Sun.
@@ -138,7 +139,7 @@ def observation_of(
     """The image of pixels [y, x] and a header, with its unusable pixels masked.
 
     stored_as_integer: whether the pixels are the numbers of an A/D converter, without a calibration. Raises DataError
-    "not-2d", "too-small", "no-exposure", "saturation-unit", "all-nan", "all-saturated", "no-signal".
+    "not-2d", "too-small", "no-exposure", "saturation-unit", "all-nan", "all-saturated", "pixel-too-large", "no-signal".
     """
     lost = _lost_pixels(pixels, header)
     if lost is not None:
@@ -174,10 +175,17 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
             "all-saturated",
             f"expected pixels below saturation; all finite pixels are at {level:g} or above: check the level",
         )
-    values = image.pixels if valid.all() else image.pixels[valid]
+    values = image.pixels if valid.all() else image.pixels[image.finite]
+    farthest = max(float(values.min()), float(values.max()), key=abs)
+    if abs(farthest) > LARGEST_PIXEL:
+        raise DataError(
+            "pixel-too-large",
+            f"expected pixels between -{LARGEST_PIXEL:g} and {LARGEST_PIXEL:g}; got one of {farthest:g}: set such pixels to NaN",
+        )
+    values = values if valid.all() else image.pixels[valid]
     smallest, largest = float(values.min()), float(values.max())
-    if smallest == largest <= 0:
-        raise DataError("no-signal", f"expected light; all pixels are {largest:g}: use another image")
+    if smallest == largest <= 0 or abs(farthest) < 1 / LARGEST_PIXEL:
+        raise DataError("no-signal", f"expected light; the brightest pixel is {largest:g}: use another image")
     if smallest == largest and stored_as_integer and largest in _FULL_SCALES:
         text = f"all pixels are {largest:g}, the largest value of an A/D converter"
         message = f"expected pixels below saturation; {text}: use another image"

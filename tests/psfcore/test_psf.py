@@ -40,6 +40,8 @@ def test_a_wrong_psf_is_refused() -> None:
         ),
         (0.5 * (delta(32) + np.roll(delta(32), 1, 1)), "psf-off-centre", "got it at x"),
         (np.ones(9) / 9, "psf-not-2d", "two axes"),
+        (np.ones((1, 1)), "psf-too-small", "3 px per side"),
+        (np.ones((1, 64)) / 64, "psf-too-small", r"\(1, 64\)"),
     ):
         with pytest.raises(DataError, match=words) as caught:
             make_psf(kernel)

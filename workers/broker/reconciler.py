@@ -1,9 +1,13 @@
-"""Keeps the broker consistent with the job table: lost messages and jobs of lost workers are submitted again."""
+"""Keeps the broker and the store consistent with the tables.
+
+Lost messages and jobs of lost workers are submitted again. Removed files are deleted for good.
+"""
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 
 from celery import Celery
 from sqlalchemy.exc import SQLAlchemyError
@@ -11,12 +15,15 @@ from sqlalchemy.exc import SQLAlchemyError
 from workers.broker import app as queue
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
+from workers.files.collection import settle_old
+from workers.files.store import Store
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
 # This number is small: an urgent job may arrive while jobs are submitted, and must not wait for many other
 # jobs.
 AT_ONCE = 50
+SETTLE_EVERY_S = 60.0
 
 
 def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
@@ -45,10 +52,14 @@ def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
 
 
 class Reconciler:
-    """A thread that reconciles every ``settings.reconcile_s`` seconds, and immediately after ``wake``."""
+    """A thread that reconciles every ``settings.reconcile_s`` seconds, and immediately after ``wake``.
 
-    def __init__(self, catalogue: Catalogue, app: Celery, settings: Settings) -> None:
-        self._catalogue, self._app, self._settings = catalogue, app, settings
+    Once a minute it also deletes the files of ``store`` that were removed, and temporary files of ended processes.
+    """
+
+    def __init__(self, catalogue: Catalogue, store: Store, app: Celery, settings: Settings) -> None:
+        self._catalogue, self._store, self._app, self._settings = catalogue, store, app, settings
+        self._settled_at = time.monotonic()
         self._wake = threading.Event()
         self._stopping = False
         self._thread = threading.Thread(target=self._loop, name="reconciler", daemon=True)
@@ -78,8 +89,14 @@ class Reconciler:
             submitted = 0
             try:
                 submitted = reconcile(self._catalogue, self._app, self._settings)
+                if time.monotonic() - self._settled_at > SETTLE_EVERY_S:
+                    self._settled_at = time.monotonic()
+                    self._store.sweep()
+                    settle_old(self._catalogue, self._store)
             except SQLAlchemyError as error:
                 # The database may be restarting; the thread tries again after the interval.
                 log.warning("reconciler: the database does not answer: %s", error)
+            except OSError as error:
+                log.warning("reconciler: the store does not answer: %s", error)
             if submitted < AT_ONCE:
                 self._wake.wait(self._settings.reconcile_s)

@@ -57,6 +57,7 @@ AnyRow = TypeVar(
 ListedRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | JobRow | PsfContextRow | BulkRow
 MOST_CANDIDATES = 6
 QUICK_CHECK = "PRAGMA quick_check(1)"  # SQLite compares all pages of the file, and reports the first fault
+_ATTEMPTS = 10
 _IN_A_QUERY = 500  # databases limit the number of values in a query
 
 
@@ -118,20 +119,24 @@ class Catalogue:
         the owner's oldest kept solutions are removed until it fits. If it would not fit even without any kept solution,
         nothing is added or removed, and ``workers.catalogue.owners.OverQuota`` is raised.
         """
-        try:
-            with self._database.writing.begin() as session:
-                if quota_mib is not None:
-                    lock_owner(session, row.owner)
-                session.add(row)
-                session.flush()
-                if quota_mib is not None:
-                    hold_to_quota(session, row, quota_mib)
-            return row, True
-        except IntegrityError:
-            existing = self.get(type(row), row.id, row.owner)
-            if existing is None:
-                raise
-            return existing, False
+        attempts = 0
+        while True:
+            try:
+                with self._database.writing.begin() as session:
+                    if quota_mib is not None:
+                        lock_owner(session, row.owner)
+                    session.add(row)
+                    session.flush()
+                    if quota_mib is not None:
+                        hold_to_quota(session, row, quota_mib)
+                return row, True
+            except IntegrityError:
+                existing = self.get(type(row), row.id, row.owner)
+                if existing is not None:
+                    return existing, False
+                attempts += 1  # another request has just deleted the existing row
+                if attempts == _ATTEMPTS:
+                    raise
 
     def refile(self, row: Made) -> Made:
         """Let the existing row with this identity refer to the files of ``row``; returns the existing row.

@@ -2,7 +2,8 @@
 
 A job leaves a file without a row if it is killed before it adds its row. Recent files are not removed, because an upload
 first stores its file and then adds the row that refers to it. An upload may also store a file again while the collection
-removes it, and add the row a little later. Therefore the rows are read a second time before a file is deleted for good.
+removes it, and add the row a little later. Therefore the rows are read a second time before a file is deleted for good:
+``settle`` is the only place that deletes files of the store.
 
 Kept solutions of transits can be made again, so old ones are removed too, with their rows. The same age limit applies.
 """
@@ -20,8 +21,11 @@ from workers.catalogue.owners import FileRow
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
 from workers.files.store import Blob, FileState, Store
 
-# An upload adds its row directly after it has stored its file; a job adds its row within seconds.
+# A collection moves only old files aside. The second look finds a file that was sent again at the same moment.
 SECOND_LOOK_AFTER_S = 10.0
+# Other files may be new when they are moved aside. An upload adds its row directly after it has stored its file, a job
+# within a minute, and both may wait for other writers of the database.
+SETTLED_AFTER_S = 300.0
 # Entries of a row's details that name further files.
 NAMED_IN_DETAILS = (
     "changes_picture_sha256",
@@ -167,12 +171,33 @@ def collect(
 
 
 def remove_unnamed(catalogue: Catalogue, store: Store, digests: Iterable[str]) -> None:
-    """Remove these files now, except the files to which a row of any owner refers (``NamedFiles.among``)."""
+    """Move these files aside, except the files to which a row of any owner refers (``NamedFiles.among``).
+
+    ``settle`` deletes them later.
+    """
     wanted = frozenset(digests)
     before = time.time()
     for digest in wanted - catalogue.named_files.among(wanted):
         store.remove(digest, before)
-    store.settle(catalogue.named_files.all())
+
+
+def settle(catalogue: Catalogue, store: Store, digests: set[str]) -> set[str]:
+    """Bring back those of the files moved aside to which a row refers, and delete the others.
+
+    Returns the hashes of the files that were brought back. If this is interrupted, the next call finds the files.
+    """
+    if not digests:
+        return set()
+    named = digests.intersection(catalogue.named_files.all())
+    back = {digest for digest in named if store.bring_back(digest)}
+    for digest in digests:
+        store.delete_aside(digest)
+    return back
+
+
+def settle_old(catalogue: Catalogue, store: Store) -> None:
+    """``settle`` the files that were moved aside more than ``SETTLED_AFTER_S`` seconds ago."""
+    settle(catalogue, store, store.aside(time.time() - SETTLED_AFTER_S))
 
 
 def _removed(
@@ -180,11 +205,12 @@ def _removed(
 ) -> list[Blob]:
     """Remove the files ``old``; returns the removed files.
 
-    If a row refers to a file after the removal, the file is restored.
+    If a row refers to a file after the removal, the file is brought back.
     """
-    # An earlier collection may have been killed after it moved files aside. First restore those files that a
-    # row refers to.
-    store.settle(catalogue.named_files.all())
+    # An earlier collection may have been killed after it moved files aside.
+    settle_old(catalogue, store)
     gone = [blob for blob in old if store.remove(blob.digest, kept_before)]
-    put_back = store.settle(catalogue.named_files.all(), after_s=second_look_after_s)
-    return [blob for blob in gone if blob.digest not in put_back]
+    if gone:
+        time.sleep(second_look_after_s)
+    back = settle(catalogue, store, {blob.digest for blob in gone})
+    return [blob for blob in gone if blob.digest not in back]

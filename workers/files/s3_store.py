@@ -6,9 +6,10 @@ come from the usual environment variables (``AWS_*``).
 
 from __future__ import annotations
 
+import math
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ class RemoteStore(Store):
 
     def path(self, digest: str) -> Path:
         """A local copy of the file with this SHA-256, downloaded if missing. Raises ``StoreAway``, FileNotFoundError."""
-        copy = super().path(digest)
+        copy = self._place(digest)
         try:
             os.utime(copy)
         except FileNotFoundError:
@@ -52,11 +53,10 @@ class RemoteStore(Store):
 
     def size(self, digest: str) -> int | None:
         """The size of the file with this SHA-256, bytes; None if the store has no such file. Raises ``StoreAway``."""
-        with _answering():
-            try:
-                return int(self._s3.info(self._key(digest), refresh=True)["size"])
-            except FileNotFoundError:
-                return None
+        there = self._about(digest)
+        if there is None and self.bring_back(digest):
+            there = self._about(digest)
+        return None if there is None else int(there["size"])
 
     def _content_sha256(self, digest: str) -> str:
         """SHA-256 of the object itself.
@@ -64,8 +64,7 @@ class RemoteStore(Store):
         The copy in the local folder is not used, because this copy may be good although the object is damaged.
         """
         with self.temporary() as copy:
-            with _answering():
-                self._s3.get_file(self._key(digest), str(copy))
+            self._download(digest, copy)
             return sha256_of(copy)
 
     def verified(self, digest: str) -> Path:
@@ -75,7 +74,7 @@ class RemoteStore(Store):
         except BadFile as error:
             if error.code == "file-lost":
                 raise
-        super().path(digest).unlink(missing_ok=True)
+        self._place(digest).unlink(missing_ok=True)
         return super().verified(digest)
 
     def set_aside(self, digest: str) -> bool:
@@ -89,7 +88,7 @@ class RemoteStore(Store):
                 return False
             self._s3.cp_file(self._key(digest), f"{self._root}/damaged/{digest}")
             self._s3.rm_file(self._key(digest))
-        super().path(digest).unlink(missing_ok=True)
+        self._place(digest).unlink(missing_ok=True)
         return True
 
     def check(self) -> None:
@@ -103,17 +102,13 @@ class RemoteStore(Store):
         digest = digest or sha256_of(temporary)
         with _answering():
             self._s3.put_file(str(temporary), self._key(digest))
-        self._keep_copy(temporary, super().path(digest))
+        self._keep_copy(temporary, self._place(digest))
         return digest
 
     def kept_at(self, digest: str) -> float | None:
         """The time when a file was last stored; None if it is not in the store. Raises ``StoreAway``."""
-        with _answering():
-            try:
-                stored_at: float = self._s3.info(self._key(digest), refresh=True)["LastModified"].timestamp()
-            except FileNotFoundError:
-                return None
-        return stored_at
+        there = self._about(digest)
+        return None if there is None else float(there["LastModified"].timestamp())
 
     def blobs(self) -> Iterator[Blob]:
         """All files of the store, in the order of the first digit of their hashes. Raises ``StoreAway``."""
@@ -124,10 +119,9 @@ class RemoteStore(Store):
                 yield Blob(name.rsplit("/", 1)[1], int(about["size"]), about["LastModified"].timestamp())
 
     def remove(self, digest: str, kept_before: float) -> bool:
-        """Remove a file. If the file was stored again since ``kept_before``, or no longer exists, do nothing.
+        """As ``Store.remove``. Raises ``StoreAway``.
 
-        Returns whether the file was removed. Raises ``StoreAway``. S3 cannot check and remove a file in one step.
-        Therefore a copy is kept until ``settle``: the file may be stored again between the two steps.
+        S3 cannot check and move a file in one step: a file that is stored in between is lost, but not its copy aside.
         """
         with _answering():
             if not self._is_old(digest, kept_before):
@@ -140,31 +134,39 @@ class RemoteStore(Store):
             if not self._is_old(digest, kept_before):
                 return False
             self._s3.rm_file(self._key(digest))
-        super().path(digest).unlink(missing_ok=True)
+        self._place(digest).unlink(missing_ok=True)
         return True
 
-    def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
-        """As ``Store.settle``, also for copies that a killed process had moved aside.
+    def aside(self, before: float = math.inf) -> set[str]:
+        """As ``Store.aside``. Raises ``StoreAway``."""
+        with _answering():
+            found = self._s3.find(f"{self._root}/aside", detail=True)
+        moved = {name: about["LastModified"].timestamp() for name, about in found.items()}
+        return {name.rsplit("/", 1)[1] for name, moved_at in moved.items() if moved_at < before}
 
-        Raises ``StoreAway``.
-        """
+    def bring_back(self, digest: str) -> bool:
+        """As ``Store.bring_back``; the copy aside stays until ``delete_aside``. Raises ``StoreAway``."""
         with _answering():
-            aside = {name.rsplit("/", 1)[1] for name in self._s3.find(f"{self._root}/aside")}
-        if not aside:
-            return set()
-        time.sleep(after_s)
-        # `named` is read after the listing; copies that are moved aside later stay there.
-        wanted = aside.intersection(named)
-        put_back = set()
+            if self._s3.exists(self._key(digest)):
+                return False
+            try:
+                self._s3.cp_file(self._key_aside(digest), self._key(digest))
+            except FileNotFoundError:
+                return False
+        return True
+
+    def delete_aside(self, digest: str) -> None:
+        """As ``Store.delete_aside``. Raises ``StoreAway``."""
+        with _answering(), suppress(FileNotFoundError):
+            self._s3.rm_file(self._key_aside(digest))
+
+    def _about(self, digest: str) -> dict[str, Any] | None:
+        """The size and the time of the object; None if there is no such object."""
         with _answering():
-            for digest in wanted:
-                if not self._s3.exists(self._key(digest)):
-                    self._s3.cp_file(self._key_aside(digest), self._key(digest))
-                    put_back.add(digest)
-            # Delete only after all files are restored. If this function is interrupted, the next call finds the copies.
-            for digest in aside:
-                self._s3.rm_file(self._key_aside(digest))
-        return put_back
+            try:
+                return dict(self._s3.info(self._key(digest), refresh=True))
+            except FileNotFoundError:
+                return None
 
     def _is_old(self, digest: str, kept_before: float) -> bool:
         """Whether the file exists and was last stored before this time."""
@@ -179,11 +181,19 @@ class RemoteStore(Store):
 
     def _fetch(self, digest: str, copy: Path) -> None:
         with self.temporary() as partial:
-            with _answering():
-                self._s3.get_file(self._key(digest), str(partial))
+            try:
+                self._download(digest, partial)
+            except FileNotFoundError:
+                if not self.bring_back(digest):
+                    raise
+                self._download(digest, partial)
             if sha256_of(partial) != digest:
                 raise BadFile("file-damaged", f"expected the file {digest} as it was stored; {DAMAGED}")
             self._keep_copy(partial, copy)
+
+    def _download(self, digest: str, to: Path) -> None:
+        with _answering():
+            self._s3.get_file(self._key(digest), str(to))
 
     def _keep_copy(self, temporary: Path, copy: Path) -> None:
         copy.parent.mkdir(exist_ok=True)

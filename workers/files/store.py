@@ -2,17 +2,23 @@
 
 A file is written under a temporary name, forced to the disk and then renamed. An existing file is therefore complete.
 File names are hashes; they never come from a client.
+
+A file is removed in two steps, because an upload or a job stores its file before it adds the row that names the file.
+``remove`` moves the file aside. From there ``path`` brings it back as soon as something needs it. Later
+``workers.files.collection.settle`` reads the rows: it brings back the files that a row names, and deletes the others.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import math
 import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterable, Iterator
+import weakref
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,23 +67,52 @@ class Store:
     def __init__(self, folder: Path, blobs: str = "blobs") -> None:
         self._blobs = folder / blobs
         self._tmp = folder / "tmp"
+        self._aside = folder / "aside"
         self._damaged = folder / "damaged"
-        self._blobs.mkdir(parents=True, exist_ok=True)
-        self._tmp.mkdir(parents=True, exist_ok=True)
+        self._writers = folder / "writers"
+        for needed in (self._blobs, self._tmp, self._aside, self._writers):
+            needed.mkdir(parents=True, exist_ok=True)
+        self._writer = self._new_writer()
 
-    def sweep(self, older_than_s: float = 86_400.0) -> None:
-        """Remove temporary files older than ``older_than_s`` seconds. Killed processes leave such files."""
+    def _new_writer(self) -> str:
+        """The name of a new locked file. It says that the temporary files whose names begin with it are in use.
+
+        The system drops the lock when this process and its forked children have ended.
+        """
+        while True:
+            file = (self._writers / uuid.uuid4().hex).open("wb")
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if os.fstat(file.fileno()).st_nlink:  # otherwise a sweep removed it before it was locked
+                weakref.finalize(self, file.close)
+                return Path(file.name).name
+            file.close()
+
+    def sweep(self) -> None:
+        """Remove the temporary files of processes that have ended. No clock is read: clocks may be wrong."""
+        for path in self._writers.iterdir():
+            # Another sweep may run now. An exclusive lock on a network file system needs a file open for writing.
+            with suppress(FileNotFoundError, BlockingIOError), path.open("r+b") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink()
         for path in self._tmp.iterdir():
-            # A file may disappear meanwhile: a task removes its files when it ends, and another sweep may run now.
-            with suppress(FileNotFoundError):
-                if time.time() - path.stat().st_mtime > older_than_s:
-                    if path.is_dir():
-                        shutil.rmtree(path, ignore_errors=True)
-                    else:
-                        path.unlink()
+            if (self._writers / path.name.partition(".")[0]).exists():
+                continue
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+
+    def _new_temporary(self) -> Path:
+        return self._tmp / f"{self._writer}.{uuid.uuid4().hex}"
 
     def path(self, digest: str) -> Path:
-        """The path of the file with this SHA-256. The file may not exist. Open it soon, because it may be removed."""
+        """The path of the file with this SHA-256. The file may not exist."""
+        path = self._place(digest)
+        if not path.exists():
+            self.bring_back(digest)
+        return path
+
+    def _place(self, digest: str) -> Path:
         return self._blobs / digest[:2] / digest
 
     def size(self, digest: str) -> int | None:
@@ -143,7 +178,7 @@ class Store:
     @contextmanager
     def temporary(self) -> Iterator[Path]:
         """A path for a temporary file. If the file still exists at the end, it is removed."""
-        path = self._tmp / uuid.uuid4().hex
+        path = self._new_temporary()
         try:
             yield path
         finally:
@@ -152,7 +187,7 @@ class Store:
     @contextmanager
     def temporary_folder(self) -> Iterator[Path]:
         """An empty folder. At the end it is removed with its content."""
-        folder = self._tmp / uuid.uuid4().hex
+        folder = self._new_temporary()
         folder.mkdir()
         try:
             yield folder
@@ -172,7 +207,7 @@ class Store:
         digest: the SHA-256, if it is already known.
         """
         digest = digest or sha256_of(temporary)
-        target = self.path(digest)
+        target = self._place(digest)
         target.parent.mkdir(exist_ok=True)
         self._force(temporary)
         # The time is set to the nanosecond, so that remove() can distinguish this file from an identical file that is
@@ -189,7 +224,7 @@ class Store:
     def kept_at(self, digest: str) -> float | None:
         """The time when a file was last stored; None if it is not in the store."""
         try:
-            return (self._blobs / digest[:2] / digest).stat().st_mtime
+            return self._place(digest).stat().st_mtime
         except FileNotFoundError:
             return None
 
@@ -218,30 +253,46 @@ class Store:
                 yield Blob(path.name, found.st_size, found.st_mtime)
 
     def remove(self, digest: str, kept_before: float) -> bool:
-        """Remove a file. If the file was stored again since ``kept_before``, or no longer exists, do nothing.
+        """Move a file aside. If the file was stored again since ``kept_before``, or no longer exists, do nothing.
 
-        Returns whether the file was removed. The file is first moved to another folder and checked there. Otherwise a
-        file that is stored at the same moment could be lost.
+        Returns whether the file was moved. The time of a file is checked after the move. Otherwise a file that is stored
+        at the same moment could be moved too.
         """
-        aside = self._tmp / uuid.uuid4().hex
-        target = self.path(digest)
+        target, aside = self._place(digest), self._aside / digest
         try:
             os.replace(target, aside)
-        except FileNotFoundError:
+            if aside.stat().st_mtime >= kept_before:
+                os.replace(aside, target)  # if a file was stored there meanwhile, its content is the same
+                return False
+            os.utime(aside)
+        except FileNotFoundError:  # it is not in the store, or something needed it meanwhile
             return False
-        if aside.stat().st_mtime >= kept_before:
-            os.replace(aside, target)  # if a file was stored there meanwhile, its content is the same
-            return False
-        aside.unlink()
         return True
 
-    def settle(self, named: Iterable[str], after_s: float = 0.0) -> set[str]:
-        """Finish ``remove``: of the files that were moved aside, restore the files in ``named`` and delete all others.
+    def aside(self, before: float = math.inf) -> set[str]:
+        """The hashes of the files that were moved aside before this time."""
+        found = set()
+        for path in self._aside.iterdir():
+            with suppress(FileNotFoundError):
+                if path.stat().st_mtime < before:
+                    found.add(path.name)
+        return found
 
-        If there are such files, ``named`` is read after ``after_s`` seconds. Returns the hashes of the restored files.
-        """
-        # In a local folder there is nothing to finish: remove() itself checks the file that it moved aside.
-        return set()
+    def bring_back(self, digest: str) -> bool:
+        """Move a file that was moved aside back to its place; returns False if it is not aside or was stored again."""
+        target = self._place(digest)
+        if target.exists():  # it was stored again
+            return False
+        try:
+            os.replace(self._aside / digest, target)
+        except FileNotFoundError:
+            return False
+        self._force(target.parent)
+        return True
+
+    def delete_aside(self, digest: str) -> None:
+        """Delete a file that was moved aside."""
+        (self._aside / digest).unlink(missing_ok=True)
 
 
 def open_store(settings: Settings) -> Store:

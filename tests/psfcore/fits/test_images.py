@@ -101,6 +101,9 @@ UNUSABLE = [
     (np.full((20, 20), 65535, np.uint16), {}, None, "all-saturated"),
     (np.zeros((20, 20)), {}, None, "no-signal"),
     (np.full((20, 20), -3.0), {}, None, "no-signal"),
+    (ramp() * 1e-300, {}, None, "no-signal"),
+    (np.where(ramp() == 5.0, 1e300, ramp()), {}, None, "pixel-too-large"),
+    (np.where(ramp() == 5.0, -1e300, ramp()), {}, None, "pixel-too-large"),
     (ramp(), {"BUNIT": "DN/s"}, 100.0, "no-exposure"),
     (np.ones((10, 40)), {}, None, "too-small"),
 ]

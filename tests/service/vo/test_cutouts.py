@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import collections
 import io
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +13,16 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 from fastapi.testclient import TestClient
+from httpx import Response
+from sqlalchemy import update
 
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.viewing.regions import Region, write_cutout
+from tests.fits_bombs import padded
+from tests.service.conftest import execute
 from tests.service.keyed import Keyed
-from tests.service.vo.made import SHAPE, add_product, pixels
+from tests.service.vo.made import OBSERVED, SHAPE, WCS_CARDS, add_product, pixels
+from workers.catalogue.tables import ProductRow
 from workers.settings import Settings
 
 
@@ -100,6 +107,66 @@ def test_cards_of_many_axes_do_not_reach_the_library_of_coordinates(tmp_path: Pa
     with (tmp_path / "cut.fits").open("wb") as target:
         write_cutout(tmp_path / "p.fits", region, FitsLimits(max_pixels=4096), target)
     assert fits.getdata(tmp_path / "cut.fits").shape == (8, 8)
+
+
+KEYWORDS = (
+    *("WCSAXES", "WCSNAME", "RADESYS", "EQUINOX", "LONPOLE", "LATPOLE", "MJD-OBS", "MJDREF", "DATE-OBS", "DATE-BEG", "DATEREF"),
+    *("DSUN_OBS", "HGLN_OBS", "HGLT_OBS", "RSUN_REF", "RSUN_OBS", "CROTA1", "CROTA2", "TIMESYS", "TREFPOS", "OBSGEO-X"),
+    *("A_ORDER", "B_ORDER", "AP_ORDER", "A_2_0", "B_0_3", "CPDIS1", "DP1", "D2IMDIS1", "PS1_0", "PV1_1", "PV2_3", "PV2_99"),
+    *(f"{name}{axis}{version}" for name in ("CTYPE", "CUNIT", "CRPIX", "CRVAL", "CDELT", "CNAME", "CRDER", "CZPHS")
+      for axis in (1, 2, 3, 99) for version in ("", "A")),
+    *(f"{name}{i}_{j}" for name in ("PC", "CD") for i in (1, 2, 3) for j in (1, 2, 99)),
+)  # fmt: skip
+VALUES = (
+    *("0", "1", "-1", "2", "3", "99", "0.5", "-0.0", "1E300", "-1E300", "1E-300", "1E400", "99999999", "20000", "-2147483648", "NaN"),
+    *("T", "", "(1,2)", "'HPLN-TAN'", "'HPLT-TAN'", "'HPLN-SIP'", "'RA---TPV'", "'HPLN-ZPN'", "'HPLT-CAR'", "'STOKES'", "'TIME'"),
+    *("'FREQ-LOG'", "'WAVE-TAB'", "'LINEAR'", "'arcsec'", "'deg'", "'m'", "'furlong'", "'sqrt(deg)**9'", "'10**400 m'", "''", "'open"),
+    *("'2022-03-17T04:02:00.000'", "'0000-00-00'", "'99999-01-01T00:00:00'", "'HELIOPROJECTIVE'", "'\x7f'", "'%s%n'", "'TABULAR: 1'"),
+)  # fmt: skip
+
+
+def damaged_places(seed: int) -> bytes:
+    """A product with good cards of its places, then a hundred cards of places with any value."""
+    rng = np.random.default_rng(seed)
+    good = fits.Header({**OBSERVED, **WCS_CARDS}).tostring(endcard=False, padding=False)
+    first = "".join(
+        f"{key:8}= {value:>20}".ljust(80)
+        for key, value in {"SIMPLE": "T", "BITPIX": -32, "NAXIS": 2, "NAXIS1": 128, "NAXIS2": 96}.items()
+    )
+    bad = "".join(
+        f"{rng.choice(KEYWORDS):8}= {rng.choice(VALUES):>20}".ljust(80)[:80]
+        for _ in range(100 if seed % 2 else 3)
+    )
+    header = first + good + bad + "END".ljust(80)
+    data = pixels().astype(">f4").tobytes()
+    return padded(header.encode(), b" ") + padded(data, b"\0")
+
+
+def asked(api: TestClient, content: bytes, folder: Path, product: str) -> Iterator[Response]:
+    """The answer of each address that reads the cards of a file, as an image and as the file of a product."""
+    yield (sent := api.post("/v1/images", content=content))
+    if sent.status_code == 201:
+        for address in ("", "/header", "/pixels", "/psf"):
+            yield api.get(f"/v1/images/{sent.json()['id']}{address}")
+    state = api.app.state.heliopsf
+    (folder / "damaged.fits").write_bytes(content)
+    digest = state.store.keep(folder / "damaged.fits")
+    execute(state.catalogue, update(ProductRow).values(file_sha256=digest, bytes=len(content)))
+    for address in ("", "/header", "/pixels", "/file", "/provenance"):
+        yield api.get(f"/v1/products/{product}{address}")
+    for frame in ("pixel", "helioprojective"):
+        yield api.get("/vo/cutout", params={"ID": product, "CIRCLE": "100 -50 9", "FRAME": frame})
+    yield api.get("/vo/products", params={"POS": "CIRCLE 0 0 1"})
+
+
+@pytest.mark.parametrize("headers", [20, pytest.param(200, marks=pytest.mark.slow)])
+def test_cards_of_places_with_any_value(api: TestClient, tmp_path: Path, headers: int) -> None:
+    product, answers = add_product(api, tmp_path)["product"], collections.Counter[int]()
+    for seed in range(headers):
+        for answer in asked(api, damaged_places(seed), tmp_path, product):
+            assert answer.status_code < 500, (seed, answer.url, answer.text)
+            answers[answer.status_code] += 1
+    assert {200, 201, 422} <= set(answers), answers
 
 
 BAD: list[tuple[dict[str, str], int, str]] = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,10 +18,11 @@ from psfcore.errors import DataError
 from service.cli.main import main
 from tests.in_process import InProcess
 from tests.s3 import client_of, digests, elsewhere, kept, key_of, opened_store, root_of
-from tests.workers.databases import change
+from tests.workers.databases import BOTH, change
+from tests.workers.psf_examples import psf
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import ImageRow, ReportRow, SolutionRow
-from workers.files import collection, s3_store
+from workers.catalogue.tables import ImageRow, PsfRow, ReportRow, SolutionRow
+from workers.files import collection
 from workers.files.store import Store
 from workers.settings import Settings
 
@@ -132,6 +134,83 @@ def test_old_solutions_go_with_their_files_and_do_not_count_as_lost(
     assert [row.owner for row in catalogue.owners.solutions_before(1e12)] == ["q"]
 
 
+# Removal beside uploads --------------------------------------------------------------------------------
+
+
+def draft(digest: str, owner: str) -> PsfRow:
+    return psf("draft", owner=owner, file_sha256=digest)
+
+
+def delete(catalogue: Catalogue, store: Store, row: PsfRow) -> None:
+    catalogue.delete_draft(row.id, row.owner)
+    collection.remove_unnamed(catalogue, store, [row.file_sha256])
+
+
+def test_a_file_is_there_for_the_row_that_comes_after_another_owner_deleted_it(
+    store: Store, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other, orphan = kept(store, b"same bytes"), kept(store, b"orphan")
+    catalogue.add(draft(other, "a"))
+    kept(store, b"same bytes")  # the upload of another owner has stored its file, but not yet added its row
+    time.sleep(0.01)
+    delete(catalogue, store, draft(other, "a"))
+    collection.remove_unnamed(catalogue, store, [orphan])
+    assert store.aside() == {other, orphan}
+    collection.settle_old(catalogue, store)
+    assert store.aside() == {other, orphan}, "they were moved aside a moment ago"
+    catalogue.add(draft(other, "b"))
+    monkeypatch.setattr(collection, "SETTLED_AFTER_S", -60.0)
+    collection.settle_old(catalogue, store)
+    assert elsewhere(store, tmp_path).verified(other).read_bytes() == b"same bytes"
+    assert digests(store) == {other} and store.aside() == set()
+
+
+def pairs_lost(catalogue: Catalogue, store: Store, pairs: int) -> int:
+    """Delete and upload the same bytes at the same moment, as two owners; the number of rows without a file."""
+    lost = 0
+    with ThreadPoolExecutor(2) as threads:
+        for number in range(pairs):
+            digest = kept(store, b"%d" % number)
+            catalogue.add(draft(digest, "a"))
+
+            def upload(content: bytes = b"%d" % number, digest: str = digest) -> None:
+                with store.temporary() as path:
+                    path.write_bytes(content)
+                    with store.kept_if(path, digest):
+                        catalogue.add(draft(digest, "b"))
+
+            together = [threads.submit(upload), threads.submit(delete, catalogue, store, draft(digest, "a"))]
+            for one in together:
+                one.result()
+            lost += store.size(digest) is None
+            delete(catalogue, store, draft(digest, "b"))
+    return lost
+
+
+@BOTH
+@pytest.mark.parametrize("pairs", [25, pytest.param(1000, marks=pytest.mark.slow)])
+def test_no_upload_loses_its_file_to_a_deletion_at_the_same_moment(
+    store: Store, catalogue: Catalogue, pairs: int
+) -> None:
+    assert pairs_lost(catalogue, store, pairs) == 0
+
+
+def test_a_row_that_is_deleted_while_it_is_added_again_is_added(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = draft("3" * 64, "a")
+    catalogue.add(row)
+    real, asked = catalogue.get, []
+
+    def deleted_before(table: type[PsfRow], identity: str, owner: str) -> PsfRow | None:
+        if not asked:
+            asked.append(catalogue.delete_draft(identity, owner))
+        return real(table, identity, owner)
+
+    monkeypatch.setattr(catalogue, "get", deleted_before)
+    assert catalogue.add(draft("3" * 64, "a"))[1] and asked
+
+
 # In S3 ------------------------------------------------------------------------------------------------
 
 
@@ -174,8 +253,8 @@ def test_a_file_that_is_sent_at_the_moment_of_its_removal_is_not_lost(
         if seconds:
             catalogue.add(image(orphan))
 
-    clock = SimpleNamespace(time=time.time, monotonic=time.monotonic, sleep=sleep)
-    monkeypatch.setattr(s3_store, "time", clock)
+    clock = SimpleNamespace(time=time.time, sleep=sleep)
+    monkeypatch.setattr(collection, "time", clock)
     before_removal(remote, monkeypatch, orphan, lambda: kept(remote, b"sent long ago"))
     removed = collection.collect(catalogue, remote, -60.0, even_most=True).removed
     assert [blob.digest for blob in removed] == [other]
@@ -193,15 +272,16 @@ def test_the_next_collection_settles_files_that_a_killed_one_left_aside_and_a_dr
     catalogue.add(image(kept(remote, b"a")))
     sent, orphan = kept(remote, b"sent long ago"), kept(remote, b"orphan")
 
-    def killed(named: object, after_s: float = 0.0) -> set[str]:
-        if names(remote, "aside"):
+    def killed(_catalogue: object, _store: object, digests: set[str]) -> set[str]:
+        if digests:
             raise Killed
         return set()
 
     with monkeypatch.context() as patched, pytest.raises(Killed):
-        patched.setattr(remote, "settle", killed)
+        patched.setattr(collection, "settle", killed)
         collect(catalogue, remote, -60.0, even_most=True)
     catalogue.add(image(sent))
+    monkeypatch.setattr(collection, "SETTLED_AFTER_S", -60.0)
     assert names(remote, "aside") == {sent, orphan} and len(digests(remote)) == 1
     another, there = kept(remote, b"another"), []
     before = objects(remote)
@@ -222,6 +302,7 @@ def test_a_collection_killed_anywhere_loses_nothing(
     remote: Store, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     catalogue.add(image(kept(remote, b"a")))
+    monkeypatch.setattr(collection, "SETTLED_AFTER_S", -60.0)
     for steps in range(1, 20):
         content = f"sent long ago {steps}".encode()
         sent, orphan = kept(remote, content), kept(remote, f"orphan {steps}".encode())

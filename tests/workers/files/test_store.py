@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -46,7 +48,7 @@ def kept(store: Store, content: bytes = CONTENT) -> str:
 
 
 def files_in(folder: Path) -> list[Path]:
-    return [path for path in folder.rglob("*") if path.is_file()]
+    return [path for path in folder.rglob("*") if path.is_file() and path.parent.name != "writers"]
 
 
 def digests(store: Store) -> list[str]:
@@ -111,10 +113,31 @@ def test_a_file_is_removed_unless_it_was_kept_again_since(store: Store, tmp_path
     assert not store.remove(DIGEST, kept_before=time.time() - HOUR_S)
     assert store.path(DIGEST).read_bytes() == CONTENT
     assert store.remove(DIGEST, kept_before=time.time() + HOUR_S)
-    assert not store.remove(DIGEST, kept_before=time.time() + HOUR_S), "it is gone"
-    assert digests(store) == [] and store.settle(()) == set() and files_in(tmp_path) == []
+    assert not store.remove(DIGEST, kept_before=time.time() + HOUR_S), "it is aside"
+    assert digests(store) == [] and store.aside() == {DIGEST}
+    assert store.aside(before=time.time() - HOUR_S) == set()
+    store.delete_aside(DIGEST), store.delete_aside(DIGEST)
+    assert store.aside() == set() and store.size(DIGEST) is None
     with pytest.raises(FileNotFoundError):
         elsewhere(store, tmp_path).path(DIGEST).open("rb")
+
+
+def test_a_file_aside_comes_back_when_it_is_needed(store: Store, tmp_path: Path) -> None:
+    for needed in (
+        lambda: store.size(DIGEST) == len(CONTENT),
+        lambda: elsewhere(store, tmp_path).path(DIGEST).read_bytes() == CONTENT,
+        lambda: store.verified(DIGEST).read_bytes() == CONTENT,
+        lambda: store.state(DIGEST, len(CONTENT), content=True) == "good",
+        lambda: store.bring_back(DIGEST) and not store.bring_back(DIGEST),
+    ):
+        kept(store)
+        assert store.remove(DIGEST, kept_before=time.time() + HOUR_S) and digests(store) == []
+        assert needed() and digests(store) == [DIGEST]
+        store.delete_aside(DIGEST)
+        assert store.verified(DIGEST).read_bytes() == CONTENT
+    assert store.remove(DIGEST, kept_before=time.time() + HOUR_S)
+    kept(store)
+    assert not store.bring_back(DIGEST), "it was stored again"
 
 
 def failing(store: Store, meanwhile: bool = False) -> None:
@@ -169,16 +192,46 @@ def test_a_file_that_is_stored_again_meanwhile_stays(tmp_path: Path, monkeypatch
     assert again and store.path(DIGEST).read_bytes() == CONTENT
 
 
-def test_a_sweep_tolerates_files_that_vanish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def writer(folder: Path) -> subprocess.Popen[str]:
+    """A process with a temporary file and a temporary folder, which waits."""
+    code = (
+        "import sys, pathlib; from workers.files.store import Store; store = Store(pathlib.Path(sys.argv[1]))\n"
+        "with store.temporary() as file, store.temporary_folder() as inner:\n"
+        "    file.write_text('half'); (inner / 'a').write_text('half'); print('ready', flush=True); sys.stdin.read()\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    return process
+
+
+def test_a_sweep_removes_only_the_temporary_files_of_ended_processes(tmp_path: Path) -> None:
+    """However old the files look: the clock of one of the machines may be wrong."""
     store, tmp = Store(tmp_path), tmp_path / "tmp"
-    for name in ("kept", "left"):
-        (tmp / name).write_bytes(b"half")
-    os.utime(tmp / "left", (0, 0))
-    listed = [tmp / "ended", tmp / "left", tmp / "kept"]  # the first was listed and is there no more
-    with monkeypatch.context() as patched:
-        patched.setattr(Path, "iterdir", lambda folder: iter(listed))
-        store.sweep()
-    assert [path.name for path in tmp.iterdir()] == ["kept"]
+    with writer(tmp_path) as living, store.temporary() as own:
+        own.write_bytes(b"half")
+        for path in tmp.iterdir():
+            os.utime(path, (0, 0))
+        Store(tmp_path).sweep()
+        assert len(list(tmp.iterdir())) == 3, "all are in use"
+        living.kill()
+        living.wait()
+        Store(tmp_path).sweep()
+        assert list(tmp.iterdir()) == [own]
+    assert list(tmp.iterdir()) == []
+
+
+def test_sweeps_at_the_same_moment_as_new_writers_remove_nothing_in_use(tmp_path: Path) -> None:
+    def write(_: int) -> bool:
+        store = Store(tmp_path)
+        with store.temporary() as path:
+            path.write_bytes(b"half")
+            Store(tmp_path).sweep()
+            return path.exists()
+
+    with ThreadPoolExecutor(8) as threads:
+        assert all(threads.map(write, range(200)))
 
 
 # In S3 ------------------------------------------------------------------------------------------------
@@ -207,25 +260,6 @@ def test_a_file_that_is_kept_again_is_new_in_the_bucket(
     assert sent == [key_of(remote, DIGEST)] * 2
 
 
-def test_a_file_aside_is_restored_if_it_has_a_row_and_was_not_kept_again(
-    remote: Store, tmp_path: Path
-) -> None:
-    named, other, again = kept(remote), kept(remote, b"other"), kept(remote, b"again")
-    for digest in (named, other, again):
-        assert remote.remove(digest, kept_before=time.time() + HOUR_S)
-    assert digests(remote) == [], "what is aside is not listed"
-    kept(remote, b"again")
-    assert remote.settle(iter((named, again, "a" * 64))) == {named}
-    assert elsewhere(remote, tmp_path).path(named).read_bytes() == CONTENT
-    assert set(digests(remote)) == {named, again}
-
-    def unread() -> Iterator[str]:
-        raise AssertionError("nothing is aside")
-        yield
-
-    assert remote.settle(unread(), after_s=HOUR_S) == set()
-
-
 def test_a_file_kept_while_its_copy_is_put_aside_is_not_removed(
     remote: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -245,7 +279,8 @@ def test_a_file_kept_while_its_copy_is_put_aside_is_not_removed(
     monkeypatch.setattr(client, "info", as_old)
     assert not remote.remove(DIGEST, kept_before=time.time() - HOUR_S)
     assert again == [DIGEST] == digests(remote)
-    remote.settle(())
+    assert remote.aside() == {DIGEST} and not remote.bring_back(DIGEST)
+    remote.delete_aside(DIGEST)
     assert digests(remote) == [DIGEST], "the copy alone is dropped"
 
 
@@ -298,7 +333,8 @@ def test_an_unavailable_server_is_a_transient_failure(
             lambda: kept(store),
             store.check,
             lambda: digests(store),
-            lambda: store.settle(()),
+            store.aside,
+            lambda: store.bring_back(DIGEST),
         ):
             with pytest.raises(StoreAway):
                 attempt()
