@@ -336,7 +336,7 @@ def test_what_no_method_can_use_is_refused() -> None:
     name=st.sampled_from(METHODS),
     edges=st.sampled_from(["zero", "symmetric", "extended"]),
     shape=st.tuples(st.integers(16, 40), st.integers(16, 40)),
-    kernel_size=st.integers(1, 50),
+    kernel_size=st.integers(3, 50),
     masked=st.floats(0, 0.9),
     bit=st.sampled_from([MaskBit.NONFINITE, MaskBit.SATURATED]),
     dtype=st.sampled_from([np.float32, np.float64, np.int16]),
