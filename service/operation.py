@@ -34,7 +34,7 @@ STOPPED = "the reconciler stopped, so queued jobs are not submitted; restart the
 router = APIRouter(tags=["operation"])
 NOT_READY = {
     "model": ProblemDocument,
-    "description": "A part does not answer; `parts` says which part.",
+    "description": "A part does not answer, or workers take no jobs; `parts` says which part.",
 }
 
 
@@ -50,7 +50,8 @@ class Readiness(BaseModel):
 
     status: str
     parts: dict[str, str] = Field(
-        description="state of the database, of the storage, and of the broker or embedded worker; `ok`: the part answers"
+        description="state of the database, of the storage, of the waiting jobs, and of the broker or embedded worker; `ok`: the "
+        "part answers, and workers take the jobs"
     )
 
 
@@ -65,7 +66,7 @@ def healthz(state: Shared) -> Health:
 
 @router.get("/readyz", summary="Can the service do its work?", responses={503: NOT_READY})
 def readyz(state: Shared) -> Readiness:
-    """200: database, storage, and broker (or embedded worker) answer. 503: one of them does not answer; `parts` says which one."""
+    """200: database, storage, and broker (or embedded worker) answer, and workers take the jobs. 503: one of them does not; `parts` says which one."""
     parts = states(state)
     away = faults(parts)
     if away:

@@ -27,6 +27,8 @@ class Unusable(Exception):
 # For each catalogue: the time until which the result of its last check of the pages is used again.
 _pages_good_until: WeakKeyDictionary[Catalogue, float] = WeakKeyDictionary()
 PAGES_SHARE = 0.01  # largest share of the time that is spent on checking the pages
+# While workers do nothing, a waiting job is sent to them every ``resubmit_s``. They count as deaf after this number of times.
+RESUBMISSIONS = 4
 
 
 def database(catalogue: Catalogue) -> None:
@@ -110,11 +112,31 @@ def embedded_worker(catalogue: Catalogue, settings: Settings) -> None:
         raise Unusable(f"no worker has announced itself for {settings.lease_s:g} s")
 
 
+def jobs(catalogue: Catalogue, settings: Settings) -> None:
+    """Check that no job waits for workers that do nothing.
+
+    Workers that run jobs are busy, and workers that have just started may take a job soon: neither is a fault.
+    """
+    idle_s = RESUBMISSIONS * settings.resubmit_s
+    try:
+        if not catalogue.jobs.nobody_works(idle_s):
+            return
+        left = catalogue.census.count_untaken(idle_s)
+        if not left:
+            return
+        workers = catalogue.census.workers(settings.lease_s)
+    except SQLAlchemyError as error:
+        raise _silent(error) from error
+    if any(worker.started_at < time.time() - idle_s for worker in workers):
+        raise Unusable(f"jobs wait ({left}), but the workers have taken none for {idle_s:g} s")
+
+
 def needed(settings: Settings, catalogue: Catalogue, store: Store) -> dict[str, Callable[[], None]]:
     """The checks that must pass before requests are accepted, by name."""
     checks: dict[str, Callable[[], None]] = {
         "database": lambda: database(catalogue),
         "storage": lambda: storage(settings.data_dir, settings.min_free_mib),
+        "jobs": lambda: jobs(catalogue, settings),
     }
     if settings.store_url is not None:
         checks["object store"] = lambda: object_store(store)

@@ -279,6 +279,11 @@ def stuck_jobs(settings: Settings, catalogue: Catalogue) -> Finding:
     """Are there jobs that a running service would have handled by now?"""
     if "jobs" in catalogue.schema.faults().tables:
         return Finding("ok", "no jobs yet")
+    try:
+        checks.jobs(catalogue, settings)
+    except checks.Unusable as fault:
+        advice = "restart the workers with the broker of the server, for all queues (HELIOPSF_WORKER_QUEUES), and read their logs"
+        return Finding("broken", str(fault), advice)
     silent = catalogue.census.count_silent(settings.lease_s + 5 * settings.reconcile_s)
     left = catalogue.census.count_unsubmitted(max(30.0, 5 * settings.reconcile_s))
     if not silent and not left:

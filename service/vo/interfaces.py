@@ -57,7 +57,7 @@ def _document(what: str) -> dict[str, Any]:
 
 @router.get("/availability", summary="VOSI: is the service available?", **_document("the availability"))
 def get_availability(state: Shared) -> Response:
-    """Whether database, storage, and broker or embedded worker answer; a note for each part that does not answer."""
+    """Whether database, storage, and broker or embedded worker answer, and workers take the jobs; a note for each part that does not."""
     from vo_models.vosi.availability import Availability  # half a second, and only this request needs it
 
     notes = faults(states(state))

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
-from sqlalchemy import Engine, create_engine, event, text
+from sqlalchemy import Engine, create_engine, event, text, update
 from sqlalchemy.exc import OperationalError
 
 from service.app import create_app
@@ -25,7 +25,7 @@ from workers import logs
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.stage_times import KeptStageTimes
-from workers.catalogue.tables import DEFAULT_OWNER
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow
 from workers.settings import Settings
 
 Lines = Callable[[], list[dict[str, Any]]]
@@ -236,7 +236,7 @@ def test_ready_once_the_embedded_worker_is_there(api: TestClient) -> None:
     handles(api).catalogue.census.announce("host:1", time.time(), "1")
     assert api.get("/readyz").json() == {
         "status": "ready",
-        "parts": {"database": "ok", "storage": "ok", "worker": "ok"},
+        "parts": {"database": "ok", "storage": "ok", "jobs": "ok", "worker": "ok"},
     }
     silent = text("UPDATE workers SET heartbeat_at = heartbeat_at - 3000")
     execute(handles(api).catalogue, silent)  # a worker that was killed falls silent
@@ -266,7 +266,8 @@ def test_ready_with_a_broker_that_answers(settings: Settings, tmp_path: Path) ->
     except Missing as missing:
         pytest.skip(str(missing))
     with redis, TestClient(create_app(settings.model_copy(update={"broker_url": redis.url}))) as api:
-        assert api.get("/readyz").json()["parts"] == {"database": "ok", "storage": "ok", "broker": "ok"}
+        parts = api.get("/readyz").json()["parts"]
+        assert parts == {"database": "ok", "storage": "ok", "jobs": "ok", "broker": "ok"}
         redis.kill()
         assert api.get("/readyz").status_code == 503
 
@@ -275,9 +276,42 @@ def test_not_ready_without_the_broker(settings: Settings) -> None:
     nobody = settings.model_copy(update={"broker_url": f"redis://:s3cret@127.0.0.1:{free_port()}/0"})
     with TestClient(create_app(nobody)) as api:
         answer = api.get("/readyz")
-    assert answer.status_code == 503 and set(answer.json()["parts"]) == {"database", "storage", "broker"}
+    parts = {"database", "storage", "jobs", "broker"}
+    assert answer.status_code == 503 and set(answer.json()["parts"]) == parts
     assert "does not answer" in answer.json()["parts"]["broker"]
     assert "s3cret" not in answer.text
+
+
+def test_not_ready_if_a_job_waits_for_workers_that_do_nothing(api: TestClient) -> None:
+    catalogue = handles(api).catalogue
+    waiting, _ = catalogue.jobs.submit("psf-build", {}, "waits", DEFAULT_OWNER)
+    other, _ = catalogue.jobs.submit("psf-build", {}, "other", DEFAULT_OWNER)
+
+    def jobs(started_ago_s: float, queued_ago_s: float, submissions: int, worked_ago_s: float) -> str:
+        """The part "jobs", if the worker started, the job was queued and another job ended so long ago."""
+        now = time.time()
+        catalogue.census.announce("host:1", now - started_ago_s, "1")
+        of = update(JobRow)
+        execute(
+            catalogue,
+            of.where(JobRow.id == waiting.id).values(
+                created_at=now - queued_ago_s, submitted_at=now, submissions=submissions
+            ),
+        )
+        ended = {"phase": "COMPLETED", "submitted_at": now, "heartbeat_at": now - worked_ago_s}
+        execute(catalogue, of.where(JobRow.id == other.id).values(**ended))
+        part: str = api.get("/readyz").json()["parts"]["jobs"]
+        return part
+
+    assert jobs(500, 500, 3, 60) == "ok", "the worker was busy"
+    assert jobs(60, 500, 3, 500) == "ok", "the worker has just started"
+    assert jobs(500, 60, 3, 500) == "ok", "the job is new"
+    assert jobs(500, 500, 1, 500) == "ok", "a draft that was queued now, or a job that runs again"
+    assert "jobs wait (1)" in jobs(500, 500, 3, 500)
+    assert api.get("/readyz").status_code == 503
+    execute(catalogue, text("DELETE FROM workers"))
+    parts = api.get("/readyz").json()["parts"]
+    assert parts["jobs"] == "ok" and "no worker" in parts["worker"]
 
 
 FEW = {"method": {"name": "richardson-lucy", "steps": 3}}

@@ -49,6 +49,8 @@ def make_app(settings: Settings) -> Celery:
         broker_connection_retry_on_startup=True,
         worker_hijack_root_logger=False,
         worker_send_task_events=False,
+        # Its commands need no key: whoever writes to the broker could stop the workers or make them deaf.
+        worker_enable_remote_control=False,
         broker_transport="workers.broker.order:FolderTransport" if settings.embedded else None,
         broker_transport_options=_transport_options(settings),
     )

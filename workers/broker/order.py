@@ -1,16 +1,21 @@
-"""Makes a worker take messages from the queue of highest priority, and only when one of its processes is idle.
+"""Makes a worker take messages from the queue of highest priority, only when one of its processes is idle, and only
+messages that this service sent.
 
 By default Celery and kombu do not do this. Celery and kombu serve the queues in turn and ignore their priority. With
 early acknowledgement they also fetch one message more than they can start. A more urgent job would then wait for two
-jobs instead of one.
+jobs instead of one. Celery also ends the worker for many contents of a message, and obeys its headers.
 """
 
 from __future__ import annotations
 
+import base64
 import fcntl
+import json
+import logging
 import time
 import uuid
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from queue import Empty
 from typing import Any
@@ -18,12 +23,15 @@ from typing import Any
 from celery import bootsteps
 from celery.worker import state
 from kombu.exceptions import ChannelError
-from kombu.transport import filesystem
+from kombu.transport import filesystem, redis
 from kombu.utils.json import dumps
 from kombu.utils.scheduling import FairCycle, priority_cycle
 
 from psfcore.whole_files import write_whole
-from workers.contract.queues import by_urgency
+from workers.broker.app import ASSIST, RUN_JOB
+from workers.contract.queues import broker_name, by_urgency, queue_of_broker
+
+log = logging.getLogger(__name__)
 
 
 class MostUrgentFirst(priority_cycle):
@@ -47,6 +55,48 @@ class _InOrder(FairCycle):
         raise self.predicate
 
 
+def _take(read: Callable[[], Any]) -> dict[str, Any] | None:
+    """Read a message, and make it anew from its task, its job id and its queue.
+
+    Returns None, and writes a line into the log, if this service did not send the message.
+    """
+    try:
+        message = read()
+        task = message["headers"]["task"]
+        queue = queue_of_broker(message["properties"]["delivery_info"]["routing_key"])
+        [job_id], _, _ = json.loads(base64.b64decode(message["body"]))
+        if task not in (RUN_JOB, ASSIST) or uuid.UUID(job_id).hex != job_id:
+            raise ValueError
+    except (Empty, OSError):
+        raise
+    except Exception as error:  # noqa: BLE001  (whoever writes to the broker can cause any error)
+        log.warning(
+            "dropped a message of the broker that this service did not send (%s)", type(error).__name__
+        )
+        return None
+    body = json.dumps([[job_id], {}, {}]).encode()
+    return {
+        "body": base64.b64encode(body).decode(),
+        "content-type": "application/json",
+        "content-encoding": "utf-8",
+        "headers": {"task": task, "id": uuid.uuid4().hex},
+        "properties": {
+            "body_encoding": "base64",
+            "delivery_tag": uuid.uuid4().hex,
+            "delivery_info": {"exchange": "", "routing_key": broker_name(queue)},
+        },
+    }
+
+
+def _sift(response: list[bytes] | None) -> tuple[bytes, str] | None:
+    """For Redis: the answer to a BRPOP command; None, as after its time limit, if the message must be dropped."""
+    if response is None:
+        return None
+    queue, text = response
+    message = _take(partial(json.loads, text))
+    return None if message is None else (queue, json.dumps(message))
+
+
 class _FolderChannel(filesystem.Channel):
     """Writes files atomically. Kombu's own channel would hang if a file is empty or incompletely written."""
 
@@ -54,7 +104,7 @@ class _FolderChannel(filesystem.Channel):
         """The queues bound to an exchange; empty if the file is damaged, for example by a power failure."""
         try:
             return list(super().get_table(exchange))
-        except ValueError:
+        except (TypeError, ValueError):
             return []
 
     def _queue_bind(self, exchange: str, routing_key: str, pattern: str, queue: str) -> None:
@@ -69,6 +119,12 @@ class _FolderChannel(filesystem.Channel):
     def _put(self, queue: str, payload: Any, **_: Any) -> None:  # type: ignore[override]  # kombu has two
         name = f"{time.monotonic_ns() // 1_000_000}_{uuid.uuid4()}.{queue}.msg"
         _write_whole(Path(self.data_folder_out) / name, payload)
+
+    def _get(self, queue: str, timeout: float | None = None) -> dict[str, Any]:
+        while True:
+            message = _take(partial(super()._get, queue))
+            if message is not None:
+                return message
 
     def _reset_cycle(self) -> None:
         self._cycle = _InOrder(self._get_and_deliver, self._active_queues, Empty)
@@ -109,16 +165,20 @@ class FolderTransport(filesystem.Transport):
 
 
 class TakeWhatCanStart(bootsteps.StartStopStep):
-    """Keeps a worker from taking messages while all its processes are busy.
+    """Keeps a worker from taking messages while all its processes are busy, and messages that this service did not send.
 
-    Celery's ``worker_disable_prefetch`` does the same, but only for Redis.
+    Celery's ``worker_disable_prefetch`` does the first, but only for Redis.
     """
 
     requires = ("celery.worker.consumer.tasks:Tasks",)
 
     def start(self, consumer: Any) -> None:
-        """Make the channel check whether the pool has an idle process, before it checks its own limit of messages."""
-        qos = consumer.task_consumer.channel.qos
+        """Make the channel check whether the pool has an idle process, before it checks its own limit of messages;
+        for Redis, also make it drop messages that this service did not send."""
+        channel = consumer.task_consumer.channel
+        if isinstance(channel, redis.Channel):
+            channel.client.set_response_callback("BRPOP", _sift)
+        qos = channel.qos
         within_limit = qos.can_consume
         qos.can_consume = lambda: (
             len(state.reserved_requests) < consumer.pool.num_processes and within_limit()

@@ -132,6 +132,15 @@ class Census(Queries):
             no_equal_at_work(),
         )
 
+    def count_untaken(self, older_than_s: float) -> int:
+        """Number of queued jobs that are older than ``older_than_s``, and that were given to the broker more than once
+        since they were queued."""
+        return self._count_jobs(
+            JobRow.phase == Phase.QUEUED,
+            JobRow.submissions > 1,
+            JobRow.created_at < self._database.now - older_than_s,
+        )
+
     def _count_jobs(self, *conditions: ColumnElement[bool]) -> int:
         return self._database.first(select(func.count()).select_from(JobRow).where(*conditions)) or 0
 

@@ -181,21 +181,18 @@ def _catalogue() -> Catalogue:
 def main(parent: int | None = None) -> None:
     """Run a worker in this process until it is told to stop, or until the process ``parent`` ends.
 
-    Raises SystemExit with a message and status 1 if the database is not at the revision of this version.
+    Raises SystemExit with status 1 if the worker ends for another reason; with a message if the database is not at the
+    revision of this version.
     """
     logs.configure(settings)  # before Celery logs anything
     if parent is not None:
         threading.Thread(target=_stop_with, args=(parent,), daemon=True).start()
     pool = ["--pool", "prefork", "--concurrency", str(settings.worker_processes)]
     quiet = ["--without-gossip", "--without-mingle", "--without-heartbeat"]
-    try:
-        app.worker_main(["--quiet", "worker", "--loglevel", "INFO", *pool, *quiet])
-    except SystemExit as ended:
-        if ended.code == 0 and stopping.asked:
-            # All work has ended. A normal exit of the interpreter would wait for idle threads of the pool.
-            logging.shutdown()
-            os._exit(0)
-        raise
+    app.worker_main(["--quiet", "worker", "--loglevel", "INFO", *pool, *quiet])
+    # Celery returns without a status, also after an error, which it has logged.
+    if not stopping.asked:
+        raise SystemExit(1)
 
 
 def _stop_with(parent: int) -> None:

@@ -176,6 +176,17 @@ def test_jobs_that_nobody_takes(catalogue: Catalogue, monkeypatch: pytest.Monkey
     assert states()["workers"] == states()["stuck jobs"] == "broken"
 
 
+def test_a_job_that_waits_for_workers_that_do_nothing(catalogue: Catalogue) -> None:
+    catalogue.census.announce("host:1", time.time() - 7200, software_version())
+    job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
+    catalogue.jobs.mark_submitted(job.id)
+    execute("UPDATE jobs SET created_at = created_at - 7200")
+    assert states()["stuck jobs"] == "ok", "it was sent once"
+    catalogue.jobs.mark_submitted(job.id)
+    found = findings()["stuck jobs"]
+    assert found["state"] == "broken" and "jobs wait (1)" in found["found"] and found["advice"]
+
+
 def test_a_job_whose_worker_is_gone(catalogue: Catalogue) -> None:
     job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     catalogue.jobs.claim(job.id, "host:1")

@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
+import base64
 import fcntl
+import json
+import signal
 import threading
 import time
+import uuid
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty
+from random import Random
+from typing import Any
 
 import pytest
+import redis
 from click.testing import CliRunner
 from kombu import pools
 from pydantic import ValidationError
 from sqlalchemy import update
 
 from service.cli.main import main
+from tests.whole.stack import Missing, Redis, wait_for
 from tests.workers.databases import change
 from tests.workers.jobs import claimed, job_row
+from tests.workers.run.processes import started_worker
 from workers.broker import app as queue
 from workers.broker.order import FolderTransport, MostUrgentFirst
 from workers.broker.reconciler import AT_ONCE, reconcile
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import JobRow
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow
 from workers.contract.kinds import queue_of
+from workers.contract.phases import Phase
 from workers.contract.queues import Queue, broker_name, by_urgency, queues_named
 from workers.settings import Settings
 
@@ -158,17 +171,18 @@ def test_what_was_cut_in_the_folder_when_the_power_went_stops_nobody(settings: S
             channel.drain_events(timeout=1)
         return taken
 
-    assert queue.submit(queue.make_app(settings), "first", Queue.BULK)
-    assert take() == ["first"]
-    for content in ("", "[["):
+    first, second = uuid.uuid4().hex, uuid.uuid4().hex
+    assert queue.submit(queue.make_app(settings), first, Queue.BULK)
+    assert take() == [first]
+    for content in ("", "[[", "null"):
         (broker / "control" / f"{broker_name(Queue.INTERACTIVE)}.exchange").write_text(content)
         # As in a process that has just started.
         FolderTransport.global_state.clear()
         pools.reset()
         # A message that is being written is not taken.
         (broker / "queue" / f"1_x.{broker_name(Queue.BULK)}.msg.ab.part").write_text("")
-        assert queue.submit(queue.make_app(settings), "second", Queue.BULK)
-        assert take() == ["second"]
+        assert queue.submit(queue.make_app(settings), second, Queue.BULK)
+        assert take() == [second]
 
 
 def test_a_process_that_binds_a_queue_waits_for_another_that_does(settings: Settings) -> None:
@@ -185,3 +199,125 @@ def test_a_process_that_binds_a_queue_waits_for_another_that_does(settings: Sett
         assert submitting.is_alive()
     submitting.join(10.0)
     assert not submitting.is_alive()
+
+
+# Others write into the broker -----------------------------------------------------------------------
+
+WORKER = """
+import workers.tasks.psf_build
+workers.tasks.psf_build.psf_build = lambda context, _: "result"
+from workers.run.worker import main
+main()
+"""
+
+
+@dataclass
+class Broker:
+    """A broker that others can write into. put: puts bytes into the queue of interactive jobs; left: what is in it."""
+
+    settings: Settings
+    put: Callable[[bytes], object]
+    left: Callable[[], list[Any]]
+
+
+@pytest.fixture(params=["folder", "redis"])
+def broker(request: pytest.FixtureRequest, settings: Settings, tmp_path: Path) -> Iterator[Broker]:
+    name = broker_name(Queue.INTERACTIVE)
+    settings.data_dir.mkdir()
+    if request.param == "folder":
+        queue.make_app(settings)
+        folder = settings.data_dir / "broker" / "queue"
+
+        def put(text: bytes) -> None:
+            (tmp_path / "message").write_bytes(text)
+            (tmp_path / "message").rename(folder / f"1_{uuid.uuid4()}.{name}.msg")
+
+        yield Broker(settings, put, lambda: list(folder.iterdir()))
+        return
+    try:
+        server = Redis(tmp_path)
+    except Missing as missing:
+        pytest.skip(str(missing))
+    with server, redis.Redis.from_url(server.url) as client:
+        yield Broker(
+            settings.model_copy(update={"broker_url": server.url}),
+            lambda text: client.lpush(name, text),
+            lambda: [key for key in client.scan_iter() if client.type(key) in (b"list", b"hash", b"zset")],
+        )
+
+
+def own_message(settings: Settings) -> dict[str, Any]:
+    """A message as the service sends it, for a job that does not exist."""
+    apart = settings.model_copy(
+        update={"data_dir": settings.data_dir / "apart", "broker_url": "filesystem://"}
+    )
+    assert queue.submit(queue.make_app(apart), uuid.uuid4().hex)
+    (file,) = (apart.data_dir / "broker" / "queue").iterdir()
+    message: dict[str, Any] = json.loads(file.read_text())
+    return message
+
+
+def any_json(random: Random, depth: int = 0) -> Any:
+    """Any value of JSON."""
+    values = [None, True, 0, -1.5, 10**30, "", "text", "\ud800", "{", [], {}, {"__type__": "datetime"}]
+    if depth == 3 or random.random() < 0.6:
+        return random.choice(values)
+    inner = [any_json(random, depth + 1) for _ in range(random.randint(1, 4))]
+    return random.choice([inner, dict(zip(("task", "id", "args", "body"), inner, strict=False))])
+
+
+def hostile_messages(own: dict[str, Any]) -> Iterator[bytes]:
+    """100 messages: no JSON, any JSON, a message of the service with any body, and with any value somewhere."""
+    random = Random(49)
+    yield from (b"", b"null", b"\xff", b"[" * 100_000, b"9" * 10_000)
+    for number in range(95):
+        message = deepcopy(own)
+        if number % 3 == 0:
+            text = "null" if number == 0 else json.dumps(any_json(random))
+            message["body"] = base64.b64encode(text.encode()).decode()
+        elif number % 3 == 1:
+            properties = message["properties"]
+            parts = (message, message["headers"], properties, properties["delivery_info"])
+            part, key = random.choice([(part, key) for part in parts for key in part])
+            part[key] = any_json(random)
+        else:
+            message = any_json(random)
+        yield json.dumps(message).encode()
+
+
+def test_what_others_write_into_the_broker_stops_no_worker(broker: Broker, tmp_path: Path) -> None:
+    """100 hostile messages, and commands of Celery's remote control."""
+    catalogue = Catalogue(broker.settings.catalogue_url)
+    catalogue.upgrade()
+    app, log = queue.make_app(broker.settings), tmp_path / "worker.log"
+    worker = started_worker(WORKER, broker.settings, log)
+
+    def submitted() -> str:
+        job, _ = catalogue.jobs.submit("psf-build", {}, uuid.uuid4().hex, DEFAULT_OWNER)
+        assert queue.submit(app, job.id)
+        catalogue.jobs.mark_submitted(job.id)
+        return job.id
+
+    def done() -> bool:
+        assert worker.poll() is None, log.read_text()[-3000:]
+        return not broker.left() and all(job_row(catalogue, job).phase == Phase.COMPLETED for job in jobs)
+
+    jobs = [submitted()]
+    try:
+        wait_for(done, "the worker is there")
+        app.control.rate_limit(queue.RUN_JOB, "1/h")
+        app.control.cancel_consumer(broker_name(Queue.INTERACTIVE))
+        app.control.shutdown()
+        for number, text in enumerate(hostile_messages(own_message(broker.settings))):
+            broker.put(text)
+            if number % 20 == 0:
+                jobs.append(submitted())
+        wait_for(done, "the jobs are done, and nothing is put back")
+        worker.send_signal(signal.SIGTERM)
+        assert worker.wait(60.0) == 0
+    finally:
+        if worker.poll() is None:
+            worker.kill()
+            worker.wait()
+        catalogue.close()
+    assert log.read_text().count("that this service did not send") > 60

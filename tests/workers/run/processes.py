@@ -17,7 +17,7 @@ def started_worker(code: str, settings: Settings, log: Path, **changes: float) -
     """
     environment = {name: value for name, value in os.environ.items() if not name.startswith("HELIOPSF_")} | {
         "HELIOPSF_DATA_DIR": str(settings.data_dir),
-        "HELIOPSF_BROKER_URL": "filesystem://",
+        "HELIOPSF_BROKER_URL": settings.broker_url,
         "HELIOPSF_LOG_FORMAT": "json",
         "OMP_NUM_THREADS": "1",
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 import signal
 import time
 from collections.abc import Callable, Mapping
@@ -231,3 +232,19 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
     catalogue.close()
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     assert any(line.get("job") == job.id for line in lines)
+
+
+def test_a_worker_that_ends_by_an_error_has_no_status_of_success(settings: Settings, tmp_path: Path) -> None:
+    settings.data_dir.mkdir()
+    catalogue = Catalogue(settings.catalogue_url)
+    catalogue.upgrade()
+    worker = started_worker("from workers.run.worker import main\nmain()", settings, tmp_path / "worker.log")
+    try:
+        wait_for(lambda: len(catalogue.census.workers(60.0)) == 1, "the worker is there")
+        shutil.rmtree(settings.data_dir / "broker" / "queue")
+        assert worker.wait(60.0) == 1
+    finally:
+        if worker.poll() is None:
+            worker.kill()
+            worker.wait()
+        catalogue.close()
