@@ -201,7 +201,9 @@ def install(app: FastAPI, as_page: AsPage) -> None:
         detail = (
             "the service failed and logged the error; send the X-Request-ID of this answer to the operator"
         )
-        return answer(request, Problem(500, "internal-error", detail, headers=SECURITY_HEADERS | told), as_page)
+        return answer(
+            request, Problem(500, "internal-error", detail, headers=SECURITY_HEADERS | told), as_page
+        )
 
 
 def _of_system(error: SQLAlchemyError | OSError) -> Problem | None:
