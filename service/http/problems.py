@@ -85,6 +85,8 @@ SECURITY_HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+# How the addresses start at which a browser gets no pages.
+FOR_PROGRAMS = ("/v1/", "/uws", "/vo/", "/openapi.json", "/metrics", "/health")
 _OF_TUS = {460: "Checksum Mismatch"}  # a status that is not in the registry of HTTP
 
 
@@ -227,5 +229,4 @@ def _of_system(error: SQLAlchemyError | OSError) -> Problem | None:
 
 def wants_page(request: Request) -> bool:
     """Whether a person asked for a page: a browser accepts HTML, and addresses of the interfaces are for programs."""
-    for_programs = ("/v1/", "/uws", "/vo/", "/openapi.json", "/metrics", "/health")
-    return "text/html" in request.headers.get("accept", "") and not request.url.path.startswith(for_programs)
+    return "text/html" in request.headers.get("accept", "") and not request.url.path.startswith(FOR_PROGRAMS)
