@@ -16,6 +16,12 @@ def padded(content: bytes, fill: bytes = b"\0") -> bytes:
     return content + fill * (-len(content) % HEADER_BLOCK)
 
 
+def gzip_named(content: bytes, length: int) -> bytes:
+    """A gzip member whose file name has this length."""
+    packed = gzip.compress(content)
+    return packed[:3] + b"\x08" + packed[4:10] + b"n" * length + b"\0" + packed[10:]
+
+
 def lying_tiles(stream: bytes, *, edge: int = 64, column: str = "COMPRESSED_DATA") -> bytes:
     """An image of edge x edge int16 in which every row refers to the same gzip stream."""
     names = ["COMPRESSED_DATA"] if column == "COMPRESSED_DATA" else ["COMPRESSED_DATA", column]

@@ -1,7 +1,7 @@
 """Logs of the service and its workers on standard error: one line for each record, as JSON or as text.
 
 ``bind`` stores the request, the job or its owner once; all later log lines of the same context then contain these
-values. Headers, keys and contents of files are never logged.
+values. Headers, keys and contents of files are never logged: in a line, the secret of a key is replaced by ``***``.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _ABOUT: ContextVar[dict[str, str]] = ContextVar("what log lines are about", default={})  # noqa: B039 - the dictionary is never changed in place
 # A client chooses its request id, so it must not contain characters that end a line or imitate another log entry.
+_KEY = re.compile(r"(hpsf_[0-9a-f]{1,16}_)[\w-]+", re.ASCII | re.IGNORECASE)
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
@@ -70,7 +71,7 @@ class JsonFormatter(logging.Formatter):
         }
         if record.exc_info:
             line["error"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False, default=str)
+        return _without_secrets(json.dumps(line, ensure_ascii=False, default=str))
 
 
 class TextFormatter(logging.Formatter):
@@ -82,7 +83,12 @@ class TextFormatter(logging.Formatter):
         parts = {**_ABOUT.get(), **getattr(record, "fields", {})}
         facts = "".join(f" {name}={value}" for name, value in parts.items())
         line = _one_line(f"{time} {record.levelname:<7} {record.getMessage()}{facts}")
-        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
+        trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
+        return _without_secrets(f"{line}{trace}")
+
+
+def _without_secrets(text: str) -> str:
+    return _KEY.sub(r"\1***", text)
 
 
 def _one_line(text: str) -> str:

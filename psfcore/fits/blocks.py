@@ -11,7 +11,6 @@ checks every declared size first and limits the number of decompressed bytes.
 
 from __future__ import annotations
 
-import gzip
 import io
 import math
 import os
@@ -34,6 +33,7 @@ from psfcore.fits.cards import (
     optional_text,
 )
 from psfcore.fits.compression import check_compression, check_counts
+from psfcore.gunzip import GzipStream
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
@@ -130,7 +130,7 @@ class _GzipSource:
     gzipped = True
 
     def __init__(self, file: BinaryIO, budget_bytes: int) -> None:
-        self._stream = gzip.GzipFile(fileobj=file, mode="rb")
+        self._stream = GzipStream(file)
         self._budget_bytes = budget_bytes
         self.position = 0
 

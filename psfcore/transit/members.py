@@ -10,7 +10,6 @@ This module imports no numerical library, so that the web process can list an up
 from __future__ import annotations
 
 import errno
-import gzip
 import io
 import re
 import stat
@@ -24,6 +23,7 @@ from pathlib import Path
 from typing import IO, BinaryIO, Literal, Self, cast
 
 from psfcore.errors import DataError
+from psfcore.gunzip import GzipStream
 from psfcore.transit.admission import Admitted, ArchiveLimits, Gate, not_plain, shown
 
 Kind = Literal["zip", "tar", "tar.gz"]
@@ -132,12 +132,12 @@ def opened(path: Path, limits: ArchiveLimits) -> Iterator[OpenArchive]:
             elif kind == "tar":
                 yield _Tar("tar", _TarInput(file, gate, size), gate)
             elif kind == "gzip":
-                with gzip.GzipFile(fileobj=file, mode="rb") as stream:
-                    if archive_kind(stream.read(START_BYTES)) != "tar":
-                        message = "expected a .zip, .tar or .tar.gz; got a gzip file that contains no tar"
-                        raise DataError("not-an-archive", message)
-                    stream.seek(0)
-                    yield _Tar("tar.gz", _TarInput(cast(BinaryIO, stream), gate), gate)
+                stream = GzipStream(file)
+                if archive_kind(stream.read(START_BYTES)) != "tar":
+                    message = "expected a .zip, .tar or .tar.gz; got a gzip file that contains no tar"
+                    raise DataError("not-an-archive", message)
+                stream.rewind()
+                yield _Tar("tar.gz", _TarInput(cast(BinaryIO, stream), gate), gate)
             else:
                 raise DataError("not-an-archive", "expected a .zip, .tar or .tar.gz; got another format")
         except DataError:

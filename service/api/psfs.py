@@ -48,6 +48,13 @@ InContext = Annotated[
         description=f"id or name of a context; `{NOW}`: the PSFs that are certified now",
     ),
 ]
+KindOfUpload = Annotated[
+    str | None,
+    Query(
+        pattern=WORD,
+        description="`total`: the whole PSF; default: `uploaded`: the PSF is used only if a request names it",
+    ),
+]
 
 
 def psf_filter(
@@ -181,13 +188,7 @@ async def upload_psf(
     channel: Annotated[
         str | None, Query(pattern=WORD, description="default: WAVELNTH in whole angstrom")
     ] = None,
-    kind: Annotated[
-        str | None,
-        Query(
-            pattern=WORD,
-            description="`total`: the whole PSF; default: `uploaded`: the PSF is used only if a request names it",
-        ),
-    ] = None,
+    kind: KindOfUpload = None,
 ) -> PsfView:
     """Upload a PSF: one 2-D image with its centre at [n//2, n//2] and a sum of at most 1.
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import base64
 import binascii
 import hashlib
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from email.utils import formatdate
 from typing import Annotated, Any, BinaryIO
 
@@ -116,23 +116,26 @@ def begin_upload(request: Request, caller: Submitting, state: Shared) -> Respons
         if row is not None and state.store.size(sha256) == length:
             location = f"{kind.address}/{sha256}"
             return _answer(200, {"Content-Location": location, "Upload-Offset": str(length)})
-        equal = open_uploads.equal(caller.owner, name, length, sha256)
-        if equal is not None:
-            return _described(200, open_uploads, equal)
-    check_length(state, caller, length)
-    try:
-        filename = uploads.label(metadata.get("filename"))
-        upload = open_uploads.create(caller.owner, name, length, filename, sha256)
-    except DataError as error:
-        raise Problem(429, error.code, error.message) from error
-    return _described(201, open_uploads, upload)
+    with open_uploads.one_at_a_time():
+        if sha256 is not None:
+            equal = open_uploads.equal(caller.owner, name, length, sha256)
+            if equal is not None:
+                with _while_open(equal.id):
+                    return _described(200, open_uploads, equal)
+        check_length(state, caller, length)
+        try:
+            filename = uploads.label(metadata.get("filename"))
+            upload = open_uploads.create(caller.owner, name, length, filename, sha256)
+        except DataError as error:
+            raise Problem(429, error.code, error.message) from error
+        return _described(201, open_uploads, upload)
 
 
 @router.head("/{upload_id}", status_code=200, summary="How much has arrived", response_class=Response)
 def upload_offset(upload_id: UploadId, request: Request, caller: Submitting, state: Shared) -> Response:
     """`Upload-Offset`: number of bytes that the service has. Continue from there."""
-    open_uploads, upload = _open_upload(upload_id, request, caller, state)
-    answer = _described(200, open_uploads, upload)
+    with _while_open(upload_id):
+        answer = _described(200, *_open_upload(upload_id, request, caller, state))
     answer.headers["Cache-Control"] = "no-store"
     return answer
 
@@ -153,8 +156,8 @@ async def send_part(upload_id: UploadId, request: Request, caller: Submitting, s
     """
     if request.headers.get("content-type", "") != PART:
         raise Problem(415, "bad-upload", f"expected Content-Type: {PART}; got another one")
-    open_uploads, upload = await run_in_threadpool(_open_upload, upload_id, request, caller, state)
-    with ExitStack() as held:
+    with _while_open(upload_id), ExitStack() as held:
+        open_uploads, upload = await run_in_threadpool(_open_upload, upload_id, request, caller, state)
         try:
             file = held.enter_context(open_uploads.opened(upload))
         except DataError as error:
@@ -162,7 +165,7 @@ async def send_part(upload_id: UploadId, request: Request, caller: Submitting, s
         offset = file.tell()
         if (sent := _number(request, "upload-offset")) != offset:
             raise Problem(409, "wrong-offset", f"expected bytes from {offset} on; got bytes from {sent} on")
-        await _append(request, file, upload, Allowed(state, caller))
+        await _append(request, file, upload, Allowed(state, caller, upload.id))
         if file.tell() < upload.length:
             return _described(204, open_uploads, upload)
         location = await anyio.to_thread.run_sync(
@@ -247,13 +250,26 @@ def _open_upload(
     open_uploads = PartialUploads(state.settings.data_dir)
     upload = open_uploads.find(upload_id, caller.owner)
     if upload is None:
-        raise Problem(
-            404,
-            "no-such-upload",
-            f"expected the id of an open upload; got {upload_id}, which was completed, deleted or has expired: begin the upload "
-            "again",
-        )
+        raise _not_open(upload_id)
     return open_uploads, upload
+
+
+@contextmanager
+def _while_open(upload_id: str) -> Iterator[None]:
+    """Raise ``Problem`` 404 if another request completes or deletes the upload during the ``with`` block."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise _not_open(upload_id) from error
+
+
+def _not_open(upload_id: str) -> Problem:
+    return Problem(
+        404,
+        "no-such-upload",
+        f"expected the id of an open upload; got {upload_id}, which was completed, deleted or has expired: begin the upload "
+        "again",
+    )
 
 
 def _described(status: int, open_uploads: PartialUploads, upload: PartialUpload) -> Response:

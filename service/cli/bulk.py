@@ -27,7 +27,7 @@ from service.cli.connection import (
 from service.cli.fields import options_of
 from service.cli.jobs import MOST, moment
 from service.cli.options import OUTPUT, fits_files, percent, progress_bar, writes_files
-from service.cli.progress import duration
+from service.cli.progress import duration, echo
 from service.client.errors import ServiceError
 from service.client.operations import treatment
 from service.client.outputs import written
@@ -123,7 +123,7 @@ def submit(
         raise click.ClickException("no file could be uploaded, so no bulk run was started")
     psf_id = named_psf(service, psf)
     if psf_id is not None and service.psf(psf_id)["status"] == PsfStatus.DEPRECATED:
-        click.echo(f"warning: PSF {short(psf_id)} was deprecated; every product has this warning", err=True)
+        echo(f"warning: PSF {short(psf_id)} was deprecated; every product has this warning", err=True)
     request |= {
         "images": [*(whole_id(service, "images", image) for image in images), *uploaded],
         "files": [{"glob": pattern, "where": _where(conditions)} for pattern in patterns],
@@ -135,7 +135,7 @@ def submit(
         _print_estimate(estimate)
         sys.exit(1 if estimate["refused_images"] else 0)
     run = service.submit_bulk(**request)
-    click.echo(f"bulk {short(run['id'])}")
+    echo(f"bulk {short(run['id'])}")
     if wait:
         run = _wait(service, run["id"])
     _end(run, wait and not refused)
@@ -203,7 +203,7 @@ def delete(service: Client, bulk_ids: tuple[str, ...]) -> None:
     for bulk_id in bulk_ids:
         whole = whole_id(service, "bulk", bulk_id)
         service.delete_bulk(whole)
-        click.echo(f"bulk run {short(whole)} is deleted")
+        echo(f"bulk run {short(whole)} is deleted")
 
 
 @bulk.command("report", short_help="Show artefact scores and failures.")
@@ -221,22 +221,20 @@ def report(
     """Show the results of a bulk run: first the images, sorted by artefact score, then the failures."""
     _print_run(service.bulk(bulk_id))
     for row in service.bulk_results(bulk_id, order="worst", limit=most) if most else ():
-        click.echo(_line(row))
+        echo(_line(row))
     failed = list(service.bulk_failures(bulk_id))
     for row in failed[:most]:
-        click.echo(f"failed: {row['source']}: {row['error']['message']}")
+        echo(f"failed: {row['source']}: {row['error']['message']}")
     if len(failed) > most:
-        click.echo(
-            f"... and {len(failed) - most} more {'failure' if len(failed) == most + 1 else 'failures'}"
-        )
+        echo(f"... and {len(failed) - most} more {'failure' if len(failed) == most + 1 else 'failures'}")
     if output is not None:
         form = "csv" if output.suffix.lower() == ".csv" else "ndjson"
         service.write_bulk_manifest(bulk_id, output, format=form, overwrite=overwrite)
-        click.echo(str(output))
+        echo(str(output))
     if failures is not None:
         with written(failures, overwrite=overwrite) as partial:
             partial.write_text("".join(f"{json.dumps(row)}\n" for row in failed), "utf-8")
-        click.echo(str(failures))
+        echo(str(failures))
 
 
 def _upload(service: Client, files: Sequence[Path]) -> tuple[list[str], int]:
@@ -250,7 +248,7 @@ def _upload(service: Client, files: Sequence[Path]) -> tuple[list[str], int]:
                 error.status not in OF_ONE_FILE or error.code in OF_ALL_FILES
             ):
                 raise
-            click.echo(f"not uploaded: {file}: {error}", err=True)
+            echo(f"not uploaded: {file}: {error}", err=True)
     return uploaded, len(files) - len(uploaded)
 
 
@@ -286,24 +284,24 @@ def _print_estimate(estimate: Row) -> None:
     lines += [f"refused: {one['source']}: {one['error']['message']}" for one in estimate["refused"]]
     if more > 0:
         lines.append(f"... and {more} more")
-    click.echo("\n".join(lines))
+    echo("\n".join(lines))
 
 
 def _print_run(run: Row) -> None:
     """Print the state of a run."""
     images = run["images"]
     existed = f" ({images['reused']} existed already)" if images["reused"] else ""
-    click.echo(
+    echo(
         f"{run['phase']}: {images['done']} of {_total(run, images['total'])} done{existed}, {images['failed']} failed, "
         f"{images['at_work']} in progress, {images['waiting']} waiting"
     )
     if images["to_look_at"]:
-        click.echo(f"{images['to_look_at']} to look at: `heliopsf bulk report {short(run['id'])}`")
+        echo(f"{images['to_look_at']} to look at: `heliopsf bulk report {short(run['id'])}`")
     if run["images_an_hour"]:
         left = "" if run["time_left_s"] is None else f", {duration(run['time_left_s'])} left"
-        click.echo(f"{run['images_an_hour']:.0f} images per hour{left}")
+        echo(f"{run['images_an_hour']:.0f} images per hour{left}")
     if run["error"]:
-        click.echo(f"stopped: {run['error']['message']}")
+        echo(f"stopped: {run['error']['message']}")
 
 
 def _total(run: Row, total: int) -> str:

@@ -24,6 +24,7 @@ from service.cli.options import (
     user_errors,
     write_json,
 )
+from service.cli.progress import echo
 from service.client.errors import ServiceError
 from service.client.operations import Operations
 from service.client.outputs import check_output_folder, check_outputs, written
@@ -93,8 +94,8 @@ def changes(
         write_json(table_file, content, overwrite=overwrite)
         with written(sheet_file, overwrite=overwrite) as picture:
             contact_sheet_png(treated, failures, picture, most=most)
-    click.echo("\n".join(_lines(content)))
-    click.echo(f"{table_file}, {sheet_file}")
+    echo("\n".join(_lines(content)))
+    echo(f"{table_file}, {sheet_file}")
     if not treated:
         raise click.ClickException("no image could be deconvolved; the reasons are listed above")
 

@@ -15,7 +15,7 @@ from click.shell_completion import CompletionItem
 
 from service.cli.fields import options_of
 from service.cli.options import user_errors
-from service.cli.progress import say
+from service.cli.progress import echo, say
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
 from workers.contract.requests import FEWEST_DIGITS, Deconvolve
@@ -142,7 +142,7 @@ def on_service(command: Command) -> Command:
 def print_rows(rows: Iterable[Row], line: Callable[[Row], str], *, if_none: str) -> None:
     """Print a line for each row of a list. if_none: what to print if there are no rows."""
     lines = [line(row).rstrip() for row in rows]
-    click.echo("\n".join(lines or [if_none]))
+    echo("\n".join(lines or [if_none]))
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from service.cli.options import (
     user_errors,
     writes_files,
 )
-from service.cli.progress import Report
+from service.cli.progress import Report, echo
 from service.client.many import Outcome, deconvolve_many
 from service.client.operations import Operations
 from service.client.outputs import check_output_folder, check_outputs
@@ -104,7 +104,7 @@ def deconvolve(
             lines, failures = _many(service, files, output.path, report, parameters)
         if timings:
             lines += _timings(service)
-    click.echo("\n".join(lines))
+    echo("\n".join(lines))
     if failures:
         raise click.ClickException(
             f"{len(failures)} of {counted(len(files), 'image')} failed; see the list above"
@@ -169,7 +169,7 @@ def _many(
     )
     for one in outcomes:
         for warning in one.warnings:
-            click.echo(f"warning: {one.image}: {warning}", err=True)
+            echo(f"warning: {one.image}: {warning}", err=True)
     failures = [one for one in outcomes if one.failure is not None]
     existed = sum(one.existed for one in outcomes)
     done = len(outcomes) - len(failures) - existed

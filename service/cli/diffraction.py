@@ -23,6 +23,7 @@ from service.cli.options import (
     write_json,
     writes_files,
 )
+from service.cli.progress import echo
 from service.client.outputs import written
 
 INSTRUMENT = click.option("--instrument", default="hri_euv", show_default=True, metavar="NAME|FILE",
@@ -71,13 +72,13 @@ def fresnel(
             with written(plot, overwrite=overwrite) as picture:
                 fresnel_png(study, picture)
     focus = study.focus
-    click.echo(
+    echo(
         f"best focus: mirrors {focus.separation_mm:.3f} mm apart, {focus.shift_mm:+.3f} mm from the distance in the drawing "
         f"(the drawing gives a blur of {focus.printed_blur_px:.0f} px); focal length {focus.focal_length_mm:.1f} mm"
     )
-    click.echo("distance (mm)   largest difference, mean over phases   single phases")
+    echo("distance (mm)   largest difference, mean over phases   single phases")
     for at in study.distances:
-        click.echo(
+        echo(
             f"{at.distance_mm:>13g}   {at.largest_points:>25.2f} points   up to {at.largest_single_points:.2f} points"
         )
     write_json(json_file, study.as_json(), overwrite=overwrite)
@@ -124,8 +125,8 @@ def arms(
             with written(plot, overwrite=overwrite) as picture:
                 arms_png(flare.pixels, measured, picture, unit=unit_label(flare))
     for angle, sigma in zip(measured.angles_deg, measured.angles_sigma_deg, strict=True):
-        click.echo(f"arm at {angle:8.3f} ± {sigma:.3f} degrees from +x towards +y")
-    click.echo(f"spacing  {measured.spacing_px:8.4f} ± {measured.spacing_sigma_px:.4f} px")
+        echo(f"arm at {angle:8.3f} ± {sigma:.3f} degrees from +x towards +y")
+    echo(f"spacing  {measured.spacing_px:8.4f} ± {measured.spacing_sigma_px:.4f} px")
     numbers = {name: getattr(measured, name) for name in ARM_NUMBERS}
     numbers |= {
         "peaks": [dataclasses.asdict(peak) for peak in measured.peaks],
@@ -159,11 +160,11 @@ def design(
             with written(plot, overwrite=overwrite) as picture:
                 design_png(study, picture)
     names = [field.name for field in dataclasses.fields(study.rows[0])]
-    click.echo("  ".join(names))
+    echo("  ".join(names))
     for row in study.rows:
         values = (getattr(row, name) for name in names)
         texts = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in values)
-        click.echo("  ".join(f"{text:>{len(name)}}" for text, name in zip(texts, names, strict=True)))
+        echo("  ".join(f"{text:>{len(name)}}" for text, name in zip(texts, names, strict=True)))
     write_json(json_file, dataclasses.asdict(study), overwrite=overwrite)
 
 

@@ -28,7 +28,7 @@ from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from service.cli.operator import sentence
 from service.cli.options import DATA, read_settings
-from service.cli.progress import duration
+from service.cli.progress import duration, echo
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.files.store import open_store
@@ -72,9 +72,9 @@ def doctor(data: Path | None, as_json: bool) -> None:
     broken = any(finding.state == "broken" for finding in findings.values())
     if as_json:
         rows = [{"what": what, **asdict(finding)} for what, finding in findings.items()]
-        click.echo(json.dumps({"ok": not broken, "findings": rows}, indent=1))
+        echo(json.dumps({"ok": not broken, "findings": rows}, indent=1))
     else:
-        click.echo("\n".join(table(findings, shutil.get_terminal_size((110, 24)).columns)))
+        echo("\n".join(table(findings, shutil.get_terminal_size((110, 24)).columns)))
     sys.exit(1 if broken else 0)
 
 

@@ -20,6 +20,7 @@ from service.cli.options import (
     write_json,
     writes_files,
 )
+from service.cli.progress import echo
 from service.client.outputs import written
 
 
@@ -87,7 +88,7 @@ def flare(
         if plot is not None:
             with written(plot, overwrite=overwrite) as picture:
                 flare_png(found.difference, found.usable, found.comparison, picture, unit=found.unit)
-    click.echo("\n".join(summary_lines(found.comparison)))
+    echo("\n".join(summary_lines(found.comparison)))
     if json_file is not None:
         inputs = {
             "image": image.name,

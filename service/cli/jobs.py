@@ -20,7 +20,7 @@ from service.cli.options import (
     write_json,
     writes_files,
 )
-from service.cli.progress import duration, step_text
+from service.cli.progress import duration, echo, step_text
 from service.client.errors import ServiceError
 from workers.contract.phases import Phase
 
@@ -68,16 +68,16 @@ def list_jobs(service: Client, phase: str | None, most: int) -> None:
 def show(service: Client, identity: str, json_file: Path | None, overwrite: bool) -> None:
     """Show the phase, progress, and result or error of a job."""
     row = service.job(identity)
-    click.echo(f"job {row['id']}: {row['kind']}, {row['phase']}")
-    click.echo(f"  queue {row['queue']}, attempt {row['attempt']}")
+    echo(f"job {row['id']}: {row['kind']}, {row['phase']}")
+    echo(f"  queue {row['queue']}, attempt {row['attempt']}")
     for name in ("created", "started", "ended"):
         if row[f"{name}_at"] is not None:
-            click.echo(f"  {name:<8} {moment(row[f'{name}_at'])}")
+            echo(f"  {name:<8} {moment(row[f'{name}_at'])}")
     for name, value in row["parameters"].items():
         if value is not None:
-            click.echo(f"  {name} {_value(value)}")
+            echo(f"  {name} {_value(value)}")
     if state := _state(row):
-        click.echo(f"  {state}")
+        echo(f"  {state}")
     write_json(json_file, row, overwrite=overwrite)
 
 
@@ -97,9 +97,9 @@ def wait(service: Client, identities: tuple[str, ...]) -> None:
                 raise
             failed = True
             ended = Phase.ABORTED if error.code == "cancelled" else error
-            click.echo(f"job {short(row['id'])}: {ended}", err=True)
+            echo(f"job {short(row['id'])}: {ended}", err=True)
         else:
-            click.echo(f"job {short(row['id'])}: {_state(row)}")
+            echo(f"job {short(row['id'])}: {_state(row)}")
     if failed:
         raise click.exceptions.Exit(1)
 
@@ -112,7 +112,7 @@ def cancel(service: Client, identities: tuple[str, ...]) -> None:
     for identity in identities:
         row = service.cancel(identity)
         stops = row["cancel_requested"] and not Phase(row["phase"]).ended
-        click.echo(f"job {short(row['id'])}: {'stops at its next step' if stops else row['phase']}")
+        echo(f"job {short(row['id'])}: {'stops at its next step' if stops else row['phase']}")
 
 
 @click.group(short_help="List, download and delete products.")
@@ -170,7 +170,7 @@ def get(
     for part, path in files.items():
         service.download(f"/v1/products/{row['id']}/{part}", path, overwrite=overwrite)
     written = ", ".join(map(str, files.values()))
-    click.echo(f"{written}: product {short(row['id'])}, PSF {row['psf_version']}")
+    echo(f"{written}: product {short(row['id'])}, PSF {row['psf_version']}")
 
 
 @product.command("delete", short_help="Delete products.")
@@ -181,7 +181,7 @@ def delete(service: Client, identities: tuple[str, ...]) -> None:
     for identity in identities:
         whole = whole_id(service, "products", identity)
         service.delete_product(whole)
-        click.echo(f"product {short(whole)} is deleted")
+        echo(f"product {short(whole)} is deleted")
 
 
 def moment(seconds: float) -> str:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import click
 from click.shell_completion import CompletionItem
 
+from service.cli.progress import echo, printable
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.errors import WaitInterrupted
 
@@ -73,11 +74,17 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command. Control-C ends it with status 130; if its job continues, a message says how to return to the job."""
+        """Run a command. Control-C ends it with status 130; if its job continues, a message says how to return to the job.
+
+        The message of an error may contain texts of a service or a file; it is made printable.
+        """
         try:
             return super().invoke(ctx)
+        except click.ClickException as error:
+            error.message = printable(error.message)
+            raise
         except KeyboardInterrupt as stop:
-            click.echo(_interrupted(stop), err=True)
+            echo(_interrupted(stop), err=True)
             ctx.exit(INTERRUPTED)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

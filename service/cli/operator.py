@@ -15,6 +15,7 @@ from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from service.cli.options import DATA, read_settings, user_errors
+from service.cli.progress import echo
 from workers import checks
 from workers.catalogue.access import MEANINGS, OWNER, OWNER_RULE, Scope
 from workers.catalogue.catalogue import Catalogue
@@ -66,7 +67,7 @@ def status(data: Path | None) -> None:
     """Show the revision of the database and the revision that this version needs. If they differ, the exit status is 1."""
     with opened_catalogue(data) as catalogue:
         schema = catalogue.schema.status()
-    click.echo(sentence(schema))
+    echo(sentence(schema))
     if schema.state != "current":
         raise click.exceptions.Exit(1)
 
@@ -84,8 +85,8 @@ def upgrade(data: Path | None) -> None:
         catalogue.schema.mend()
         now = catalogue.schema.status()
     if now != before:
-        click.echo(f"upgraded from {before.revision or 'no revision'} to {now.revision}")
-    click.echo(sentence(now))
+        echo(f"upgraded from {before.revision or 'no revision'} to {now.revision}")
+    echo(sentence(now))
 
 
 def sentence(schema: SchemaStatus) -> str:
@@ -152,8 +153,8 @@ def collect_command(dry_run: bool, older_than_s: float, even_most: bool, data: P
         result = collect(catalogue, open_store(settings), older_than_s, dry_run=dry_run, even_most=even_most)
     if dry_run:
         for blob in result.removed:
-            click.echo(f"{blob.digest}  {blob.bytes:>12}")
-    click.echo(
+            echo(f"{blob.digest}  {blob.bytes:>12}")
+    echo(
         f"{len(result.removed)} of {result.files} files {'would be' if dry_run else 'were'} removed, "
         f"{result.removed_bytes / MIB:.1f} of {result.bytes / MIB:.1f} MiB"
     )
@@ -178,12 +179,12 @@ def check_command(sizes: bool, repairs: bool, data: Path | None) -> None:
             count += 1
             bad = ", ".join(f"{state} {digest}" for digest, state in fault.files)
             line = f"{fault.what:<8}  {fault.row.owner}  {fault.row.id}  {bad}"
-            click.echo(f"{line}: {repair(fault, catalogue, files)}" if repairs else line)
+            echo(f"{line}: {repair(fault, catalogue, files)}" if repairs else line)
     if count == 0:
-        click.echo("all files are good")
+        echo("all files are good")
         return
     advice = "" if repairs else "; to let jobs make them again where this is possible, add --repair"
-    click.echo(f"the catalogue has {count} entries with lost or damaged files{advice}", err=True)
+    echo(f"the catalogue has {count} entries with lost or damaged files{advice}", err=True)
     raise click.exceptions.Exit(1)
 
 
@@ -194,7 +195,7 @@ def usage(data: Path | None) -> None:
     settings = read_settings(data)
     with opened_catalogue(data) as catalogue:
         for one in catalogue.owners.all(settings.quota_mib):
-            click.echo(_line(one))
+            echo(_line(one))
 
 
 @store.command("quota", short_help="Set the quota of an owner.")
@@ -210,7 +211,7 @@ def quota(owner: str, mib: int | None, as_all: bool, data: Path | None) -> None:
         raise click.BadParameter(f"OWNER: expected {OWNER_RULE}; got {owner!r}")
     with opened_catalogue(data) as catalogue:
         catalogue.owners.set_quota(owner, mib)
-        click.echo(_line(catalogue.owners.usage(owner, read_settings(data).quota_mib)))
+        echo(_line(catalogue.owners.usage(owner, read_settings(data).quota_mib)))
 
 
 def _line(usage: Usage) -> str:
@@ -249,9 +250,9 @@ def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: st
     url = make_url(read_settings(data).catalogue_url).render_as_string(hide_password=True)
     with opened_catalogue(data) as catalogue:
         catalogue.upgrade()
-        click.echo(catalogue.keys.make(owner, allowed, label=label, expires_at=expires_at))
+        echo(catalogue.keys.make(owner, allowed, label=label, expires_at=expires_at))
     ends = "until it is revoked" if expires_at is None else f"until {_day(expires_at)}"
-    click.echo(
+    echo(
         f"for {owner}: {', '.join(sorted(allowed))}; {ends}. The key cannot be shown again. Clients read it from "
         f"HELIOPSF_KEY. Servers that use the database {url} accept it.",
         err=True,
@@ -269,12 +270,12 @@ def list_keys(as_json: bool, data: Path | None) -> None:
     with opened_catalogue(data) as catalogue:
         rows = catalogue.keys.all()
     if as_json:
-        click.echo(json.dumps([_described(row) for row in rows], indent=1))
+        echo(json.dumps([_described(row) for row in rows], indent=1))
     elif not rows:
-        click.echo("no key yet; `heliopsf key create --owner NAME` makes a key")
+        echo("no key yet; `heliopsf key create --owner NAME` makes a key")
     for row in () if as_json else rows:
         used = "never used" if row.last_used_at is None else f"used {_day(row.last_used_at)}"
-        click.echo(
+        echo(
             f"{row.id}  {row.owner:<16}  {_state(row):<8}  {','.join(row.scopes):<24}  "
             f"made {_day(row.created_at)}, {used}  {row.label}".rstrip()
         )
@@ -292,7 +293,7 @@ def revoke(identity: str, data: Path | None) -> None:
             raise click.ClickException(
                 f"there is no key {identity[:16]!r}; `heliopsf key list` shows all keys"
             )
-    click.echo(f"{identity} is revoked")
+    echo(f"{identity} is revoked")
 
 
 def _state(row: KeyRow) -> str:

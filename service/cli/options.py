@@ -19,9 +19,10 @@ from pydantic import ValidationError
 
 from psfcore.errors import DataError
 from service.cli.fields import options_of
+from service.cli.progress import echo
 from service.cli.progress import progress_bar as progress_bar
 from service.client.errors import ServiceError, error_lines
-from service.client.outputs import check_output_folder, check_outputs, written
+from service.client.outputs import base_name, check_output_folder, check_outputs, written
 from workers.contract.requests import Deconvolve
 
 if TYPE_CHECKING:
@@ -75,11 +76,14 @@ class Place:
     is_folder: bool
 
     def file(self, name: str) -> Path:
-        """The path of the file. name: the file name to use if the place is a folder. The folder is made if needed."""
+        """The path of the file. name: the file name to use if the place is a folder. The folder is made if needed.
+
+        The service may have chosen the name, so the file is always in the folder.
+        """
         if not self.is_folder:
             return self.path
         self.path.mkdir(parents=True, exist_ok=True)
-        return self.path / name
+        return self.path / (base_name(name) or "result.fits")
 
     def __str__(self) -> str:
         return str(self.path)
@@ -138,7 +142,7 @@ def user_errors() -> Iterator[None]:
 def say_warnings(product: dict[str, Any]) -> None:
     """Print the warnings of a product to standard error."""
     for warning in product["details"]["warnings"]:
-        click.echo(f"warning: {warning['message']}", err=True)
+        echo(f"warning: {warning['message']}", err=True)
 
 
 def writes_files(command: Command) -> Command:

@@ -1,19 +1,36 @@
-"""Shows the progress of a command on standard error: a bar on a terminal, otherwise a line every 10 s."""
+"""What a command prints: its lines, and its progress on standard error: a bar on a terminal, otherwise a line every 10 s.
+
+Names and messages of files, services and other owners may contain characters that control a terminal. Commands print
+them by ``echo`` and ``say``, which make them harmless.
+"""
 
 from __future__ import annotations
 
 import sys
 import threading
 import time
+import unicodedata
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+
+import click
 
 LINE_EVERY_S = 10.0
 STEPS_OF = {"error estimate": "realisation"}  # the name of a step, by stage; "step" in all other stages
 UNITS = (("days", 86_400), ("h", 3600), ("min", 60))
 
 Report = Callable[[str, int, int], None]
+
+
+def printable(text: str) -> str:
+    """The text with every character that can control a terminal in the form \\x1b. Line ends and tabs stay."""
+    return "".join(c if c in "\n\t" or unicodedata.category(c)[0] != "C" else ascii(c)[1:-1] for c in text)
+
+
+def echo(text: str, *, err: bool = False) -> None:
+    """Print a line to standard output, or to standard error."""
+    click.echo(printable(text), err=err)
 
 
 @dataclass
@@ -81,20 +98,23 @@ class _Teller:
                 filled = round(20 * step / max(steps, 1))
                 drawn = "#" * filled + "-" * (20 - filled)
                 elapsed_s = now_s - self.started_s
-                sys.stderr.write(f"\r{stage:<32.32} [{drawn}] {step}/{steps}  {elapsed_s:5.1f} s{left:<14}")
+                sys.stderr.write(
+                    f"\r{printable(stage):<32.32} [{drawn}] {step}/{steps}  {elapsed_s:5.1f} s{left:<14}"
+                )
                 sys.stderr.flush()
                 self.open_line = True
             elif now_s - self.told_s >= LINE_EVERY_S:
                 self.told_s = now_s
                 elapsed = duration(now_s - self.started_s)
-                sys.stderr.write(f"{step_text(stage, step, steps)} after {elapsed}{left}\n")
+                told = printable(step_text(stage, step, steps))
+                sys.stderr.write(f"{told} after {elapsed}{left}\n")
                 sys.stderr.flush()
 
     def line(self, text: str) -> None:
         """Write a text on a separate line."""
         with self.lock:
             self.end()
-            sys.stderr.write(f"{text}\n")
+            sys.stderr.write(f"{printable(text)}\n")
             sys.stderr.flush()
 
     def end(self) -> None:

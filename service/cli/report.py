@@ -19,6 +19,7 @@ from service.cli.options import (
     user_errors,
     writes_files,
 )
+from service.cli.progress import echo
 from workers.contract.requests import Report
 
 
@@ -77,12 +78,12 @@ def report(
     from psfcore.evaluation.summary_lines import summary_lines
 
     written = ", ".join(str(path) for path in (output, json_file, plot) if path is not None)
-    click.echo(f"{written}: {found['details']['sentence']}")
-    click.echo("\n".join(summary_lines(told["evaluation"], told.get("shapes"))))
+    echo(f"{written}: {found['details']['sentence']}")
+    echo("\n".join(summary_lines(told["evaluation"], told.get("shapes"))))
     for limit in found["details"]["limits"]:
-        click.echo(f"  note: {limit}")
+        echo(f"  note: {limit}")
     for missing in found["details"]["not_shown"]:
-        click.echo(f"  not shown: {missing['what']} ({missing['why']})")
+        echo(f"  not shown: {missing['what']} ({missing['why']})")
 
 
 COMMANDS = (report,)

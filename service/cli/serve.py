@@ -24,6 +24,7 @@ from service.cli.options import (
     read_settings,
     user_errors,
 )
+from service.cli.progress import echo
 from service.client.errors import WaitInterrupted
 from service.client.operations import Progress, given
 from service.client.outputs import check_outputs
@@ -68,9 +69,7 @@ def serve(host: str, port: int, data: Path | None, verbose: bool) -> None:
     log_in = " and log in with a key" if Access.of(settings, host).keys else ""
 
     def announce(url: str) -> None:
-        click.echo(
-            f"heliopsf serves {url} (data in {where})\nOpen {browser_address(url)} in a browser{log_in}."
-        )
+        echo(f"heliopsf serves {url} (data in {where})\nOpen {browser_address(url)} in a browser{log_in}.")
 
     try:
         run(settings, host, port, announce, verbose=verbose)
@@ -115,7 +114,7 @@ def worker(
             raise click.BadParameter(str(error), param_hint="--queues") from error
     settings = read_settings(data)
     if stop_with_parent is None:  # otherwise the server that started this worker has printed the folder
-        click.echo(f"heliopsf worker (data in {settings.data_dir.resolve()})", err=True)
+        echo(f"heliopsf worker (data in {settings.data_dir.resolve()})", err=True)
     os.environ |= environment(settings.model_copy(update=options))
     from workers.run.worker import main as run
 
@@ -135,7 +134,7 @@ def demo(image: Path | None, output: Path) -> None:
     check_fresh_folder(output, overwrite=(output / DEMO_LOG).is_file())
     with user_errors(), progress_bar() as report:
         lines = run_demo(image, output, report)
-    click.echo("\n".join(lines))
+    echo("\n".join(lines))
 
 
 def run_demo(image: Path | None, output: Path, progress: Progress) -> list[str]:

@@ -23,6 +23,7 @@ from service.cli.options import (
     write_json,
     writes_files,
 )
+from service.cli.progress import echo
 
 if TYPE_CHECKING:
     from psfcore.simulate.bound import PhotonBound
@@ -146,11 +147,11 @@ def transit(
         except OSError as error:
             raise click.ClickException(f"cannot write {output}: {error.strerror or error}") from error
     exposures = sorted({shot.exposure_s for shot in plan.shots})
-    click.echo(
+    echo(
         f"{output}: {counted(images, 'image')} of {size} x {size} px, {counted(len(plan.pointings), 'pointing')}, "
         f"exposure{'s' if len(exposures) > 1 else ''} of {listed([f'{t:g}' for t in exposures])} s"
     )
-    click.echo(
+    echo(
         f"scatter b {b_px:g} px, c {c:g}, total {total:g}; the file of true values is {output / 'truth.json'}"
     )
 
@@ -166,7 +167,7 @@ def bound(folder: Path, json_file: Path | None, overwrite: bool) -> None:
     with user_errors():
         found = bound_of_folder(folder, threads=THREADS)
     write_json(json_file, found.to_json(), overwrite=overwrite)
-    click.echo("\n".join(_lines(found)))
+    echo("\n".join(_lines(found)))
 
 
 COMMANDS = (simulate,)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -73,6 +74,15 @@ def written(output: Name, *, overwrite: bool = False) -> Iterator[Path]:
     with whole_path(Path(os.path.realpath(target))) as partial:
         yield partial
         _check_free(target, overwrite)  # another process may have written it during the work
+
+
+def base_name(name: str) -> str:
+    """The last part of a file name that somebody else chose: at most 200 printable characters, and no dot at its start.
+
+    The result can be empty.
+    """
+    last = re.split(r"[/\\]", name)[-1]
+    return "".join(c for c in last if c.isprintable()).lstrip(".")[:200]
 
 
 def _files_in(path: Path) -> Iterator[Path]:

@@ -1,15 +1,20 @@
-"""Checks every request before its route (host, origin, size of the body), and sets the security headers of every answer.
+"""Checks every request before its route (host, origin, address, size of the body), and sets the security headers of every
+answer.
 
 A body costs memory and time before its content is known. Therefore its size is bounded while it arrives, and the values
 in JSON are counted before Python makes objects of these values. The proxy in front of the server bounds the time.
+
+Every text of a request is checked by ``check_text``: those of the address and of JSON here, those of forms where the forms
+are read. The interfaces of the Virtual Observatory check theirs themselves, and answer errors in another form.
 """
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 from fastapi import FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
@@ -17,7 +22,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.forms import FORM
-from service.http.problems import SECURITY_HEADERS, AsPage, Problem, answer
+from service.http.problems import FOR_PROGRAMS, SECURITY_HEADERS, AsPage, Problem, answer
 from service.http.state import Access
 from workers.settings import Settings
 
@@ -32,6 +37,9 @@ UWS_FORMS = re.compile(r"/uws/jobs(/[^/]+/parameters)?")
 # The largest request, a bulk run of 100,000 uploaded images, has one list and one value for each image. Python makes a
 # list or an object for each bracket, and pydantic may report an error for each member of an object.
 MOST_OF = {b"[": 25_000, b"{": 25_000, b":": 25_000, b",": 200_000}
+VO = ("/uws", "/vo/")
+# NUL, which PostgreSQL cannot store, and halves of surrogate pairs, which UTF-8 cannot encode.
+NO_TEXT = re.compile("[\0\ud800-\udfff]")
 
 
 def install(app: FastAPI, access: Access, settings: Settings, as_page: AsPage) -> None:
@@ -58,6 +66,9 @@ class _Guard:
             if scope["method"] not in SAFE_METHODS or not scope["path"].startswith(FOR_EVERYBODY):
                 self._check_host(headers)
             _check_origin(scope["method"], headers)
+            if not scope["path"].startswith(VO):
+                check_text(scope["path"], unquote(scope["query_string"].decode("latin-1")))
+            _check_form(scope["path"], headers)
         except Problem as problem:
             await answer(Request(scope), problem, self._as_page)(scope, receive, kept)
             return
@@ -130,6 +141,26 @@ def _may_have_files(path: str, content_type: str) -> bool:
     return UPLOADS.fullmatch(path) is not None or (form and UWS_FORMS.fullmatch(path) is not None)
 
 
+def check_text(*texts: str) -> None:
+    """Raise ``Problem`` 422 if a text contains a character that no text of a request may contain."""
+    if any(map(NO_TEXT.search, texts)):
+        raise Problem(
+            422,
+            "invalid-request",
+            "expected texts without the character NUL and without halves of surrogate pairs; got one of them: remove it",
+        )
+
+
+def _check_form(path: str, headers: Headers) -> None:
+    """Refuse a multipart form for a page that takes no file. Its own charset could name any codec of Python."""
+    if path.startswith(FOR_PROGRAMS) or UPLOADS.fullmatch(path):
+        return
+    if headers.get("content-type", "").lower().startswith(FORM):
+        raise Problem(
+            415, "bad-form", f"expected application/x-www-form-urlencoded; got {FORM}: send fields only"
+        )
+
+
 def _host_of(origin: str) -> str | None:
     """The host and port of an origin; None for a text that is no address."""
     try:
@@ -183,7 +214,8 @@ class JsonRequest(Request):
     """A request with JSON. Its values are counted before it is parsed; a thread parses it, so that other requests do not wait."""
 
     async def json(self) -> Any:
-        """The content of the body. Raises ``Problem`` 413 for too many values, and ValueError if it is not JSON."""
+        """The content of the body. Raises ``Problem`` 413 for too many values, ``Problem`` 422 as ``check_text``, and
+        ValueError if it is not JSON."""
         content = await self.body()
         for sign, most in MOST_OF.items():
             if content.count(sign) > most:
@@ -192,4 +224,24 @@ class JsonRequest(Request):
                     "too-many-values",
                     f"expected JSON with at most {most} characters '{sign.decode()}'; got {content.count(sign)}: send less in one request",
                 )
-        return await run_in_threadpool(json.loads, content)
+        return await run_in_threadpool(_parsed, content)
+
+
+def _parsed(content: bytes) -> Any:
+    value = json.loads(content)
+    check_text(*_texts_in(value))
+    return value
+
+
+def _texts_in(value: Any) -> Iterator[str]:
+    """The texts in a value of JSON, with the names of its members."""
+    left = [value]
+    while left:
+        one = left.pop()
+        if isinstance(one, str):
+            yield one
+        elif isinstance(one, dict):
+            yield from one
+            left += one.values()
+        elif isinstance(one, list):
+            left += one

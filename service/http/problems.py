@@ -76,14 +76,17 @@ STATUS_OF = {
     "not-an-archive": 415,
 }
 # Headers of every answer; a route may set others. The headers forbid browsers to guess media types, to show
-# the answer in a frame, to send a referrer, and to load content.
+# the answer in a frame, to send a referrer, to load content, and to let windows of other sites reach the answer.
 SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "X-Frame-Options": "DENY",
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+# How the addresses start at which a browser gets no pages.
+FOR_PROGRAMS = ("/v1/", "/uws", "/vo/", "/openapi.json", "/metrics", "/health")
 _OF_TUS = {460: "Checksum Mismatch"}  # a status that is not in the registry of HTTP
 
 
@@ -194,13 +197,15 @@ def install(app: FastAPI, as_page: AsPage) -> None:
 
     @app.exception_handler(Exception)
     def _ours(request: Request, _error: Exception) -> Response:
-        # After this answer Starlette logs the traceback and passes the error on to the server. No middleware sets the
-        # headers of this answer, so they are set here.
-        headers = {**SECURITY_HEADERS, "X-Request-ID": logs.about().get("request", "")}
+        # After this answer Starlette logs the traceback and passes the error on to the server, which closes the
+        # connection. No middleware sets the headers of this answer, so they are set here.
+        told = {"Connection": "close", "X-Request-ID": logs.about().get("request", "")}
         detail = (
             "the service failed and logged the error; send the X-Request-ID of this answer to the operator"
         )
-        return answer(request, Problem(500, "internal-error", detail, headers=headers), as_page)
+        return answer(
+            request, Problem(500, "internal-error", detail, headers=SECURITY_HEADERS | told), as_page
+        )
 
 
 def _of_system(error: SQLAlchemyError | OSError) -> Problem | None:
@@ -224,5 +229,4 @@ def _of_system(error: SQLAlchemyError | OSError) -> Problem | None:
 
 def wants_page(request: Request) -> bool:
     """Whether a person asked for a page: a browser accepts HTML, and addresses of the interfaces are for programs."""
-    for_programs = ("/v1/", "/uws", "/vo/", "/openapi.json", "/metrics", "/health")
-    return "text/html" in request.headers.get("accept", "") and not request.url.path.startswith(for_programs)
+    return "text/html" in request.headers.get("accept", "") and not request.url.path.startswith(FOR_PROGRAMS)

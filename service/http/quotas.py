@@ -1,7 +1,11 @@
-"""Checks the storage quota of an owner before an upload is received, before a job is accepted, and when rows are added."""
+"""Checks the storage quota of an owner before an upload is received, before a job is accepted, and when rows are added.
+
+The declared lengths of the owner's open resumable uploads count as used.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from service.http.callers import Caller
@@ -10,14 +14,18 @@ from service.http.state import State
 from workers import checks
 from workers.catalogue.catalogue import Row
 from workers.catalogue.owners import MIB, NOT_KEPT, ROWS_NOT_KEPT, OverQuota, Usage
+from workers.files.partial_uploads import PartialUploads
 from workers.files.store import STORAGE_FULL
 
 
 class Allowed:
-    """Counts the bytes of one upload against the caller's rate and against the owner's quota."""
+    """Counts the bytes of one upload against the caller's rate and against the owner's quota.
 
-    def __init__(self, state: State, caller: Caller) -> None:
-        self._state, self._caller = state, caller
+    upload_id: the id of the resumable upload that the bytes belong to; its declared length does not count as used.
+    """
+
+    def __init__(self, state: State, caller: Caller, upload_id: str | None = None) -> None:
+        self._state, self._caller, self._upload_id = state, caller, upload_id
         self._bytes = 0
         self._usage: Usage | None = None
 
@@ -27,7 +35,7 @@ class Allowed:
         The other files of the owner are added up once, at the first bytes; ``keep`` adds them up again.
         """
         if not self._bytes:
-            self._usage = _limited(self._state, self._caller.owner)
+            self._usage = _limited(self._state, self._caller.owner, self._upload_id)
         self._bytes += count
         _check_file(self._state, self._usage, self._bytes)
         self._state.rates.take_bytes(self._caller.name, count)
@@ -92,8 +100,13 @@ def _check_rows(usage: Usage | None, more_rows: int) -> None:
         raise _exceeded(507, usage, usage.too_many_rows(ROWS_NOT_KEPT))
 
 
-def _limited(state: State, owner: str) -> Usage | None:
-    return state.catalogue.owners.limited(owner, state.settings.quota_mib)
+def _limited(state: State, owner: str, but: str | None = None) -> Usage | None:
+    """The usage of an owner who has a limit, with the open uploads except ``but``; None if there is no limit."""
+    usage = state.catalogue.owners.limited(owner, state.settings.quota_mib)
+    if usage is None:
+        return None
+    open_bytes = PartialUploads(state.settings.data_dir).declared_bytes(owner, but)
+    return replace(usage, used_bytes=usage.used_bytes + open_bytes)
 
 
 def _file_too_large(usage: Usage, count: int) -> Problem:

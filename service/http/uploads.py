@@ -4,7 +4,6 @@ upload is never in memory."""
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from fastapi.concurrency import run_in_threadpool
 from psfcore.fits.header import HeaderSummary, read_summary
 from psfcore.fits.stored_psf import check_is_psf
 from psfcore.transit.archive import START_BYTES, ArchiveContents, archive_kind, could_be_archive, list_archive
+from service.client.outputs import base_name
 from service.http.callers import Caller
 from service.http.forms import FORM, FormPart, chunks_of, media_type_of, pieces_of
 from service.http.problems import Problem, as_problems
@@ -238,7 +238,4 @@ async def _file_of(request: Request, max_bytes: int) -> AsyncIterator[tuple[str 
 
 def label(filename: str | None) -> str | None:
     """A short printable label from a client's file name. The label is never used as a path."""
-    if not filename:
-        return None
-    last = re.split(r"[/\\]", filename)[-1]
-    return "".join(c for c in last if c.isprintable())[:200] or None
+    return base_name(filename or "") or None

@@ -15,6 +15,7 @@ from starlette.datastructures import UploadFile
 
 from service.api.jobs import submit_job
 from service.http.callers import Caller
+from service.http.guard import check_text
 from service.http.problems import Problem
 from service.http.state import State
 from workers.contract.kinds import KINDS, JobRequest
@@ -25,7 +26,9 @@ Sent = Mapping[str, str | UploadFile]
 
 
 async def _sent_form(request: Request) -> Sent:
-    return await request.form()
+    form = await request.form()
+    check_text(*(value for value in form.values() if isinstance(value, str)))
+    return form
 
 
 # The fields of the form of a request. It follows the caller in the parameters of a route, so that nothing is read for strangers.

@@ -10,6 +10,8 @@ contain a large file, which only the route may read.
 
 from __future__ import annotations
 
+import time
+from math import ceil
 from typing import Annotated
 from urllib.parse import urlencode
 
@@ -30,9 +32,6 @@ from workers.catalogue.access import KeyRefused, Scope
 
 FORM = "application/x-www-form-urlencoded"
 DAY_S = 86_400
-# The longest time that browsers keep a cookie. The service decides when the session ends, and can say so to a browser that
-# still has the cookie.
-COOKIE_S = 400 * DAY_S
 LONGEST_ADDRESS = 2000  # characters
 ENDED = "Your login has ended. Log in again."
 
@@ -138,9 +137,11 @@ def log_in(
     state.rates.take(Bucket.SUBMISSIONS, row.id)
     _close(request, state)
     state.catalogue.sessions.sweep()
-    token = state.catalogue.sessions.open(row, state.settings.session_days * DAY_S)
+    lasts_s = state.settings.session_days * DAY_S
+    if row.expires_at is not None:
+        lasts_s = min(lasts_s, row.expires_at - time.time())
     answer = RedirectResponse(local_address(next_address), 303)
-    _set_cookie(request, answer, token, COOKIE_S)
+    _set_cookie(request, answer, state.catalogue.sessions.open(row, lasts_s), ceil(lasts_s))
     return answer
 
 

@@ -25,7 +25,7 @@ from service.api.psf_status import (
     get_series,
     list_affected_by_psf,
 )
-from service.api.psfs import delete_psf, get_psf, list_psfs, psf_filter, upload_psf
+from service.api.psfs import KindOfUpload, delete_psf, get_psf, list_psfs, psf_filter, upload_psf
 from service.http import downloads
 from service.http.callers import Caller
 from service.http.paging import Cursor, Listing
@@ -74,7 +74,7 @@ def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Curso
 
 @router.post("")
 async def upload(
-    request: Request, response: Response, caller: PageSubmitting, state: Shared, kind: str | None = None
+    request: Request, response: Response, caller: PageSubmitting, state: Shared, kind: KindOfUpload = None
 ) -> Response:
     """Take a PSF from the form, and go to its page. kind: as for the API."""
     view = await upload_psf(request, response, caller, state, kind=kind)

@@ -187,6 +187,12 @@ def test_fits_and_fourier_have_one_home_each() -> None:
             assert not {n for n in names if "fft" in n.split(".")}, path
 
 
+def test_commands_print_by_one_function() -> None:
+    """It makes texts of services and files harmless for a terminal."""
+    printing = [path.name for path in sources("service/cli") if "click.echo(" in path.read_text()]
+    assert printing == ["progress.py"]
+
+
 def test_the_description_of_the_interface_is_what_the_application_generates() -> None:
     kept = (HERE / "openapi" / "openapi.json").read_text()
     assert kept == description(), "`make openapi` writes it anew"

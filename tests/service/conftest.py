@@ -13,18 +13,24 @@ from fastapi.testclient import TestClient
 from httpx import Response
 from sqlalchemy import Executable
 
+from psfcore.transit.archive import pack
 from service.app import create_app
 from tests.blank_figures import blank_unless_told
+from tests.conftest import write_image, write_psf
 from tests.service.keyed import Keyed, keyed
 from tests.shared_routes import shared_routes
 from tests.tables import copied_tables
+from tests.transit_files import write_transit
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import DEFAULT_OWNER, JobRow
+from workers.catalogue.contexts import Pin
+from workers.catalogue.psfs import StatusAsked
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow, ProductRow, PsfRow, ReportRow
 from workers.contract.phases import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
+from workers.versions import PsfStatus
 
 
 @pytest.fixture
@@ -154,3 +160,56 @@ def result_of(api: TestClient, run_jobs: Callable[[], None], kind: str, **parame
 def execute(catalogue: Catalogue, statement: Executable) -> None:
     """Change rows in a way that no method of the catalogue does."""
     catalogue._database.change(statement)
+
+
+def one_of_everything(service: Keyed, folder: Path) -> dict[str, str]:
+    """Ids of ann's, one of each kind, by the names that they have in addresses. folder: for the files that are uploaded."""
+    write_image(folder / "image.fits")
+    write_psf(folder / "psf.fits")
+    pack(write_transit(folder / "transit", images=3), folder / "transit.tar")
+    ann, catalogue = service.client("ann"), service.catalogue
+    image_id, psf_id = upload(ann, folder / "image.fits"), upload(ann, folder / "psf.fits", "/v1/psfs")
+    job = {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id}}
+    pending = ann.post("/uws/jobs", data={"KIND": "deconvolve", "image_id": image_id}, follow_redirects=False)
+    store: Store = service.api.app.state.heliopsf.store
+    with store.temporary() as path:
+        path.write_bytes(b"kept")
+        digest = store.keep(path)
+    parts = ("changes_picture", "page", "report", "tables")
+    about: dict[str, Any] = {
+        "owner": "ann",
+        "created_at": time.time(),
+        "bytes": 4,
+        "file_sha256": digest,
+        "preview_sha256": digest,
+        "details": {f"{part}_sha256": digest for part in parts},
+    }
+    made = {"image_id": image_id, "psf_id": psf_id, "psf_version": "1"}
+    series = {"instrument": "hri_euv", "series": "hri_euv/174/total", "status": "draft", "origin": "built"}
+    catalogue.add(ProductRow(**about, **made, id="1" * 64, kind="x"))
+    catalogue.add(ReportRow(**about, id="2" * 64, kind="x", transit_id="3" * 64))
+    catalogue.add(PsfRow(**about, **series, id="4" * 64, name="s3cret", version="1"))
+    certified = StatusAsked(PsfStatus.CERTIFIED, "good", "1.0.0", channel="174")
+    catalogue.psfs.change("4" * 64, "ann", certified, "ann")
+    context, _ = catalogue.contexts.create("s3cret", "ann", "ann", pins=[Pin("4" * 64)])
+    bulk = ann.post("/v1/bulk", json={"images": [image_id], "psf_id": psf_id})
+    tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "10", "Upload-Metadata": "kind dHJhbnNpdA=="}
+    open_upload = ann.post("/v1/uploads", headers=tus).headers["location"]
+    return {
+        "upload_id": open_upload.rpartition("/")[2],
+        "bulk_id": bulk.json()["id"],
+        "image_id": image_id,
+        "psf_id": "4" * 64,
+        "other_id": "4" * 64,
+        "product_id": "1" * 64,
+        "report_id": "2" * 64,
+        "transit_id": upload(ann, folder / "transit.tar", "/v1/transits"),
+        "context": context.id,
+        "job_id": ann.post("/v1/jobs", json=job).json()["id"],
+        "uws": pending.headers["location"].rpartition("/")[2],
+        "name": "result",
+        "instrument": "hri_euv",
+        "channel": "174",
+        "kind": "total",
+        "key_id": next(row.id for row in catalogue.keys.all() if row.owner == "ann"),
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -91,3 +92,16 @@ def written(
         root.setLevel(level)
         logging.captureWarnings(False)
     return stream.getvalue()
+
+
+@pytest.mark.parametrize("form", [logs.JsonFormatter(), logs.TextFormatter()], ids=["json", "text"])
+def test_the_secret_of_a_key_is_in_no_line(form: logging.Formatter) -> None:
+    key = "hpsf_0123456789abcdef_Abc-_" + "d" * 38
+    one = record("GET /v1/images/%s 404", key)
+    try:
+        raise ValueError(key)
+    except ValueError:
+        one.exc_info = sys.exc_info()
+    one.fields = {"sent": key}  # type: ignore[attr-defined]
+    line = form.format(one)
+    assert "Abc" not in line and line.count("hpsf_0123456789abcdef_***") >= 3

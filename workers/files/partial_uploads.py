@@ -46,11 +46,21 @@ class PartialUploads:
     def __init__(self, data_dir: Path) -> None:
         self._folder = data_dir / "uploads"
 
+    @contextmanager
+    def one_at_a_time(self) -> Iterator[None]:
+        """Let other threads and servers that want to begin an upload wait until the ``with`` block ends."""
+        self._folder.mkdir(mode=0o700, exist_ok=True)
+        with (self._folder / "lock").open("ab") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
     def create(
         self, owner: str, kind: str, length: int, filename: str | None, sha256: str | None
     ) -> PartialUpload:
-        """Begin an upload. Raises DataError "too-many-uploads" if the owner has ``MOST_OPEN`` open uploads."""
-        self._folder.mkdir(mode=0o700, exist_ok=True)
+        """Begin an upload. Call this function within ``one_at_a_time``.
+
+        Raises DataError "too-many-uploads" if the owner has ``MOST_OPEN`` open uploads.
+        """
         self.sweep()
         if sum(one.owner == owner for one in self._all()) >= MOST_OPEN:
             raise DataError(
@@ -72,12 +82,20 @@ class PartialUploads:
         wanted = (owner, kind, length, sha256)
         return next((u for u in self._all() if (u.owner, u.kind, u.length, u.sha256) == wanted), None)
 
+    def declared_bytes(self, owner: str, but: str | None = None) -> int:
+        """The sum of the lengths of the owner's open uploads. but: the id of an upload that is left out."""
+        self.sweep()
+        return sum(one.length for one in self._all() if one.owner == owner and one.id != but)
+
     def offset(self, upload: PartialUpload) -> int:
-        """Number of bytes received so far."""
+        """Number of bytes received so far. Raises FileNotFoundError if the upload was removed meanwhile."""
         return self.path(upload).stat().st_size
 
     def expires_at(self, upload: PartialUpload) -> float:
-        """The time at which the upload is removed if it gets no more bytes, seconds since 1970."""
+        """The time at which the upload is removed if it gets no more bytes, seconds since 1970.
+
+        Raises FileNotFoundError as ``offset`` does.
+        """
         return self.path(upload).stat().st_mtime + EXPIRES_S
 
     def path(self, upload: PartialUpload) -> Path:
@@ -87,7 +105,7 @@ class PartialUploads:
     @contextmanager
     def opened(self, upload: PartialUpload) -> Iterator[BinaryIO]:
         """The file with the bytes received so far, for appending. Raises DataError "upload-locked" if another request
-        appends to it."""
+        appends to it, and FileNotFoundError as ``offset`` does."""
         with self.path(upload).open("r+b") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

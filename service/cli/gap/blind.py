@@ -13,6 +13,7 @@ import click
 
 from psfcore.errors import DataError
 from service.cli.options import FILE, OUTPUT_FOLDER, limits, user_errors
+from service.cli.progress import echo
 
 # The diagnosis runs as a command in another process, which does not know the withheld effects.
 DIAGNOSE = (
@@ -98,7 +99,7 @@ def blind(
     from psfcore.simulate.inputs import image_rate
 
     def say(line: str) -> None:
-        click.echo(line, err=True)
+        echo(line, err=True)
 
     if clean_only and only:
         raise click.UsageError("expected one of --clean-only and --only; got both")
@@ -118,10 +119,10 @@ def blind(
                 "no-case-made", f"none of the {cases} cases could be made; the first failed with: {why}"
             )
         if make_only:
-            click.echo(f"{output}: {len(numbers)} of {cases} cases made and sealed")
+            echo(f"{output}: {len(numbers)} of {cases} cases made and sealed")
             return
         run_set(made, numbers, DIAGNOSE, ideal=IDEAL, processes=processes, keep=keep, progress=say)
-        click.echo(write_score(made, numbers, not_made))
+        echo(write_score(made, numbers, not_made))
 
 
 COMMANDS = (blind,)

@@ -21,6 +21,7 @@ from service.cli.options import (
     user_errors,
     writes_files,
 )
+from service.cli.progress import echo
 from workers.contract.requests import GapDiagnose
 
 SHOWN = 6
@@ -112,7 +113,7 @@ def diagnose(
         corrected = found["details"]["corrected_psf_id"]
         if corrected_file is not None and corrected is not None:
             service.download(f"/v1/psfs/{corrected}/file", corrected_file, overwrite=overwrite)
-    click.echo("\n".join(_lines(report)))
+    echo("\n".join(_lines(report)))
     if corrected_file is not None and corrected is None:
         raise click.ClickException(
             f"{corrected_file} was not written: the diagnosis found no effect for a corrected PSF (verdict {report['verdict']})"

@@ -20,6 +20,7 @@ from service.cli.options import (
     write_json,
     writes_files,
 )
+from service.cli.progress import echo
 from service.client.outputs import written
 
 THREADS = 2
@@ -69,7 +70,7 @@ def plan(
         if output is not None:
             with written(output, overwrite=overwrite) as partial:
                 partial.write_text(plan_page(found), "utf-8")
-    click.echo("\n".join(lines(found)))
+    echo("\n".join(lines(found)))
 
 
 COMMANDS = (plan,)

@@ -22,6 +22,7 @@ from service.cli.options import (
     user_errors,
     writes_files,
 )
+from service.cli.progress import echo
 from service.client.outputs import written
 from workers.contract.requests import CrossValidate, PsfBuild, PsfFit
 
@@ -67,9 +68,9 @@ def build(
             overwrite=overwrite,
             **parameters,
         )
-    click.echo(f"{output}: {built['name']} {built['version']} ({built['status']}), id {short(built['id'])}")
+    echo(f"{output}: {built['name']} {built['version']} ({built['status']}), id {short(built['id'])}")
     for radius, beyond_pct in built["details"]["cumulative_curve_pct"].items():
-        click.echo(f"  light beyond {radius:>5} px  {beyond_pct:6.2f} %")
+        echo(f"  light beyond {radius:>5} px  {beyond_pct:6.2f} %")
 
 
 @click.command("fit")
@@ -103,24 +104,22 @@ def fit(
             **parameters,
         )
     found = fitted["details"]["fit"]
-    click.echo(
-        f"{output}: {fitted['name']} {fitted['version']} ({fitted['status']}), id {short(fitted['id'])}"
-    )
+    echo(f"{output}: {fitted['name']} {fitted['version']} ({fitted['status']}), id {short(fitted['id'])}")
     say_fit(found)
     for limit in found["limits"]:
-        click.echo(f"  note: {limit}")
+        echo(f"  note: {limit}")
 
 
 def say_fit(fit: dict[str, Any]) -> None:
     """Print the sentence of a fitted shape, its parameters and its curve, with their errors."""
-    click.echo(fit["sentence"])
+    echo(fit["sentence"])
     for name, parameter in fit["parameters"].items():
-        click.echo(f"  {name:<12} {parameter['value']:10.4f} ± {parameter['sigma']:.4f} {parameter['unit']}")
+        echo(f"  {name:<12} {parameter['value']:10.4f} ± {parameter['sigma']:.4f} {parameter['unit']}")
     curve = fit["curve"]
     for radius, beyond, sigma in zip(
         curve["radii_px"], curve["light_beyond_pct"], curve["sigma"], strict=True
     ):
-        click.echo(f"  light beyond {radius:>6g} px  {beyond:6.2f} ± {sigma:.2f} %")
+        echo(f"  light beyond {radius:>6g} px  {beyond:6.2f} ± {sigma:.2f} %")
 
 
 @click.command("crossval")
@@ -150,7 +149,7 @@ def crossval(
             overwrite=overwrite,
             **parameters,
         )
-    click.echo(f"{json_file}: {found['details']['sentence']}")
+    echo(f"{json_file}: {found['details']['sentence']}")
 
 
 @click.command("show")
@@ -174,15 +173,15 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     radii = np.array([r for r in SHOWN_RADII_PX if r < psf.reach_px])
     kernels = {"TOTAL": psf.kernel, **psf.components}
     curves = {name: cumulative_curve(kernel, radii) for name, kernel in kernels.items()}
-    click.echo(f"{psf.name} {psf.version} ({psf.status}), instrument {psf.instrument or 'unnamed'}")
-    click.echo(
+    echo(f"{psf.name} {psf.version} ({psf.status}), instrument {psf.instrument or 'unnamed'}")
+    echo(
         f"{psf.kernel.shape[1]} x {psf.kernel.shape[0]} px, reach {psf.reach_px:.0f} px, sum {psf.kernel.sum():.6f}, "
         f"central pixel {psf.kernel.max():.4f}, plate scale {psf.plate_scale_arcsec or 'unknown'} arcsec/px"
     )
-    click.echo("\nlight beyond R, or outside the array, in percent:")
-    click.echo(f"{'R (px)':>8}" + "".join(f"{name:>15}" for name in kernels))
+    echo("\nlight beyond R, or outside the array, in percent:")
+    echo(f"{'R (px)':>8}" + "".join(f"{name:>15}" for name in kernels))
     for n, radius in enumerate(radii):
-        click.echo(f"{radius:>8g}" + "".join(f"{curve[n]:>15.3f}" for curve in curves.values()))
+        echo(f"{radius:>8g}" + "".join(f"{curve[n]:>15.3f}" for curve in curves.values()))
 
 
 @contextmanager

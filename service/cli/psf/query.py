@@ -18,6 +18,7 @@ from psfcore.psf_cache import PROVENANCE, CachedPsf, PsfCache
 from psfcore.tables import lookup
 from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_file, remote, short, whole_id
 from service.cli.options import JSON, OUTPUT, limits, user_errors, write_json, writes_files
+from service.cli.progress import echo
 from service.client.outputs import written
 from workers.cache_folder import psf_cache
 
@@ -65,7 +66,7 @@ def query(
         if compare is not None:
             answers["compare"] = ask("compare")
     for name, answer in answers.items():
-        click.echo("\n".join(_LINES[name](answer)))
+        echo("\n".join(_LINES[name](answer)))
     write_json(json_file, answers, overwrite=overwrite)
 
 
@@ -87,7 +88,7 @@ def cutout(psf: str, size: int, output: Path, server: str | None, overwrite: boo
                 service.psf_cutout(psf, size, output, overwrite=overwrite)
         else:
             _write(output, central_part(_read(psf), size), overwrite)
-    click.echo(f"{output}: central {size} x {size} px")
+    echo(f"{output}: central {size} x {size} px")
 
 
 @click.command("rebin")
@@ -104,7 +105,7 @@ def rebin(psf: str, factor: int, output: Path, server: str | None, overwrite: bo
         binned = rebinned(_read(str(file)), factor)
         _write(output, binned, overwrite)
     ny, nx = binned.kernel.shape
-    click.echo(f"{output}: {binned.name} {binned.version}, {nx} x {ny} px of {factor} x {factor}")
+    echo(f"{output}: {binned.name} {binned.version}, {nx} x {ny} px of {factor} x {factor}")
 
 
 @click.group(short_help="List and remove built PSFs that are kept.")
@@ -124,9 +125,9 @@ def list_cached() -> None:
         psfs = folder.psfs()
         for psf in psfs:
             used = datetime.fromtimestamp(psf.used_at, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-            click.echo(f"{short(psf.identity)}  {psf.bytes / _MIB:8.1f} MiB  {used}  {_named(folder, psf)}")
+            echo(f"{short(psf.identity)}  {psf.bytes / _MIB:8.1f} MiB  {used}  {_named(folder, psf)}")
     total = sum(psf.bytes for psf in psfs) / _MIB
-    click.echo(f"{len(psfs)} PSFs, {total:.1f} of {folder.max_bytes // _MIB} MiB, in {folder.folder}")
+    echo(f"{len(psfs)} PSFs, {total:.1f} of {folder.max_bytes // _MIB} MiB, in {folder.folder}")
 
 
 @cache.command("clear", short_help="Remove all PSFs that are kept.")
@@ -135,7 +136,7 @@ def clear() -> None:
     with user_errors():
         folder = psf_cache()
         count, removed = len(folder.psfs()), folder.clear()
-    click.echo(f"removed {count} PSFs, {removed / _MIB:.1f} MiB, from {folder.folder}")
+    echo(f"removed {count} PSFs, {removed / _MIB:.1f} MiB, from {folder.folder}")
 
 
 def _named(folder: PsfCache, psf: CachedPsf) -> str:

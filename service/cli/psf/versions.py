@@ -31,6 +31,7 @@ from service.cli.options import (
     write_json,
     writes_files,
 )
+from service.cli.progress import echo
 from service.cli.psf.make import say_fit
 from service.client.operations import given
 from workers.versions import TOTAL, PsfStatus
@@ -100,7 +101,7 @@ def download(
     for part, path in (("file", file), ("preview", plot), ("report", json_file)):
         if path is not None:
             service.download(f"/v1/psfs/{row['id']}/{part}", path, overwrite=overwrite)
-    click.echo(f"{file}: PSF {short(row['id'])}, {row['name']} {row['version']} ({row['status']})")
+    echo(f"{file}: PSF {short(row['id'])}, {row['name']} {row['version']} ({row['status']})")
 
 
 @click.command("instruments")
@@ -110,7 +111,7 @@ def instruments() -> None:
     from psfcore.instruments.model import load_instrument
 
     for instrument in map(load_instrument, instrument_names()):
-        click.echo(
+        echo(
             f"{instrument.name:<12}  {instrument.wavelength_angstrom:6.1f} angstrom  {instrument.version}  {instrument.status}  "
             f"`heliopsf psf build --instrument {instrument.name} -o FILE`"
         )
@@ -126,7 +127,7 @@ def upload_psf(service: Client, file: Path, **description: str | None) -> None:
     """Upload a PSF from FILE (FITS). A PSF of kind total is used for images of its instrument when it is certified."""
     row = service.upload_psf(file, **description)
     series = f"{row['instrument'] or 'unknown instrument'} {row['channel'] or '-'} {row['kind']}"
-    click.echo(f"{_named(row)}  {row['status']}  {series}")
+    echo(f"{_named(row)}  {row['status']}  {series}")
 
 
 @click.command("certify")
@@ -147,7 +148,7 @@ def certify(service: Client, psf_id: str, supersedes: tuple[str, ...], **change:
     """Certify a PSF for a range of times of observation, or change the range of a certified PSF."""
     superseded = [whole_id(service, "psfs", identity) for identity in supersedes]
     now = service.certify_psf(psf_id, supersedes=superseded, **change)
-    click.echo(f"{now['series']} {now['version']}: {now['status']}{_validity(now)}")
+    echo(f"{now['series']} {now['version']}: {now['status']}{_validity(now)}")
 
 
 @click.command("deprecate")
@@ -161,8 +162,8 @@ def deprecate(service: Client, psf_id: str, successor: str | None, reason: str) 
     now = service.deprecate_psf(psf_id, successor_id, reason=reason)
     count = sum(1 for _ in service.affected(psf_id))
     instead = f", use {short(now['successor'])}" if now["successor"] else ""
-    click.echo(f"{now['series']} {now['version']}: {now['status']}{instead}")
-    click.echo(f"products made with it: {count}")
+    echo(f"{now['series']} {now['version']}: {now['status']}{instead}")
+    echo(f"products made with it: {count}")
 
 
 @click.command("delete")
@@ -174,7 +175,7 @@ def delete_psf(service: Client, psf_id: str) -> None:
     A PSF is not deleted if it is used by a product, a job that has not ended, an open bulk run, a context or another
     PSF.
     """
-    click.echo(f"deleted {_named(service.delete_psf(psf_id))}")
+    echo(f"deleted {_named(service.delete_psf(psf_id))}")
 
 
 @click.command("best")
@@ -202,9 +203,9 @@ def best(
         choice = service.psf_for_image(service.upload_image(image)["id"], **filters)
     psf = choice["psf"]
     status = "not built yet" if psf["status"] is None else f"{psf['status']}{_validity(psf)}"
-    click.echo(f"{_named(psf)}  {status}")
+    echo(f"{_named(psf)}  {status}")
     if "why" in choice:
-        click.echo(f"  {choice['why']}")
+        echo(f"  {choice['why']}")
     write_json(json_file, choice, overwrite=overwrite)
 
 
@@ -228,7 +229,7 @@ def lineage(
     entry = service.lineage(of, identity)
     if prov_file is not None:
         service.provenance(of, entry["id"], prov_file, overwrite=overwrite)
-    click.echo("\n".join(_tree(entry, 0)))
+    echo("\n".join(_tree(entry, 0)))
     write_json(json_file, entry, overwrite=overwrite)
 
 
@@ -246,7 +247,7 @@ def rerun(
         report = service.rerun(of, whole_id(service, f"{of}s", identity), progress=progress)
     if json_file is not None:
         service.download(report["file"], json_file, overwrite=overwrite)
-    click.echo(report["details"]["sentence"])
+    echo(report["details"]["sentence"])
     sys.exit(0 if report["details"]["same"] else 1)
 
 
@@ -312,7 +313,7 @@ def interpolate(
         psf = service.interpolate_psf(first, second, time, progress=report, **times)
     if output is not None:
         service.download(psf["file"], output, overwrite=overwrite)
-    click.echo(f"{_named(psf)}  {psf['status']}")
+    echo(f"{_named(psf)}  {psf['status']}")
     say_fit(psf["details"]["fit"])
 
 
@@ -331,7 +332,7 @@ def create(service: Client, name: str, psf_ids: tuple[str, ...], reason: str) ->
     """Create a context NAME that pins all PSFs that are certified now, or the PSFs that you name."""
     pins = [{"psf_id": whole_id(service, "psfs", psf_id)} for psf_id in psf_ids] or None
     row = service.create_context(name, pins, reason=reason)
-    click.echo(f"{short(row['id'])}  {row['name']}  {row['size']} pinned")
+    echo(f"{short(row['id'])}  {row['name']}  {row['size']} pinned")
 
 
 @context.command("list", short_help="List contexts.")
@@ -354,10 +355,10 @@ def list_contexts(service: Client) -> None:
 def show(service: Client, name: str) -> None:
     """List the PSFs that the context NAME (or id) pins."""
     row = service.context(name)
-    click.echo(f"{short(row['id'])}  {row['name']}")
+    echo(f"{short(row['id'])}  {row['name']}")
     for pin in row["pins"]:
         may = "  may be interpolated" if pin["interpolated"] else ""
-        click.echo(f"  {pin['series']}  {_range(pin)}  {pin['version']}  {short(pin['psf_id'])}{may}")
+        echo(f"  {pin['series']}  {_range(pin)}  {pin['version']}  {short(pin['psf_id'])}{may}")
 
 
 @context.command("use", short_help="Set the default context.")
@@ -371,7 +372,7 @@ def use(service: Client, name: str | None, no_context: bool, reason: str) -> Non
     if (name is None) != no_context:
         raise click.UsageError("expected either NAME or --none")
     now = service.use_context(name, reason=reason)["context"]
-    click.echo(
+    echo(
         "no default context: the certified PSFs are used"
         if now is None
         else f"default: {now['name']}  {short(now['id'])}"

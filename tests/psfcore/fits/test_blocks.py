@@ -13,6 +13,7 @@ from astropy.io import fits
 from psfcore.errors import HeaderError
 from psfcore.fits.hdus import read_pixels
 from psfcore.fits.header import FitsLimits, all_hdus, read_summary
+from tests.fits_bombs import gzip_named
 from tests.psfcore.fits.raw_files import block, compressed, cube, empty_primary, good, image_cards, table
 
 SMALL = FitsLimits(max_pixels=4096 * 4096, max_header_bytes=64 * 1024, max_hdus=8)
@@ -64,6 +65,8 @@ BAD = {
     "gzip of nothing": (gzip.compress(b""), "empty-file"),
     "gzip cut": (gzip.compress(good() + np.random.default_rng(0).bytes(9000))[:60], "truncated-gzip"),
     "gzip broken": (b"\x1f\x8b" + bytes(100), "bad-gzip"),
+    "gzip of a long name": (gzip_named(good(), 2**17), "bad-gzip"),
+    "gzip of many members": (20_000 * gzip.compress(b"") + gzip.compress(b"x"), "bad-gzip"),
     "gzip, 60000 x 60000": (gzip.compress(block(*image_cards(60000, 60000))), "too-many-pixels"),
     "gzip, END never comes": (gzip.compress(b"SIMPLE  = T".ljust(50_000_000)), "header-too-long"),
 }  # fmt: skip
@@ -93,6 +96,17 @@ def test_the_error_about_a_cube_says_how_to_write_one_plane(
         exec(caught.value.message.partition("astropy: ")[2], {"fits": fits})
         assert read_summary(tmp_path / "NEW", SMALL).shape == (5, 6)
         np.testing.assert_array_equal(fits.getdata(tmp_path / "NEW", hdu), cube.reshape(-1, 5, 6)[0])
+
+
+def test_a_gzip_file_may_have_a_name_a_comment_several_members_and_zeros(tmp_path: Path) -> None:
+    content = good()
+    path = tmp_path / "parts.fits.gz"
+    parts = [gzip_named(content[at : at + 1000], 60_000) for at in range(0, len(content), 1000)]
+    path.write_bytes(bytes(1000).join(parts) + bytes(1000))
+    assert read_summary(path, SMALL).gzipped and fits.getdata(path).shape == read_summary(path, SMALL).shape
+    path.write_bytes(b"".join(parts[:3]) + parts[3][:60_015])
+    with pytest.raises(HeaderError, match=r"^truncated-gzip"):
+        read_summary(path, SMALL)
 
 
 def test_a_gzip_bomb_is_refused_before_it_is_inflated(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from psfcore.transit.archive import (
     unpack,
 )
 from psfcore.whole_files import sha256_of
+from tests.fits_bombs import gzip_named
 from tests.transit_files import write_transit
 
 LIMITS = ArchiveLimits()
@@ -325,6 +326,12 @@ def test_an_endless_gzip_is_read_only_to_the_limit(tmp_path: Path) -> None:
         path = endless_gz(tmp_path / "a.tar.gz", tar_header(name, 2**50), mib=48)
         with held_below(8 * MIB):
             refused(path, tmp_path / "out", "archive-too-large", limits)
+
+
+def test_a_gzip_with_a_long_name_is_refused(folder: Path, tmp_path: Path) -> None:
+    tar = as_tar(tmp_path / "a.tar", members_of(folder)).read_bytes()
+    (tmp_path / "a.tar.gz").write_bytes(gzip_named(tar, 2**17))
+    refused(tmp_path / "a.tar.gz", tmp_path / "out", "archive-broken")
 
 
 def test_skipped_members_of_a_gzip_count(tmp_path: Path) -> None:

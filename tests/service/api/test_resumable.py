@@ -8,6 +8,7 @@ import os
 import socket
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -171,15 +172,20 @@ def test_another_process_continues_the_upload(
     )
 
 
+def open_files(settings: Settings) -> list[str]:
+    """The names of the files of open uploads."""
+    return [path.name for path in (settings.data_dir / "uploads").iterdir() if path.name != "lock"]
+
+
 def test_a_file_that_cannot_be_used_is_refused_and_removed(live: Live, settings: Settings) -> None:
     url = begun(live, 100)
     assert patch(url, 0, b"Dear archive, " * 8).status_code == 413 and offset(url) == 0
     refused = patch(url, 0, b"x" * 100)
     assert refused.status_code == 415 and refused.json()["type"] == "urn:heliopsf:not-an-archive"
-    assert list((settings.data_dir / "uploads").iterdir()) == []
+    assert open_files(settings) == []
     url = begun(live, 5, sha256="0" * 64)
     assert "expected a file with the SHA-256 000" in patch(url, 0, b"hello").json()["detail"]
-    assert list((settings.data_dir / "uploads").iterdir()) == []
+    assert open_files(settings) == []
 
 
 def test_the_protocol_of_uploads(live: Live) -> None:
@@ -220,3 +226,60 @@ def test_only_one_request_sends_bytes_and_uploads_expire(
     monkeypatch.setattr(partial_uploads, "MOST_OPEN", 1)
     many = httpx.post(f"{live.url}/v1/uploads", headers=TUS | {"Upload-Length": "10"})
     assert many.status_code == 429 and "at most 1 open uploads" in many.json()["detail"]
+
+
+def test_uploads_that_begin_at_once_are_counted_one_after_the_other(
+    live: Live, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(partial_uploads, "MOST_OPEN", 4)
+    whole = PartialUploads.create
+
+    def slow(uploads: PartialUploads, *about: Any) -> Any:
+        time.sleep(0.02)  # so that all requests would count the same uploads
+        return whole(uploads, *about)
+
+    monkeypatch.setattr(PartialUploads, "create", slow)
+    headers = TUS | {"Upload-Length": "10"}
+    with ThreadPoolExecutor(12) as pool:
+        answers = list(pool.map(lambda _n: httpx.post(f"{live.url}/v1/uploads", headers=headers), range(12)))
+    assert sorted(answer.status_code for answer in answers) == 4 * [201] + 8 * [429]
+    assert len(open_files(settings)) == 2 * 4
+
+
+def test_the_declared_lengths_of_open_uploads_count_in_the_quota(
+    settings: Settings, archive: Path, image_file: Path
+) -> None:
+    limited = settings.model_copy(update={"quota_mib": 1})
+    with running(limited) as live:
+        url = begun(live, 2**20 - 1000)
+        second = httpx.post(f"{live.url}/v1/uploads", headers=TUS | {"Upload-Length": "1001"})
+        assert second.status_code == 413 and second.json()["used_bytes"] == 2**20 - 1000
+        image = httpx.post(f"{live.url}/v1/images", content=image_file.read_bytes())
+        assert image.status_code == 413 and image.json()["type"] == "urn:heliopsf:quota-exceeded"
+        assert patch(url, 0, bytes(2000)).status_code == 204, "its own length is not counted twice"
+        [part] = (limited.data_dir / "uploads").glob("*.part")
+        old = time.time() - partial_uploads.EXPIRES_S - 1
+        os.utime(part, (old, old))
+        assert httpx.post(f"{live.url}/v1/images", content=image_file.read_bytes()).status_code == 201
+        content = archive.read_bytes()
+        assert patch(begun(live, len(content)), 0, content).status_code == 204
+
+
+def test_an_upload_that_another_request_ends_meanwhile_is_not_there(
+    live: Live, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, method in (("offset", "HEAD"), ("opened", "PATCH"), ("offset", "PATCH")):
+        url = begun(live, 10)
+        whole = getattr(PartialUploads, name)
+
+        def ended(uploads: PartialUploads, upload: Any, whole: Any = whole) -> Any:
+            uploads.remove(upload)
+            return whole(uploads, upload)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(PartialUploads, name, ended)
+            headers = PART | {"Upload-Offset": "0"}
+            answer = httpx.request(method, url, headers=headers, content=b"12345")
+        assert answer.status_code == 404, (name, method)
+        assert method == "HEAD" or answer.json()["type"] == "urn:heliopsf:no-such-upload"
+        assert open_files(settings) == []

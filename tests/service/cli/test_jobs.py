@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from astropy.io import fits
 from fastapi.testclient import TestClient
 
 from service.cli.connection import short
+from service.client import http
+from service.client.errors import ServiceError
 from tests.conftest import write_psf
 from tests.service.conftest import upload
 
@@ -88,6 +91,41 @@ def test_results_go_into_a_folder_under_their_own_names(
     assert "the file exists" in twice
     (tmp_path / "file").touch()
     assert "expected a folder" in command("psf", "download", short(psf), "-o", f"{tmp_path}/file/", code=1)
+
+
+def test_a_name_that_the_service_sends_leads_out_of_no_folder_and_controls_no_terminal(
+    command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    row = {"id": "a" * 64, "image_id": "b" * 64, "psf_id": "c" * 64, "created_at": 0.0}
+    foreign = row | {"psf_version": "1\x1b[2J\x9b2J\u202e", "details": {"method": {"name": "x\x07"}}}
+
+    def download(_client: http.Client, _address: str, path: Path, **_options: Any) -> None:
+        path.write_text("product")
+
+    monkeypatch.setattr(http.Client, "products", lambda _client, **_filters: [foreign])
+    monkeypatch.setattr(http.Client, "download", download)
+    printed = command("product", "list")
+    for name, expected in (
+        ("../../x.fits", "x.fits"),
+        ("/etc/x.fits", "x.fits"),
+        ("..\\..\\x.fits", "x.fits"),
+        ("..", "result.fits"),
+        ("", "result.fits"),
+        (".bashrc", "bashrc"),
+        ("a\x1b[2J.fits", "a[2J.fits"),
+    ):
+        sent = foreign | {"details": {"filename": name}}
+        monkeypatch.setattr(http.Client, "product", lambda _client, _identity, sent=sent: sent)
+        printed += command("product", "get", "a" * 8, "-o", f"{tmp_path}/in/there/", "--overwrite")
+        assert [one.name for one in (tmp_path / "in" / "there").iterdir()] == [expected], name
+        (tmp_path / "in" / "there" / expected).unlink()
+
+    def refused(_client: http.Client, _identity: str) -> Any:
+        raise ServiceError("no such\x1b[2J")
+
+    monkeypatch.setattr(http.Client, "product", refused)
+    printed += command("product", "get", "a" * 8, "-o", f"{tmp_path}/in/there/", code=1)
+    assert printed.replace("\n", "").isprintable() and "1\\x1b[2J\\x9b2J\\u202e" in printed
 
 
 def test_jobs_are_cancelled_and_a_wait_for_several_ends_with_1_if_one_failed(

@@ -57,9 +57,12 @@ def test_a_terminal_shows_a_bar(
         report("reading", 2, 4)
         say("the service answers again")
         report("nothing to do", 0, 0)
+        report("\x1b[2J", 0, 0)
+        say("\x1b[2J")
     told = capsys.readouterr().err
     assert f"[{'#' * 10}{'-' * 10}] 2/4    3.0 s, 6 s left" in told
-    assert "\nthe service answers again\n" in told and told.endswith("0/0    3.0 s              \n")
+    assert "\nthe service answers again\n" in told and "0/0    3.0 s              " in told
+    assert "\x1b" not in told and told.endswith("\\x1b[2J\n")
 
 
 def test_without_a_terminal_a_line_is_written_now_and_then(

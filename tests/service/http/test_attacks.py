@@ -159,7 +159,7 @@ NAMES = (
     "/etc/passwd",
     "..\\evil.fits",
     "a\r\nSet-Cookie: x=1",
-    "\x00evil",
+    "\x01evil",
     "evil\u202e",
     "x" * 5000,
     '"; rm -rf /',

@@ -204,6 +204,7 @@ def test_every_answer_tells_the_browser_what_it_may_do(
         assert headers["X-Content-Type-Options"] == "nosniff"
         assert headers["Referrer-Policy"] == "no-referrer"
         assert headers["X-Frame-Options"] == "DENY"
+        assert headers["Cross-Origin-Opener-Policy"] == "same-origin"
         assert "default-src 'none'" in headers["Content-Security-Policy"]
         assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
         assert headers["Cache-Control"] == "no-store"
@@ -215,6 +216,7 @@ def test_every_answer_tells_the_browser_what_it_may_do(
     monkeypatch.setattr(shared_service.catalogue, "page", fail)
     answer = ann.get("/v1/jobs")
     assert answer.status_code == 500 and answer.headers["X-Content-Type-Options"] == "nosniff"
+    assert answer.headers["Connection"] == "close", "the server closes it after a failure"
 
 
 def test_the_api_reference_loads_nothing_from_other_hosts(shared_service: Keyed) -> None:

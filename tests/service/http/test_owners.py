@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,17 +11,10 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from psfcore.transit.archive import pack
-from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
-from tests.service.conftest import refusal, upload
+from tests.conftest import SMALL_INSTRUMENT, write_image
+from tests.service.conftest import one_of_everything, refusal, upload
 from tests.service.keyed import Keyed
-from tests.transit_files import write_transit
 from workers.catalogue.access import Scope
-from workers.catalogue.contexts import Pin
-from workers.catalogue.psfs import StatusAsked
-from workers.catalogue.tables import ProductRow, PsfRow, ReportRow
-from workers.files.store import Store
-from workers.versions import PsfStatus
 
 UNKNOWN = {64: "f" * 64, 32: "f" * 32, 16: "f" * 16}
 
@@ -30,56 +22,7 @@ UNKNOWN = {64: "f" * 64, 32: "f" * 32, 16: "f" * 16}
 @pytest.fixture(scope="module")
 def anns(shared_service: Keyed, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """One of everything, ann's; by the name that it has in addresses. No test changes these."""
-    folder = tmp_path_factory.mktemp("anns")
-    write_image(folder / "image.fits")
-    write_psf(folder / "psf.fits")
-    pack(write_transit(folder / "transit", images=3), folder / "transit.tar")
-    ann, catalogue = shared_service.client("ann"), shared_service.catalogue
-    image_id, psf_id = upload(ann, folder / "image.fits"), upload(ann, folder / "psf.fits", "/v1/psfs")
-    job = {"kind": "deconvolve", "parameters": {"image_id": image_id, "psf_id": psf_id}}
-    pending = ann.post("/uws/jobs", data={"KIND": "deconvolve", "image_id": image_id}, follow_redirects=False)
-    store: Store = shared_service.api.app.state.heliopsf.store
-    with store.temporary() as path:
-        path.write_bytes(b"kept")
-        digest = store.keep(path)
-    parts = ("changes_picture", "page", "report", "tables")
-    about: dict[str, Any] = {
-        "owner": "ann",
-        "created_at": time.time(),
-        "bytes": 4,
-        "file_sha256": digest,
-        "preview_sha256": digest,
-        "details": {f"{part}_sha256": digest for part in parts},
-    }
-    made = {"image_id": image_id, "psf_id": psf_id, "psf_version": "1"}
-    series = {"instrument": "hri_euv", "series": "hri_euv/174/total", "status": "draft", "origin": "built"}
-    catalogue.add(ProductRow(**about, **made, id="1" * 64, kind="x"))
-    catalogue.add(ReportRow(**about, id="2" * 64, kind="x", transit_id="3" * 64))
-    catalogue.add(PsfRow(**about, **series, id="4" * 64, name="s3cret", version="1"))
-    certified = StatusAsked(PsfStatus.CERTIFIED, "good", "1.0.0", channel="174")
-    catalogue.psfs.change("4" * 64, "ann", certified, "ann")
-    context, _ = catalogue.contexts.create("s3cret", "ann", "ann", pins=[Pin("4" * 64)])
-    bulk = ann.post("/v1/bulk", json={"images": [image_id], "psf_id": psf_id})
-    tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "10", "Upload-Metadata": "kind dHJhbnNpdA=="}
-    open_upload = ann.post("/v1/uploads", headers=tus).headers["location"]
-    return {
-        "upload_id": open_upload.rpartition("/")[2],
-        "bulk_id": bulk.json()["id"],
-        "image_id": image_id,
-        "psf_id": "4" * 64,
-        "other_id": "4" * 64,
-        "product_id": "1" * 64,
-        "report_id": "2" * 64,
-        "transit_id": upload(ann, folder / "transit.tar", "/v1/transits"),
-        "context": context.id,
-        "job_id": ann.post("/v1/jobs", json=job).json()["id"],
-        "uws": pending.headers["location"].rpartition("/")[2],
-        "name": "result",
-        "instrument": "hri_euv",
-        "channel": "174",
-        "kind": "total",
-        "key_id": next(row.id for row in catalogue.keys.all() if row.owner == "ann"),
-    }
+    return one_of_everything(shared_service, tmp_path_factory.mktemp("anns"))
 
 
 def asked(client: TestClient, ids: dict[str, str]) -> Iterator[tuple[str, str, str]]:

@@ -229,3 +229,17 @@ def test_a_key_without_the_scope_bulk_neither_checks_nor_starts(settings: Settin
         assert 'name="pattern"' not in reader.get("/bulk").text
         for place in ("/bulk/check", "/bulk/files"):
             assert reader.post(place, data={"pattern": "/x"}).status_code == 403
+
+
+def test_without_folders_a_run_of_files_is_refused_with_the_reason(
+    api: TestClient, settings: Settings, form: dict[str, str]
+) -> None:
+    with TestClient(
+        create_app(settings.model_copy(update={"bulk_roots": "", "bulk_output_roots": ""})),
+        raise_server_exceptions=False,
+    ) as without:
+        for address in ("/bulk/check", "/bulk/files"):
+            for fields in (form, {}):
+                answer = without.post(address, data=fields, headers={"Accept": "text/html"})
+                assert answer.status_code == 422 and 'role="alert"' in answer.text, address
+            assert "HELIOPSF_BULK_ROOTS" in without.post(address, data=form).text

@@ -66,6 +66,9 @@ def test_a_login_sets_a_cookie_that_scripts_and_other_sites_cannot_use(service: 
         assert re.fullmatch(r"[\w-]{43}", cookie.value) and cookie.value not in key
         assert cookie["httponly"] is True and cookie["samesite"] == "strict" and cookie["path"] == "/"
         assert bool(cookie["secure"]) == secure and cookie["domain"] == ""
+        assert int(cookie["max-age"]) == 30 * 86_400, "as long as the session"
+    short = browser(service).post("/login", data={"key": service.key("ann", lasts_s=3600)})
+    assert 3590 < int(SimpleCookie(short.headers["set-cookie"])[COOKIE]["max-age"]) <= 3600
     assert answer.headers["Cache-Control"] == "no-store"
 
 
