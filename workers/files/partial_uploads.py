@@ -12,7 +12,7 @@ import os
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -124,17 +124,18 @@ class PartialUploads:
         self.path(upload).unlink(missing_ok=True)
 
     def sweep(self) -> None:
-        """Remove expired uploads."""
+        """Remove expired uploads, except those to which a request appends now: the clock may be wrong."""
         if not self._folder.is_dir():
             return
         for path in self._folder.glob("*.part"):
-            try:
+            # It may be completed meanwhile.
+            with suppress(FileNotFoundError, BlockingIOError):
                 if time.time() - path.stat().st_mtime <= EXPIRES_S:
                     continue
-            except FileNotFoundError:  # it was completed meanwhile
-                continue
-            path.with_suffix(".json").unlink(missing_ok=True)
-            path.unlink(missing_ok=True)
+                with path.open("r+b") as file:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    path.with_suffix(".json").unlink(missing_ok=True)
+                    path.unlink(missing_ok=True)
 
     def _all(self) -> Iterator[PartialUpload]:
         if self._folder.is_dir():

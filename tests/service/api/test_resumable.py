@@ -221,6 +221,9 @@ def test_only_one_request_sends_bytes_and_uploads_expire(
     assert patch(url, 0, b"12345").status_code == 204
     old = time.time() - partial_uploads.EXPIRES_S - 1
     os.utime(uploads.path(upload), (old, old))
+    with uploads.opened(upload):
+        uploads.sweep()
+        assert uploads.path(upload).exists(), "a request appends to it, so the clock must be wrong"
     begun(live, 10)
     assert httpx.head(url, headers=TUS).status_code == 404
     monkeypatch.setattr(partial_uploads, "MOST_OPEN", 1)
