@@ -81,7 +81,7 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except click.ClickException as error:
-            error.message = printable(error.message)
+            error.message = printable(error.message)  # type: ignore[misc]  # click declares it final
             raise
         except KeyboardInterrupt as stop:
             echo(_interrupted(stop), err=True)
