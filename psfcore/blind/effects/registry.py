@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copyreg
+from collections.abc import Callable
+
 from psfcore.blind.effects.detector import DETECTOR_EFFECTS
 from psfcore.blind.effects.effect import Kind
 from psfcore.blind.effects.optics import OPTICS_EFFECTS
@@ -39,3 +42,12 @@ def effect_named(name: str) -> Kind:
     if name not in EFFECTS:
         raise DataError("unknown-effect", f"expected one of {', '.join(sorted(EFFECTS))}; got {name!r}")
     return EFFECTS[name]
+
+
+def _by_name(kind: Kind) -> tuple[Callable[[str], Kind], tuple[str]]:
+    return effect_named, (kind.name,)
+
+
+copyreg.pickle(
+    Kind, _by_name
+)  # a process that makes cases gets the name of a kind: functions without a name have no pickle

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,13 @@ def effect_free(plan: Plan, optics: FineOptics) -> EffectFree:
 @pytest.fixture(scope="module")
 def clean(effect_free: EffectFree) -> list[np.ndarray]:
     return Chain(effect_free, ()).all_expected()
+
+
+def test_every_effect_can_be_sent_to_another_process(plan: Plan) -> None:
+    for kind in EFFECTS.values():
+        effect = kind.drawn(plan, np.random.default_rng(1))
+        sent = pickle.loads(pickle.dumps(effect))
+        assert sent.kind is kind and sent.as_json() == effect.as_json()
 
 
 def test_there_are_eighteen_known_effects_and_at_least_eight_unknown() -> None:
