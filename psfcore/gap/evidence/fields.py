@@ -151,7 +151,7 @@ class FieldColumns:
             rings = self._rings if over_field else self._rings.repeat(len(_FACTORS), axis=0)
             if not over_field:
                 rings[np.arange(len(rings)) % len(_FACTORS) > 0] = 0.0
-            to_shape = np.kron(np.eye(len(sides)), rings.T) * KERNEL_LIKELY
+            to_shape = np.asarray(np.kron(np.eye(len(sides)), rings.T) * KERNEL_LIKELY, dtype=np.float64)
             at = np.tile(2.0**self._octaves * self._box_px, len(sides))
             return _shape(field, ("radius_px",), at[:, None], to_shape, coefficients, covariance, "1/octave")
         unit = "" if field.form.startswith("gain") else "DN/s"
@@ -251,9 +251,9 @@ class FieldShape:
     unit: str
 
     @property
-    def largest(self) -> int:
-        """The point with the largest absolute value."""
-        return int(np.argmax(np.abs(self.values)))
+    def clearest(self) -> int:
+        """The point whose value is largest in units of its error."""
+        return int(np.argmax(np.abs(self.values) / np.maximum(self.sigma, 1e-300)))
 
 
 def _shape(

@@ -260,7 +260,7 @@ class Likelihood:
         whole = self._stiffness + self._cells
         return np.asarray(whole * (1 - (1 + decrease / whole) ** -CORRELATED) / (2 * CORRELATED))
 
-    def fitted(self, columns: Sequence[int], values: Sequence[float]) -> tuple[Vector, Matrix]:
+    def fitted(self, columns: Sequence[int], values: Sequence[float] | Vector) -> tuple[Vector, Matrix]:
         """Two results of a fit of the columns of one effect: their values (of any sign), and the covariance.
 
         values: approximately the values that the fit finds; they set the template error, whose width is USUAL_ERROR.
@@ -469,11 +469,12 @@ class _Pointing:
     free: NDArray[np.bool_]
     brightness: Matrix
     errors: Planes
-    at: tuple[NDArray[np.intp], ...]
+    at: tuple[NDArray[np.intp], NDArray[np.intp]]
 
     def with_further(self, further: Planes, size: int) -> _Pointing:
         """The same blocks, with further columns (columns, all images, all blocks) after the first `size` columns."""
-        here = np.moveaxis(further[(slice(None), *self.at)], 0, -1)
+        images, blocks = self.at
+        here = np.moveaxis(further[:, images, blocks], 0, -1)
         return replace(self, errors=np.concatenate([self.errors[..., :size], here], axis=2))
 
     def part(
@@ -521,7 +522,7 @@ def _pointings(model: LinearModel) -> list[_Pointing]:
         shown = blocks.free[here].sum(axis=0) >= LEAST_IMAGES
         if here.size < LEAST_IMAGES or not shown.any():
             continue
-        at = np.ix_(here, np.flatnonzero(shown))
+        at = here[:, None], np.flatnonzero(shown)[None, :]
         found.append(
             _Pointing(
                 level=blocks.levels[at],
