@@ -36,6 +36,7 @@ Planes = NDArray[np.float32]
 # Inner and outer radius (fractions of the radius of the outermost dark pixel), number of sectors.
 RINGS = ((0.0, 0.38, 1), (0.38, 0.7, 4), (0.7, 1.0, 8))
 LEAST_PIXELS = 3
+BOXES = 64
 # Smaller eigenvalues of a covariance are raised to this fraction of the largest one: redundant cells would give 0.
 LEAST_VARIANCE = 1e-12
 
@@ -112,7 +113,9 @@ class DiscCells:
 
     index: the number of the frame among all frames. residual: observed minus expected (cells,), DN/s. expected: the light that
     the model predicts (cells,), DN/s. covariance: Eq. (2). jacobian: (columns, cells), DN/s for one unit of a parameter.
-    pixels, radius, azimuth: as in `Cells`. level_before: the value of `level` before the light of an effect was
+    pixels, radius, azimuth: as in `Cells`. boxes: the sensitivities of the cells, and these times the expected image, each
+    summed over boxes of the detector (2, cells, rows, columns). scene: the mean of the occulted scene in each box [y, x],
+    DN/s. level_before: the value of `level` before the light of an effect was
     subtracted from the image, DN/s; None if nothing was subtracted.
     """
 
@@ -124,6 +127,8 @@ class DiscCells:
     pixels: Vector
     radius: Vector
     azimuth: Vector
+    boxes: Planes
+    scene: Matrix
     level_before: float | None = None
 
     @property
@@ -175,4 +180,19 @@ def disc_cells(solution: Solution, n: int) -> tuple[DiscCells, Planes]:
         pixels=cells.pixels,
         radius=cells.radius,
         azimuth=cells.azimuth,
+        boxes=np.zeros((2, 0, 0, 0), np.float32),
+        scene=np.zeros((0, 0)),
     ), planes
+
+
+def box_px(shape: tuple[int, ...]) -> int:
+    """The edge of a box, px: the shorter side of the detector has about BOXES boxes."""
+    return max(min(shape[-2:]) // BOXES, 1)
+
+
+def summed_over_boxes(planes: Planes) -> Planes:
+    """The sums of planes (planes, y, x) over boxes. Incomplete boxes at the last rows and columns are left out."""
+    edge = box_px(planes.shape)
+    rows, columns = (n // edge for n in planes.shape[1:])
+    cut = planes[:, : rows * edge, : columns * edge]
+    return np.asarray(cut.reshape(-1, rows, edge, columns, edge).sum(axis=(2, 4)))

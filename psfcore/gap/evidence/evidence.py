@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.gap.effect import Change, Effect
-from psfcore.gap.evidence.cells import DiscCells, cells_of, disc_cells
+from psfcore.gap.evidence.cells import DiscCells, box_px, cells_of, disc_cells, summed_over_boxes
 from psfcore.gap.evidence.unocculted_blocks import (
     UnoccultedBlocks,
     UnoccultedEquations,
@@ -79,7 +79,7 @@ class Evidence:
     effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns that
     every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every image,
     used or not. untestable: the reasons why effects cannot be tested, by name. longest_step: `Parameter.largest_step` of each
-    coordinate of the PSF. numbers: `Change.numbers` by column. templates: `Effect.distinguished` by effect.
+    coordinate of the PSF. box_px: the edge of a box of `DiscCells.boxes`. numbers: `Change.numbers` by column. templates: `Effect.distinguished` by effect.
     """
 
     effects: tuple[Effect, ...]
@@ -90,6 +90,7 @@ class Evidence:
     image_info: tuple[ImageInfo, ...]
     untestable: dict[str, str]
     longest_step: Vector
+    box_px: int
     numbers: dict[int, int] = field(default_factory=dict)
     templates: dict[str, float] = field(default_factory=dict)
 
@@ -195,6 +196,7 @@ def gather(
             )
         ),
         untestable=untestable,
+        box_px=box_px(solution.transit.shape),
         longest_step=np.array([parameter.largest_step for parameter in solution.inversion.shape.parameters]),
         numbers={len(base) + k: change.numbers for k, change in enumerate(changes) if change.numbers},
         templates={
@@ -240,7 +242,10 @@ def disc_with_jacobian(view: View, n: int, changes: Sequence[Change]) -> DiscCel
         # Several fields are processed together, so that the large planes of the cells are read from memory only once for them.
         some = np.array([np.ravel(one) for one in itertools.islice(fields, AT_ONCE)], dtype=flat.dtype)
         jacobian[rows[first : first + AT_ONCE]] = some @ flat.T
-    return replace(cells, jacobian=jacobian)
+    boxes = np.array([summed_over_boxes(planes), summed_over_boxes(planes * view.expected[n])])
+    whole = solution.optics.field(scene)
+    in_boxes = summed_over_boxes(whole[None])[0].astype(np.float64) / box_px(whole.shape) ** 2
+    return replace(cells, jacobian=jacobian, boxes=boxes, scene=in_boxes)
 
 
 def residuals_at(

@@ -37,6 +37,7 @@ each number, and the likely size of the number is unknown.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -121,9 +122,9 @@ class _Part:
 
 
 class Likelihood:
-    """The likelihood of hypotheses about the data of a linear model. further: columns that follow the columns of the evidence."""
+    """The likelihood of hypotheses about the data of a linear model."""
 
-    def __init__(self, model: LinearModel, further: Directions | None = None) -> None:
+    def __init__(self, model: LinearModel) -> None:
         evidence = model.evidence
         self._model, self._evidence = model, evidence
         self._base = list(evidence.base)
@@ -141,24 +142,34 @@ class Likelihood:
             self._covariance[k, :n, :n] = disc.covariance * model.disc_scale + model.floor**2 * np.outer(
                 level, level
             )
-        errors = evidence.unocculted.errors
-        if further is not None:
-            self._jacobian = np.concatenate([self._jacobian, further.discs], axis=2)
-            errors = np.concatenate([errors, further.unocculted])
-        own, more = evidence.prior, 0 if further is None else further.discs.shape[2]
-        self._of_columns = Prior(
-            np.append(own.likely, np.full(more, 0.0 if further is None else further.width)),
-            np.append(own.positive, np.zeros(more, np.bool_)),
-            np.append(own.field, np.zeros(more, np.bool_)),
-        )
+        self._of_columns = evidence.prior
         self._white = np.linalg.inv(np.linalg.cholesky(self._covariance))
         base = (self._white @ self._jacobian[:, :, self._base]).reshape(-1, len(self._base))
         self._to_base = np.linalg.pinv(base)
         self._normal_of_base = base.T @ base
-        self._blocks = list(_pointings(model, errors))
+        self._blocks = list(_pointings(model))
         self._log_det = (0.0, 0.0)  # of discs and blocks without any effect
         self._parts((), np.zeros(len(self._base)), np.zeros(0), 0.0)
         self._stiffness = 2 / max(model.scale_error, 1e-3) ** 2
+
+    def with_further(self, further: Directions) -> Likelihood:
+        """The same likelihood with further columns, which follow the columns of the evidence. They have no template error."""
+        found = copy.copy(self)
+        size, count = self._evidence.size, further.discs.shape[2]
+        found._jacobian = np.concatenate([self._jacobian[..., :size], further.discs], axis=2)
+        own = self._evidence.prior
+        found._of_columns = Prior(
+            np.append(own.likely, np.full(count, further.width)),
+            np.append(own.positive, np.zeros(count, np.bool_)),
+            np.append(own.field, np.zeros(count, np.bool_)),
+        )
+        found._blocks = [pointing.with_further(further.unocculted, size) for pointing in self._blocks]
+        return found
+
+    @property
+    def further_columns(self) -> range:
+        """The columns of `with_further`."""
+        return range(self._evidence.size, self._jacobian.shape[2])
 
     def weigh(
         self,
@@ -166,19 +177,17 @@ class Likelihood:
         *,
         templates: float = 1.0,
         subtracted: Sequence[float] = (),
-        exact: bool = False,
     ) -> Weighed:
         """Weigh the hypothesis that some effects act. effects: the columns of each effect.
 
         templates: the number of templates among which those of the effects were chosen (`search.distinguished`).
         subtracted: the amounts that a full refit subtracted from the images, by column; the fitted values are then the remaining amounts.
-        exact: whether the columns have no template error.
         """
         out = dict(zip((c for g in effects for c in g), subtracted, strict=True)) if len(subtracted) else {}
         found = [self._weigh(effects, templates, out, 0.0)]
         first, _ = found[0]
         whole = first.values + np.array([out.get(c, 0.0) for c in first.columns])
-        if not exact and self._visible_error(first.columns, whole, TEMPLATE_ERRORS[-1]) > UNSEEN:
+        if self._visible_error(first.columns, whole, TEMPLATE_ERRORS[-1]) > UNSEEN:
             found += [self._weigh(effects, templates, out, error) for error in TEMPLATE_ERRORS[1:]]
         evidence = float(logsumexp([one.log_evidence for one, _ in found])) - math.log(len(found))
         best, of_psf = max(found, key=lambda one: one[0].log_evidence)
@@ -251,7 +260,7 @@ class Likelihood:
         whole = self._stiffness + self._cells
         return np.asarray(whole * (1 - (1 + decrease / whole) ** -CORRELATED) / (2 * CORRELATED))
 
-    def fitted(self, columns: Sequence[int], values: Sequence[float]) -> tuple[Vector, Matrix]:
+    def fitted(self, columns: Sequence[int], values: Sequence[float] | Vector) -> tuple[Vector, Matrix]:
         """Two results of a fit of the columns of one effect: their values (of any sign), and the covariance.
 
         values: approximately the values that the fit finds; they set the template error, whose width is USUAL_ERROR.
@@ -375,10 +384,11 @@ class Likelihood:
         return total
 
     def _visible_error(self, columns: Sequence[int], values: Vector, error: float) -> float:
-        """The chi2 that a relative error of the change by these columns would add."""
-        if not columns:
+        """The chi2 that a relative error of the change by these columns would add. Further columns have no such error."""
+        values = values[[c < self._evidence.size for c in columns]]
+        here = [c for c in columns if c < self._evidence.size]
+        if not here:
             return 0.0
-        here = list(columns)
         seen = float(np.sum((self._white @ self._net(self._jacobian[:, :, here] @ values)[..., None]) ** 2))
         for pointing in self._blocks:
             change = pointing.errors[..., here] @ values
@@ -409,7 +419,8 @@ class Likelihood:
         whole = theta + np.append(np.zeros(len(self._base)), taken)
         spans, first = [], len(self._base)
         for group in groups:
-            spans.append((list(group), whole[first : first + len(group)]))
+            if not group or group[0] < self._evidence.size:  # further columns have no template error
+                spans.append((list(group), whole[first : first + len(group)]))
             first += len(group)
         covariance = self._covariance
         if error > 0 and any(values.any() for _, values in spans):
@@ -449,7 +460,8 @@ def _together(parts: tuple[_Part, _Part], scales: tuple[float, float]) -> tuple[
 class _Pointing:
     """The unocculted blocks of one pointing: arrays (images, blocks), and `errors` (images, blocks, columns).
 
-    brightness: the change by one standard deviation of the brightness of an image, DN/s.
+    brightness: the change by one standard deviation of the brightness of an image, DN/s. at: the indices of the images and
+    blocks among all.
     """
 
     level: Matrix
@@ -457,6 +469,13 @@ class _Pointing:
     free: NDArray[np.bool_]
     brightness: Matrix
     errors: Planes
+    at: tuple[NDArray[np.intp], NDArray[np.intp]]
+
+    def with_further(self, further: Planes, size: int) -> _Pointing:
+        """The same blocks, with further columns (columns, all images, all blocks) after the first `size` columns."""
+        images, blocks = self.at
+        here = np.moveaxis(further[:, images, blocks], 0, -1)
+        return replace(self, errors=np.concatenate([self.errors[..., :size], here], axis=2))
 
     def part(
         self, columns: Sequence[int], effects: Sequence[tuple[list[int], Vector]], error: float
@@ -493,7 +512,7 @@ class _Pointing:
         )
 
 
-def _pointings(model: LinearModel, errors: Planes) -> list[_Pointing]:
+def _pointings(model: LinearModel) -> list[_Pointing]:
     """For every pointing: the blocks that at least LEAST_IMAGES images show; pointings without such blocks are left
     out."""
     blocks = model.evidence.unocculted
@@ -503,14 +522,15 @@ def _pointings(model: LinearModel, errors: Planes) -> list[_Pointing]:
         shown = blocks.free[here].sum(axis=0) >= LEAST_IMAGES
         if here.size < LEAST_IMAGES or not shown.any():
             continue
-        at = np.ix_(here, np.flatnonzero(shown))
+        at = here[:, None], np.flatnonzero(shown)[None, :]
         found.append(
             _Pointing(
                 level=blocks.levels[at],
                 variance=blocks.variance[at] * model.unocculted_scale,
                 free=blocks.free[at],
                 brightness=blocks.means[at] * blocks.gain_width,
-                errors=np.moveaxis(errors[:, here][:, :, shown], 0, -1),
+                errors=np.moveaxis(blocks.errors[:, here][:, :, shown], 0, -1),
+                at=at,
             )
         )
     return found

@@ -16,6 +16,7 @@ from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.discrepancy import WORDS
 from psfcore.gap.evidence.effect_fits import EffectFit
+from psfcore.gap.evidence.fields import FieldShape
 from psfcore.gap.verdict.closure import Interval
 from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names
@@ -78,6 +79,7 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "would_separate": would_separate(found),
         "untestable": [{"name": name, "why": why} for name, why in found.evidence.untestable.items()],
         "looks_like": [{"form": form, "probability": share} for form, share in looks_like(judged)],
+        "unknown": unknown(judged),
         "cautions": list(found.cautions),
         "expected": {
             "residual_pct": found.expected.residual_pct,
@@ -101,8 +103,50 @@ def looks_like(judged: Judgement) -> list[tuple[str, float]]:
     """If the cause may be unknown: the patterns that the gap resembles, and their probabilities, the most probable first."""
     if UNKNOWN not in judged.members:
         return []
-    ordered = sorted(judged.orders.items(), key=lambda one: -one[1])
-    return [(order_words(orders), share) for orders, share in ordered if share >= LIKELY_ORDER]
+    forms = {order_words(orders): share for orders, share in judged.orders.items()}
+    forms |= {field.words: share for field, share in judged.fields.items()}
+    ordered = sorted(forms.items(), key=lambda one: -one[1])
+    return [(form, share) for form, share in ordered if share >= LIKELY_ORDER]
+
+
+def unknown(judged: Judgement) -> dict[str, Any] | None:
+    """The most probable field of an unknown cause, with its shape; None if the answer set does not contain "unknown".
+
+    The probabilities hold if the cause is unknown.
+    """
+    shape = judged.shape
+    if UNKNOWN not in judged.members or shape is None:
+        return None
+    stages: dict[str, float] = {}
+    for field, share in judged.fields.items():
+        stages[field.stage] = stages.get(field.stage, 0.0) + share
+    return {
+        "stages": stages,
+        "form": shape.field.form,
+        "stage": shape.field.stage,
+        "width": shape.field.width,
+        "pointing": shape.field.pointing,
+        "probability": judged.fields[shape.field],
+        "words": shape.field.words,
+        "axes": list(shape.axes),
+        "at": shape.at.tolist(),
+        "values": shape.values.tolist(),
+        "sigma": shape.sigma.tolist(),
+        "unit": shape.unit,
+    }
+
+
+def clearest_words(shape: FieldShape) -> str:
+    """The value and the place at which a field is clearest, as text."""
+    k = shape.clearest
+    names = {
+        "x_px": "x = {:.0f} px",
+        "y_px": "y = {:.0f} px",
+        "time_s": "{:.0f} s",
+        "radius_px": "{:.0f} px from the centre of the PSF",
+    }
+    place = ", ".join(names[axis].format(at) for axis, at in zip(shape.axes, shape.at[k], strict=True))
+    return f"{shape.values[k]:.2g} ± {shape.sigma[k]:.1g} {shape.unit}".rstrip() + f" at {place}"
 
 
 def order_words(orders: Names) -> str:
@@ -229,6 +273,8 @@ def sentence(found: Diagnosis) -> str:
     if judged.verdict == "unknown":
         like = looks_like(judged)
         close = f"; it most resembles {like[0][0]}" if like else ""
+        if judged.shape is not None and like and like[0][0] == judged.shape.field.words:
+            close += f" ({clearest_words(judged.shape)})"
         return f"{lead} Its cause is not in the library{close}."
     if judged.verdict == "tie":
         return (

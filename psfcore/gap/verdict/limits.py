@@ -173,7 +173,7 @@ def limits(
     endless = [e.name for e in every if not all(math.isfinite(p.likely) for p in e.parameters)]
     evidence = replace(model.evidence, effects=tuple(e for e in every if e.name not in endless))
     unknown = discrepancy(evidence)
-    found = _Limits(Likelihood(model, unknown.directions), evidence, unknown, prior)
+    found = _Limits(Likelihood(model).with_further(unknown.directions), evidence, unknown, prior)
     need = _Need(threshold, temperature)
     effects = {
         effect.name: EffectLimits(effect.name, found.parameters(effect, need, observed))

@@ -17,6 +17,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from typing import Literal
 
 import numpy as np
@@ -26,6 +27,7 @@ from scipy.special import logsumexp
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.discrepancy import ALTERNATIVES, discrepancy
 from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.fields import Field, FieldColumns, FieldShape, fields_of
 from psfcore.gap.evidence.likelihood import Likelihood, Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict.same_data import with_same_data
@@ -60,12 +62,15 @@ class Posterior:
     """The weights of all hypotheses.
 
     log_weights: ln of prior times evidence of each hypothesis, up to a common constant. visible_error: `Weighed.visible_error`
-    by hypothesis. orders: the probability of each alternative of the discrepancy if the cause is unknown.
+    by hypothesis. orders: the probability of each alternative of the discrepancy if the cause is unknown. fields: the same of
+    each field. shape: the shape of the most probable field.
     """
 
     log_weights: dict[Names, float]
     visible_error: dict[Names, float]
     orders: dict[Names, float]
+    fields: dict[Field, float] = dataclass_field(default_factory=dict)
+    shape: FieldShape | None = None
 
     def probabilities(self, temperature: float = 1.0) -> dict[Names, float]:
         """The probability of each hypothesis, the most probable first. temperature: divides the logarithms of the weights."""
@@ -109,24 +114,43 @@ def _sorted(probabilities: Mapping[Names, float]) -> dict[Names, float]:
 def posterior(model: LinearModel) -> Posterior:
     """The posterior in the linear model, without any full refit."""
     evidence = model.evidence
-    further = discrepancy(evidence)
-    likelihood = Likelihood(model, further.directions)
+    likelihood = Likelihood(model)
     weighed = {names: weigh(likelihood, evidence, names) for names in _hypotheses(evidence.effects)}
     weighed |= _triples(likelihood, evidence, weighed, evidence.effects)
+    further = discrepancy(evidence)
+    with_polynomials = likelihood.with_further(further.directions)
     orders = {
-        orders: likelihood.weigh([columns], exact=True).log_evidence
+        orders: with_polynomials.weigh([columns]).log_evidence
         for orders in ALTERNATIVES
         if (columns := further.columns(orders, evidence.size))
     }
-    logs = np.array(list(orders.values()))
+    fields, shape = _of_fields(likelihood, evidence)
+    logs = np.array([*orders.values(), *fields.values()])
     whole = float(logsumexp(logs))
     count = len(evidence.effects)
+    shares = np.exp(logs - whole).tolist()
     return Posterior(
         {names: w.log_evidence + _log_prior(names, count) for names, w in weighed.items()}
         | {UNKNOWN: whole - math.log(logs.size) + _log_prior(UNKNOWN, count)},
         {names: w.visible_error for names, w in weighed.items()},
-        dict(zip(orders, np.exp(logs - whole).tolist(), strict=True)),
+        dict(zip(orders, shares, strict=False)),
+        dict(zip(fields, shares[len(orders) :], strict=True)),
+        shape,
     )
+
+
+def _of_fields(likelihood: Likelihood, evidence: Evidence) -> tuple[dict[Field, float], FieldShape]:
+    """ln of the evidence of each field, and the shape of the most probable one."""
+    columns = FieldColumns(evidence)
+    found: dict[Field, Weighed] = {}
+    best = -math.inf
+    for field in fields_of(evidence):
+        with_field = likelihood.with_further(columns.of(field))
+        found[field] = weighed = with_field.weigh([with_field.further_columns])
+        if weighed.log_evidence > best:
+            best = weighed.log_evidence
+            shape = columns.shown(field, *with_field.fitted(with_field.further_columns, weighed.values))
+    return {field: weighed.log_evidence for field, weighed in found.items()}, shape
 
 
 def _triples(

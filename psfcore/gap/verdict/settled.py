@@ -6,6 +6,9 @@ refitted alone, for two reasons: this refit also gives the evidence of all pairs
 that is not linear can make a pair look more probable than the effect alone. The refits end when no plausible hypothesis needs a
 refit, or after MOST_REFITS refits.
 
+A field of an unknown cause has no template error. It may therefore be more probable than a strong effect that is the true
+cause, until this effect is refitted. So the plausible hypotheses are those that are plausible if the cause is not unknown.
+
 The report names the effects of a hypothesis that is more probable than all others together. Its refit is made even if the
 linear model is exact enough, and if this refit fails, the hypothesis is excluded. If it succeeds, the evidence of the linear
 model stays: the evidence of a refit scatters by a few units, and the other hypotheses have no refit.
@@ -101,8 +104,10 @@ def _without_stale(
 
 def _to_refit(found: Posterior, done: set[Names]) -> Names | None:
     """The most probable hypothesis for which the linear model is not exact enough, or one of its effects."""
-    for names, share in found.probabilities().items():
-        if share < PLAUSIBLE:
+    probabilities = found.probabilities()
+    of_others = max(1.0 - probabilities[UNKNOWN], 1e-300)
+    for names, share in probabilities.items():
+        if share < PLAUSIBLE * min(of_others, 1.0):
             return None
         if names in (NONE, UNKNOWN) or names in done or found.visible_error.get(names, 0.0) <= VISIBLE:
             continue

@@ -22,6 +22,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from psfcore.gap.evidence.fields import Field, FieldShape
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior, without_idle
 
@@ -39,8 +40,8 @@ class Judgement:
     set, the most probable hypothesis first. deciding: the members that
     decide the verdict. coverage: the coverage of the answer set.
     hypotheses: the probability of each hypothesis, the most probable first, after `posterior.without_idle`. effects: the
-    probability that each effect acts, alone or with another; also of "none" and "unknown". orders: `Posterior.orders`.
-    failed: the hypotheses whose full refit failed.
+    probability that each effect acts, alone or with another; also of "none" and "unknown". orders, fields, shape: as in
+    `Posterior`. failed: the hypotheses whose full refit failed.
     """
 
     verdict: Verdict
@@ -51,6 +52,8 @@ class Judgement:
     hypotheses: Mapping[Names, float]
     effects: Mapping[str, float]
     orders: Mapping[Names, float]
+    fields: Mapping[Field, float]
+    shape: FieldShape | None
     failed: tuple[Names, ...] = ()
 
     @property
@@ -111,6 +114,8 @@ def verdict_of(
         hypotheses=hypotheses,
         effects=of_effects(raw),
         orders=found.orders,
+        fields=found.fields,
+        shape=found.shape,
         failed=failed,
     )
 

@@ -14,9 +14,9 @@ from tests.psfcore.gap.linear_models import with_left, with_residuals
 def likeliest(model: LinearModel) -> tuple[str, ...]:
     """The alternative with the largest evidence."""
     further = discrepancy(model.evidence)
-    likelihood = Likelihood(model, further.directions)
+    likelihood = Likelihood(model).with_further(further.directions)
     evidence = {
-        orders: likelihood.weigh([columns], exact=True).log_evidence
+        orders: likelihood.weigh([columns]).log_evidence
         for orders in ALTERNATIVES
         if (columns := further.columns(orders, model.evidence.size))
     }

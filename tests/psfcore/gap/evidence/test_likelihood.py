@@ -147,7 +147,7 @@ def test_the_odds_of_one_sided_parameters_are_integrals_and_means_over_all_choic
 
 
 def test_what_an_error_of_the_first_template_explains_is_credited_less_to_a_second_effect(
-    evidence: Evidence,
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A weak smear beside a strong offset counts less if the template of the offset is not exact."""
     sigma = sigma_of(evidence, "column_smear")
@@ -158,15 +158,20 @@ def test_what_an_error_of_the_first_template_explains_is_credited_less_to_a_seco
     offset, smear = (list(evidence.columns[name]) for name in ("dark_offset", "column_smear"))
     assert weak.weigh([offset]).visible_error < 9 < strong.weigh([offset]).visible_error
 
-    def credit(likelihood: Likelihood, exact: bool) -> float:
-        alone, both = (likelihood.weigh(some, exact=exact) for some in ([offset], [offset, smear]))
-        return both.log_evidence - alone.log_evidence
+    def credit(likelihood: Likelihood, errors: tuple[float, ...]) -> float:
+        with monkeypatch.context() as patched:
+            patched.setattr(likelihoods, "TEMPLATE_ERRORS", errors)
+            alone, both = (likelihood.weigh(some) for some in ([offset], [offset, smear]))
+            return both.log_evidence - alone.log_evidence
 
-    assert credit(weak, exact=False) == pytest.approx(credit(weak, exact=True), abs=1)
-    assert 100 < credit(strong, exact=False) < credit(strong, exact=True) - 10
+    exact, usual = (0.0, 0.0), likelihoods.TEMPLATE_ERRORS
+    assert credit(weak, usual) == pytest.approx(credit(weak, exact), abs=1)
+    assert 100 < credit(strong, usual) < credit(strong, exact) - 10
 
 
-def test_the_template_error_leaves_out_what_a_change_of_the_psf_absorbs(evidence: Evidence) -> None:
+def test_the_template_error_leaves_out_what_a_change_of_the_psf_absorbs(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A template that also contains a change of the PSF describes the same hypothesis."""
     (offset,), base = evidence.columns["dark_offset"], evidence.base[0]
     plain = with_residuals(evidence, {"dark_offset": 1000.0}, noise=1.0)
@@ -177,10 +182,9 @@ def test_the_template_error_leaves_out_what_a_change_of_the_psf_absorbs(evidence
         jacobian[offset] += 5 * sizes[0] / sizes[1] * jacobian[base]
         discs.append(replace(disc, jacobian=jacobian))
     mixed = replace(plain, evidence=replace(plain.evidence, discs=tuple(discs)))
-    exact, one, other = (
-        Likelihood(model).weigh([[offset]], exact=exact).log_evidence
-        for model, exact in ((plain, True), (plain, False), (mixed, False))
-    )
+    one, other = (Likelihood(model).weigh([[offset]]).log_evidence for model in (plain, mixed))
+    monkeypatch.setattr(likelihoods, "TEMPLATE_ERRORS", (0.0, 0.0))
+    exact = Likelihood(plain).weigh([[offset]]).log_evidence
     assert other == pytest.approx(one, abs=0.01)
     assert abs(one - exact) > 1
 
