@@ -63,7 +63,7 @@ def listed(astronomer: Astronomer, **filters: object) -> list[str]:
 
 def long_job(astronomer: Astronomer, folder: Path, psf_file: Path, **more: str) -> AsyncTAPJob:
     """A job that takes long enough for something to happen to it, at work."""
-    write_image(folder / "image.fits", shape=(1024, 1024))
+    write_image(folder / "image.fits", shape=(2048, 2048))
     image_id = astronomer.client.upload_image(folder / "image.fits")["id"]
     psf_id = astronomer.client.upload_psf(psf_file)["id"]
     method = '{"name": "richardson-lucy", "steps": 200}'

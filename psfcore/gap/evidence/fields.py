@@ -29,8 +29,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
 
+from psfcore.convolution.convolver import correlations
 from psfcore.gap.effect import Stage
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Directions
@@ -194,13 +194,17 @@ class FieldColumns:
         return np.einsum("ay,bx->abyx", along_y, along_x).reshape(-1, y.size * x.size)
 
     def _of_kernel(self, field: Field, of_light: Matrix, scene: Matrix) -> Matrix:
-        around, first = self._spectra.shape[1], max(scene.shape) - 1
-        moved = irfft2(rfft2(scene, (around, around)) * self._spectra, (around, around))
-        changes = moved[:, first : first + scene.shape[0], first : first + scene.shape[1]]
-        if field.form == "kernel_over_field":
-            rings = changes[:: len(_FACTORS)]
-            changes = np.concatenate([rings * self._box_x, rings * self._box_y[:, None]])
-        return np.asarray(KERNEL_LIKELY * np.einsum("cyx,kyx->ck", of_light, changes, optimize=True))
+        if field.form == "kernel":
+            return self._along_kernels(of_light, scene, self._kernels)
+        rings = self._kernels[:: len(_FACTORS)]
+        sides = [of_light * self._box_x, of_light * self._box_y[:, None]]
+        return np.concatenate([self._along_kernels(side, scene, rings) for side in sides], axis=1)
+
+    def _along_kernels(self, weights: Matrix, scene: Matrix, kernels: Matrix) -> Matrix:
+        """The sums over the boxes of weights (cells, y, x) times the scene convolved with each kernel (cells, kernels)."""
+        reach = kernels.shape[-1] // 2
+        to_displacements = correlations(weights, np.pad(scene, reach), reach)
+        return np.asarray(KERNEL_LIKELY * np.tensordot(to_displacements, kernels, axes=((1, 2), (1, 2))))
 
     @staticmethod
     def _width(field: Field) -> float:
@@ -220,8 +224,8 @@ class FieldColumns:
         return np.asarray(np.exp(-0.5 * (apart / OCTAVES) ** 2) / (OCTAVES * np.sqrt(2 * np.pi)))
 
     @cached_property
-    def _spectra(self) -> NDArray[np.complex128]:
-        """The transforms of the changes of the PSF on the boxes, each of sum 1 before its factor of the azimuth."""
+    def _kernels(self) -> Matrix:
+        """The changes of the PSF on the boxes, each of sum 1 before its factor of the azimuth."""
         reach = max(self._box_y.size, self._box_x.size)
         d = np.arange(-reach + 1, reach)
         r, a = np.hypot(d[:, None], d[None, :]), np.arctan2(d[:, None], d[None, :])
@@ -230,8 +234,7 @@ class FieldColumns:
         for centre in self._octaves:
             ring = np.exp(-0.5 * ((octave - centre) / OCTAVES) ** 2)
             kernels += [ring / ring.sum() * factor(a) for factor in _FACTORS]
-        around = next_fast_len(3 * reach, real=True)
-        return np.asarray(rfft2(np.array(kernels), (around, around)))
+        return np.array(kernels)
 
 
 @dataclass(frozen=True, eq=False)

@@ -262,7 +262,7 @@ def test_correct_tiles_pass(tmp_path: Path) -> None:
 
 def test_quantised_floats_pass_with_tiles_that_could_not_be_quantised(tmp_path: Path) -> None:
     pixels = RNG.normal(100, 1, (40, 50)).astype("f4")
-    pixels[3] *= 1e30  # stored in GZIP_COMPRESSED_DATA
+    pixels[3] *= 1e27  # stored in GZIP_COMPRESSED_DATA
     for codec in ("RICE_1", "GZIP_1", "GZIP_2"):
         path = written(tmp_path / "tiles.fits", pixels, compression_type=codec)
         assert np.allclose(read_observation(path, LIMITS).pixels, pixels, rtol=0.01), codec
