@@ -162,6 +162,10 @@ def observation_of(
     return image
 
 
+def _range_of(pixels: NDArray[np.float64]) -> tuple[float, float]:
+    return float(pixels.min()), float(pixels.max())
+
+
 def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
     valid = image.valid
     if not valid.any():
@@ -175,15 +179,16 @@ def _check_signal(image: Image, *, stored_as_integer: bool) -> None:
             "all-saturated",
             f"expected pixels below saturation; all finite pixels are at {level:g} or above: check the level",
         )
-    values = image.pixels if valid.all() else image.pixels[image.finite]
-    farthest = max(float(values.min()), float(values.max()), key=abs)
+    whole = bool(valid.all())
+    smallest, largest = _range_of(image.pixels if whole else image.pixels[image.finite])
+    farthest = max(smallest, largest, key=abs)
     if abs(farthest) > LARGEST_PIXEL:
         raise DataError(
             "pixel-too-large",
             f"expected pixels between -{LARGEST_PIXEL:g} and {LARGEST_PIXEL:g}; got one of {farthest:g}: set such pixels to NaN",
         )
-    values = values if valid.all() else image.pixels[valid]
-    smallest, largest = float(values.min()), float(values.max())
+    if not whole:  # saturated pixels are finite, but say nothing about the signal
+        smallest, largest = _range_of(image.pixels[valid])
     if smallest == largest <= 0 or abs(farthest) < 1 / LARGEST_PIXEL:
         raise DataError("no-signal", f"expected light; the brightest pixel is {largest:g}: use another image")
     if smallest == largest and stored_as_integer and largest in _FULL_SCALES:

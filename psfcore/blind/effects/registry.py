@@ -48,6 +48,5 @@ def _by_name(kind: Kind) -> tuple[Callable[[str], Kind], tuple[str]]:
     return effect_named, (kind.name,)
 
 
-copyreg.pickle(
-    Kind, _by_name
-)  # a process that makes cases gets the name of a kind: functions without a name have no pickle
+# A process that makes cases gets the name of a kind: functions without a name have no pickle.
+copyreg.pickle(Kind, _by_name)

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import correlations
 from psfcore.gap.effect import Stage
+from psfcore.gap.evidence.discrepancy import LIKELY
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Directions
 
@@ -43,7 +44,6 @@ SPACING = 1.2  # distance of two bumps, in units of their width
 KERNEL_LIKELY = 0.25
 OCTAVES = 0.5  # width of a bump of the optics, and distance of two of them, in octaves of the radius
 NEAREST_BOXES = 2.0  # smallest radius of a bump of the optics, in boxes
-LIKELY = 0.02  # likely relative size of a coefficient; the likelihood also tries ten times this size
 
 WORDS = {
     "light": "light added on the detector",

@@ -107,7 +107,7 @@ def _to_refit(found: Posterior, done: set[Names]) -> Names | None:
     probabilities = found.probabilities()
     of_others = max(1.0 - probabilities[UNKNOWN], 1e-300)
     for names, share in probabilities.items():
-        if share < PLAUSIBLE * min(of_others, 1.0):
+        if share < PLAUSIBLE * of_others:
             return None
         if names in (NONE, UNKNOWN) or names in done or found.visible_error.get(names, 0.0) <= VISIBLE:
             continue

@@ -9,10 +9,10 @@ import pytest
 from scipy.signal import fftconvolve
 
 from psfcore.gap.evidence.cells import DiscCells, disc_cells
+from psfcore.gap.evidence.discrepancy import LIKELY
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.fields import (
     KERNEL_LIKELY,
-    LIKELY,
     NEAREST_BOXES,
     OCTAVES,
     Field,
