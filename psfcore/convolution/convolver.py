@@ -104,23 +104,25 @@ def linear_convolve(
 ) -> NDArray[np.float64]:
     """Convolve two kernels linearly, in float64. The centre of each kernel is at [ny // 2, nx // 2].
 
-    The result has the shape `out_shape`, and its centre is at [ny // 2, nx // 2] too. Light outside is cut off.
+    a may be a stack of kernels (..., ny, nx). The last two axes of the result have the shape `out_shape`, and its centre is at
+    [ny // 2, nx // 2] too. Light outside is cut off.
     """
     length = tuple(
         int(scipy.fft.next_fast_len(p + q - 1, real=True))
-        for p, q in zip(a.shape, b_kernel.shape, strict=True)
+        for p, q in zip(a.shape[-2:], b_kernel.shape, strict=True)
     )
     product = scipy.fft.rfft2(a, s=length, workers=threads) * scipy.fft.rfft2(
         b_kernel, s=length, workers=threads
     )
     full = scipy.fft.irfft2(product, s=length, workers=threads)
-    out = np.zeros(out_shape, dtype=np.float64)
-    source, target = [], []
-    for p, q, n in zip(a.shape, b_kernel.shape, out_shape, strict=True):
+    out = np.zeros((*a.shape[:-2], *out_shape), dtype=np.float64)
+    source: list[slice] = []
+    target: list[slice] = []
+    for p, q, n in zip(a.shape[-2:], b_kernel.shape, out_shape, strict=True):
         shift = p // 2 + q // 2 - n // 2
         source.append(slice(max(shift, 0), min(shift + n, p + q - 1)))
         target.append(slice(max(-shift, 0), max(-shift, 0) + source[-1].stop - source[-1].start))
-    out[tuple(target)] = full[tuple(source)]
+    out[..., target[0], target[1]] = full[..., source[0], source[1]]
     return out
 
 

@@ -16,7 +16,7 @@ The steps, in this order:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,8 +27,9 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.expected_gap import ExpectedGap, expected_gap
+from psfcore.gap.evidence.fields import UNKNOWN, Field, fields_of, refittable
 from psfcore.gap.evidence.gap_test import p_value_of_gap
-from psfcore.gap.evidence.linear_model import FLOOR, LinearModel, Step
+from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration, shipped_calibration
@@ -44,16 +45,18 @@ from psfcore.gap.verdict.closure import (
 )
 from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.verdict.limits import Limits, limits
-from psfcore.gap.verdict.refits import Refits
+from psfcore.gap.verdict.posterior import NONE, Form
+from psfcore.gap.verdict.refits import Refits, linear_start
 from psfcore.gap.verdict.settled import settled_posterior
-from psfcore.gap.verdict.verdict import Judgement, verdict_of
+from psfcore.gap.verdict.unknown import UnknownField, bounds, unknown_fields
+from psfcore.gap.verdict.verdict import Judgement, earned, verdict_of
 from psfcore.gap.verdict.where import Axis, where
 from psfcore.gap.view import View
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Inverter, solution_of
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector, shape_named
-from psfcore.transit.transit import Fold, Transit
+from psfcore.transit.transit import Transit
 
 SMALLEST_SCALE, LARGEST_SCALE = 1.0, 3.0
 
@@ -77,16 +80,18 @@ class Diagnosis:
 
     Three values of the gap: before_refit, with the PSF that was fitted together with the named effects, but without these
     effects; rms, with the PSF refitted without any effect; after, with the named effects in the model. fits: the linear
-    fits of all single effects, the most probable first; then of the pairs that are best or decide the verdict. p_value:
-    the p-value of the gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by their
-    label. corrected: the full refits with the named effects that were made; the refit with the best effects comes first. residual,
+    fits, by form: of all single effects, the most probable first; then of the hypotheses that are best or decide the verdict, and of
+    the fields of an unknown cause. p_value:
+    the p-value of the gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by
+    form. corrected: the full refits with the named effects that were made; the refit with the best effects comes first. unknown: the
+    fields of an unknown cause, if it is in the answer set. bounds: the bound of each field (`unknown.bounds`). residual,
     residual_after: the residuals of held-out images without and with the best effects. cautions: sentences on
     everything that weakens the result.
     """
 
     judgement: Judgement
     calibration: Calibration
-    fits: tuple[EffectFit, ...]
+    fits: Mapping[Form, EffectFit]
     p_value: float
     limits: Limits
     solution: Solution
@@ -98,8 +103,10 @@ class Diagnosis:
     rms: Interval
     after: Interval
     noise_pct: float
-    shrinking: dict[str, Shrinking]
+    shrinking: Mapping[Form, Shrinking]
     corrected: tuple[Corrected, ...]
+    unknown: tuple[UnknownField, ...]
+    bounds: Mapping[Field, tuple[float, str]]
     residual: HeldOut | None
     residual_after: HeldOut | None
     cautions: tuple[str, ...]
@@ -188,24 +195,28 @@ def diagnose_solution(
     model, expected = linear_model_of(view, library, seed=seed, progress=progress)
     refits = Refits(view, model, progress)
     settled, failed = settled_posterior(model, refits.weighed if refit else None)
-    found = verdict_of(
+    rng = np.random.default_rng(seed)
+    judged = verdict_of(
         settled, calibration, images=len(model.evidence.discs), coverage=coverage, failed=failed
     )
-    fits = linear_fits(model, found)
-    best = next((fit for fit in fits if fit.names == found.best), None)
-    corrected = refits.of(found.named) if refit and found.verdict in ("attributed", "tie") else ()
-    rng = np.random.default_rng(seed)
-    shrinking, before, after = _shrinking(model, found, fits, refits.made, rng)
-    nothing = Interval(0.0, 0.0, 0.0)
-    rms = gap(before, rng) if before is not None else nothing
-    gone = found.verdict in ("attributed", "tie") and after is not None
-    explained = best.step if best is not None and found.answer else None
+    told = unknown_fields(model, settled) if any(UNKNOWN in names for names in judged.members) else ()
+    fits = _fits(refits, model, judged, told)
+    best = next((form for form in fits if judged.best and form == judged.form(judged.best)), None)
+    named = judged.verdict in ("attributed", "tie")
+    corrected = refits.of([judged.form(names) for names in judged.named]) if refit and named else ()
+    held_out = [hold_out(model, (), scheme) for scheme in (time_blocks(model), pointings(model))]
+    shrinking, after = _shrinking(model, judged, fits, refits, held_out, rng)
+    judged = earned(judged, None if best is None else shrinking[best].closure)
+    before, gone = held_out[0], None if best is None else after[best]
+    explained = fits[best] if best is not None and judged.answer else None
+    named = judged.verdict in ("attributed", "tie") and gone is not None
+    rms = gap(before, rng) if before is not None else Interval(0.0, 0.0, 0.0)
     cautions = [*cautions_of(solution, noise, model.evidence), *refits.failures]
-    if gone and best is not None and after is not None:
-        error_pct = float(np.sqrt(np.mean(after.noise_pct**2)))
-        cautions += caution_of_closure(best.label, rms.value, error_pct)
+    if named and best is not None and gone is not None:
+        error_pct = float(np.sqrt(np.mean(gone.noise_pct**2)))
+        cautions += caution_of_closure(fits[best].label, rms.value, error_pct)
     return Diagnosis(
-        judgement=found,
+        judgement=judged,
         calibration=calibration,
         fits=fits,
         p_value=p_value_of_gap(model),
@@ -214,17 +225,24 @@ def diagnose_solution(
         model=model,
         expected=expected,
         noise=noise,
-        where=where(model, rng, _favoured(model, found), explained),
-        before_refit=_before_refit(model, explained, rng) if gone and explained is not None else rms,
+        where=where(
+            model if explained is None else explained.model,
+            rng,
+            _favoured(judged, explained, told),
+            None if explained is None else explained.step,
+        ),
+        before_refit=_before_refit(explained, rng) if named and explained is not None else rms,
         rms=rms,
-        after=gap(after, rng) if gone and after is not None else rms,
+        after=gap(gone, rng) if named and gone is not None else rms,
         noise_pct=float(np.sqrt(np.mean(before.noise_pct**2)))
         if before is not None
         else _noise_pct(model.evidence),
         shrinking=shrinking,
         corrected=corrected,
+        unknown=told,
+        bounds=bounds(model, fields_of(model.evidence)),
         residual=before,
-        residual_after=after if gone else None,
+        residual_after=gone if named else None,
         cautions=tuple(cautions),
     )
 
@@ -252,14 +270,18 @@ def linear_model_of(
     return model, expected
 
 
-def _favoured(model: LinearModel, found: Judgement) -> list[str]:
-    """The axes along which the effects of the best hypothesis vary.
+def _favoured(
+    judged: Judgement, explained: EffectFit | None, told: Sequence[UnknownField]
+) -> list[str]:
+    """The axes along which the effects of the best hypothesis vary, or the most probable field of an unknown cause.
 
-    Empty if the verdict is `none`, or if no hypothesis names an effect.
+    Empty if the verdict is `none`.
     """
-    if found.verdict == "none" or found.best is None:
+    if judged.verdict == "unknown" and told:
+        return list(told[0].field.axes)
+    if judged.verdict == "none" or explained is None:
         return []
-    return [axis for effect in model.evidence.effects if effect.name in found.best for axis in effect.axes]
+    return [axis for e in explained.model.evidence.effects if e.name in explained.names for axis in e.axes]
 
 
 def _limits(
@@ -277,57 +299,61 @@ def _limits(
     return found
 
 
-def linear_fits(model: LinearModel, found: Judgement) -> tuple[EffectFit, ...]:
-    """The linear fits of all single effects, the most probable first; then of the pairs that are the best hypothesis or
-    a named hypothesis."""
+def _fits(
+    refits: Refits, model: LinearModel, judged: Judgement, told: Sequence[UnknownField]
+) -> dict[Form, EffectFit]:
+    """The linear fits of all single effects, the most probable first; then of the best hypothesis and the named ones, in their
+    most probable form, and of the fields of an unknown cause."""
     effects = {effect.name: effect for effect in model.evidence.effects}
-    ordered = sorted(effects, key=lambda name: -found.effects.get(name, 0.0))
-    singles = [(name,) for name in ordered]
-    pairs = [names for names in dict.fromkeys((found.best or (), *found.named)) if len(names) > 1]
-    return tuple(fit_effects(model, [effects[name] for name in names]) for names in (*singles, *pairs))
+    ordered = sorted(effects, key=lambda name: -judged.effects.get(name, 0.0))
+    fits = {Form((name,)): fit_effects(model, [effects[name]]) for name in ordered}
+    hypotheses = [names for names in (judged.best or NONE, *judged.named) if names != NONE]
+    forms = [*(judged.form(names) for names in hypotheses), *(one.form for one in told)]
+    for form in forms:
+        if form in fits or not (form.field is None or refittable(form.field)):
+            continue
+        with_field = refits.model_with(form)
+        names = form.names(tuple(effects))
+        chosen = [effect for effect in with_field.evidence.effects if effect.name in names]
+        fits[form] = linear_start(with_field, chosen) if form.field else fit_effects(with_field, chosen)
+    return fits
 
 
 def _shrinking(
     model: LinearModel,
-    found: Judgement,
-    fits: Sequence[EffectFit],
-    refits: Sequence[Corrected],
+    judged: Judgement,
+    fits: Mapping[Form, EffectFit],
+    refits: Refits,
+    before: Sequence[HeldOut | None],
     rng: np.random.Generator,
-) -> tuple[dict[str, Shrinking], HeldOut | None, HeldOut | None]:
-    """Three results: the closure of every fit; the held-out residuals without any effect; the held-out residuals with
-    the effects of the best hypothesis.
+) -> tuple[dict[Form, Shrinking], dict[Form, HeldOut | None]]:
+    """Two results for every fit: its closure, and the held-out residuals with its effects.
 
-    If effects have a full refit, their closure is computed with the model of that refit.
+    before: the held-out residuals without any effect, for the blocks of time and for the pointings. If effects have a full refit,
+    their closure is computed with the model of that refit.
     """
     schemes = (time_blocks(model), pointings(model))
-    before = [hold_out(model, (), scheme) for scheme in schemes]
-    real = {fit.label: fit.model for fit in refits}
-    out: dict[str, Shrinking] = {}
-    best: HeldOut | None = None
+    out: dict[Form, Shrinking] = {}
+    left: dict[Form, HeldOut | None] = {}
     base = len(model.evidence.base)
-    for fit in fits:
-        after = [hold_out(model, fit.step.columns[base:], scheme) for scheme in schemes]
-        if fit.label in real:
+    for form, fit in fits.items():
+        after = [hold_out(fit.model, fit.step.columns[base:], scheme) for scheme in schemes]
+        if form in refits.made:
+            real = refits.made[form].model
             after = [
-                _better_known(_held_out_by(real[fit.label], scheme), linear)
+                _better_known(hold_out(real, real.evidence.of_effects, scheme), linear)
                 for scheme, linear in zip(schemes, after, strict=True)
             ]
-        if fit.names == found.best:
-            best = after[0]
+        left[form] = after[0]
         closures = [
             closure(b, a, rng, model.scale_error)
-            if found.verdict != "none" and b is not None and a is not None
+            if judged.verdict != "none" and b is not None and a is not None
             else None
             for b, a in zip(before, after, strict=True)
         ]
         falls = fall(before[0], after[0]) if before[0] is not None and after[0] is not None else None
-        out[fit.label] = Shrinking(closures[0], closures[1], falls)
-    return out, before[0], best
-
-
-def _held_out_by(model: LinearModel, scheme: Sequence[Fold]) -> HeldOut | None:
-    """Hold out images with the model of a full refit; all effects of that refit are fitted."""
-    return hold_out(model, model.evidence.of_effects, scheme)
+        out[form] = Shrinking(closures[0], closures[1], falls)
+    return out, left
 
 
 def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | None:
@@ -336,15 +362,15 @@ def _better_known(real: HeldOut | None, linear: HeldOut | None) -> HeldOut | Non
     return real if same else linear
 
 
-def _before_refit(model: LinearModel, step: Step, rng: np.random.Generator) -> Interval:
-    """The gap with the PSF that was fitted together with the best effects (`step`), but without these effects.
+def _before_refit(best: EffectFit, rng: np.random.Generator) -> Interval:
+    """The gap with the PSF that was fitted together with the best effects, but without these effects.
 
     A refit of the PSF without the effects absorbs a part of this gap.
     """
-    base = list(model.evidence.base)
+    base = list(best.model.evidence.base)
     rows = []
-    for disc in model.evidence.discs:
-        mean = float(disc.share @ (disc.residual - disc.jacobian[base].T @ step.values[: len(base)]))
+    for disc in best.model.evidence.discs:
+        mean = float(disc.share @ (disc.residual - disc.jacobian[base].T @ best.step.values[: len(base)]))
         rows.append((-100 * mean / disc.level, 100 * disc.mean_noise / disc.level))
     residual, noise = np.array(rows).T
     nothing = np.zeros_like(residual)

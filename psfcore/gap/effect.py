@@ -6,7 +6,8 @@ the scene with its occulter. The scene is reconstructed from the image. A change
 light that the model predicts in the disc (`evidence.cells`). The unocculted field shows a change only if it
 differs between the images of one pointing.
 
-The stage of an effect is the step of the light on which it acts: the scene, the optics or the detector.
+The stage of an effect is the step of the light on which it acts: the scene, the optics or the detector. A field
+(`evidence.fields`) that changes the light with time has the stage "time".
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Literal
 
 from psfcore.gap.view import Field, View
 
-Stage = Literal["scene", "optics", "detector"]
+Stage = Literal["scene", "optics", "detector", "time"]
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Effect:
     distinguished(view): how many of these the data distinguish (`search.distinguished`; None: all of them); a larger number
     lowers the evidence. held(view): for an effect that searches for a position or a template, the same effect with the result of
     the search fixed. field: whether the parameters describe a random field, in which each parameter is about as large
-    as `likely`.
+    as `likely`. exact: whether the changes have no template error (`likelihood`).
     """
 
     name: str
@@ -79,3 +80,4 @@ class Effect:
     distinguished: Callable[[View], float] | None = None
     held: Callable[[View], Effect] | None = None
     field: bool = False
+    exact: bool = False

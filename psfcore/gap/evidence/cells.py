@@ -196,3 +196,15 @@ def summed_over_boxes(planes: Planes) -> Planes:
     rows, columns = (n // edge for n in planes.shape[1:])
     cut = planes[:, : rows * edge, : columns * edge]
     return np.asarray(cut.reshape(-1, rows, edge, columns, edge).sum(axis=(2, 4)))
+
+
+def coarse_kernel(kernel: Matrix, step: int) -> Matrix:
+    """A kernel [y, x], binned: each coarse pixel is the sum of `step` x `step` pixels. Its centre is in the
+    middle of a coarse pixel."""
+    middle = kernel.shape[0] // 2
+    reach = (middle + step // 2) // step
+    at = (np.arange(kernel.shape[0]) - middle + step // 2) // step + reach
+    out = np.zeros((2 * reach + 1,) * 2)
+    keep = at <= 2 * reach
+    np.add.at(out, np.ix_(at[keep], at[keep]), kernel[np.ix_(keep, keep)])
+    return out

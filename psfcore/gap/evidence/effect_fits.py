@@ -28,7 +28,7 @@ class EffectFit:
     """The linear fit of one effect, or of several effects, together with the PSF.
 
     values: value, error and unit of each parameter; the key is "parameter", or "effect.parameter" if there are several
-    effects. gain: the decrease of chi2. p_value: the p-value of the gain. step: the fit.
+    effects. gain: the decrease of chi2. p_value: the p-value of the gain. step: the fit. model: the model that was fitted.
     """
 
     names: tuple[str, ...]
@@ -36,6 +36,7 @@ class EffectFit:
     gain: float
     p_value: float
     step: Step
+    model: LinearModel
 
     @property
     def label(self) -> str:
@@ -90,6 +91,7 @@ def fit_effects(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool
         gain=gain,
         p_value=_p_value(model, tuple(columns), gain, math.prod(effect.trials for effect in effects)),
         step=step,
+        model=model,
     )
 
 

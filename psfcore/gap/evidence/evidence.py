@@ -17,7 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.gap.effect import Change, Effect
-from psfcore.gap.evidence.cells import DiscCells, box_px, cells_of, disc_cells, summed_over_boxes
+from psfcore.gap.evidence.cells import (
+    DiscCells,
+    box_px,
+    cells_of,
+    coarse_kernel,
+    disc_cells,
+    summed_over_boxes,
+)
 from psfcore.gap.evidence.unocculted_blocks import (
     UnoccultedBlocks,
     UnoccultedEquations,
@@ -60,12 +67,13 @@ class Prior:
     """The prior of the parameter of each column, a Gaussian (columns,). The coordinates of the PSF have no prior.
 
     likely: the largest plausible size; infinite for the coordinates of the PSF. positive: whether the parameter cannot be
-    negative. field: whether it is a coefficient of a random field.
+    negative. field: whether it is a coefficient of a random field. exact: whether its change has no template error.
     """
 
     likely: Vector
     positive: NDArray[np.bool_]
     field: NDArray[np.bool_]
+    exact: NDArray[np.bool_]
 
     def precision(self, columns: Sequence[int], scale: float | Vector = 1.0) -> Vector:
         """1 / variance for these columns. scale: the width of the Gaussian, in units of the likely size."""
@@ -79,7 +87,7 @@ class Evidence:
     effects: the effects that these data can show. columns: the columns of each effect, by its name. base: the columns that
     every fit contains. discs: the cells of each image that the fit used. image_info: the properties of every image,
     used or not. untestable: the reasons why effects cannot be tested, by name. longest_step: `Parameter.largest_step` of each
-    coordinate of the PSF. box_px: the edge of a box of `DiscCells.boxes`. numbers: `Change.numbers` by column. templates: `Effect.distinguished` by effect.
+    coordinate of the PSF. box_px: the edge of a box of `DiscCells.boxes`. kernel: the total PSF, summed over boxes. numbers: `Change.numbers` by column. templates: `Effect.distinguished` by effect.
     """
 
     effects: tuple[Effect, ...]
@@ -91,6 +99,7 @@ class Evidence:
     untestable: dict[str, str]
     longest_step: Vector
     box_px: int
+    kernel: Matrix
     numbers: dict[int, int] = field(default_factory=dict)
     templates: dict[str, float] = field(default_factory=dict)
 
@@ -107,13 +116,13 @@ class Evidence:
     @cached_property
     def prior(self) -> Prior:
         """The prior of every column."""
-        found = Prior(
-            np.full(self.size, np.inf), np.zeros(self.size, np.bool_), np.zeros(self.size, np.bool_)
-        )
+        nothing = np.zeros(self.size, np.bool_)
+        found = Prior(np.full(self.size, np.inf), nothing, nothing.copy(), nothing.copy())
         for effect in self.effects:
             for column, parameter in zip(self.columns[effect.name], effect.parameters, strict=False):
                 found.likely[column] = parameter.likely
                 found.positive[column], found.field[column] = parameter.positive, effect.field
+                found.exact[column] = effect.exact
         return found
 
     def numbers_of(self, columns: Sequence[int]) -> int:
@@ -197,6 +206,7 @@ def gather(
         ),
         untestable=untestable,
         box_px=box_px(solution.transit.shape),
+        kernel=coarse_kernel(view.kernel, box_px(solution.transit.shape)),
         longest_step=np.array([parameter.largest_step for parameter in solution.inversion.shape.parameters]),
         numbers={len(base) + k: change.numbers for k, change in enumerate(changes) if change.numbers},
         templates={

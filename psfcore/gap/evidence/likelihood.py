@@ -7,7 +7,7 @@ and the parameters of the effects. change is the change by an effect; in the dis
 cannot absorb. No template is exact: delta is its relative error, a Gaussian.
 One delta is common to all cells of a disc (or all blocks of an image) and one belongs to each cell (or block); their
 variance is added to the variance of the noise. Some templates are nearly exact, and others are not. The width of the Gaussian is
-therefore unknown: the evidence is the mean over the widths TEMPLATE_ERRORS. A discrepancy (`evidence.discrepancy`) is
+therefore unknown: the evidence is the mean over the widths TEMPLATE_ERRORS. A field (`evidence.fields`) is
 random and has no template, so it has no template error. The scene and the brightness of each image are parameters of the
 unocculted blocks, as in `unocculted_blocks`.
 
@@ -161,7 +161,8 @@ class Likelihood:
         found._of_columns = Prior(
             np.append(own.likely, np.full(count, further.width)),
             np.append(own.positive, np.zeros(count, np.bool_)),
-            np.append(own.field, np.zeros(count, np.bool_)),
+            np.append(own.field, np.ones(count, np.bool_)),
+            np.append(own.exact, np.ones(count, np.bool_)),
         )
         found._blocks = [pointing.with_further(further.unocculted, size) for pointing in self._blocks]
         return found
@@ -260,15 +261,18 @@ class Likelihood:
         whole = self._stiffness + self._cells
         return np.asarray(whole * (1 - (1 + decrease / whole) ** -CORRELATED) / (2 * CORRELATED))
 
-    def fitted(self, columns: Sequence[int], values: Sequence[float] | Vector) -> tuple[Vector, Matrix]:
-        """Two results of a fit of the columns of one effect: their values (of any sign), and the covariance.
+    def fitted(
+        self, effects: Sequence[Sequence[int]], values: Sequence[float] | Vector
+    ) -> tuple[Vector, Matrix]:
+        """Two results of a fit of the columns of some effects: their values (of any sign), and the covariance.
 
         values: approximately the values that the fit finds; they set the template error, whose width is USUAL_ERROR.
         """
         first = len(self._base)
+        columns = [column for effect in effects for column in effect]
         theta = np.concatenate([np.zeros(first), np.asarray(values, dtype=np.float64)])
         nothing = np.zeros(len(columns))
-        parts = self._parts([list(columns)], theta, nothing, USUAL_ERROR)
+        parts = self._parts(effects, theta, nothing, USUAL_ERROR)
         found, scales = self._fit(parts, columns, nothing)
         prior = np.diag(self._prior(columns, SCALES[-1]))
         covariance = scaled_inverse(_together(parts, scales)[0] + prior, weakest=WEAKEST)
@@ -384,9 +388,9 @@ class Likelihood:
         return total
 
     def _visible_error(self, columns: Sequence[int], values: Vector, error: float) -> float:
-        """The chi2 that a relative error of the change by these columns would add. Further columns have no such error."""
-        values = values[[c < self._evidence.size for c in columns]]
-        here = [c for c in columns if c < self._evidence.size]
+        """The chi2 that a relative error of the change by these columns would add. Exact columns have no such error."""
+        inexact = ~self._of_columns.exact[list(columns)]
+        here, values = np.asarray(columns, dtype=int)[inexact].tolist(), values[inexact]
         if not here:
             return 0.0
         seen = float(np.sum((self._white @ self._net(self._jacobian[:, :, here] @ values)[..., None]) ** 2))
@@ -419,7 +423,7 @@ class Likelihood:
         whole = theta + np.append(np.zeros(len(self._base)), taken)
         spans, first = [], len(self._base)
         for group in groups:
-            if not group or group[0] < self._evidence.size:  # further columns have no template error
+            if not group or not self._of_columns.exact[group[0]]:
                 spans.append((list(group), whole[first : first + len(group)]))
             first += len(group)
         covariance = self._covariance

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import correlations, linear_convolve
-from psfcore.gap.evidence.cells import sensitivities
+from psfcore.gap.evidence.cells import coarse_kernel, sensitivities
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.evidence.near_discs import NearDiscs, cut
 from psfcore.gap.view import View
@@ -217,18 +217,6 @@ def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach
     """C of Eq. (3) for displacements up to reach_px along each axis: (2 reach + 1, 2 reach + 1), with d = 0 in the middle."""
     around = np.pad(scene.astype(np.float64), reach_px)
     return np.asarray(correlations(plane[None].astype(np.float64), around, reach_px)[0])
-
-
-def coarse_kernel(kernel: Plane, step: int) -> Plane:
-    """A kernel [y, x], binned: each coarse pixel is the sum of `step` x `step` pixels. Its centre is in the
-    middle of a coarse pixel."""
-    middle = kernel.shape[0] // 2
-    reach = (middle + step // 2) // step
-    at = (np.arange(kernel.shape[0]) - middle + step // 2) // step + reach
-    out = np.zeros((2 * reach + 1,) * 2)
-    keep = at <= 2 * reach
-    np.add.at(out, np.ix_(at[keep], at[keep]), kernel[np.ix_(keep, keep)])
-    return out
 
 
 def _displacements(count: int) -> NDArray[np.intp]:

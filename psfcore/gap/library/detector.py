@@ -13,8 +13,9 @@ from psfcore.gap.effect import Change, Effect, EffectParameter
 from psfcore.gap.evidence.unocculted_blocks import spread_blocks, unocculted_blocks
 from psfcore.gap.view import Field, View
 
-# Decay levels of two losses; their sum approximates a loss with any decay level in between.
-FAINT_DN = (30.0, 150.0)
+# The loss of the detector is a smooth function of the counts: a sum of bumps at these counts, Gaussian in the logarithm.
+COUNTS_DN = (8, 25, 80, 250, 800, 2500)
+COUNTS_WIDTH = math.log(COUNTS_DN[-1] / COUNTS_DN[0]) / (len(COUNTS_DN) - 1) / 1.2
 # Decay times, in units of the mean interval between images. Sums of these decays and of a fraction of the previous image
 # approximate charge traps.
 FADES_IN = {"one_wait": 1, "three_waits": 3}
@@ -62,11 +63,12 @@ def _one_gain_mode(view: View) -> str | None:
 
 
 def _nonlinearity(view: View) -> Sequence[Change]:
-    def change(n: int, images: Sequence[Field], faint_dn: float) -> Field:
-        counts = np.maximum(images[n] * np.float32(view.exposure_s(n)), 0)
-        return np.asarray(-images[n] * np.exp(-counts / np.float32(faint_dn)))
+    def change(n: int, images: Sequence[Field], at_dn: float) -> Field:
+        counts = np.maximum(images[n] * np.float32(view.exposure_s(n)), np.float32(1.0))
+        away = np.log(counts / np.float32(at_dn)) / np.float32(COUNTS_WIDTH)
+        return np.asarray(-images[n] * np.exp(-0.5 * away**2))
 
-    return [Change(lambda n, images, k=k: change(n, images, k)) for k in FAINT_DN]  # type: ignore[misc]
+    return [Change(lambda n, images, at=at: change(n, images, at)) for at in COUNTS_DN]  # type: ignore[misc]
 
 
 def half_waves() -> list[tuple[int, int]]:
@@ -204,7 +206,8 @@ EFFECTS: tuple[Effect, ...] = (
            ("detector_x", "detector_y"), _gradient),
     Effect("gain_mismatch", "detector", (_p("excess", "", 0.05),), "Combined-gain and high-gain images differ in their calibrated gain.",
            "images of the same scene in both gain modes", ("gain_mode", "exposure"), _gain_mismatch, _one_gain_mode),
-    Effect("nonlinearity", "detector", (_p("loss", "", 0.05), _p("loss_beyond", "", 0.05)), "The detector reads faint signals too low.",
+    Effect("nonlinearity", "detector", tuple(_p(f"loss_at_{dn}_dn", "", 0.05) for dn in COUNTS_DN),
+           "The signal of the detector is not proportional to the light: it loses a share that depends on the counts.",
            "a series of exposure times at one pointing", ("intensity",), _nonlinearity),
     Effect("flat_field_residual", "detector", cosine_parameters("", 0.02),
            "The flat field leaves a smooth error of the detector's sensitivity.", "images of the same scene at several positions on the detector",

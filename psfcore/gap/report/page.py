@@ -103,9 +103,24 @@ def unit_words(unit: str) -> str:
     return re.sub(r"(?<=[a-z])2\b", "²", unit)
 
 
-def pattern_rows(report: Report) -> list[Row]:
-    """The patterns that the gap resembles, with their probabilities."""
-    return [[one["form"], percent_words(one["probability"])] for one in report["looks_like"]]
+def field_rows(report: Report) -> list[Row]:
+    """The most probable fields of an unknown cause."""
+    rows: list[Row] = []
+    for one in report["unknown"]["fields"]:
+        beside = "".join(f", beside {words(name)}" for name in one["beside"])
+        strength, closure = one["strength"], one["closure"]
+        alike = (f"{words(near['effect'])} ({near['distance']:.1f})" for near in one["resembles"])
+        rows.append(
+            [
+                one["words"] + beside,
+                one["stage"] or "",
+                percent_words(one["probability"]),
+                "" if strength is None else f"{strength['value']:.2g} ± {strength['sigma']:.1g} {one['unit']}",
+                "" if closure is None else f"{100 * closure['value']:.0f} %",
+                ", ".join(alike),
+            ]
+        )
+    return rows
 
 
 def hypothesis_rows(report: Report) -> list[Row]:
@@ -207,6 +222,6 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
     one.__name__: one
     for one in (
         *(best_words, effect_rows, hypothesis_rows, image_rows, interval_words, limit_rows),
-        *(pattern_rows, percent_words, psf_table, range_words, tied_words, untestable_rows),
+        *(field_rows, percent_words, psf_table, range_words, tied_words, untestable_rows),
     )
 }

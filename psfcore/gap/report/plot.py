@@ -130,35 +130,32 @@ def draw_map(figure: Any, charts: Sequence[Any], report: Report) -> None:
 
 def unknown_png(report: Report) -> bytes:
     """The most probable field of an unknown cause: a map of the detector with its errors, or a curve."""
-    field = report["unknown"]
-    at, values, sigma = (np.array(field[name]) for name in ("at", "values", "sigma"))
+    field = report["unknown"]["fields"][0]
     label = f"{field['form'].replace('_', ' ').capitalize()} {field['unit'] and '(' + field['unit'] + ')'}".rstrip()
-    if len(field["axes"]) == 1:
+    if "curve" in field:
+        at, values, sigma = field["curve"].values()
+        in_psf = "radius_px" in field["curve"]
         figure = _figure(7.0, 3.4)
         axes = figure.subplots()
-        axes.errorbar(at[:, 0], values, sigma, fmt="o", ms=4, color=_ANSWER, ecolor=_OTHER)
+        axes.errorbar(at, values, sigma, fmt="o", ms=4, color=_ANSWER, ecolor=_OTHER)
         axes.axhline(0.0, color="#777777", lw=0.8)
-        in_psf = field["axes"] == ["radius_px"]
         axes.set(xlabel="Radius in the PSF (px)" if in_psf else "Time (s)", ylabel=label)
         if in_psf:
             axes.set_xscale("log")
         tidy([axes])
         return png_of(figure)
-    rows = np.unique(at[:, 1]).size
-    columns = at.shape[0] // rows
+    values, sigma = (np.array(field["map"][name]) for name in ("value", "sigma"))
     figure = _figure(10.0, 4.4)
     charts = figure.subplots(1, 2)
     ny, nx = report["shape"]
     edges = (-0.5, nx - 0.5, -0.5, ny - 0.5)
-    clearest = float(np.abs(values[np.argmax(np.abs(values) / sigma)]))
+    clearest = abs(field["strength"]["value"])
     seen = np.where(sigma < clearest, values, np.nan)  # elsewhere the prior decides, not the data
     for axes, plane, title, top, name in (
         (charts[0], seen, "The field, where its error is smaller", 1.2 * clearest, label),
         (charts[1], values / sigma, "The field divided by its error", 5.0, "sigma"),
     ):
-        drawn = axes.imshow(
-            plane.reshape(rows, columns), origin="lower", extent=edges, cmap=CHANGE, vmin=-top, vmax=top
-        )
+        drawn = axes.imshow(plane, origin="lower", extent=edges, cmap=CHANGE, vmin=-top, vmax=top)
         axes.set(title=title, xlabel="Detector x (px)", ylabel="Detector y (px)")
         axes.plot(*(_column(report["images"], name) for name in ("x_px", "y_px")), ".", color="#333333", ms=3)
         figure.colorbar(drawn, ax=axes, label=name, shrink=0.85)

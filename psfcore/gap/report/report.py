@@ -5,6 +5,7 @@ The named effects are those that the verdict names as the cause of the gap. The 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,20 +15,18 @@ from scipy.special import chdtrc
 
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.discrepancy import WORDS
-from psfcore.gap.evidence.effect_fits import EffectFit
-from psfcore.gap.evidence.fields import FieldShape
+from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
+from psfcore.gap.evidence.fields import Field, FieldShape
 from psfcore.gap.verdict.closure import Interval
 from psfcore.gap.verdict.correction import Corrected
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names
+from psfcore.gap.verdict.posterior import NONE, Form, Names
+from psfcore.gap.verdict.unknown import UnknownField
 from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement
 from psfcore.scatter.reconstruction import Inversion
 
 SCHEMA = "gap/2"
 MOST_READ = 12  # if an effect has more parameters, the report summarises them
-LIKELY_ORDER = 0.05  # an unknown cause resembles the patterns with at least this probability
 LEAST_SHARE = 1e-3  # hypotheses with a smaller probability are not listed
-MOST_ORDERS = 3
 MOST_LISTED = 4  # hypotheses in the summary sentence
 VISIBLE_P = 0.005  # the discs show a gap if its p-value is below this
 AXIS_WORDS = {
@@ -48,7 +47,7 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
     """The report of a diagnosis, schema gap/2."""
     judged = found.judgement
     refits = {c.label: c for c in found.corrected}
-    fits = [(fit, _effect(found, fit, refits.get(fit.label))) for fit in found.fits]
+    fits = [(form, _effect(found, form, refits.get(fit.label))) for form, fit in found.fits.items()]
     stated = found.limits.as_json()
     return {
         "schema": SCHEMA,
@@ -73,13 +72,13 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "limits": stated["limits"],
         "alike": stated["alike"],
         "calibration": found.calibration.to_json(),
-        "effects": [fit for one, fit in fits if len(one.names) == 1],
-        "together": [fit for one, fit in fits if len(one.names) > 1],
+        "effects": [fit for form, fit in fits if len(form.effects) == 1 and form.field is None],
+        "together": [fit for form, fit in fits if len(form.effects) > 1 or form.field is not None],
         "ties": [list(judged.tied)] if judged.verdict == "tie" else [],
         "would_separate": would_separate(found),
         "untestable": [{"name": name, "why": why} for name, why in found.evidence.untestable.items()],
-        "looks_like": [{"form": form, "probability": share} for form, share in looks_like(judged)],
-        "unknown": unknown(judged),
+        "looks_like": [{"form": one.field.words, "probability": one.probability} for one in found.unknown],
+        "unknown": unknown(found),
         "cautions": list(found.cautions),
         "expected": {
             "residual_pct": found.expected.residual_pct,
@@ -99,40 +98,50 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
     }
 
 
-def looks_like(judged: Judgement) -> list[tuple[str, float]]:
-    """If the cause may be unknown: the patterns that the gap resembles, and their probabilities, the most probable first."""
-    if UNKNOWN not in judged.members:
-        return []
-    forms = {order_words(orders): share for orders, share in judged.orders.items()}
-    forms |= {field.words: share for field, share in judged.fields.items()}
-    ordered = sorted(forms.items(), key=lambda one: -one[1])
-    return [(form, share) for form, share in ordered if share >= LIKELY_ORDER]
+def unknown(found: Diagnosis) -> dict[str, Any]:
+    """The unknown cause: its probability, its most probable fields if it is in the answer set, and the bounds of all fields.
 
-
-def unknown(judged: Judgement) -> dict[str, Any] | None:
-    """The most probable field of an unknown cause, with its shape; None if the answer set does not contain "unknown".
-
-    The probabilities hold if the cause is unknown.
+    The probability of a field holds if an unknown cause acts.
     """
-    shape = judged.shape
-    if UNKNOWN not in judged.members or shape is None:
-        return None
-    stages: dict[str, float] = {}
-    for field, share in judged.fields.items():
-        stages[field.stage] = stages.get(field.stage, 0.0) + share
     return {
-        "stages": stages,
-        "form": shape.field.form,
-        "stage": shape.field.stage,
-        "width": shape.field.width,
-        "pointing": shape.field.pointing,
-        "probability": judged.fields[shape.field],
-        "words": shape.field.words,
-        "axes": list(shape.axes),
-        "at": shape.at.tolist(),
-        "values": shape.values.tolist(),
-        "sigma": shape.sigma.tolist(),
+        "probability": found.judgement.effects[UNKNOWN_NAME],
+        "fields": [_field(found, one) for one in found.unknown],
+        "excluded_95": [
+            _kind(field) | {"strength": strength, "unit": unit}
+            for field, (strength, unit) in found.bounds.items()
+            if math.isfinite(strength)
+        ],
+    }
+
+
+def _kind(field: Field) -> dict[str, Any]:
+    told = {"stage": field.stage, "form": field.form, "width": field.width}
+    return told if field.pointing is None else told | {"pointing": field.pointing}
+
+
+def _field(found: Diagnosis, one: UnknownField) -> dict[str, Any]:
+    shape, shrinking = one.shape, found.shrinking.get(one.form)
+    axes: dict[str, Any] = {}
+    if shape.axes == ("x_px", "y_px"):
+        x_px, y_px = (np.unique(along) for along in shape.at.T)
+        grid = y_px.size, x_px.size
+        values, sigma = (part.reshape(grid).tolist() for part in (shape.values, shape.sigma))
+        axes = {"map": {"x_px": x_px.tolist(), "y_px": y_px.tolist(), "value": values, "sigma": sigma}}
+    elif shape.axes:
+        (axis,) = shape.axes
+        at = shape.at[:, 0].tolist()
+        axes = {"curve": {axis: at, "value": shape.values.tolist(), "sigma": shape.sigma.tolist()}}
+    value = one.strength
+    return {
+        **_kind(one.field),
+        "beside": list(one.beside),
         "unit": shape.unit,
+        "probability": one.probability,
+        "words": one.field.words,
+        "strength": None if value is None else dict(zip(("value", "sigma"), value, strict=True)),
+        **axes,
+        "closure": None if shrinking is None else _interval(shrinking.closure),
+        "resembles": [{"effect": name, "distance": distance} for name, distance in one.resembles],
     }
 
 
@@ -147,13 +156,6 @@ def clearest_words(shape: FieldShape) -> str:
     }
     place = ", ".join(names[axis].format(at) for axis, at in zip(shape.axes, shape.at[k], strict=True))
     return f"{shape.values[k]:.2g} ± {shape.sigma[k]:.1g} {shape.unit}".rstrip() + f" at {place}"
-
-
-def order_words(orders: Names) -> str:
-    """A text that describes a change along these orders of the data (see `discrepancy`)."""
-    if len(orders) > MOST_ORDERS:
-        return "a change along many orders of the data"
-    return "a change that varies with " + " and ".join(WORDS[order] for order in orders)
 
 
 def fits_of(report: dict[str, Any]) -> list[dict[str, Any]]:
@@ -181,10 +183,12 @@ def _by_name(found: Diagnosis, name: str) -> Effect:
     return next(effect for effect in found.evidence.effects if effect.name == name)
 
 
-def _effect(found: Diagnosis, fit: EffectFit, refit: Corrected | None) -> dict[str, Any]:
-    shrinking = found.shrinking[fit.label]
+def _effect(found: Diagnosis, form: Form, refit: Corrected | None) -> dict[str, Any]:
+    fit, shrinking = found.fits[form], found.shrinking[form]
     values = fit.values if refit is None else refit.values
-    share = found.judgement.effects.get(fit.names[0], 0.0) if len(fit.names) == 1 else None
+    alone = len(fit.names) == 1 and form.field is None
+    share = found.judgement.effects.get(fit.names[0], 0.0) if alone else None
+    effects = {effect.name: effect for effect in fit.model.evidence.effects}
     return {
         "name": fit.label,
         "probability": found.judgement.hypotheses.get(fit.names, 0.0) if share is None else share,
@@ -198,7 +202,7 @@ def _effect(found: Diagnosis, fit: EffectFit, refit: Corrected | None) -> dict[s
         "closure": _interval(shrinking.closure),
         "closure_by_pointing": _interval(shrinking.closure_by_pointing),
         "refitted": refit is not None,
-        "cause": " ".join(_by_name(found, name).cause for name in fit.names),
+        "cause": " ".join(effects[name].cause for name in fit.names),
     }
 
 
@@ -243,7 +247,7 @@ def would_separate(found: Diagnosis) -> str:
     """The observations that would separate the tied effects, as text; empty for other verdicts."""
     if found.judgement.verdict != "tie":
         return ""
-    said = [_by_name(found, name).settled_by for name in found.judgement.tied]
+    said = [_by_name(found, name).settled_by for name in found.judgement.tied if name != UNKNOWN_NAME]
     return "; ".join(dict.fromkeys(said))
 
 
@@ -271,11 +275,7 @@ def sentence(found: Diagnosis) -> str:
             f"(the gap in the discs is {left})."
         )
     if judged.verdict == "unknown":
-        like = looks_like(judged)
-        close = f"; it most resembles {like[0][0]}" if like else ""
-        if judged.shape is not None and like and like[0][0] == judged.shape.field.words:
-            close += f" ({clearest_words(judged.shape)})"
-        return f"{lead} Its cause is not in the library{close}."
+        return f"{lead} Its cause is not in the library{_unknown_words(found)}."
     if judged.verdict == "tie":
         return (
             f"{lead} These data cannot show which effect causes the gap: {tied_words(judged)}. To separate these effects, take "
@@ -287,6 +287,15 @@ def sentence(found: Diagnosis) -> str:
             f"{_listed(judged.members, judged)}."
         )
     return f"{lead} {_explained(found)}.{_not_excluded(judged)}"
+
+
+def _unknown_words(found: Diagnosis) -> str:
+    """The most probable field of an unknown cause, as the end of a sentence."""
+    if not found.unknown:
+        return ""
+    first = found.unknown[0]
+    at = f" ({clearest_words(first.shape)})" if first.shape.axes else ""
+    return f"; it most resembles {first.field.words}{at}"
 
 
 def _not_excluded(judged: Judgement) -> str:
@@ -312,10 +321,8 @@ def hypothesis_words(names: Names) -> str:
     """A hypothesis as text."""
     if names == NONE:
         return "no gap"
-    return (
-        "a cause outside the library"
-        if names == UNKNOWN
-        else " together with ".join(words(name) for name in names)
+    return " together with ".join(
+        "a cause outside the library" if name == UNKNOWN_NAME else words(name) for name in names
     )
 
 
@@ -343,7 +350,7 @@ def _unocculted_alone(found: Diagnosis) -> bool:
 
 def _explained(found: Diagnosis) -> str:
     judged = found.judgement
-    best = next(fit for fit in found.fits if fit.names == judged.best)
+    best = found.fits[judged.form(judged.named[0])]
     values = found.corrected[0].values if found.corrected else best.values
     numbers = [
         f"{words(name)} {value:.3g} ± {sigma:.2g} {unit}".strip()

@@ -45,8 +45,8 @@ from scipy.optimize import brentq, nnls
 from scipy.special import logsumexp, ndtr, ndtri
 
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.discrepancy import ALTERNATIVES, LIKELY, Discrepancy, discrepancy
 from psfcore.gap.evidence.evidence import Evidence
+from psfcore.gap.evidence.fields import LIKELY, widest_fields
 from psfcore.gap.evidence.likelihood import MEASURED, SCALES, Likelihood
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
 from psfcore.gap.verdict.posterior import PRIOR, Kind
@@ -172,8 +172,8 @@ def limits(
     every = model.evidence.effects
     endless = [e.name for e in every if not all(math.isfinite(p.likely) for p in e.parameters)]
     evidence = replace(model.evidence, effects=tuple(e for e in every if e.name not in endless))
-    unknown = discrepancy(evidence)
-    found = _Limits(Likelihood(model).with_further(unknown.directions), evidence, unknown, prior)
+    directions, fields = widest_fields(evidence)
+    found = _Limits(Likelihood(model).with_further(directions), evidence, fields, prior)
     need = _Need(threshold, temperature)
     effects = {
         effect.name: EffectLimits(effect.name, found.parameters(effect, need, observed))
@@ -245,12 +245,12 @@ class _Limits:
     """The normal matrix of all columns, and the hypotheses."""
 
     def __init__(
-        self, likelihood: Likelihood, evidence: Evidence, unknown: Discrepancy, prior: Mapping[Kind, float]
+        self, likelihood: Likelihood, evidence: Evidence, fields: Sequence[range], prior: Mapping[Kind, float]
     ) -> None:
         self._likelihood, self._evidence = likelihood, evidence
         self._columns = {e.name: list(evidence.columns_of(e.name).values()) for e in evidence.effects}
-        orders = [columns for one in ALTERNATIVES if (columns := unknown.columns(one, evidence.size))]
-        shown = sorted({c for columns in (*self._columns.values(), *orders) for c in columns})
+        unknown = [[evidence.size + k for k in one] for one in fields]
+        shown = sorted({c for columns in (*self._columns.values(), *unknown) for c in columns})
         number = {column: k for k, column in enumerate(shown)}
         self._normal = likelihood.normal(shown)
         self._of = {name: np.array([number[c] for c in some]) for name, some in self._columns.items()}
@@ -261,10 +261,10 @@ class _Limits:
             _Hypothesis(
                 np.array([number[c] for c in columns]),
                 scales * np.full(len(columns), LIKELY),
-                math.log(prior["unknown"] / len(orders) / prior["none"]),
+                math.log(prior["unknown"] / len(unknown) / prior["none"]),
                 self._normal,
             )
-            for columns in orders
+            for columns in unknown
         ]
 
     def _hypothesis(self, effect: Effect, kept: Sequence[int] | None = None) -> _Hypothesis:
@@ -352,7 +352,7 @@ class _Limits:
         out: list[float | None] = []
         for k, column in enumerate(columns):
             acting = [c for c in columns if c in values or c == column]
-            found, covariance = self._likelihood.fitted(acting, [values.get(c, 0.0) for c in acting])
+            found, covariance = self._likelihood.fitted([acting], [values.get(c, 0.0) for c in acting])
             own = acting.index(column)
             sigma = math.sqrt(max(float(covariance[own, own]), 0.0))
             out.append(upper_limit(float(found[own]), sigma, effect.parameters[k].positive))
@@ -365,7 +365,7 @@ class _Limits:
         z are the scores in units of their noise without the field.
         """
         columns = self._columns[effect.name]
-        found, covariance = self._likelihood.fitted(columns, np.zeros(len(columns)).tolist())
+        found, covariance = self._likelihood.fitted([columns], np.zeros(len(columns)).tolist())
         shape = likely / likely[0]
         precision = np.linalg.pinv(covariance, hermitian=True)
         score = (

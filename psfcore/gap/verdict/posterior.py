@@ -1,48 +1,63 @@
 """The posterior: a probability for every hypothesis about the cause of the gap.
 
 The hypotheses are: no effect acts (`NONE`); one effect of the library acts; two effects act together; three effects act
-together, of which two are the most probable pair; a cause outside the library acts (`UNKNOWN`, `evidence.discrepancy`).
-`evidence.likelihood` computes the evidence E of each hypothesis:
+together, of which two are the most probable pair; an unknown cause acts (`UNKNOWN`); an effect of the library and an unknown
+cause act together. `evidence.likelihood` computes the evidence E of each hypothesis:
 
     p(h) ~ prior(kind of h) / (number of hypotheses of this kind) * E(h)              Eq. (1)
 
+A hypothesis can have several forms (`Form`): with the forms of the library alone, or with a field (`evidence.fields`). An
+unknown cause is one of the fields that have no name; an effect whose form nobody knows has the form of the library, or that
+of a field with its name. The evidence of a hypothesis is the mean over its forms: half of the weight belongs to the form of
+the library, and the other half to the fields, with equal shares. A field beside an effect is weighed for the effects and fields
+that are the most probable alone; the others count as if they had no evidence.
+
 The linear model holds only for a small effect. A full refit of a hypothesis therefore gives this hypothesis a new
 evidence. If a single effect was refitted, all pairs with this effect get a new evidence too, and so do the triples of the
-most probable of these pairs.
+most probable of these pairs and the fields beside this effect.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.discrepancy import ALTERNATIVES, discrepancy
 from psfcore.gap.evidence.evidence import Evidence
-from psfcore.gap.evidence.fields import Field, FieldColumns, FieldShape, fields_of
+from psfcore.gap.evidence.fields import LIKELY, Field, FieldColumns, fields_of, with_likely
+from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
 from psfcore.gap.evidence.likelihood import Likelihood, Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict.same_data import with_same_data
 
 Vector = NDArray[np.float64]
 Names = tuple[str, ...]
-Kind = Literal["none", "single", "pair", "triple", "unknown"]
+Kind = Literal["none", "single", "pair", "triple", "unknown", "mixed"]
 
 NONE: Names = ()
-UNKNOWN: Names = ("unknown",)  # no effect may have this name
-KINDS: tuple[Kind, ...] = ("none", "single", "pair", "triple", "unknown")
+UNKNOWN: Names = (UNKNOWN_NAME,)
+KINDS: tuple[Kind, ...] = ("none", "single", "pair", "triple")
 # Prior probabilities of the kinds. Those of one effect and of an unknown cause maximise the mean logarithm of the probability of the true
 # cause in 144 simulated cases (`studies.gap_calibration` computes them). With 0.4 for one effect and 0.15 for an
 # unknown cause, answer sets of the same coverage have 3.4 members instead of 2.2.
-PRIOR: Mapping[Kind, float] = {"none": 0.28, "single": 0.15, "pair": 0.08, "triple": 0.01, "unknown": 0.48}
+PRIOR: Mapping[Kind, float] = {
+    "none": 0.28,
+    "single": 0.15,
+    "pair": 0.08,
+    "triple": 0.01,
+    "unknown": 0.44,
+    "mixed": 0.04,
+}
+FORM_OF_LIBRARY = 0.5  # weight of the form of the library, if an effect can also have the form of a field
+FIELDS_BESIDE = 3  # the most probable fields, which are weighed beside every effect
 
 # The data do not show a further effect if it makes a hypothesis less probable by this factor. The priors alone make a pair 0.06 times
 # as probable as one of its effects. With the factor 1, pairs that are nearly as probable as one of their effects are not in the
@@ -52,40 +67,113 @@ IDLE = 0.2
 
 def kind_of(names: Names) -> Kind:
     """The kind of a hypothesis."""
-    if names == UNKNOWN:
-        return "unknown"
+    if UNKNOWN_NAME in names:
+        return "unknown" if names == UNKNOWN else "mixed"
     return KINDS[min(len(names), 3)]
+
+
+def known_effects(names: Names) -> Names:
+    """The effects of the library in a hypothesis."""
+    return tuple(name for name in names if name != UNKNOWN_NAME)
+
+
+def name_of(field: Field, order: Names) -> str:
+    """The name of the cause that a field stands for. order: the effects that the data can show."""
+    return field.effect if field.effect in order else UNKNOWN_NAME
+
+
+@dataclass(frozen=True)
+class Form:
+    """A form of a hypothesis. effects: the effects that have the form of the library. field: a field that acts beside them."""
+
+    effects: Names = ()
+    field: Field | None = None
+
+    def names(self, order: Names) -> Names:
+        """The hypothesis: its effects in the order of the library, and UNKNOWN last."""
+        own = {*self.effects, *(() if self.field is None else (name_of(self.field, order),))}
+        return (*(name for name in order if name in own), *(name for name in UNKNOWN if name in own))
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The weights of all hypotheses.
+    """The evidence of all forms of all hypotheses.
 
-    log_weights: ln of prior times evidence of each hypothesis, up to a common constant. visible_error: `Weighed.visible_error`
-    by hypothesis. orders: the probability of each alternative of the discrepancy if the cause is unknown. fields: the same of
-    each field. shape: the shape of the most probable field.
+    forms: each form, weighed. order: the effects that these data can show, in the order of the library. models: the model of
+    the full refit at which a form was weighed; a form that is missing was weighed in the model without any effect.
     """
 
-    log_weights: dict[Names, float]
-    visible_error: dict[Names, float]
-    orders: dict[Names, float]
-    fields: dict[Field, float] = dataclass_field(default_factory=dict)
-    shape: FieldShape | None = None
+    forms: dict[Form, Weighed]
+    order: Names
+    models: dict[Form, LinearModel] = dataclass_field(default_factory=dict)
+
+    @cached_property
+    def hypotheses(self) -> dict[Names, dict[Form, float]]:
+        """For each hypothesis, ln of prior times evidence of each of its forms, up to a common constant."""
+        every: dict[Names, list[Form]] = {}
+        for form in self.forms:
+            every.setdefault(form.names(self.order), []).append(form)
+        out = {}
+        for names, forms in every.items():
+            prior = _log_prior(names, len(self.order))
+            free = sum(form.field is not None for form in forms)
+            shares = {form: self._share(form, alone=free in (0, len(forms))) for form in forms}
+            out[names] = {form: prior + math.log(shares[form]) + self.forms[form].log_evidence for form in forms}
+        return out
+
+    def _share(self, form: Form, *, alone: bool) -> float:
+        """The weight of a form in its hypothesis. alone: the hypothesis has no form of the other sort (library or fields)."""
+        if form.field is None:
+            return 1.0 if alone else FORM_OF_LIBRARY
+        own = name_of(form.field, self.order)
+        alike = (one.field for one in self.forms if not one.effects and one.field is not None)
+        same = sum(name_of(field, self.order) == own for field in alike)
+        return (1.0 if alone else 1 - FORM_OF_LIBRARY) / max(same, 1)
+
+    @property
+    def log_weights(self) -> dict[Names, float]:
+        """ln of prior times evidence of each hypothesis, up to a common constant."""
+        return {names: float(logsumexp(list(forms.values()))) for names, forms in self.hypotheses.items()}
+
+    def leading(self, names: Names) -> Form:
+        """The most probable form of a hypothesis."""
+        forms = self.hypotheses[names]
+        return max(forms, key=lambda form: forms[form])
+
+    def fields(self) -> dict[tuple[Names, Field], float]:
+        """The probability of each field, beside these effects, if an unknown cause acts; the most probable first."""
+        found = {
+            (form.effects, form.field): weight
+            for names, forms in self.hypotheses.items()
+            if UNKNOWN_NAME in names
+            for form, weight in forms.items()
+            if form.field is not None
+        }
+        whole = logsumexp(list(found.values())) if found else 0.0
+        shares = {one: float(np.exp(weight - whole)) for one, weight in found.items()}
+        return dict(sorted(shares.items(), key=lambda one: -one[1]))
 
     def probabilities(self, temperature: float = 1.0) -> dict[Names, float]:
         """The probability of each hypothesis, the most probable first. temperature: divides the logarithms of the weights."""
-        names = list(self.log_weights)
-        weights = np.array([self.log_weights[name] for name in names]) / temperature
-        shares = np.exp(weights - logsumexp(weights))
-        return _sorted(dict(zip(names, shares.tolist(), strict=True)))
+        return probabilities(self.log_weights, temperature)
 
-    def with_evidence(self, evidence: Mapping[Names, Weighed], effects: int) -> Posterior:
-        """The same posterior with a new evidence for the given hypotheses. effects: the number of effects in the library."""
-        weights = {names: w.log_evidence + _log_prior(names, effects) for names, w in evidence.items()}
-        errors = {names: w.visible_error for names, w in evidence.items()}
+    def with_evidence(self, forms: Mapping[Form, Weighed], model: LinearModel) -> Posterior:
+        """The same posterior with a new evidence for the given forms, which were weighed in the model of a full refit."""
         return replace(
-            self, log_weights=self.log_weights | weights, visible_error=self.visible_error | errors
+            self, forms=self.forms | dict(forms), models=self.models | dict.fromkeys(forms, model)
         )
+
+    def without(self, forms: Iterable[Form]) -> Posterior:
+        """The same posterior without these forms."""
+        gone = set(forms)
+        return replace(self, forms={form: w for form, w in self.forms.items() if form not in gone})
+
+
+def probabilities(log_weights: Mapping[Names, float], temperature: float = 1.0) -> dict[Names, float]:
+    """The probability of each hypothesis, from its `Posterior.log_weights`, the most probable first."""
+    weights = np.array(list(log_weights.values())) / temperature
+    shares = np.exp(weights - logsumexp(weights))
+    return _sorted(dict(zip(log_weights, shares.tolist(), strict=True)))
 
 
 def without_idle(probabilities: Mapping[Names, float]) -> dict[Names, float]:
@@ -115,90 +203,98 @@ def posterior(model: LinearModel) -> Posterior:
     """The posterior in the linear model, without any full refit."""
     evidence = model.evidence
     likelihood = Likelihood(model)
-    weighed = {names: weigh(likelihood, evidence, names) for names in _hypotheses(evidence.effects)}
-    weighed |= _triples(likelihood, evidence, weighed, evidence.effects)
-    further = discrepancy(evidence)
-    with_polynomials = likelihood.with_further(further.directions)
-    orders = {
-        orders: with_polynomials.weigh([columns]).log_evidence
-        for orders in ALTERNATIVES
-        if (columns := further.columns(orders, evidence.size))
-    }
-    fields, shape = _of_fields(likelihood, evidence)
-    logs = np.array([*orders.values(), *fields.values()])
-    whole = float(logsumexp(logs))
-    count = len(evidence.effects)
-    shares = np.exp(logs - whole).tolist()
-    return Posterior(
-        {names: w.log_evidence + _log_prior(names, count) for names, w in weighed.items()}
-        | {UNKNOWN: whole - math.log(logs.size) + _log_prior(UNKNOWN, count)},
-        {names: w.visible_error for names, w in weighed.items()},
-        dict(zip(orders, shares, strict=False)),
-        dict(zip(fields, shares[len(orders) :], strict=True)),
-        shape,
-    )
+    order = tuple(effect.name for effect in evidence.effects)
+    singles = [Form((name,)) for name in order]
+    pairs = [Form(names) for names in itertools.combinations(order, 2)]
+    forms = {form: weigh(likelihood, evidence, form) for form in (Form(), *singles, *pairs)}
+    forms |= _triples(likelihood, evidence, {form: forms[form] for form in pairs}, order)
+    best = sorted(singles, key=lambda form: -forms[form].log_evidence)[:1]
+    forms |= _with_fields(likelihood, evidence, [Form(), *best], singles)
+    return Posterior(forms, order)
 
 
-def _of_fields(likelihood: Likelihood, evidence: Evidence) -> tuple[dict[Field, float], FieldShape]:
-    """ln of the evidence of each field, and the shape of the most probable one."""
+def _with_fields(
+    likelihood: Likelihood,
+    evidence: Evidence,
+    beside: Sequence[Form],
+    others: Sequence[Form] = (),
+    taken: Mapping[str, Sequence[float]] | None = None,
+) -> dict[Form, Weighed]:
+    """Weigh every field beside each of these forms, and the most probable fields also beside the `others`."""
     columns = FieldColumns(evidence)
-    found: dict[Field, Weighed] = {}
-    best = -math.inf
-    for field in fields_of(evidence):
+    out: dict[Form, Weighed] = {}
+
+    def weigh_beside(field: Field, forms: Sequence[Form]) -> None:
         with_field = likelihood.with_further(columns.of(field))
-        found[field] = weighed = with_field.weigh([with_field.further_columns])
-        if weighed.log_evidence > best:
-            best = weighed.log_evidence
-            shape = columns.shown(field, *with_field.fitted(with_field.further_columns, weighed.values))
-    return {field: weighed.log_evidence for field, weighed in found.items()}, shape
+        for form in forms:
+            if field.effect not in form.effects:
+                whole = Form(form.effects, field)
+                out[whole] = weigh(with_field, evidence, whole, taken)
+
+    fields = fields_of(evidence)
+    for field in fields:
+        weigh_beside(field, beside)
+    best = {f: max(w.log_evidence for form, w in out.items() if form.field == f) for f in fields}
+    missing = [form for form in others if form not in beside]
+    for field in sorted(best, key=lambda one: -best[one])[:FIELDS_BESIDE] if missing else []:
+        weigh_beside(field, missing)
+    return out
 
 
 def _triples(
     likelihood: Likelihood,
     evidence: Evidence,
-    weighed: Mapping[Names, Weighed],
-    effects: Sequence[Effect],
+    pairs: Mapping[Form, Weighed],
+    order: Names,
     taken: Mapping[str, Sequence[float]] | None = None,
-) -> dict[Names, Weighed]:
-    """Weigh the triples that contain the most probable pair. taken: as in `at_refit`."""
-    pairs = [names for names in weighed if kind_of(names) == "pair"]
+) -> dict[Form, Weighed]:
+    """Weigh the triples that contain the most probable of these pairs. taken: as in `at_refit`."""
     if not pairs:
         return {}
-    best = max(pairs, key=lambda names: weighed[names].log_evidence)
-    others = [effect.name for effect in effects if effect.name not in best]
-    triples = [_in_order((*best, other), effects) for other in others]
-    return {names: weigh(likelihood, evidence, names, taken) for names in triples}
+    best = max(pairs, key=lambda form: pairs[form].log_evidence).effects
+    triples = [Form(Form((*best, other)).names(order)) for other in order if other not in best]
+    return {form: weigh(likelihood, evidence, form, taken) for form in triples}
 
 
 def at_refit(
     refit: LinearModel,
     before: LinearModel,
-    names: Names,
+    form: Form,
     taken: Mapping[str, Sequence[float]],
     moved: Vector,
-    effects: Sequence[Effect],
-) -> dict[Names, Weighed]:
-    """The evidence from a full refit, for the refitted hypothesis and, after a refit of a single effect, for its pairs.
+    order: Names,
+) -> tuple[dict[Form, Weighed], LinearModel]:
+    """The evidence from a full refit of a form, and the model in which it was weighed.
 
+    After a refit of a single effect in the form of the library, the result also contains the pairs, triples and fields beside it.
     refit: the linear model at the refit, with the effects that may act. before: the linear model without any effect.
     taken: the amounts of the parameters that the refit subtracted from the images, by effect. moved: the coordinates of
-    the PSF of the refit minus those of the fit without any effect.
+    the PSF of the refit minus those of the fit without any effect. order: the effects that the data can show.
     """
-    refit = replace(refit, evidence=with_same_data(before.evidence, refit.evidence, taken, moved))
-    likelihood = Likelihood(refit)
-    others = [e.name for e in effects if e.name not in names] if len(names) == 1 else []
-    pairs = [_in_order((*names, other), effects) for other in others]
-    found = {one: weigh(likelihood, refit.evidence, one, taken) for one in (names, *pairs)}
-    return found | _triples(likelihood, refit.evidence, {one: found[one] for one in pairs}, effects, taken)
+    evidence = with_same_data(before.evidence, refit.evidence, taken, moved)
+    effects = tuple(with_likely(effect, LIKELY) if effect.exact else effect for effect in evidence.effects)
+    model = replace(refit, evidence=replace(evidence, effects=effects))
+    likelihood, evidence = Likelihood(model), model.evidence
+    found = {form: weigh(likelihood, evidence, form, taken)}
+    if form.field is None and len(form.effects) == 1:
+        pairs = [Form(Form((*form.effects, other)).names(order)) for other in order if other not in form.effects]
+        of_pairs = {pair: weigh(likelihood, evidence, pair, taken) for pair in pairs}
+        found |= of_pairs | _triples(likelihood, evidence, of_pairs, order, taken)
+        found |= _with_fields(likelihood, evidence, [form], (), taken)
+    return found, model
 
 
 def weigh(
     likelihood: Likelihood,
     evidence: Evidence,
-    names: Names,
+    form: Form,
     taken: Mapping[str, Sequence[float]] | None = None,
 ) -> Weighed:
-    """Weigh the hypothesis that the effects `names` act together. taken: as in `at_refit`."""
+    """Weigh a form. The columns of its field are those of an effect of the evidence (after a full refit with this field), or the
+    further columns of the likelihood. taken: as in `at_refit`."""
+    names = form.effects
+    if form.field is not None and not likelihood.further_columns:
+        names = (*names, form.field.effect)
     columns = [list(evidence.columns_of(name).values()) for name in names]
     before = taken or {}
     subtracted = [
@@ -206,20 +302,21 @@ def weigh(
         for name, some in zip(names, columns, strict=True)
         for value in before.get(name, (0.0,) * len(some))
     ]
-    templates = math.prod(evidence.templates.get(name, 1.0) for name in names)
-    return likelihood.weigh(columns, templates=templates, subtracted=subtracted)
-
-
-def _hypotheses(effects: Sequence[Effect]) -> list[Names]:
-    names = [effect.name for effect in effects]
-    return [NONE, *((name,) for name in names), *itertools.combinations(names, 2)]
-
-
-def _in_order(names: Names, effects: Sequence[Effect]) -> Names:
-    return tuple(effect.name for effect in effects if effect.name in names)
+    further = list(likelihood.further_columns)
+    templates = math.prod(evidence.templates.get(name, 1.0) for name in form.effects)
+    return likelihood.weigh(
+        [*columns, further] if further else columns,
+        templates=templates,
+        subtracted=[*subtracted, *(0.0 for _ in further)],
+    )
 
 
 def _log_prior(names: Names, effects: int) -> float:
-    count = {"single": effects, "pair": math.comb(effects, 2), "triple": math.comb(effects, 3)}
+    count = {
+        "single": effects,
+        "pair": math.comb(effects, 2),
+        "triple": math.comb(effects, 3),
+        "mixed": effects,
+    }
     kind = kind_of(names)
     return math.log(PRIOR[kind] / max(count.get(kind, 1), 1))

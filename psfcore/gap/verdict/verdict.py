@@ -7,10 +7,13 @@ but improbable:
 | the deciding members | verdict | named effects |
 |---|---|---|
 | "no gap" is the most probable one | none | - |
-| "unknown" only | unknown | - |
-| one hypothesis, which names effects | attributed | its effects |
+| all contain "unknown", and one of them is "unknown" alone | unknown | - |
+| one hypothesis, which names effects | attributed | its effects; also "unknown", if it contains it |
 | several hypotheses, which all name effects | tie | the effects of all of them |
 | anything else | inconclusive | the effects of the most probable hypothesis that names effects |
+
+A name must earn itself: if the effects of the best named hypothesis close less than EARNED of the gap on held-out images (the upper
+end of the 90 % interval), "unknown" joins the answer set, and the verdict is `inconclusive`.
 
 With fewer than LEAST_IMAGES images, the verdict is `inconclusive` instead of `none`: no image can be held out, and a gap may
 exist although the images do not show it.
@@ -19,16 +22,19 @@ exist although the images do not show it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from psfcore.gap.evidence.fields import Field, FieldShape
+from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior, without_idle
+from psfcore.gap.verdict.closure import Interval
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form, Names, Posterior, without_idle
 
 Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
 
 LEAST_IMAGES = 6
+# A true effect closes more: in 144 simulated cases, the upper end of the interval is below this value for EARNED_FIGURE.
+EARNED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +46,8 @@ class Judgement:
     set, the most probable hypothesis first. deciding: the members that
     decide the verdict. coverage: the coverage of the answer set.
     hypotheses: the probability of each hypothesis, the most probable first, after `posterior.without_idle`. effects: the
-    probability that each effect acts, alone or with another; also of "none" and "unknown". orders, fields, shape: as in
-    `Posterior`. failed: the hypotheses whose full refit failed.
+    probability that each effect acts, alone or with another; also of "none" and "unknown". posterior: the forms of the hypotheses.
+    failed: the hypotheses whose full refit failed.
     """
 
     verdict: Verdict
@@ -51,9 +57,7 @@ class Judgement:
     coverage: float
     hypotheses: Mapping[Names, float]
     effects: Mapping[str, float]
-    orders: Mapping[Names, float]
-    fields: Mapping[Field, float]
-    shape: FieldShape | None
+    posterior: Posterior
     failed: tuple[Names, ...] = ()
 
     @property
@@ -65,6 +69,10 @@ class Judgement:
     def best(self) -> Names | None:
         """The most probable hypothesis that names effects, whether or not it is in the set; None if all of them failed."""
         return next((names for names in self.hypotheses if names not in (NONE, UNKNOWN)), None)
+
+    def form(self, names: Names) -> Form:
+        """The most probable form of a hypothesis."""
+        return self.posterior.leading(names)
 
     @property
     def certain(self) -> Names:
@@ -100,7 +108,7 @@ def verdict_of(
     answer = best if members[0] != NONE else NONE
     if members[0] == NONE:
         verdict = "none" if images >= LEAST_IMAGES else "inconclusive"
-    elif deciding == (UNKNOWN,):
+    elif UNKNOWN in deciding and all(UNKNOWN_NAME in names for names in deciding):
         verdict, answer = "unknown", NONE
     elif len(named) == len(deciding):
         verdict = "attributed" if len(deciding) == 1 else "tie"
@@ -113,10 +121,23 @@ def verdict_of(
         coverage=coverage,
         hypotheses=hypotheses,
         effects=of_effects(raw),
-        orders=found.orders,
-        fields=found.fields,
-        shape=found.shape,
+        posterior=found,
         failed=failed,
+    )
+
+
+def earned(judged: Judgement, closure: Interval | None) -> Judgement:
+    """The judgement, with "unknown" in the set if the named effects close too little of the gap.
+
+    closure: of the best named hypothesis; None if the discs show no gap, or if no image can be held out.
+    """
+    if judged.verdict not in ("attributed", "tie") or closure is None or closure.high >= EARNED:
+        return judged
+    if any(UNKNOWN_NAME in names for names in judged.deciding):
+        return judged
+    members = judged.members if UNKNOWN in judged.members else (*judged.members, UNKNOWN)
+    return replace(
+        judged, verdict="inconclusive", members=members, deciding=(*judged.deciding, UNKNOWN), answer=judged.best or NONE
     )
 
 
@@ -134,9 +155,8 @@ def _deciding(
 
 def of_effects(hypotheses: Mapping[Names, float]) -> dict[str, float]:
     """The probability that each effect acts: the sum over the hypotheses that contain it. "none" and "unknown" come first."""
-    out = {"none": hypotheses.get(NONE, 0.0), "unknown": hypotheses.get(UNKNOWN, 0.0)}
+    out = {"none": hypotheses.get(NONE, 0.0), UNKNOWN_NAME: 0.0}
     for names, share in hypotheses.items():
-        if names not in (NONE, UNKNOWN):
-            for name in names:
-                out[name] = out.get(name, 0.0) + share
+        for name in names:
+            out[name] = out.get(name, 0.0) + share
     return out
