@@ -52,11 +52,7 @@ UNSEEN = 1e-300
 
 def place_search(view: View) -> PlaceSearch:
     """The search of a view. It is created once for each view."""
-    if PlaceSearch not in view.kept:
-        view.kept[PlaceSearch] = PlaceSearch(view)
-    found = view.kept[PlaceSearch]
-    assert isinstance(found, PlaceSearch)
-    return found
+    return view.once("place_search", lambda: PlaceSearch(view))
 
 
 class PlaceSearch:
