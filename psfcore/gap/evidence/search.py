@@ -34,6 +34,7 @@ from psfcore.convolution.convolver import correlations, linear_convolve
 from psfcore.gap.evidence.cells import sensitivities
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.evidence.near_discs import NearDiscs, cut
+from psfcore.gap.evidence.unocculted_blocks import block_means
 from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
 
@@ -66,13 +67,13 @@ class PlaceSearch:
         for n in solution.part:
             dark = solution.sky.dark[n]
             (plane,) = sensitivities(solution.optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
-            self._planes[n] = _binned(plane, STEP_PX) * STEP_PX**2
-            self._fine[n] = _binned(plane, FINE_PX) * FINE_PX**2
+            self._planes[n] = block_means(plane, STEP_PX) * STEP_PX**2
+            self._fine[n] = block_means(plane, FINE_PX) * FINE_PX**2
             scene = solution.optics.field(view.occulted_scene(n))
             to_displacements.append(_correlation(plane, scene, KERNEL_REACH_PX))
             self._near.add(n, scene)
             reach = max(self._planes[n].shape) - 2
-            to_far.append(_correlation(self._planes[n], _binned(scene, STEP_PX), reach))
+            to_far.append(_correlation(self._planes[n], block_means(scene, STEP_PX), reach))
         self._to_displacements = np.array(to_displacements, dtype=np.float32)
         self._to_far = np.array(to_far)
         self._nearest_px = NEAREST_RADII * float(np.mean([f.place.radius_px for f in solution.sky.found]))
@@ -130,7 +131,7 @@ class PlaceSearch:
         rows, columns = (2 * n - 1 for n in next(iter(self._planes.values())).shape)
 
         def response(n: int, q: Plane) -> Plane:
-            copy = _binned(gaussian_filter(self._expected[n], COARSE_BLUR_PX), STEP_PX)
+            copy = block_means(gaussian_filter(self._expected[n], COARSE_BLUR_PX), STEP_PX)
             return linear_convolve(q, copy[::-1, ::-1], (rows, columns))
 
         dy, dx = (_displacements(n) for n in (rows, columns))
@@ -150,7 +151,7 @@ class PlaceSearch:
         of_means, of_cells = [], []
         for n, q in self._fine.items():
             copy = gaussian_filter(self._expected[n], blur_px)
-            coarse = _binned(copy, FINE_PX)
+            coarse = block_means(copy, FINE_PX)
             of_means.append([along_copy(q, coarse, x // FINE_PX, y // FINE_PX) for x, y in places])
             of_cells.append(self._near.of_copies(n, copy, places))
         means = np.array(of_means) / self._sigma[:, None]
@@ -246,10 +247,3 @@ def along_copy(q: Plane, plane: Plane, dx: int, dy: int) -> float:
         for by, size in zip((dy, dx), q.shape, strict=True)
     )
     return float(np.einsum("yx,yx->", q[rows, columns], plane[from_rows, from_columns]))
-
-
-def _binned(plane: NDArray[np.floating], step: int) -> Plane:
-    """The means of a plane [y, x] over squares of `step` px. Incomplete squares in the last rows and columns are dropped."""
-    rows, columns = (n // step for n in plane.shape)
-    cut = plane[: rows * step, : columns * step].astype(np.float64)
-    return np.asarray(cut.reshape(rows, step, columns, step).mean(axis=(1, 3)))

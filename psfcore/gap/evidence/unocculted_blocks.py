@@ -213,12 +213,16 @@ def block_px(shape: tuple[int, int]) -> int:
     return max(1, min(BLOCK_PX, min(shape) // LEAST_BLOCKS))
 
 
-def blocks(plane: NDArray[np.floating]) -> Vector:
-    """The mean of each block of a plane [y, x]: (blocks,). Incomplete blocks in the last rows and columns are dropped."""
-    edge = block_px((plane.shape[0], plane.shape[1]))
+def block_means(plane: NDArray[np.floating], edge: int) -> Matrix:
+    """The means of a plane [y, x] over squares of `edge` px. Incomplete squares in the last rows and columns are dropped."""
     rows, columns = (n // edge for n in plane.shape)
     cut = plane[: rows * edge, : columns * edge]
-    return np.asarray(cut.reshape(rows, edge, columns, edge).mean(axis=(1, 3), dtype=np.float64).ravel())
+    return np.asarray(cut.reshape(rows, edge, columns, edge).mean(axis=(1, 3), dtype=np.float64))
+
+
+def blocks(plane: NDArray[np.floating]) -> Vector:
+    """The mean of each block of a plane [y, x]: (blocks,)."""
+    return block_means(plane, block_px((plane.shape[0], plane.shape[1]))).ravel()
 
 
 def spread_blocks(values: Vector, shape: tuple[int, int]) -> NDArray[np.float32]:
