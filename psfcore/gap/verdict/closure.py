@@ -135,7 +135,7 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
             continue
         step = model.fit(columns, model.equations(fitted))
         here = list(step.columns)
-        of_discs, of_blocks = [], []
+        in_discs, in_blocks = [], []
         for n in held:
             disc, white = evidence.discs[by_index[n]], model.discs[by_index[n]]
             left = white.residual - white.jacobian[here].T @ step.values
@@ -143,8 +143,8 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
             blocks = (blocks - step.values[base:] @ jacobian) / unocculted_noise
             expected = max(blocks.size - 1, 0) + _error(jacobian, step.covariance[base:, base:])
             unchanged = np.zeros((base, blocks.size))  # the blocks do not depend on the PSF
-            of_discs.append((left, white.jacobian[here]))
-            of_blocks.append((blocks, np.vstack([unchanged, jacobian / unocculted_noise])))
+            in_discs.append((left, white.jacobian[here]))
+            in_blocks.append((blocks, np.vstack([unchanged, jacobian / unocculted_noise])))
             answer = disc.jacobian[here] @ disc.share
             mean = float(disc.share @ disc.residual - answer @ step.values)
             noise = math.sqrt(disc.mean_noise**2 + float(answer @ step.covariance @ answer))
@@ -153,13 +153,18 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
             rows.append((*of_disc, float(blocks @ blocks), expected, *percent))
         images += held
         residuals, jacobians = (
-            np.concatenate(parts, axis=-1) for parts in zip(*of_discs, *of_blocks, strict=True)
+            np.concatenate(parts, axis=-1) for parts in zip(*in_discs, *in_blocks, strict=True)
         )
         along = _along_errors(jacobians, step.covariance)
-        cells = sum(left.size for left, _ in of_discs)
+        cells = sum(left.size for left, _ in in_discs)
         deviance[tuple(held)] = _deviance(residuals, along)
         spread[tuple(held)] = _spread(along[:, :cells]), _spread(along)
-    return HeldOut(tuple(images), *np.array(rows).T, deviance=deviance, spread=spread) if rows else None
+    if not rows:
+        return None
+    chi2, of_cells, blocks_chi2, of_blocks, residual, noise_pct = np.array(rows).T
+    return HeldOut(
+        tuple(images), chi2, of_cells, blocks_chi2, of_blocks, residual, noise_pct, deviance, spread
+    )
 
 
 def _error(jacobian: Vector, covariance: Vector) -> float:
