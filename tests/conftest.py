@@ -15,6 +15,7 @@ import numpy as np
 import psutil
 import pytest
 from astropy.io import fits
+from threadpoolctl import threadpool_limits
 
 from psfcore.gap.unused_memory import return_unused_memory
 
@@ -92,6 +93,8 @@ def pytest_configure(config: pytest.Config) -> None:
     No test may use the cache folder of the user. Fixtures of modules use that of this process.
     """
     config.option.loadscopereorder = False
+    # Plugins load numpy before `tests` sets the number of its threads.
+    threadpool_limits(limits=1, user_api="blas")
     os.environ["HELIOPSF_CACHE_DIR"] = _CACHE.name
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from psfcore.gap import corrected_psf
 from psfcore.gap.diagnose import Diagnosis
-from psfcore.gap.library import added as added_effects
+from psfcore.gap.library import registry
 from psfcore.gap.report import plot as gap_plot
 from psfcore.scatter import total_psf
 from psfcore.simulate.plan import default_plan
@@ -74,7 +74,7 @@ def small_reach() -> Iterator[None]:
 @contextmanager
 def quick_diagnosis() -> Iterator[None]:
     """Diagnose with a library of two effects and fewer sign flips."""
-    with patch.object(added_effects, "LIBRARY", TWO), few_sign_flips():
+    with patch.object(registry, "LIBRARY", TWO), few_sign_flips():
         yield
 
 

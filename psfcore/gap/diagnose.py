@@ -270,9 +270,7 @@ def linear_model_of(
     return model, expected
 
 
-def _favoured(
-    judged: Judgement, explained: EffectFit | None, told: Sequence[UnknownField]
-) -> list[str]:
+def _favoured(judged: Judgement, explained: EffectFit | None, told: Sequence[UnknownField]) -> list[str]:
     """The axes along which the effects of the best hypothesis vary, or the most probable field of an unknown cause.
 
     Empty if the verdict is `none`.

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from psfcore.transit.occulter import coverage, disc_distance, neighbours_of, pat
 
 Field = NDArray[np.float32]
 Vector = NDArray[np.float64]
+Result = TypeVar("Result")
 DISC_MARGIN_PX = 2.0
 # Most memory for one kind of field; at least LEAST_KEPT fields are kept, whatever their size.
 KEPT_BYTES = 2**25
@@ -55,9 +56,14 @@ class View:
     solution: Solution
 
     @cached_property
-    def kept(self) -> dict[type, Any]:
-        """Results that are computed once for each view, for example a search. The key is the type of the result."""
+    def _results(self) -> dict[str, Any]:
         return {}
+
+    def once(self, name: str, compute: Callable[[], Result]) -> Result:
+        """The result of `compute`, which runs once for each view, for example a search. name: of the result."""
+        if name not in self._results:
+            self._results[name] = compute()
+        return cast(Result, self._results[name])
 
     @cached_property
     def kernel(self) -> Vector:

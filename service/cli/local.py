@@ -459,7 +459,7 @@ class Local(Operations):
 
     def _gap_diagnose(self, request: ResolvedGapDiagnose, job_id: str, report: _Report) -> str:
         from psfcore.fits.psfs import write_psf
-        from psfcore.gap.library.added import added_effects
+        from psfcore.gap.library.registry import added_effects
         from workers.tasks.gap import diagnosis_of
 
         added = added_effects(request.added_effects)

@@ -17,7 +17,7 @@ from psfcore.errors import DataError
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
 from psfcore.gap.effect_sources import library_sha256
-from psfcore.gap.library.added import Added, added_effects, library_with
+from psfcore.gap.library.registry import Added, added_effects, library_with
 from psfcore.gap.report.page import gap_page
 from psfcore.gap.report.plot import gap_png
 from psfcore.gap.report.report import gap_report

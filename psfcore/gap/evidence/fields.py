@@ -326,7 +326,10 @@ class FieldColumns:
         parts = {
             "disc_shape": (shapes.transpose(1, 0, 2), None),
             DISC: (each[:, :, None] * whole, None),
-            CELL: ((each[:, None, :, None] * shapes.transpose(1, 0, 2)[None]).reshape(-1, *whole.shape), None),
+            CELL: (
+                (each[:, None, :, None] * shapes.transpose(1, 0, 2)[None]).reshape(-1, *whole.shape),
+                None,
+            ),
             BLOCK: (None, readouts[:, None] * usual * np.eye(levels[1])[:, None]),
         }
         in_discs, in_blocks = [], []
@@ -348,9 +351,7 @@ class FieldColumns:
         rows, columns = (one.size for one in self._at)
         scene = float(np.mean([one.mean() for one in self._scenes.values()]))
         wide = np.zeros((4 * SIDES, rows + 2 * OUTSIDE_BOXES, columns + 2 * OUTSIDE_BOXES))
-        along_y, along_x = (
-            bumps(_middles(n), 2 / (SIDES - 1) / SPACING)[:SIDES] for n in wide.shape[1:]
-        )
+        along_y, along_x = (bumps(_middles(n), 2 / (SIDES - 1) / SPACING)[:SIDES] for n in wide.shape[1:])
         for k in range(SIDES):
             wide[4 * k, :OUTSIDE_BOXES] = wide[4 * k + 1, -OUTSIDE_BOXES:] = along_x[k]
             wide[4 * k + 2, :, :OUTSIDE_BOXES] = wide[4 * k + 3, :, -OUTSIDE_BOXES:] = along_y[k][:, None]

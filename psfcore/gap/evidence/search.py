@@ -4,8 +4,8 @@ A template f, displaced by d, changes the mean of disc n by
 
     T_n(d) = sum over pixels of q_n(x) f_n(x - d)          Eq. (1)
 
-where q_n is the sensitivity of the disc (`cells`). This is a correlation, so one correlation gives all displacements of a
-coarse grid. Let r be the residuals of the discs that remain after the fit of the PSF. The template at d decreases chi2 by
+where q_n is the sensitivity of the disc (`cells`). This is a correlation, so one correlation gives all displacements. Let r
+be the residuals of the discs that remain after the fit of the PSF. The template at d decreases chi2 by
 
     gain(d) = (sum r T)^2 / sum T^2                        Eq. (2)
 
@@ -15,14 +15,20 @@ the mean of disc n by
 
     T_n = sum over displacements of K(d) C_n(d),   C_n(d) = sum over pixels of q_n(x) scene_n(x - d)     Eq. (3)
 
-One correlation for each disc therefore serves any number of kernels K. Ghosts (displaced copies of the image) and changes
-of the PSF core also change the distribution of light within the discs. For them, r and T also contain the cells
-(`near_discs`).
+One correlation for each disc therefore serves any number of kernels K.
+
+Ghosts (displaced copies of the image) and changes of the PSF core also change the distribution of light within the discs: a
+wider core hardly changes the mean of a disc, but it changes the outermost cells. For them, r and T also contain the cells, by
+Eqs. (1) and (3) in a small patch around each disc (`NearDisc`). The mean brightness of the disc is removed from the responses of
+its cells, because it is known from the whole field. Light that scatters into the disc from outside the patch is nearly
+uniform over the disc, so it is neglected.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -30,12 +36,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from psfcore.convolution.convolver import correlations, linear_convolve
-from psfcore.gap.evidence.cells import coarse_kernel, sensitivities
+from psfcore.convolution.convolver import correlations
+from psfcore.gap.evidence.cells import cells_of, coarse_kernel, sensitivities, whitening
 from psfcore.gap.evidence.linear_model import FLOOR
-from psfcore.gap.evidence.near_discs import NearDiscs, cut
-from psfcore.gap.view import View
+from psfcore.gap.evidence.unocculted_blocks import block_means
+from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
+from psfcore.scatter.optics import Optics
 
 Plane = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -46,17 +53,15 @@ COARSE_BLUR_PX = 8.0
 BLURS_PX = (2.0, 4.0, 8.0, 16.0)
 NEAREST_RADII = 1.8  # smallest displacement of a copy, in radii of the disc: a closer copy looks like the disc's surroundings
 KERNEL_REACH_PX = 255  # the orders of the mesh contain little light beyond this distance
+MARGIN_PX = 28  # distance from the edge of the disc to the edge of its patch
+NEAR_REACH_PX = 64  # largest displacement of light within a patch, along each axis
 SEEN = 1e-4  # positions whose sum T^2 is below this fraction of the largest sum T^2 are skipped
 UNSEEN = 1e-300
 
 
 def place_search(view: View) -> PlaceSearch:
     """The search of a view. It is created once for each view."""
-    if PlaceSearch not in view.kept:
-        view.kept[PlaceSearch] = PlaceSearch(view)
-    found = view.kept[PlaceSearch]
-    assert isinstance(found, PlaceSearch)
-    return found
+    return view.once("place_search", lambda: PlaceSearch(view))
 
 
 class PlaceSearch:
@@ -64,19 +69,17 @@ class PlaceSearch:
 
     def __init__(self, view: View) -> None:
         solution, self._expected = view.solution, view.expected
-        self._planes, self._fine = {}, {}
-        to_displacements, to_far = [], []
-        self._near = NearDiscs(view)
-        for n in solution.part:
+        self._images = solution.part
+        self._near = near_discs(view, self._images)
+        self._planes, self._fine, to_displacements, to_far = [], [], [], []
+        for n in self._images:
             dark = solution.sky.dark[n]
-            (plane,) = sensitivities(solution.optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))
-            self._planes[n] = _binned(plane, STEP_PX) * STEP_PX**2
-            self._fine[n] = _binned(plane, FINE_PX) * FINE_PX**2
+            plane = sensitivities(solution.optics, dark, np.full((1, dark[0].size), 1 / dark[0].size))[0]
+            self._planes.append(block_means(plane, STEP_PX) * STEP_PX**2)
+            self._fine.append(block_means(plane, FINE_PX) * FINE_PX**2)
             scene = solution.optics.field(view.occulted_scene(n))
-            to_displacements.append(_correlation(plane, scene, KERNEL_REACH_PX))
-            self._near.add(n, scene)
-            reach = max(self._planes[n].shape) - 2
-            to_far.append(_correlation(self._planes[n], _binned(scene, STEP_PX), reach))
+            to_displacements.append(_sums(plane[None].astype(np.float64), scene, KERNEL_REACH_PX)[0])
+            to_far.append(_at_displacements(self._planes[-1], block_means(scene, STEP_PX)))
         self._to_displacements = np.array(to_displacements, dtype=np.float32)
         self._to_far = np.array(to_far)
         self._nearest_px = NEAREST_RADII * float(np.mean([f.place.radius_px for f in solution.sky.found]))
@@ -84,10 +87,11 @@ class PlaceSearch:
         self._sigma = np.array([np.hypot(f.noise, FLOOR * f.expected) for f in frames])
         responses = np.array([f.mean_jacobian for f in frames]) / self._sigma[:, None]
         residual = np.array([f.observed - f.expected for f in frames]) / self._sigma
-        in_cells = np.array([self._near.of_kernel(slope) for slope in view.slope_kernels]).T
+        in_cells = self._of_cells(view.slope_kernels)
         self._of_means = _Unabsorbed(responses, residual)
         self._of_all = _Unabsorbed(
-            np.concatenate([responses, in_cells]), np.concatenate([residual, self._near.residual])
+            np.concatenate([responses, in_cells]),
+            np.concatenate([residual, *(near.residual for near in self._near)]),
         )
 
     def kernels(self, kernels: Sequence[Plane]) -> Vector:
@@ -96,23 +100,21 @@ class PlaceSearch:
         kernels: changes of the PSF [y, x], with the centre at n // 2. The search uses the means of the discs and, for light
         that moves near a disc, also its cells, Eq. (3).
         """
-        cells = np.array([self._near.of_kernel(kernel) for kernel in kernels]).T
-        return self._gains_of(self._to_displacements, kernels, cells)
+        return self._gain(self._of_discs(self._to_displacements, kernels), self._of_cells(kernels))
 
     def wide_kernels(self, kernels: Sequence[Plane]) -> Vector:
         """As `kernels`, for smooth changes of the PSF that may reach across the field. It uses only the means of the discs, not their cells, and coarse pixels."""
-        return self._gains_of(self._to_far, [coarse_kernel(kernel, STEP_PX) for kernel in kernels])
+        return self._gain(self._of_discs(self._to_far, [coarse_kernel(one, STEP_PX) for one in kernels]))
 
-    def _gains_of(
-        self, to_displacements: NDArray[np.floating], kernels: Sequence[Plane], cells: Plane | None = None
-    ) -> Vector:
+    def _of_discs(self, to_displacements: NDArray[np.floating], kernels: Sequence[Plane]) -> Plane:
+        """T of Eq. (3) for the means of the discs (discs, kernels)."""
         size, dtype = to_displacements.shape[1], to_displacements.dtype
-        of_discs = [
-            np.einsum("nyx,yx->n", to_displacements, crop_or_pad(kernel, size).astype(dtype))
-            for kernel in kernels
-        ]
-        means = np.array(of_discs, dtype=np.float64).T / self._sigma[:, None]
-        return self._gain(means, cells)
+        cropped = (crop_or_pad(kernel, size).astype(dtype) for kernel in kernels)
+        return np.array([np.einsum("nyx,yx->n", to_displacements, kernel) for kernel in cropped], float).T
+
+    def _of_cells(self, kernels: Sequence[Plane]) -> Plane:
+        """T of Eq. (3) for the cells of all discs (cells, kernels), in units of their noise."""
+        return np.array([np.concatenate([near.of_kernel(one) for near in self._near]) for one in kernels]).T
 
     @cached_property
     def copy(self) -> tuple[float, int, int]:
@@ -131,17 +133,19 @@ class PlaceSearch:
     @property
     def _coarse_displacement(self) -> tuple[int, int]:
         """The displacement (x, y) of the coarse grid with the largest gain."""
-        rows, columns = (2 * n - 1 for n in next(iter(self._planes.values())).shape)
-
-        def response(n: int, q: Plane) -> Plane:
-            copy = _binned(gaussian_filter(self._expected[n], COARSE_BLUR_PX), STEP_PX)
-            return linear_convolve(q, copy[::-1, ::-1], (rows, columns))
-
-        dy, dx = (_displacements(n) for n in (rows, columns))
-        gain = self._gains(response)
-        gain[np.hypot(dy[:, None], dx[None, :]) < self._nearest_px] = -1.0
+        copies = (gaussian_filter(self._expected[n], COARSE_BLUR_PX) for n in self._images)
+        means = np.array(
+            [
+                _at_displacements(q, block_means(copy, STEP_PX))
+                for q, copy in zip(self._planes, copies, strict=True)
+            ]
+        )
+        size = means.shape[1]
+        gain = self._gain(means.reshape(len(means), -1), least=SEEN).reshape(size, size)
+        along = (np.arange(size) - size // 2) * STEP_PX
+        gain[np.hypot(along[:, None], along[None, :]) < self._nearest_px] = -1.0
         row, column = np.unravel_index(np.argmax(gain), gain.shape)
-        return int(dx[column]), int(dy[row])
+        return int(along[column]), int(along[row])
 
     def _fine_displacement(self, blur_px: float, dx: int, dy: int) -> tuple[float, int, int]:
         """The best gain and its displacement (x, y), among displacements within one coarse step of (dx, dy).
@@ -149,36 +153,27 @@ class PlaceSearch:
         The grid has a step of FINE_PX, and the gain contains the means and the cells of the discs.
         """
         reach = STEP_PX // FINE_PX
-        steps = [(j, k) for j in range(-reach, reach + 1) for k in range(-reach, reach + 1)]
-        places = [(dx + k * FINE_PX, dy + j * FINE_PX) for j, k in steps]
-        of_means, of_cells = [], []
-        for n, q in self._fine.items():
+        means, cells = [], []
+        for n, q, near in zip(self._images, self._fine, self._near, strict=True):
             copy = gaussian_filter(self._expected[n], blur_px)
-            coarse = _binned(copy, FINE_PX)
-            of_means.append([along_copy(q, coarse, x // FINE_PX, y // FINE_PX) for x, y in places])
-            of_cells.append(self._near.of_copies(n, copy, places))
-        means = np.array(of_means) / self._sigma[:, None]
-        gain = self._gain(means, np.concatenate(of_cells), least=SEEN)
+            coarse = block_means(copy, FINE_PX)
+            means.append(_sums(q[None], coarse, reach, -dy // FINE_PX, -dx // FINE_PX).ravel())
+            of_copies = near.of_copies(copy, dx, dy, STEP_PX)[:, ::FINE_PX, ::FINE_PX]
+            cells.append(of_copies.reshape(of_copies.shape[0], -1))
+        gain = self._gain(np.array(means), np.concatenate(cells), least=SEEN)
         best = int(np.argmax(gain))
-        return float(gain[best]), *places[best]
-
-    def _gains(self, response: Callable[[int, Plane], Plane]) -> Plane:
-        """Eq. (2) at every position of the coarse grid [y, x]."""
-        responses = np.array(
-            [response(n, q) / s for (n, q), s in zip(self._planes.items(), self._sigma, strict=True)]
-        )
-        gain = self._gain(responses.reshape(self._sigma.size, -1), least=SEEN)
-        return np.asarray(gain.reshape(responses.shape[1:]))
+        row, column = np.divmod(best, 2 * reach + 1)
+        return float(gain[best]), dx + (int(column) - reach) * FINE_PX, dy + (int(row) - reach) * FINE_PX
 
     def _gain(self, means: Plane, cells: Plane | None = None, *, least: float = 0.0) -> Vector:
         """Eq. (2) for several templates (templates,).
 
-        means: T of the means of the discs (discs, templates), in units of the noise. cells: T of the cells (cells, templates);
+        means: T of the means of the discs (discs, templates). cells: T of the cells (cells, templates), in units of the noise;
         None: use the means alone. least: a template gains 0 if its sum T^2 is below this fraction of the largest sum T^2.
         """
-        left, responses = (
-            (self._of_means, means) if cells is None else (self._of_all, np.concatenate([means, cells]))
-        )
+        responses, left = means / self._sigma[:, None], self._of_means
+        if cells is not None:
+            responses, left = np.concatenate([responses, cells]), self._of_all
         flat = left.of(responses)
         size, along = (flat**2).sum(axis=0), left.residual @ flat
         seen = size > max(least * float(size.max()), UNSEEN)
@@ -213,17 +208,94 @@ class _Unabsorbed:
         return np.asarray(responses - self._absorbed @ (self._absorbed.T @ responses))
 
 
-def _correlation(plane: NDArray[np.floating], scene: NDArray[np.floating], reach_px: int) -> Plane:
-    """C of Eq. (3) for displacements up to reach_px along each axis: (2 reach + 1, 2 reach + 1), with d = 0 in the middle."""
-    around = np.pad(scene.astype(np.float64), reach_px)
-    return np.asarray(correlations(plane[None].astype(np.float64), around, reach_px)[0])
+# --- patches around the discs -----------------------------------------------------------------------------
 
 
-def _displacements(count: int) -> NDArray[np.intp]:
-    """The displacement (px) at each index of the full correlation of two rows; each row has (count + 1) / 2 elements."""
-    line = (count + 1) // 2
-    zero = line - 1 - (2 * (line // 2) - count // 2)
-    return (np.arange(count) - zero) * STEP_PX
+@dataclass(frozen=True, eq=False)
+class NearDisc:
+    """The cells of one disc, in a patch around it.
+
+    top, left: the first pixel of the patch. planes: the sensitivities of the cells (cells, y, x). residual: their residuals
+    (cells,). to_displacements: C of Eq. (3) (cells, displacements y, displacements x). All are in units of the noise of the cells,
+    without the mean of the disc.
+    """
+
+    top: int
+    left: int
+    planes: NDArray[np.float32]
+    residual: Vector
+    to_displacements: NDArray[np.floating]
+
+    def of_kernel(self, change: Plane) -> Vector:
+        """T of Eq. (3) for each cell (cells,). change: the change of the PSF [y, x], with the centre at [n // 2, n // 2]."""
+        near = crop_or_pad(change, 2 * NEAR_REACH_PX + 1).astype(np.float32)
+        return np.asarray(np.tensordot(self.to_displacements, near, axes=2), dtype=np.float64)
+
+    def of_copies(self, image: Field, dx: int, dy: int, reach_px: int) -> Plane:
+        """T of Eq. (1) for each cell and each copy of an image [y, x]: (cells, copies y, copies x).
+
+        The copies are displaced by (dx, dy) and up to reach_px more along each axis, in whole pixels.
+        """
+        sums = _sums(self.planes, image, reach_px, self.top - dy, self.left - dx)
+        return np.asarray(sums, dtype=np.float64)
+
+
+def near_discs(view: View, images: Sequence[int]) -> list[NearDisc]:
+    """The patches around the discs of these images. All have the same size."""
+    solution = view.solution
+    shape, optics = solution.transit.shape, solution.optics
+    radius_px = max(solution.sky.found[n].place.radius_px for n in solution.part)
+    whole = 2 * math.ceil(radius_px + MARGIN_PX) + 1
+    size = min(whole, shape[0]), min(whole, shape[1])
+    # This kernel is large enough to connect any two pixels of a patch.
+    small = Optics(crop_or_pad(view.kernel, 2 * max(size) - 1), size, threads=solution.threads)
+    out = []
+    for n in images:
+        place, (rows, columns) = solution.sky.found[n].place, solution.sky.dark[n]
+        top = int(np.clip(round(place.y_px) - size[0] // 2, 0, shape[0] - size[0]))
+        left = int(np.clip(round(place.x_px) - size[1] // 2, 0, shape[1] - size[1]))
+        cells = cells_of((rows, columns), place.x_px, place.y_px)
+        planes = sensitivities(small, (rows - top, columns - left), cells.weights)
+        frame = solution.transit.frames[n]
+        observed = cut(frame.pixels, top, left, size).astype(np.float64)
+        variance = solution.transit.noise.variance(observed, frame.exposure_s)
+        flat = planes.reshape(planes.shape[0], -1).astype(np.float64)
+        residual, expected = solution.residual(n)
+        white = _without((flat * variance.ravel()) @ flat.T, cells.weights @ expected)
+        planes = (white @ flat).astype(np.float32).reshape(planes.shape)
+        scene = optics.field(view.occulted_scene(n))
+        to_displacements = _sums(planes, scene, NEAR_REACH_PX, top, left)
+        out.append(NearDisc(top, left, planes, white @ (cells.weights @ residual), to_displacements))
+    return out
+
+
+def _without(covariance: Plane, level: Vector) -> Plane:
+    """The matrix that whitens cells with this covariance and removes the component proportional to `level` (cells,)."""
+    white = whitening(covariance)
+    along = white @ level
+    along /= max(float(np.linalg.norm(along)), 1e-300)
+    return np.asarray(white - np.outer(along, along @ white))
+
+
+# --- planes and kernels -------------------------------------------------------------------------------------
+
+
+def _sums(
+    planes: NDArray[np.floating], image: NDArray[np.floating], reach: int, top: int = 0, left: int = 0
+) -> NDArray[np.floating]:
+    """Eq. (1) for displacements up to `reach` along each axis: (planes, 2 reach + 1, 2 reach + 1), with d = 0 in the middle.
+
+    planes: q (planes, y, x); their first pixel is the pixel [top, left] of the image. The image is 0 outside its pixels.
+    """
+    ny, nx = planes.shape[1:]
+    return correlations(
+        planes, cut(image, top - reach, left - reach, (ny + 2 * reach, nx + 2 * reach)), reach
+    )
+
+
+def _at_displacements(plane: Plane, image: Plane) -> Plane:
+    """Eq. (1) for one plane, at all displacements at which at least two of its rows or columns overlap with the image."""
+    return np.asarray(_sums(plane[None], image, max(plane.shape) - 2)[0])
 
 
 def displaced(plane: Any, dx: int, dy: int) -> Any:
@@ -231,17 +303,11 @@ def displaced(plane: Any, dx: int, dy: int) -> Any:
     return cut(plane, -dy, -dx, plane.shape)
 
 
-def along_copy(q: Plane, plane: Plane, dx: int, dy: int) -> float:
-    """Eq. (1): the sum of q times `displaced(plane, dx, dy)`, without a copy of the plane."""
-    (rows, from_rows), (columns, from_columns) = (
-        (slice(max(by, 0), max(size + min(by, 0), 0)), slice(max(-by, 0), max(size - max(by, 0), 0)))
-        for by, size in zip((dy, dx), q.shape, strict=True)
-    )
-    return float(np.einsum("yx,yx->", q[rows, columns], plane[from_rows, from_columns]))
-
-
-def _binned(plane: NDArray[np.floating], step: int) -> Plane:
-    """The means of a plane [y, x] over squares of `step` px. Incomplete squares in the last rows and columns are dropped."""
-    rows, columns = (n // step for n in plane.shape)
-    cut = plane[: rows * step, : columns * step].astype(np.float64)
-    return np.asarray(cut.reshape(rows, step, columns, step).mean(axis=(1, 3)))
+def cut(plane: Any, top: int, left: int, size: tuple[int, int]) -> Any:
+    """A window of a plane [y, x]; its pixels outside the plane are 0."""
+    out = np.zeros(size, plane.dtype)
+    low_y, high_y = (min(max(at, 0), plane.shape[0]) for at in (top, top + size[0]))
+    low_x, high_x = (min(max(at, 0), plane.shape[1]) for at in (left, left + size[1]))
+    if low_y < high_y and low_x < high_x:
+        out[low_y - top : high_y - top, low_x - left : high_x - left] = plane[low_y:high_y, low_x:high_x]
+    return out

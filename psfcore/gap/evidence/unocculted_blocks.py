@@ -72,11 +72,11 @@ class UnoccultedBlocks:
     def flicker(self) -> Matrix:
         """The observed variance of each flickering block, divided by the usual variance; 1 for the other blocks: (images, blocks)."""
         excess = np.ones_like(self.variance)
-        gains = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
-        steady = self.levels / (1 + gains[:, None])
+        steady = self.levels / (1 + self._gains[:, None])
+        weights = self._weights
         for pointing in np.unique(self.pointing):
             here = np.flatnonzero((self.pointing == pointing) & self.part)
-            weight = np.where(self.free[here], 1 / self.variance[here], 0.0)
+            weight = weights[here]
             images = (weight > 0).sum(axis=0)
             used = images >= LEAST_IMAGES
             if not used.any():
@@ -95,39 +95,46 @@ class UnoccultedBlocks:
         same kind."""
         if self.given_gain_width is not None:
             return self.given_gain_width
-        free = self._equations(np.flatnonzero(self.part), np.zeros(0, int), WIDEST_GAIN).gains
         spread: list[float] = []
         for kind in np.unique(self.kind[self.part]):
-            here = (self.kind == kind) & self.part
-            if here.sum() >= LEAST_IMAGES:
-                spread.extend((free[here] - np.median(free[here])) ** 2 * here.sum() / (here.sum() - 1))
+            gains = self._gains[(self.kind == kind) & self.part]
+            if gains.size >= LEAST_IMAGES:
+                spread.extend((gains - np.median(gains)) ** 2 * gains.size / (gains.size - 1))
         return max(float(np.sqrt(np.mean(spread))), LEAST_GAIN) if spread else WIDEST_GAIN
 
-    def equations(self, columns: Sequence[int], images: Sequence[int] | None = None) -> UnoccultedEquations:
-        """The normal equations of these columns. images: the images to use; None: all.
+    @cached_property
+    def _gains(self) -> Vector:
+        """g_n of each image, with a wide prior (images,)."""
+        return self.equations((), width=WIDEST_GAIN).gains
+
+    @property
+    def _weights(self) -> Matrix:
+        """1 / variance of each block; 0 if it is not compared with other images (images, blocks)."""
+        return np.where(self.free, 1 / self.variance, 0.0)
+
+    def equations(
+        self, columns: Sequence[int], images: Sequence[int] | None = None, *, width: float | None = None
+    ) -> UnoccultedEquations:
+        """The normal equations of these columns. images: the images to use; None: all. width: the width of the prior of g_n;
+        None: `gain_width`.
 
         Scene and brightness are free parameters.
         """
-        chosen = (
-            np.flatnonzero(self.part) if images is None else np.array([n for n in images if self.part[n]])
-        )
-        return self._equations(chosen, np.asarray(columns, dtype=int), self.gain_width)
-
-    def _equations(
-        self, images: NDArray[np.intp], columns: NDArray[np.intp], width: float
-    ) -> UnoccultedEquations:
-        size = columns.size
-        count = self.levels.shape[0]
+        chosen = np.flatnonzero(self.part)
+        if images is not None:
+            chosen = np.array([n for n in images if self.part[n]], dtype=int)
+        size, count = len(columns), self.levels.shape[0]
         normal, score, chi2, freedom = np.zeros((size + count,) * 2), np.zeros(size + count), 0.0, 0
-        for pointing in np.unique(self.pointing[images]) if images.size else []:
-            here = images[self.pointing[images] == pointing]
+        weights = self._weights
+        for pointing in np.unique(self.pointing[chosen]):
+            here = chosen[self.pointing[chosen] == pointing]
             if here.size < LEAST_IMAGES:
                 continue
-            weight = np.where(self.free[here], 1 / self.variance[here], 0.0)
+            weight = weights[here]
             weight[:, (weight > 0).sum(axis=0) < LEAST_IMAGES] = 0.0
             total = np.maximum(weight.sum(axis=0), 1e-300)
             design = np.zeros((size + count, here.size, self.levels.shape[1]))
-            design[:size] = self.errors[columns][:, here]
+            design[:size] = self.errors[list(columns)][:, here]
             design[size + here, np.arange(here.size)] = self.means[here]
             design -= ((design * weight).sum(axis=1) / total)[:, None]  # mu_b is free
             level = self.levels[here]
@@ -138,7 +145,17 @@ class UnoccultedBlocks:
             chi2 += float((weight * misfit**2).sum())
             used = weight > 0
             freedom += int(used.sum() - used.any(axis=0).sum())
-        return _without_gains(normal, score, chi2, freedom, size, width, used_images=int(images.size))
+        precision = (self.gain_width if width is None else width) ** -2.0
+        inverse = np.linalg.inv(normal[size:, size:] + np.eye(count) * precision)
+        cross = normal[:size, size:]
+        gains = inverse @ score[size:]
+        return UnoccultedEquations(
+            normal=normal[:size, :size] - cross @ inverse @ cross.T,
+            score=score[:size] - cross @ gains,
+            chi2=chi2 - float(score[size:] @ gains),
+            freedom=max(freedom - chosen.size, 1),
+            gains=gains,
+        )
 
     def held_out(
         self, columns: Sequence[int], images: Sequence[int], fitted: Sequence[int]
@@ -149,14 +166,14 @@ class UnoccultedBlocks:
         (columns, n). For each held-out image they contain the values of its blocks, followed by its brightness in units of
         `gain_width`.
         """
-        errors = self.errors[list(columns)]
+        errors, weights = self.errors[list(columns)], self._weights
         residuals, jacobians = [np.zeros(0)], [np.zeros((len(columns), 0))]
         for n in images:
             others = [k for k in fitted if self.pointing[k] == self.pointing[n] and self.part[k]]
             if not self.part[n] or len(others) < LEAST_IMAGES - 1:
                 continue
             here = np.array(others)
-            weight = np.where(self.free[here], 1 / self.variance[here], 0.0)
+            weight = weights[here]
             total = weight.sum(axis=0)
             use = self.free[n] & ((weight > 0).sum(axis=0) >= LEAST_IMAGES - 1)
             if not use.any():
@@ -192,33 +209,21 @@ class UnoccultedEquations:
     gains: Vector
 
 
-def _without_gains(
-    normal: Matrix, score: Vector, chi2: float, freedom: int, size: int, width: float, *, used_images: int
-) -> UnoccultedEquations:
-    of_gains = normal[size:, size:]
-    inverse = np.linalg.inv(of_gains + np.eye(of_gains.shape[0]) / width**2)
-    cross = normal[:size, size:]
-    gains = inverse @ score[size:]
-    return UnoccultedEquations(
-        normal=normal[:size, :size] - cross @ inverse @ cross.T,
-        score=score[:size] - cross @ gains,
-        chi2=chi2 - float(score[size:] @ gains),
-        freedom=max(freedom - used_images, 1),
-        gains=gains,
-    )
-
-
 def block_px(shape: tuple[int, int]) -> int:
     """The edge length of a block, px: BLOCK_PX, or less in small images."""
     return max(1, min(BLOCK_PX, min(shape) // LEAST_BLOCKS))
 
 
-def blocks(plane: NDArray[np.floating]) -> Vector:
-    """The mean of each block of a plane [y, x]: (blocks,). Incomplete blocks in the last rows and columns are dropped."""
-    edge = block_px((plane.shape[0], plane.shape[1]))
+def block_means(plane: NDArray[np.floating], edge: int) -> Matrix:
+    """The means of a plane [y, x] over squares of `edge` px. Incomplete squares in the last rows and columns are dropped."""
     rows, columns = (n // edge for n in plane.shape)
     cut = plane[: rows * edge, : columns * edge]
-    return np.asarray(cut.reshape(rows, edge, columns, edge).mean(axis=(1, 3), dtype=np.float64).ravel())
+    return np.asarray(cut.reshape(rows, edge, columns, edge).mean(axis=(1, 3), dtype=np.float64))
+
+
+def blocks(plane: NDArray[np.floating]) -> Vector:
+    """The mean of each block of a plane [y, x]: (blocks,)."""
+    return block_means(plane, block_px((plane.shape[0], plane.shape[1]))).ravel()
 
 
 def spread_blocks(values: Vector, shape: tuple[int, int]) -> NDArray[np.float32]:

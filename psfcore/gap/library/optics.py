@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, gaussian_filter, rotate
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.gap.effect import Change, Effect, EffectParameter
+from psfcore.gap.effect import Change, Effect
+from psfcore.gap.effect import EffectParameter as Parameter
 from psfcore.gap.evidence.search import KERNEL_REACH_PX, displaced, distinguished, place_search
 from psfcore.gap.view import Field, View
 from psfcore.psf import crop_or_pad
@@ -42,103 +43,82 @@ AMOUNT = SOFTENED_POWER_LAW.names.index("total")  # the coordinate of the total 
 
 
 @dataclass(frozen=True)
-class _Sought:
+class _Best:
     """The result of a search among templates: the best one, and how many the data distinguish (`search.distinguished`)."""
 
-    best: Any
+    template: Any
     distinguished: float
 
 
-Search = Callable[[View], _Sought]
+def _searching(
+    name: str,
+    parameter: Parameter,
+    cause: str,
+    settled_by: str,
+    axes: tuple[str, ...],
+    trials: int,
+    search: Callable[[View], _Best],
+    changes: Callable[[View, Any], Sequence[Change]],
+    described: Callable[[Any], str] = lambda template: "",
+) -> Effect:
+    """An effect that uses the best of several templates. search: runs once for each view. changes(view, template): the changes
+    by a template. described(template): the text that follows the cause if the template is held."""
+
+    def best(view: View) -> _Best:
+        return view.once(name, lambda: search(view))
+
+    def held(view: View) -> Effect:
+        found = best(view)
+        return replace(
+            effect,
+            cause=cause[:-1] + described(found.template) + ".",
+            changes=lambda view: changes(view, found.template),
+            distinguished=lambda view: found.distinguished,
+            held=None,
+        )
+
+    effect = Effect(
+        name,
+        "optics",
+        (parameter,),
+        cause,
+        settled_by,
+        axes,
+        changes=lambda view: changes(view, best(view).template),
+        trials=trials,
+        distinguished=lambda view: best(view).distinguished,
+        held=held,
+    )
+    return effect
 
 
-def _once(name: str, search: Search) -> Search:
-    """The same search, which runs once for each view."""
-
-    def kept(view: View) -> _Sought:
-        results = view.kept.setdefault(_Sought, {})
-        if name not in results:
-            results[name] = search(view)
-        found = results[name]
-        assert isinstance(found, _Sought)
-        return found
-
-    return kept
-
-
-def by_psf(view: View, blur: Blur, weight: Field | None = None) -> Change:
+def _by_psf(view: View, blur: Blur, weight: Field | None = None) -> Change:
     """The change of the images by a change of the PSF (`blur`). weight: a factor for the light of each scene pixel [y, x]."""
     return Change(lambda n, images: view.blurred(n, blur, weight), unocculted=False)
 
 
-def shape_slopes(view: View, shape: str, parameters: tuple[int, ...]) -> list[Blur]:
-    """Derivatives of the total PSF with respect to coordinates of another shape, evaluated at the fit.
-
-    parameters: the indices of these coordinates. The other parameters have the fitted values.
-    """
-    transit, solution = view.solution.transit, view.solution
-    total = TotalPsf(transit.diffraction, SHAPES[shape], transit.shape, threads=solution.threads)
-    at = SHAPES[shape].coordinates(solution.inversion.values)
-    return [Blur(total.slope(at, k), transit.shape, threads=solution.threads) for k in parameters]
+def _by_kernel(view: View, kernel: Kernel) -> Sequence[Change]:
+    """The change of the images by a change of the PSF [y, x]."""
+    return [_by_psf(view, Blur(kernel, view.solution.transit.shape, threads=view.solution.threads))]
 
 
-def not_a_power_law(view: View) -> str | None:
-    """The reason why changes of the softened power law cannot be tested for this fit; None if they can be tested."""
-    name = view.solution.inversion.shape.name
-    return (
-        None
-        if name == SOFTENED_POWER_LAW.name
-        else f"this effect needs the softened power law; the fitted shape is {name}"
-    )
+def _scatter(view: View) -> Kernel:
+    """The scatter kernel of the fit, on the grid of the total PSF."""
+    inversion = view.solution.inversion
+    return inversion.shape.kernel(inversion.coordinates, view.solution.total.size)
 
 
-def _blur(view: View, kernel: Kernel) -> Blur:
-    return Blur(kernel, view.solution.transit.shape, threads=view.solution.threads)
-
-
-def _ghost(view: View) -> _Sought:
+def _ghost(view: View) -> _Best:
     """A blurred, displaced copy of the image. A search over the field finds the displacement that explains the discs best."""
     # The coarse grid of the search uses the means of the discs only. How many displacements the cells distinguish is not known, so all count.
-    return _Sought(place_search(view).copy, GHOST_TRIALS)
+    return _Best(place_search(view).copy, GHOST_TRIALS)
 
 
-def _copy(blur_px: float, dx: int, dy: int) -> Sequence[Change]:
+def _copy(view: View, blur_px: float, dx: int, dy: int) -> Sequence[Change]:
     def change(n: int, images: Sequence[Field]) -> Field:
         return np.asarray(displaced(gaussian_filter(images[n], blur_px), dx, dy), dtype=np.float32)
 
     return [Change(change, unocculted=False)]
-
-
-def _searching(
-    effect: Effect,
-    search: Search,
-    changes: Callable[[View, Any], Sequence[Change]],
-    cause: Callable[[Any], str] = lambda best: "",
-) -> Effect:
-    """The effect with a search among templates. changes(view, best): the changes by a template. cause(best): its description, which
-    follows the cause of the effect if the template is held."""
-    search = _once(effect.name, search)
-
-    def held(view: View) -> Effect:
-        found = search(view)
-        return replace(
-            effect,
-            cause=effect.cause[:-1] + cause(found.best) + ".",
-            changes=lambda view: changes(view, found.best),
-            distinguished=lambda view: found.distinguished,
-        )
-
-    return replace(
-        effect,
-        changes=lambda view: changes(view, search(view).best),
-        distinguished=lambda view: search(view).distinguished,
-        held=held,
-    )
-
-
-def _sought_later(view: View) -> Sequence[Change]:
-    """No changes; `_searching` replaces them."""
-    return ()
 
 
 def _where_copied(copy: tuple[float, int, int]) -> str:
@@ -146,8 +126,20 @@ def _where_copied(copy: tuple[float, int, int]) -> str:
     return f": displaced by ({dx}, {dy}) px, blurred by {blur_px:g} px"
 
 
+def _not_a_power_law(view: View) -> str | None:
+    """The reason why changes of the softened power law cannot be tested for this fit; None if they can be tested."""
+    name = view.solution.inversion.shape.name
+    if name == SOFTENED_POWER_LAW.name:
+        return None
+    return f"this effect needs the softened power law; the fitted shape is {name}"
+
+
 def _anisotropic(view: View) -> Sequence[Change]:
-    return [by_psf(view, blur) for blur in shape_slopes(view, "stretched", (3, 4))]
+    """Derivatives of the total PSF with respect to p and q of the stretched power law, evaluated at the fit."""
+    transit, solution, shape = view.solution.transit, view.solution, SHAPES["stretched"]
+    total = TotalPsf(transit.diffraction, shape, transit.shape, threads=solution.threads)
+    at = shape.coordinates(solution.inversion.values)
+    return [change for k in (3, 4) for change in _by_kernel(view, total.slope(at, k))]
 
 
 def _exponential(scale_px: float) -> Halo:
@@ -169,16 +161,15 @@ HALOS: tuple[Halo, ...] = tuple(form(scale) for scale in HALO_SCALES_PX for form
 
 def _as_halo(view: View, halo: Halo) -> Sequence[Change]:
     """The change of the images if a fraction of the scatter kernel is replaced by a halo."""
-    total, inversion = view.solution.total, view.solution.inversion
-    scatter = inversion.shape.kernel(inversion.coordinates, total.size)
-    return [by_psf(view, _blur(view, total.diffracted(halo(total.size) - scatter)))]
+    total = view.solution.total
+    return _by_kernel(view, total.diffracted(halo(total.size) - _scatter(view)))
 
 
-def _halo(view: View) -> _Sought:
+def _halo(view: View) -> _Best:
     """The halo that explains most of the residuals."""
     size = view.solution.total.size
     gains = place_search(view).wide_kernels([halo(size) for halo in HALOS])
-    return _Sought(HALOS[int(np.argmax(gains))], distinguished(gains))
+    return _Best(HALOS[int(np.argmax(gains))], distinguished(gains))
 
 
 def _field_dependent(view: View) -> Sequence[Change]:
@@ -186,20 +177,19 @@ def _field_dependent(view: View) -> Sequence[Change]:
     # The coordinate is a logit; the parameter is a relative change of the total scatter.
     share = np.float32(1 - view.solution.inversion.values["total"])
     x, y = view.places
-    return [by_psf(view, slope, (where / share).astype(np.float32)) for where in (x, y, x * x + y * y)]
+    return [_by_psf(view, slope, (where / share).astype(np.float32)) for where in (x, y, x * x + y * y)]
 
 
 def blur_as(view: View, width_px: float, steps: Steps) -> Sequence[Change]:
     """The change of the images by a blur of width `width_px`, divided by the variance of the blur, width_px^2."""
-    change = (_blurred(view.kernel, width_px, steps) - view.kernel) / width_px**2
-    return [by_psf(view, _blur(view, change))]
+    return _by_kernel(view, (_blurred(view.kernel, width_px, steps) - view.kernel) / width_px**2)
 
 
-def _core_blur(view: View) -> _Sought:
+def _core_blur(view: View) -> _Best:
     """The width (px) and the directions of the blur that explains most of the residuals."""
     near = crop_or_pad(view.kernel, 2 * KERNEL_REACH_PX + 1)
     gains = place_search(view).kernels([_blurred(near, *blur) - near for blur in BLURS])
-    return _Sought(BLURS[int(np.argmax(gains))], distinguished(gains))
+    return _Best(BLURS[int(np.argmax(gains))], distinguished(gains))
 
 
 def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
@@ -211,15 +201,6 @@ def _blurred(kernel: Kernel, width_px: float, steps: Steps) -> Kernel:
     walk = sum((np.cos(2 * np.pi * (y * fy + x * fx)) - 1) / (y * y + x * x) for y, x in steps)
     transfer = np.exp(width_px**2 * walk)
     return np.asarray(np.fft.irfft2(np.fft.rfft2(kernel) * transfer, s=kernel.shape))
-
-
-def _mesh(view: View, changed: Kernel) -> list[Change]:
-    """The change of the images by a change of the diffraction PSF (`changed`), convolved with the scatter kernel."""
-    solution = view.solution
-    size = solution.total.size
-    scatter = solution.inversion.shape.kernel(solution.inversion.coordinates, size)
-    through = Convolver(changed, (size, size), dtype=np.float64, threads=solution.threads)
-    return [by_psf(view, _blur(view, np.asarray(through.apply(scatter), dtype=np.float64)))]
 
 
 def _odd(view: View) -> Kernel:
@@ -240,73 +221,57 @@ def _stretched(pattern: Kernel, percent: float) -> Kernel:
     )
 
 
-def _amount(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> _Sought:
+def _amount(view: View, form: Callable[[Kernel, float], Kernel], steps: Sequence[float]) -> _Best:
     """The amount of change of the diffraction PSF that explains most of the residuals.
 
     A search is needed because the mesh orders move by more than their width. form(pattern, amount): the changed pattern.
     steps: absolute amounts; each is tried with both signs. Then amounts between the neighbours of the best one are tried.
     """
-    search, pattern = place_search(view), _near(_odd(view))
+    pattern = _odd(view)
+    pattern = crop_or_pad(pattern, min(2 * KERNEL_REACH_PX + 1, pattern.shape[0]))
+
+    def gains_of(amounts: Sequence[float]) -> NDArray[np.float64]:
+        return place_search(view).kernels([form(pattern, amount) - pattern for amount in amounts])
+
     tried = sorted(sign * step for step in steps for sign in (-1, 1))
-    gains = search.kernels([form(pattern, amount) - pattern for amount in tried])
+    gains = gains_of(tried)
     best = int(np.argmax(gains))
     low, high = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
     between = [low + (high - low) * k / BETWEEN for k in range(1, BETWEEN)]
     between = [amount for amount in between if abs(amount) >= min(steps)]
-    nearer = search.kernels([form(pattern, amount) - pattern for amount in between])
-    return _Sought(between[int(np.argmax(nearer))], distinguished(gains))
+    return _Best(between[int(np.argmax(gains_of(between)))], distinguished(gains))
 
 
-def _near(pattern: Kernel) -> Kernel:
-    """The central part of a pattern. The search uses only this part."""
-    return crop_or_pad(pattern, min(2 * KERNEL_REACH_PX + 1, pattern.shape[0]))
-
-
-def _changed_mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: float) -> list[Change]:
+def _mesh(view: View, form: Callable[[Kernel, float], Kernel], amount: float) -> Sequence[Change]:
     """The change of the images if form(pattern, amount) replaces the diffraction PSF, divided by the amount."""
-    pattern = _odd(view)
-    change = (form(pattern, amount) - pattern) / amount
-    return _mesh(view, crop_or_pad(change, view.solution.transit.diffraction.shape[0]))
-
-
-def _mesh_effect(name: str, form: Callable[[Kernel, float], Kernel], steps: Sequence[float],
-                 parameter: EffectParameter, cause: str, axes: tuple[str, ...]) -> Effect:  # fmt: skip
-    return _searching(
-        Effect(name, "optics", (parameter,), cause, "the diffraction arms of a flare", axes, _sought_later, trials=2 * len(steps)),
-        lambda view: _amount(view, form, steps),
-        lambda view, amount: _changed_mesh(view, form, amount),
-    )  # fmt: skip
-
-
-def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
-    return EffectParameter(name, unit, likely, positive)
+    solution, pattern = view.solution, _odd(view)
+    size = solution.total.size
+    change = crop_or_pad((form(pattern, amount) - pattern) / amount, solution.transit.diffraction.shape[0])
+    through = Convolver(change, (size, size), dtype=np.float64, threads=solution.threads)
+    return _by_kernel(view, np.asarray(through.apply(_scatter(view)), dtype=np.float64))
 
 
 EFFECTS: tuple[Effect, ...] = (
-    _searching(
-        Effect("ghost", "optics", (_p("share", "", 0.02, True),), "A reflection adds a displaced, defocused copy of the image.",
-               "images of a bright source at several positions in the field", ("detector_x", "detector_y", "intensity"), _sought_later,
-               trials=GHOST_TRIALS),
-        _ghost, lambda view, copy: _copy(*copy), _where_copied),
-    Effect("anisotropic_scatter", "optics", (_p("p", "", 0.1), _p("q", "", 0.1)),
+    _searching("ghost", Parameter("share", "", 0.02, True), "A reflection adds a displaced, defocused copy of the image.",
+               "images of a bright source at several positions in the field", ("detector_x", "detector_y", "intensity"), GHOST_TRIALS,
+               _ghost, lambda view, copy: _copy(view, *copy), _where_copied),
+    Effect("anisotropic_scatter", "optics", (Parameter("p", "", 0.1), Parameter("q", "", 0.1)),
            "Scatter reaches farther along one direction. p and q are ln(1 + stretch) times the cosine and the sine of twice the angle of this direction.",
            "a transit along a second track that crosses the first", ("azimuth_in_disc", "detector_x", "detector_y"),
-           _anisotropic, not_a_power_law),
+           _anisotropic, _not_a_power_law),
     Effect("field_dependent_scatter", "optics",
-           (_p("x", "/field", 0.1), _p("y", "/field", 0.1), _p("outwards", "/field2", 0.2)),
+           (Parameter("x", "/field", 0.1), Parameter("y", "/field", 0.1), Parameter("outwards", "/field2", 0.2)),
            "The total scatter varies across the detector, linearly or from its centre outwards.", "a transit across another part of the detector",
-           ("detector_x", "detector_y"), _field_dependent, not_a_power_law),
-    _searching(
-        Effect("wide_halo", "optics", (_p("share", "", 0.1, True),), "The scatter has a second, wide component.",
-               "an eclipse, or a transit of a larger occulter", ("scattering_distance", "pointing", "intensity"), _sought_later,
-               trials=len(HALOS)),
-        _halo, _as_halo),
-    _searching(
-        Effect("core_blur", "optics", (_p("variance", "px2", 1.0, True),), "Jitter or defocus widens the core.",
-               "an image of a sharp limb or of a point source", ("radius_in_disc", "azimuth_in_disc"), _sought_later, trials=len(BLURS)),
-        _core_blur, lambda view, blur: blur_as(view, *blur)),
-    _mesh_effect("mesh_rotation", _turned, ANGLES_DEG, _p("angle", "deg", 3.0),
-                 "The meshes are rotated relative to the detector.", ("azimuth_in_disc", "detector_x", "detector_y")),
-    _mesh_effect("mesh_pitch", _stretched, PITCHES_PCT, _p("stretch", "%", 3.0),
-                 "The pitch of the meshes differs from its nominal value.", ("radius_in_disc", "azimuth_in_disc")),
+           ("detector_x", "detector_y"), _field_dependent, _not_a_power_law),
+    _searching("wide_halo", Parameter("share", "", 0.1, True), "The scatter has a second, wide component.",
+               "an eclipse, or a transit of a larger occulter", ("scattering_distance", "pointing", "intensity"), len(HALOS), _halo, _as_halo),
+    _searching("core_blur", Parameter("variance", "px2", 1.0, True), "Jitter or defocus widens the core.",
+               "an image of a sharp limb or of a point source", ("radius_in_disc", "azimuth_in_disc"), len(BLURS),
+               _core_blur, lambda view, blur: blur_as(view, *blur)),
+    _searching("mesh_rotation", Parameter("angle", "deg", 3.0), "The meshes are rotated relative to the detector.",
+               "the diffraction arms of a flare", ("azimuth_in_disc", "detector_x", "detector_y"), 2 * len(ANGLES_DEG),
+               lambda view: _amount(view, _turned, ANGLES_DEG), lambda view, angle_deg: _mesh(view, _turned, angle_deg)),
+    _searching("mesh_pitch", Parameter("stretch", "%", 3.0), "The pitch of the meshes differs from its nominal value.",
+               "the diffraction arms of a flare", ("radius_in_disc", "azimuth_in_disc"), 2 * len(PITCHES_PCT),
+               lambda view: _amount(view, _stretched, PITCHES_PCT), lambda view, percent: _mesh(view, _stretched, percent)),
 )  # fmt: skip

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.gap.effect import Change, Effect, EffectParameter
+from psfcore.gap.effect import Change, Effect
+from psfcore.gap.effect import EffectParameter as Parameter
 from psfcore.gap.evidence.search import coarse_kernel
-from psfcore.gap.evidence.unocculted_blocks import blocks, not_compared
+from psfcore.gap.evidence.unocculted_blocks import block_means, blocks, not_compared
 from psfcore.gap.view import Field, View
 from psfcore.transit.occulter import coverage
 from psfcore.transit.transit import Place
@@ -47,63 +49,55 @@ def _beyond_field(view: View) -> Sequence[Change]:
     # The left and the right side include the corners, so that the four sides cover the whole surroundings of the field.
     sides = (low_x, high_x, low_y & ~low_x & ~high_x, high_y & ~low_x & ~high_x)
 
-    def change(n: int, side: NDArray[np.bool_]) -> Field:
-        scene = _coarse(view.scenes[n])
-        wide = np.pad(scene, ((pad_y, pad_y), (pad_x, pad_x)), mode="symmetric") * side
-        seen = through.apply(wide.astype(np.float32))[pad_y : pad_y + ny, pad_x : pad_x + nx]
-        return on_pixels(seen, solution.transit.shape)
-
-    frames = solution.transit.frames
-    nothing = np.zeros(solution.transit.shape, np.float32)
-
-    def one(pointing: int, side: NDArray[np.bool_]) -> Change:
-        return Change(
-            lambda n, _: change(n, side) if frames[n].pointing == pointing else nothing, unocculted=False
-        )
+    def light(n: int, images: Sequence[Field], here: Sequence[int], side: NDArray[np.bool_]) -> Field:
+        if n not in here:
+            return np.zeros(solution.transit.shape, np.float32)
+        scene = np.pad(_coarse(view.scenes[n]), ((pad_y, pad_y), (pad_x, pad_x)), mode="symmetric") * side
+        seen = through.apply(scene.astype(np.float32))[pad_y : pad_y + ny, pad_x : pad_x + nx]
+        return _on_pixels(seen, solution.transit.shape)
 
     # The surroundings differ between pointings, so each pointing has separate parameters.
+    pointings = list(_images_of_pointings(view).values())[:MOST_POINTINGS]
     return [
-        one(pointing, side)
-        for pointing in sorted({f.pointing for f in frames})[:MOST_POINTINGS]
-        for side in sides
+        Change(partial(light, here=here, side=side), unocculted=False) for here in pointings for side in sides
     ]
 
 
-def _coarse(plane: Field) -> Field:
+def _coarse(plane: NDArray[np.floating]) -> NDArray[np.float64]:
     """The means of a plane over squares of COARSE_PX px. Repeated edge pixels complete incomplete squares."""
     ny, nx = plane.shape
-    whole = np.pad(plane, ((0, -ny % COARSE_PX), (0, -nx % COARSE_PX)), mode="edge")
-    rows, columns = (n // COARSE_PX for n in whole.shape)
-    return np.asarray(whole.reshape(rows, COARSE_PX, columns, COARSE_PX).mean(axis=(1, 3)))
+    return block_means(np.pad(plane, ((0, -ny % COARSE_PX), (0, -nx % COARSE_PX)), mode="edge"), COARSE_PX)
+
+
+def _on_pixels(plane: NDArray[np.floating], shape: tuple[int, int]) -> Field:
+    """A plane on coarse pixels, expanded to the pixels of the images. shape: of the images."""
+    fine = np.repeat(np.repeat(plane, COARSE_PX, axis=0), COARSE_PX, axis=1)
+    return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
 
 
 def _motion(view: View) -> Sequence[Change]:
     """The change of the images if the disc moves along its track during an exposure, so that its edge is blurred."""
     solution = view.solution
-    frames = solution.transit.frames
+    frames, optics, shape = solution.transit.frames, solution.optics, solution.transit.shape
     places = [found.place for found in solution.sky.found]
     longest = max(frame.exposure_s for frame in frames)
-    shape = solution.transit.shape
 
-    def change(n: int, longest_px: float) -> Field:
+    def blur(n: int, images: Sequence[Field], longest_px: float) -> Field:
         near = [k for k, f in enumerate(frames) if f.pointing == frames[n].pointing and k != n]
         hidden = view.behind(n)
         if not near or hidden is None:
             return np.zeros(shape, np.float32)
-        other = min(near, key=lambda k: abs(frames[k].time_s - frames[n].time_s))
-        dx, dy = places[other].x_px - places[n].x_px, places[other].y_px - places[n].y_px
+        here, other = places[n], places[min(near, key=lambda k: abs(frames[k].time_s - frames[n].time_s))]
+        dx, dy = other.x_px - here.x_px, other.y_px - here.y_px
         reach = longest_px * frames[n].exposure_s / longest / max(float(np.hypot(dx, dy)), 1e-9)
-        here = places[n]
-        parts = (np.arange(MOTION_PARTS) + 0.5) / MOTION_PARTS - 0.5
+        parts = reach * ((np.arange(MOTION_PARTS) + 0.5) / MOTION_PARTS - 0.5)
         along = (
-            coverage(shape, Place(here.x_px + s * reach * dx, here.y_px + s * reach * dy, here.radius_px))
-            for s in parts
+            coverage(shape, Place(here.x_px + s * dx, here.y_px + s * dy, here.radius_px)) for s in parts
         )
         lost = (sum(along) / MOTION_PARTS - coverage(shape, here)) * hidden
-        optics = solution.optics
         return optics.field(optics.convolve(optics.lanes((-lost).astype(np.float32))))
 
-    return [Change(lambda n, _, px=px: change(n, px), unocculted=False) for px in MOTIONS_PX]  # type: ignore[misc]
+    return [Change(partial(blur, longest_px=px), unocculted=False) for px in MOTIONS_PX]
 
 
 def _evolution(view: View) -> Sequence[Change]:
@@ -112,27 +106,34 @@ def _evolution(view: View) -> Sequence[Change]:
     Two changes: the part that is linear in time, and the other part that is smooth in time. The discs do not show these
     changes, because the scene of each image is reconstructed from the image itself.
     """
-    frames = view.solution.transit.frames
     evolving = [
-        _smooth_in_time(view, images)
-        for pointing in sorted({f.pointing for f in frames})
-        if len(images := [n for n, f in enumerate(frames) if f.pointing == pointing]) >= LEAST_TO_EVOLVE
+        _Evolving.measured(view, images)
+        for images in _images_of_pointings(view).values()
+        if len(images) >= LEAST_TO_EVOLVE
     ]
-    nothing = np.zeros(view.solution.transit.shape, np.float32)
+    shape = view.solution.transit.shape
+    nothing = np.zeros(shape, np.float32)
 
     def one(terms: slice) -> Change:
         planes = {n: plane for part in evolving for n, plane in part.planes(terms).items()}
-        rms = np.sqrt(
-            np.mean([np.mean(planes[n] ** 2) / part.level**2 for part in evolving for n in part.images])
-        )
-        unit = {n: np.asarray(plane / max(float(rms), 1e-9), np.float32) for n, plane in planes.items()}
+        relative = [np.mean(planes[n] ** 2) / part.level**2 for part in evolving for n in part.images]
+        rms = max(float(np.sqrt(np.mean(relative))), 1e-9)
         return Change(
-            lambda n, _: on_pixels(unit[n], nothing.shape) if n in unit else nothing,
+            lambda n, _: _on_pixels(planes[n] / rms, shape) if n in planes else nothing,
             disc=False,
             numbers=sum(part.numbers(terms) for part in evolving),
         )
 
     return [one(slice(1, 2)), one(slice(2, None))]
+
+
+def _images_of_pointings(view: View) -> dict[int, list[int]]:
+    """The numbers of the images of each pointing."""
+    frames = view.solution.transit.frames
+    return {
+        pointing: [n for n, frame in enumerate(frames) if frame.pointing == pointing]
+        for pointing in sorted({frame.pointing for frame in frames})
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,17 +144,44 @@ class _Evolving:
     pointing, DN/s. free: for each block, the number of images that show it (blocks,).
     """
 
-    images: tuple[int, ...]
+    images: Sequence[int]
     basis: NDArray[np.float64]
     terms: Planes
     level: float
     free: NDArray[np.int64]
 
-    def planes(self, terms: slice) -> dict[int, Planes]:
-        """For each image, by its number: the change of the scene that these terms describe [y, x], DN/s.
+    @staticmethod
+    def measured(view: View, images: Sequence[int]) -> _Evolving:
+        """The change that is fitted to these images, in the pixels that can be compared."""
+        time_s = np.array([view.solution.transit.frames[n].time_s for n in images])
+        at = 2 * (time_s - time_s[0]) / max(float(time_s[-1] - time_s[0]), 1e-9) - 1
+        basis = np.polynomial.legendre.legvander(at, min(MOST_TERMS, len(images) // 2))
+        hidden = [not_compared(view.solution, n).astype(np.float64) for n in images]
+        weight = np.array([_coarse(one) == 0 for one in hidden], dtype=np.float64)
+        seen = np.array([_coarse(view.unocculted[n]) for n in images])
 
-        The mean of the change over time is 0.
-        """
+        def mean() -> NDArray[np.float64]:
+            return np.asarray((seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1))
+
+        # The brightness of a whole image is not a change of the Sun's structure.
+        level = mean()
+        for one, use in zip(seen, weight > 0, strict=True):
+            if use.any():
+                one /= one[use].sum() / max(float(level[use].sum()), 1e-9)
+        level = mean()
+        normal = np.einsum("nk,nyx,nl->yxkl", basis, weight, basis) + RIDGE * np.eye(basis.shape[1])
+        score = np.einsum("nk,nyx->yxk", basis, weight * (seen - level))
+        terms = np.moveaxis(np.linalg.solve(normal, score[..., None])[..., 0], -1, 0)
+        return _Evolving(
+            images=images,
+            basis=basis,
+            terms=np.array([gaussian_filter(plane, STRUCTURE_PX / COARSE_PX) for plane in terms]),
+            level=max(float(level.mean()), 1e-9),
+            free=np.sum([blocks(one) == 0 for one in hidden], axis=0),
+        )
+
+    def planes(self, terms: slice) -> dict[int, Planes]:
+        """For each image, by its number: the change of the scene that these terms describe [y, x], DN/s."""
         # The mean over time belongs to the scene, not to its change.
         basis = self.basis[:, terms] - self.basis[:, terms].mean(axis=0)
         return dict(zip(self.images, np.tensordot(basis, self.terms[terms], axes=1), strict=True))
@@ -167,73 +195,20 @@ class _Evolving:
         return int(np.maximum(last - terms.start, 0).sum())
 
 
-def _smooth_in_time(view: View, images: Sequence[int]) -> _Evolving:
-    solution = view.solution
-    time_s = np.array([solution.transit.frames[n].time_s for n in images])
-    at = 2 * (time_s - time_s[0]) / max(float(time_s[-1] - time_s[0]), 1e-9) - 1
-    degree = min(MOST_TERMS, len(images) // 2)
-    basis = np.polynomial.legendre.legvander(at, degree)
-    seen, weight, free = unocculted_on_coarse(view, images)
-    level = (seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
-    normal = np.einsum("nk,nyx,nl->yxkl", basis, weight, basis) + RIDGE * np.eye(degree + 1)
-    score = np.einsum("nk,nyx->yxk", basis, weight * (seen - level))
-    terms = np.moveaxis(np.linalg.solve(normal, score[..., None])[..., 0], -1, 0)
-    return _Evolving(
-        images=tuple(images),
-        basis=basis,
-        terms=np.array([gaussian_filter(plane, STRUCTURE_PX / COARSE_PX) for plane in terms]),
-        level=max(float(level.mean()), 1e-9),
-        free=free,
-    )
-
-
-def unocculted_on_coarse(view: View, images: Sequence[int]) -> tuple[Planes, Planes, NDArray[np.int64]]:
-    """The unocculted field of images of one pointing, on coarse pixels. Three results:
-
-    - the images (images, y, x), DN/s, with the hidden light added, all scaled to the same brightness;
-    - their weights (images, y, x): 1 where a pixel can be compared with other images, otherwise 0;
-    - the number of images that show each block (blocks,).
-    """
-    planes, weights, free = [], [], []
-    for n in images:
-        out = not_compared(view.solution, n)
-        planes.append(_coarse(view.unocculted[n]))
-        weights.append(_coarse((~out).astype(np.float32)) == 1)
-        free.append(blocks(out.astype(np.float64)) == 0)
-    seen, weight = np.array(planes, dtype=np.float64), np.array(weights, dtype=np.float64)
-    level = (seen * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
-    # The brightness of a whole image is not a change of the Sun's structure.
-    for one, use in zip(seen, weight > 0, strict=True):
-        if use.any():
-            one /= one[use].sum() / max(float(level[use].sum()), 1e-9)
-    return seen, weight, np.sum(free, axis=0)
-
-
-def on_pixels(plane: Field, shape: tuple[int, ...]) -> Field:
-    """A plane on coarse pixels, expanded to the pixels of the images. shape: of the images."""
-    fine = np.repeat(np.repeat(plane, COARSE_PX, axis=0), COARSE_PX, axis=1)
-    return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
-
-
 def _too_few_to_evolve(view: View) -> str | None:
-    frames = view.solution.transit.frames
-    most = max(sum(f.pointing == pointing for f in frames) for pointing in {f.pointing for f in frames})
+    most = max(len(images) for images in _images_of_pointings(view).values())
     if most >= LEAST_TO_EVOLVE:
         return None
     return f"this effect needs a pointing with {LEAST_TO_EVOLVE} images; the largest pointing has {most}"
 
 
-def _p(name: str, unit: str, likely: float, positive: bool = False) -> EffectParameter:
-    return EffectParameter(name, unit, likely, positive)
-
-
 EFFECTS: tuple[Effect, ...] = (
     Effect("occulter_motion", "scene",
-           (_p("short_tracks", "", 4.0, True), _p("long_tracks", "", 1.0, True)), "The occulter moves during an exposure.",
+           (Parameter("short_tracks", "", 4.0, True), Parameter("long_tracks", "", 1.0, True)), "The occulter moves during an exposure.",
            "shorter exposures", ("radius_in_disc", "azimuth_in_disc"), _motion),
-    Effect("out_of_field_light", "scene", tuple(_p(f"{side}_{k}", "", 0.5, True) for k in range(1, MOST_POINTINGS + 1) for side in SIDES),
+    Effect("out_of_field_light", "scene", tuple(Parameter(f"{side}_{k}", "", 0.5, True) for k in range(1, MOST_POINTINGS + 1) for side in SIDES),
            "Light from the Sun outside the field scatters into the field.",
            "full-Sun images taken at the same time", ("scattering_distance", "pointing", "intensity"), _beyond_field),
-    Effect("scene_evolution", "scene", (_p("rms", "", 0.3, True), _p("rms_uneven", "", 0.3, True)), "The Sun changes while the occulter crosses the field of a pointing.",
+    Effect("scene_evolution", "scene", (Parameter("rms", "", 0.3, True), Parameter("rms_uneven", "", 0.3, True)), "The Sun changes while the occulter crosses the field of a pointing.",
            "images that are closer together in time", ("time", "pointing"), _evolution, _too_few_to_evolve),
 )  # fmt: skip

@@ -115,7 +115,9 @@ def field_rows(report: Report) -> list[Row]:
                 one["words"] + beside,
                 one["stage"] or "",
                 percent_words(one["probability"]),
-                "" if strength is None else f"{strength['value']:.2g} ± {strength['sigma']:.1g} {one['unit']}",
+                ""
+                if strength is None
+                else f"{strength['value']:.2g} ± {strength['sigma']:.1g} {one['unit']}",
                 "" if closure is None else f"{100 * closure['value']:.0f} %",
                 ", ".join(alike),
             ]

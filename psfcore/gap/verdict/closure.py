@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -88,17 +88,13 @@ class HeldOut:
 
     def of(self, images: Sequence[int]) -> HeldOut:
         """The results for these images only. Deviance and spread are left out, because they belong to folds."""
-        at = {image: k for k, image in enumerate(self.images)}
-        here = [at[image] for image in images]
-        return HeldOut(
-            tuple(images),
-            self.chi2[here],
-            self.expected[here],
-            self.unocculted_chi2[here],
-            self.unocculted_expected[here],
-            self.residual_pct[here],
-            self.noise_pct[here],
-        )
+        here = [self.images.index(image) for image in images]
+        arrays = {
+            one.name: getattr(self, one.name)[here]
+            for one in fields(self)
+            if isinstance(getattr(self, one.name), np.ndarray)
+        }
+        return HeldOut(tuple(images), **arrays)
 
 
 def time_blocks(model: LinearModel) -> tuple[Fold, ...]:
@@ -108,13 +104,12 @@ def time_blocks(model: LinearModel) -> tuple[Fold, ...]:
 
 def pointings(model: LinearModel) -> tuple[Fold, ...]:
     """Folds that hold out one pointing each; empty if there are fewer than two pointings."""
-    fovs = [taken.pointing for taken in model.evidence.image_info]
-    if len(set(fovs)) < 2:
-        return ()
-    every = range(len(fovs))
+    pointing = np.array([taken.pointing for taken in model.evidence.image_info])
+    every = np.unique(pointing)
     return tuple(
-        Fold(tuple(n for n in every if fovs[n] == one), tuple(n for n in every if fovs[n] != one))
-        for one in sorted(set(fovs))
+        Fold(*(tuple(np.flatnonzero(part).tolist()) for part in (pointing == one, pointing != one)))
+        for one in every
+        if every.size > 1
     )
 
 
@@ -140,55 +135,41 @@ def hold_out(model: LinearModel, columns: Sequence[int], scheme: Sequence[Fold])
             continue
         step = model.fit(columns, model.equations(fitted))
         here = list(step.columns)
-        everything: list[tuple[Vector, Vector]] = []
+        in_discs, in_blocks = [], []
         for n in held:
             disc, white = evidence.discs[by_index[n]], model.discs[by_index[n]]
             left = white.residual - white.jacobian[here].T @ step.values
-            error = float(
-                np.einsum("ki,kl,li->", white.jacobian[here], step.covariance, white.jacobian[here])
-            )
-            of_blocks, jacobian = evidence.unocculted.held_out(columns, [n], fitted)
-            of_blocks = (of_blocks - step.values[base:] @ jacobian) / unocculted_noise
-            errors = step.covariance[base:, base:]
-            of_unocculted = max(of_blocks.size - 1, 0) + float(
-                np.einsum("kb,kl,lb->", jacobian, errors, jacobian)
-            )
-            of_all = np.zeros((len(here), of_blocks.size))  # the blocks do not depend on the PSF
-            of_all[base:] = jacobian / unocculted_noise
-            everything += [(left, white.jacobian[here]), (of_blocks, of_all)]
+            blocks, jacobian = evidence.unocculted.held_out(columns, [n], fitted)
+            blocks = (blocks - step.values[base:] @ jacobian) / unocculted_noise
+            expected = max(blocks.size - 1, 0) + _error(jacobian, step.covariance[base:, base:])
+            unchanged = np.zeros((base, blocks.size))  # the blocks do not depend on the PSF
+            in_discs.append((left, white.jacobian[here]))
+            in_blocks.append((blocks, np.vstack([unchanged, jacobian / unocculted_noise])))
             answer = disc.jacobian[here] @ disc.share
             mean = float(disc.share @ disc.residual - answer @ step.values)
             noise = math.sqrt(disc.mean_noise**2 + float(answer @ step.covariance @ answer))
-            images.append(n)
-            rows.append(
-                (
-                    float(left @ left),
-                    left.size + error,
-                    float(of_blocks @ of_blocks),
-                    of_unocculted,
-                    -100 * mean / disc.level,
-                    100 * noise / disc.level,
-                )
-            )
-        residuals, jacobians = (np.concatenate(parts, axis=-1) for parts in zip(*everything, strict=True))
+            percent = (-100 * mean / disc.level, 100 * noise / disc.level)
+            of_disc = (float(left @ left), left.size + _error(white.jacobian[here], step.covariance))
+            rows.append((*of_disc, float(blocks @ blocks), expected, *percent))
+        images += held
+        residuals, jacobians = (
+            np.concatenate(parts, axis=-1) for parts in zip(*in_discs, *in_blocks, strict=True)
+        )
         along = _along_errors(jacobians, step.covariance)
-        of_discs = np.repeat([True, False] * len(held), [part.size for part, _ in everything])
+        cells = sum(left.size for left, _ in in_discs)
         deviance[tuple(held)] = _deviance(residuals, along)
-        spread[tuple(held)] = _spread(along[:, of_discs]), _spread(along)
+        spread[tuple(held)] = _spread(along[:, :cells]), _spread(along)
     if not rows:
         return None
-    chi2, expected, unocculted_chi2, unocculted_expected, residual, noise_pct = np.array(rows).T
+    chi2, of_cells, blocks_chi2, of_blocks, residual, noise_pct = np.array(rows).T
     return HeldOut(
-        tuple(images),
-        chi2,
-        expected,
-        unocculted_chi2,
-        unocculted_expected,
-        residual,
-        noise_pct,
-        deviance,
-        spread,
+        tuple(images), chi2, of_cells, blocks_chi2, of_blocks, residual, noise_pct, deviance, spread
     )
+
+
+def _error(jacobian: Vector, covariance: Vector) -> float:
+    """trace(J Cov J^T). jacobian: (parameters, n)."""
+    return float(np.einsum("ki,kl,li->", jacobian, covariance, jacobian))
 
 
 def _along_errors(jacobian: Vector, covariance: Vector) -> Vector:
@@ -213,26 +194,14 @@ def _deviance(left: Vector, along: Vector) -> float:
     return float(left @ left - projected @ np.linalg.solve(inner, projected) + np.linalg.slogdet(inner)[1])
 
 
-def _in_both(before: HeldOut, after: HeldOut) -> tuple[HeldOut, HeldOut] | None:
-    """Restrict both results to the images that both contain; None if they share no image.
-
-    The two can differ, because a fold is skipped if it has too few images for the number of fitted parameters.
-    """
-    common = sorted(set(before.images) & set(after.images))
-    if not common:
-        return None
-    return before.of(common), after.of(common)
-
-
 def closure(
     before: HeldOut, after: HeldOut, rng: np.random.Generator, scale_error: float = 0.0
 ) -> Interval | None:
     """Eq. (1) with its 90 % interval; None if there is no gap. scale_error: relative error of the scale of chi2 (noise variance)."""
-    both = _in_both(before, after)
-    if both is None:
-        return None
+    # A fold is skipped if it has too few images for the number of fitted parameters, so the images can differ.
+    common = sorted(set(before.images) & set(after.images))
     spread = list(after.spread.values())
-    before, after = both
+    before, after = before.of(common), after.of(common)
     chi2_before, chi2_after, nu, nu_after = before.chi2, after.chi2, before.expected, after.expected
     shown = float((before.unocculted_chi2 - before.unocculted_expected).sum())
     fallen = float((before.unocculted_chi2 - after.unocculted_chi2).sum())

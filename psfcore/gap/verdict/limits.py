@@ -36,7 +36,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,6 @@ from scipy.optimize import brentq, nnls
 from scipy.special import logsumexp, ndtr, ndtri
 
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.fields import LIKELY, widest_fields
 from psfcore.gap.evidence.likelihood import MEASURED, SCALES, Likelihood
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
@@ -85,7 +84,6 @@ class ParameterLimits:
 class EffectLimits:
     """The limits of one effect: one entry for each parameter, valid if the other parameters are 0."""
 
-    effect: str
     parameters: tuple[ParameterLimits, ...]
 
     @property
@@ -103,10 +101,10 @@ class EffectLimits:
 
     def as_json(self) -> dict[str, Any]:
         """The limits of the leading parameter. If the effect has several parameters, the limits of all parameters are added."""
-        found = {"parameter": self.leading.name} | self.leading.as_json()
+        content = {"parameter": self.leading.name} | self.leading.as_json()
         if len(self.parameters) > 1:
-            found["parameters"] = {one.name: one.as_json() for one in self.parameters}
-        return found
+            content["parameters"] = {one.name: one.as_json() for one in self.parameters}
+        return content
 
 
 @dataclass(frozen=True)
@@ -144,12 +142,12 @@ class Limits:
             else one
             for one in self.effects[effect.name].parameters
         )
-        return replace(self, effects={**self.effects, effect.name: EffectLimits(effect.name, parameters)})
+        return replace(self, effects={**self.effects, effect.name: EffectLimits(parameters)})
 
     def as_json(self) -> dict[str, Any]:
         """`limits`, `alike` and `untestable` as in a report."""
         return {
-            "limits": {name: found.as_json() for name, found in self.effects.items()},
+            "limits": {name: one.as_json() for name, one in self.effects.items()},
             "alike": [one.as_json() for one in self.alike],
             "untestable": [{"name": name, "why": why} for name, why in self.untestable.items()],
         }
@@ -172,15 +170,23 @@ def limits(
     every = model.evidence.effects
     endless = [e.name for e in every if not all(math.isfinite(p.likely) for p in e.parameters)]
     evidence = replace(model.evidence, effects=tuple(e for e in every if e.name not in endless))
-    directions, fields = widest_fields(evidence)
-    found = _Limits(Likelihood(model).with_further(directions), evidence, fields, prior)
-    need = _Need(threshold, temperature)
-    effects = {
-        effect.name: EffectLimits(effect.name, found.parameters(effect, need, observed))
-        for effect in evidence.effects
-    }
-    distances = found.distances(effects)
-    settled_by = {effect.name: effect.settled_by for effect in evidence.effects}
+    hypotheses = _Hypotheses(replace(model, evidence=evidence), prior)
+    effects, settled_by = {}, {}
+    for effect in evidence.effects:
+        strengths = hypotheses.strengths(
+            effect, partial(_margin, threshold=threshold, temperature=temperature)
+        )
+        excluded = hypotheses.excluded(effect) if observed else [None] * len(strengths)
+        fields = [(RMS, effect.parameters[0].unit, effect.parameters[0].likely)]
+        fields = fields if effect.field else [(p.name, p.unit, p.likely) for p in effect.parameters]
+        effects[effect.name] = EffectLimits(
+            tuple(
+                ParameterLimits(*one, *limit)
+                for one, *limit in zip(fields, strengths, excluded, strict=False)
+            )
+        )
+        settled_by[effect.name] = effect.settled_by
+    distances = hypotheses.distances(effects)
     alike = (
         Alike(pair, distance, "; or ".join(dict.fromkeys(settled_by[name] for name in pair)))
         for pair, distance in distances.items()
@@ -190,27 +196,17 @@ def limits(
     return Limits(effects, distances, tuple(sorted(alike, key=lambda one: one.distance)), untestable)
 
 
-@dataclass(frozen=True)
-class _Need:
-    """The condition under which a hypothesis belongs to the answer. threshold, temperature: as in `limits`."""
+def _margin(log_odds: Matrix, threshold: float, temperature: float) -> Vector:
+    """One number for each strength: 0 or more if the first hypothesis belongs to the answer and "no effect" does not.
 
-    threshold: float
-    temperature: float
-
-    def margin(self, log_odds: Matrix, own: int) -> Vector:
-        """One number for each strength: 0 or more if hypothesis `own` belongs to the answer and "no effect" does not.
-
-        Otherwise the number is negative. log_odds: (strengths, hypotheses), ln of the weight of each hypothesis divided
-        by the weight of "no effect".
-        """
-        against = log_odds / self.temperature
-        whole = logsumexp(np.pad(against, ((0, 0), (0, 1))), axis=1)
-        none_is_out = whole + math.log(self.threshold)
-        rivals = np.pad(np.delete(against, own, axis=1), ((0, 0), (0, 1))).max(axis=1)
-        best = against[:, own] - rivals  # the most probable hypothesis always belongs to the answer
-        return np.asarray(
-            np.minimum(none_is_out, np.maximum(best, against[:, own] - whole - math.log(self.threshold)))
-        )
+    Otherwise the number is negative. log_odds: (hypotheses, strengths), ln of the weight of each hypothesis divided by the
+    weight of "no effect". threshold, temperature: as in `limits`.
+    """
+    against = np.pad(log_odds / temperature, ((0, 1), (0, 0)))
+    whole = logsumexp(against, axis=0)
+    # The most probable hypothesis always belongs to the answer.
+    first = np.maximum(against[0] - against[1:].max(axis=0), against[0] - whole - math.log(threshold))
+    return np.asarray(np.minimum(whole + math.log(threshold), first))
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,137 +230,121 @@ class _Hypothesis:
         Every effect is compared with the same rivals, so the eigenvalues are computed once for each hypothesis.
         """
         inner = self.normal[np.ix_(self.columns, self.columns)]
-        found = []
+        modes = []
         for widths in self.widths:
             values, vectors = np.linalg.eigh(inner * np.outer(widths, widths))
-            found.append((np.maximum(values, 0.0), vectors.T * widths))
-        return found
+            modes.append((np.maximum(values, 0.0), vectors.T * widths))
+        return modes
 
 
-class _Limits:
-    """The normal matrix of all columns, and the hypotheses."""
+class _Hypotheses:
+    """The normal matrix of all columns, and the hypotheses about the cause."""
 
-    def __init__(
-        self, likelihood: Likelihood, evidence: Evidence, fields: Sequence[range], prior: Mapping[Kind, float]
-    ) -> None:
-        self._likelihood, self._evidence = likelihood, evidence
+    def __init__(self, model: LinearModel, prior: Mapping[Kind, float]) -> None:
+        evidence = self._evidence = model.evidence
+        directions, fields = widest_fields(evidence)
+        self._likelihood = Likelihood(model).with_further(directions)
         self._columns = {e.name: list(evidence.columns_of(e.name).values()) for e in evidence.effects}
-        unknown = [[evidence.size + k for k in one] for one in fields]
+        unknown = [[evidence.size + k for k in field] for field in fields]
         shown = sorted({c for columns in (*self._columns.values(), *unknown) for c in columns})
-        number = {column: k for k, column in enumerate(shown)}
-        self._normal = likelihood.normal(shown)
-        self._of = {name: np.array([number[c] for c in some]) for name, some in self._columns.items()}
-        self._prior = prior
-        self._single = {effect.name: self._hypothesis(effect) for effect in evidence.effects}
-        scales = np.array(SCALES)[:, None]
+        self._number = {column: k for k, column in enumerate(shown)}
+        self._normal = self._likelihood.normal(shown)
+        single = math.log(prior["single"] / max(len(evidence.effects), 1) / prior["none"])
+        self._log_prior = {effect.name: single - math.log(effect.trials) for effect in evidence.effects}
+        self._single = {effect.name: self._acting(effect) for effect in evidence.effects}
+        log_prior = math.log(prior["unknown"] / len(unknown) / prior["none"])
         self._unknown = [
-            _Hypothesis(
-                np.array([number[c] for c in columns]),
-                scales * np.full(len(columns), LIKELY),
-                math.log(prior["unknown"] / len(unknown) / prior["none"]),
-                self._normal,
-            )
-            for columns in unknown
+            self._hypothesis(columns, np.full(len(columns), LIKELY), log_prior) for columns in unknown
         ]
 
-    def _hypothesis(self, effect: Effect, kept: Sequence[int] | None = None) -> _Hypothesis:
-        """The hypothesis that an effect acts alone. kept: indices of the parameters that the hypothesis contains;
-        None: all."""
-        columns = self._columns[effect.name]
-        part = np.arange(len(columns)) if kept is None else np.array(kept)
-        likely = self._likely(effect)[part]
-        scales = np.array(SCALES)
-        prior = self._prior["single"] / len(self._evidence.effects) / self._prior["none"]
-        offset = math.log(prior / effect.trials)
-        offset -= MEASURED * self._evidence.numbers_of([columns[k] for k in part]) / 2
-        one_sided = part.size == 1 and bool(self._evidence.prior.positive[columns[part[0]]])
-        return _Hypothesis(
-            self._of[effect.name][part], scales[:, None] * likely, offset, self._normal, one_sided
-        )
+    def _hypothesis(
+        self, columns: Sequence[int], likely: Vector, offset: float, one_sided: bool = False
+    ) -> _Hypothesis:
+        widths = np.array(SCALES)[:, None] * likely
+        return _Hypothesis(self._numbers(columns), widths, offset, self._normal, one_sided)
 
-    def _likely(self, effect: Effect) -> Vector:
-        return self._evidence.prior.likely[self._columns[effect.name]]
+    def _numbers(self, columns: Sequence[int]) -> NDArray[np.intp]:
+        """The numbers of columns of the evidence in the normal matrix."""
+        return np.array([self._number[column] for column in columns], dtype=np.intp)
+
+    def _acting(self, effect: Effect, part: Sequence[int] | None = None) -> _Hypothesis:
+        """The hypothesis that an effect acts alone. part: the columns of the parameters that may act; None: all."""
+        columns = self._columns[effect.name] if part is None else part
+        prior = self._evidence.prior
+        offset = self._log_prior[effect.name] - MEASURED * self._evidence.numbers_of(columns) / 2
+        one_sided = len(columns) == 1 and bool(prior.positive[columns[0]])
+        return self._hypothesis(columns, prior.likely[list(columns)], offset, one_sided)
 
     # --- strengths that would be found ------------------------------------------------------------------
 
-    def parameters(self, effect: Effect, need: _Need, observed: bool) -> tuple[ParameterLimits, ...]:
-        """The limits of every parameter of an effect. If the effect is a random field: the limits of its rms."""
+    def strengths(self, effect: Effect, margin: Callable[[Matrix], Vector]) -> list[float | None]:
+        """found_90 of every parameter of an effect. If the effect is a random field: that of its rms."""
+        columns, prior = self._columns[effect.name], self._evidence.prior
+        numbers, single = self._numbers(columns), self._single[effect.name]
         if effect.field:
-            return (self._of_field(effect, need, observed),)
-        excluded = self._excluded(effect) if observed else [None] * self._of[effect.name].size
-        return tuple(
-            ParameterLimits(
-                parameter.name, parameter.unit, parameter.likely, self._found(effect, k, need), limit
-            )
-            for k, (parameter, limit) in enumerate(zip(effect.parameters, excluded, strict=False))
-        )
+            likely = prior.likely[columns]
+            change = self._normal[:, numbers] * (likely / likely[0])
+            seen = float(np.diag(self._normal)[numbers].mean())
+            return [self._strength(effect, change, seen, (single,), float(likely[0]), margin)]
+        found = []
+        for column, number in zip(columns, numbers, strict=True):
+            # A fit leaves out a positive parameter if its fitted value is negative. If the true value is 0, this happens in half of
+            # all cases. ln E is therefore the mean of two values: with all parameters, and without those that may be left out.
+            fewer = self._acting(effect, [c for c in columns if c == column or not prior.positive[c]])
+            # A single positive parameter has twice the weight.
+            fewer = replace(fewer, offset=fewer.offset + 2 * math.log(2) * bool(prior.positive[column]))
+            change, seen = self._normal[:, number], float(self._normal[number, number])
+            likely_size = float(prior.likely[column])
+            found.append(self._strength(effect, change, seen, (single, fewer), likely_size, margin))
+        return found
 
-    def _found(self, effect: Effect, k: int, need: _Need) -> float | None:
-        column = self._of[effect.name][k]
-        seen = float(self._normal[column, column])
-        if seen <= 0:
-            return None
-        change = self._normal[:, column]
-        positive = self._evidence.prior.positive[self._columns[effect.name]]
-        # A fit leaves out a positive parameter if its fitted value is negative. If the true value is 0, this happens in half of
-        # all cases. ln E is therefore the mean of two values: with all parameters, and without those that may be left out.
-        fewer = [m for m in range(positive.size) if m == k or not positive[m]]
-        own = (self._single[effect.name], self._hypothesis(effect, fewer))
-        sided = math.log(2) if positive[k] else 0.0
-        # A rival that would have to be negative cannot act.
-        rivals = [h for h in self._rivals(effect) if not (h.one_sided and change[h.columns[0]] <= 0)]
-        ways = [_odds_of(h, change, self._likelihood.gained) for h in (*own, *rivals)]
+    def _strength(
+        self,
+        effect: Effect,
+        change: Matrix | Vector,
+        seen: float,
+        own: Sequence[_Hypothesis],
+        likely: float,
+        margin: Callable[[Matrix], Vector],
+    ) -> float | None:
+        """The smallest strength that would be found. change: the columns of N of the true effect. seen: the chi2 of a strength
+        of 1. own: hypotheses that the effect acts; the mean of their ln E counts."""
+        rivals = [*(h for name, h in self._single.items() if name != effect.name), *self._unknown]
+        if change.ndim == 1:  # a rival that would have to be negative cannot act
+            rivals = [h for h in rivals if not (h.one_sided and change[h.columns[0]] <= 0)]
+        odds = [_odds_of(h, change, self._likelihood.gained) for h in (*own, *rivals)]
 
-        def margin(strengths: Vector) -> Vector:
-            odds = np.array([way(strengths) for way in ways]).T
-            both = (odds[:, 0] + odds[:, 1]) / 2 + sided
-            return need.margin(np.concatenate([both[:, None], odds[:, 2:]], axis=1), 0)
+        def margin_at(strengths: Vector) -> Vector:
+            found = np.array([one(strengths) for one in odds])
+            return margin(np.vstack([found[: len(own)].mean(axis=0), found[len(own) :]]))
 
-        return _first_found(margin, 1 / math.sqrt(seen), CREDIBLE * effect.parameters[k].likely)
-
-    def _rivals(self, effect: Effect) -> list[_Hypothesis]:
-        """All hypotheses except an effect and "no effect"."""
-        return [*(h for name, h in self._single.items() if name != effect.name), *self._unknown]
-
-    def _of_field(self, effect: Effect, need: _Need, observed: bool) -> ParameterLimits:
-        """The limits of the standard deviation of the coefficients of a random field."""
-        columns = self._of[effect.name]
-        likely = self._likely(effect)
-        change = self._normal[:, columns] * (likely / likely[0])
-        hypotheses = (self._single[effect.name], *self._rivals(effect))
-        ways = [_odds_of(h, change, self._likelihood.gained) for h in hypotheses]
-        typical = math.sqrt(1 / max(float(np.diag(self._normal)[columns].mean()), 1e-300))
-
-        def margin(strengths: Vector) -> Vector:
-            return need.margin(np.array([way(strengths) for way in ways]).T, 0)
-
-        found = _first_found(margin, typical, CREDIBLE * float(likely[0]))
-        excluded = self._excluded_rms(effect, likely) if observed else None
-        return ParameterLimits(RMS, effect.parameters[0].unit, float(likely[0]), found, excluded)
+        return _first_found(margin_at, 1 / math.sqrt(seen), CREDIBLE * likely) if seen > 0 else None
 
     # --- strengths that are excluded ----------------------------------------------------------------------
 
-    def _excluded(self, effect: Effect) -> list[float | None]:
-        """The 95 % quantile of each parameter."""
+    def excluded(self, effect: Effect) -> list[float | None]:
+        """The 95 % quantile of each parameter. If the effect is a random field: that of its rms."""
         columns = self._columns[effect.name]
+        if effect.field:
+            return [self._excluded_rms(columns)]
         weighed = self._likelihood.weigh([columns])
         values = dict(zip(weighed.columns, weighed.values.tolist(), strict=True))
         out: list[float | None] = []
-        for k, column in enumerate(columns):
+        for column, parameter in zip(columns, effect.parameters, strict=False):
             acting = [c for c in columns if c in values or c == column]
             found, covariance = self._likelihood.fitted([acting], [values.get(c, 0.0) for c in acting])
             own = acting.index(column)
             sigma = math.sqrt(max(float(covariance[own, own]), 0.0))
-            out.append(upper_limit(float(found[own]), sigma, effect.parameters[k].positive))
+            out.append(upper_limit(float(found[own]), sigma, parameter.positive))
         return out
 
-    def _excluded_rms(self, effect: Effect, likely: Vector) -> float | None:
+    def _excluded_rms(self, columns: Sequence[int]) -> float | None:
         """The 95 % quantile of the standard deviation t of the coefficients of a random field, for a constant prior of t.
 
         ln L(t) is the sum of (z^2 t^2 l / (1 + t^2 l) - ln(1 + t^2 l)) / 2. l are the eigenvalues of S N S for t = 1.
         z are the scores in units of their noise without the field.
         """
-        columns = self._columns[effect.name]
+        likely = self._evidence.prior.likely[list(columns)]
         found, covariance = self._likelihood.fitted([columns], np.zeros(len(columns)).tolist())
         shape = likely / likely[0]
         precision = np.linalg.pinv(covariance, hermitian=True)
@@ -406,22 +386,21 @@ class _Limits:
         """The square root of the chi2 that remains if `fitted` is fitted to the change by `acting` with the strength found_90."""
         if at.found_90 is None:
             return None
-        rival = self._single[fitted.name]
-        columns = self._of[acting.name]
+        rival, prior = self._single[fitted.name], self._evidence.prior
         inner = self._normal[np.ix_(rival.columns, rival.columns)] + np.diag(rival.widths[-1] ** -2.0)
+        columns = self._columns[acting.name]
+        if not acting.field:
+            columns = [columns[[parameter.name for parameter in acting.parameters].index(at.name)]]
+        numbers, likely = self._numbers(columns), prior.likely[columns]
+        size = at.found_90 * likely / likely[0]
+        own = float((np.diag(self._normal)[numbers] * size**2).sum())
+        change = self._normal[np.ix_(rival.columns, numbers)] * size
         if acting.field:
-            likely = self._likely(acting)
-            size = at.found_90 * likely / likely[0]
-            across = self._normal[np.ix_(rival.columns, columns)] * size
-            own = float((np.diag(self._normal)[columns] * size**2).sum())
-            return math.sqrt(max(own - float(np.sum(across * np.linalg.solve(inner, across))), 0.0))
-        names = [parameter.name for parameter in acting.parameters]
-        column = columns[names.index(at.name)]
-        change = self._normal[rival.columns, column] * at.found_90
-        own = float(self._normal[column, column]) * at.found_90**2
-        positive = self._evidence.prior.positive[self._columns[fitted.name]]
-        signs = (1.0,) if acting.parameters[names.index(at.name)].positive else (1.0, -1.0)
-        explained = max(_explained(inner, sign * change, positive) for sign in signs)
+            explained = float(np.sum(change * np.linalg.solve(inner, change)))
+        else:
+            signs = (1.0,) if prior.positive[columns[0]] else (1.0, -1.0)
+            positive = prior.positive[self._columns[fitted.name]]
+            explained = max(_explained(inner, sign * change[:, 0], positive) for sign in signs)
         return math.sqrt(max(own - explained, 0.0))
 
 

@@ -118,7 +118,9 @@ class Posterior:
             prior = _log_prior(names, len(self.order))
             free = sum(form.field is not None for form in forms)
             shares = {form: self._share(form, alone=free in (0, len(forms))) for form in forms}
-            out[names] = {form: prior + math.log(shares[form]) + self.forms[form].log_evidence for form in forms}
+            out[names] = {
+                form: prior + math.log(shares[form]) + self.forms[form].log_evidence for form in forms
+            }
         return out
 
     def _share(self, form: Form, *, alone: bool) -> float:
@@ -159,9 +161,7 @@ class Posterior:
 
     def with_evidence(self, forms: Mapping[Form, Weighed], model: LinearModel) -> Posterior:
         """The same posterior with a new evidence for the given forms, which were weighed in the model of a full refit."""
-        return replace(
-            self, forms=self.forms | dict(forms), models=self.models | dict.fromkeys(forms, model)
-        )
+        return replace(self, forms=self.forms | dict(forms), models=self.models | dict.fromkeys(forms, model))
 
     def without(self, forms: Iterable[Form]) -> Posterior:
         """The same posterior without these forms."""
@@ -277,7 +277,9 @@ def at_refit(
     likelihood, evidence = Likelihood(model), model.evidence
     found = {form: weigh(likelihood, evidence, form, taken)}
     if form.field is None and len(form.effects) == 1:
-        pairs = [Form(Form((*form.effects, other)).names(order)) for other in order if other not in form.effects]
+        pairs = [
+            Form(Form((*form.effects, other)).names(order)) for other in order if other not in form.effects
+        ]
         of_pairs = {pair: weigh(likelihood, evidence, pair, taken) for pair in pairs}
         found |= of_pairs | _triples(likelihood, evidence, of_pairs, order, taken)
         found |= _with_fields(likelihood, evidence, [form], (), taken)

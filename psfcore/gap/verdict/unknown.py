@@ -80,7 +80,9 @@ def _fitted(model: LinearModel, found: Posterior, form: Form, share: float) -> U
     coefficients, covariance = likelihood.fitted([*groups, further], start)
     own = slice(-len(further), None)
     shape = columns.shown(form.field, coefficients[own], covariance[own, own])
-    alike = _distances(likelihood, {e.name: evidence.columns[e.name] for e in evidence.effects}, coefficients[own])
+    alike = _distances(
+        likelihood, {e.name: evidence.columns[e.name] for e in evidence.effects}, coefficients[own]
+    )
     nearest = sorted(alike.items(), key=lambda one: one[1])[:MOST_ALIKE]
     return UnknownField(form.field, form.effects, share, shape, tuple(nearest))
 

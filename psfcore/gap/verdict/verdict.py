@@ -137,7 +137,11 @@ def earned(judged: Judgement, closure: Interval | None) -> Judgement:
         return judged
     members = judged.members if UNKNOWN in judged.members else (*judged.members, UNKNOWN)
     return replace(
-        judged, verdict="inconclusive", members=members, deciding=(*judged.deciding, UNKNOWN), answer=judged.best or NONE
+        judged,
+        verdict="inconclusive",
+        members=members,
+        deciding=(*judged.deciding, UNKNOWN),
+        answer=judged.best or NONE,
     )
 
 

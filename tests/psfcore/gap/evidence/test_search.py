@@ -17,8 +17,7 @@ from psfcore.gap.evidence.cells import cells_of, sensitivities, whitening
 from psfcore.gap.evidence.effect_fits import fit_effects
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
-from psfcore.gap.evidence.near_discs import NearDiscs, cut
-from psfcore.gap.evidence.search import along_copy, displaced, distinguished, place_search
+from psfcore.gap.evidence.search import NearDisc, cut, displaced, distinguished, near_discs, place_search
 from psfcore.gap.library.optics import ANGLES_DEG, BETWEEN_THEM, BLURS, DIRECTIONS, HALOS, blur_as
 from psfcore.gap.view import View
 from psfcore.psf import crop_or_pad
@@ -43,17 +42,9 @@ def along_line(plane: np.ndarray) -> np.ndarray:
     return plane
 
 
-def near_of(view: View, *images: int) -> NearDiscs:
-    """The patches around the discs of these images."""
-    near = NearDiscs(view)
-    for n in images:
-        near.add(n, view.solution.optics.field(view.occulted_scene(n)))
-    return near
-
-
 @cache
-def near() -> NearDiscs:
-    return near_of(view(), *solution().part)
+def near() -> list[NearDisc]:
+    return near_discs(view(), solution().part)
 
 
 def response(n: int, change: Plane) -> float:
@@ -71,10 +62,10 @@ def gain_by_hand(change: Plane, with_cells: bool) -> float:
     residual = np.array([f.observed - f.expected for f in frames]) / sigma
     absorbed = np.array([f.mean_jacobian for f in frames]) / sigma[:, None]
     if with_cells:
-        means = np.append(means, near().of_kernel(change))
-        residual = np.append(residual, near().residual)
-        of_cells = np.array([near().of_kernel(slope) for slope in view().slope_kernels]).T
-        absorbed = np.vstack([absorbed, of_cells])
+        means = np.append(means, [disc.of_kernel(change) for disc in near()])
+        residual = np.append(residual, [disc.residual for disc in near()])
+        slopes = view().slope_kernels
+        absorbed = np.vstack([absorbed, *(np.array([d.of_kernel(k) for k in slopes]).T for d in near())])
     basis = np.linalg.qr(absorbed)[0]
     left, seen = (one - basis @ (basis.T @ one) for one in (residual, means))
     along = float(left @ seen)
@@ -93,12 +84,6 @@ def test_the_gain_of_a_change_of_the_psf_is_that_of_the_whole_field() -> None:
             gain_by_hand(change, False), rel=0.1, abs=0.1
         )
     assert search.kernels([kernel, -kernel]).max() > 0.01
-
-
-def test_the_response_to_a_copy_equals_the_sum_over_the_displaced_plane() -> None:
-    q, plane = np.random.default_rng(1).normal(size=(2, 20, 30))
-    for by in [(0, 0), (3, -4), (-31, 2), (29, 19), (-29, -19), (5, 25), (40, 1), (-7, 6)]:
-        assert along_copy(q, plane, *by) == pytest.approx(float(np.vdot(q, displaced(plane, *by))), abs=1e-12)
 
 
 def test_a_blur_is_not_negative_and_has_its_nominal_width() -> None:
@@ -274,27 +259,36 @@ def test_a_patch_is_zero_outside_the_field() -> None:
 def test_a_patch_gives_the_same_response_as_the_whole_field() -> None:
     kernel = crop_or_pad(view().kernel, 129)
     change = along_line(kernel) - kernel
-    shape, places = solution().transit.shape, [(20, -12), (-30, 6)]
-    for n in (solution().part[5], solution().part[9]):
-        near = near_of(view(), n)
+    shape = solution().transit.shape
+    for k in (5, 9):
+        n, near_disc = solution().part[k], near()[k]
         whole = by_whole_field(view().blurred(n, Blur(change, shape)).astype(np.float64), n)
-        assert np.linalg.norm(near.of_kernel(change) - whole) < 0.05 * np.linalg.norm(whole)
+        assert np.linalg.norm(near_disc.of_kernel(change) - whole) < 0.05 * np.linalg.norm(whole)
         copy = gaussian_filter(view().expected[n], 3.0)
-        for (dx, dy), column in zip(places, near.of_copies(n, copy, places).T, strict=True):
-            whole = by_whole_field(displaced(copy, dx, dy).astype(np.float64), n)
+        around = near_disc.of_copies(copy, 20, -12, 2)
+        assert around.shape[1:] == (5, 5)
+        for dx, dy in ((0, 0), (2, -1)):
+            whole = by_whole_field(displaced(copy, 20 + dx, -12 + dy).astype(np.float64), n)
             # A copy is light all over the field, and what scatters in from beyond the patch is left out.
-            assert np.linalg.norm(column - whole) < 0.5 * np.linalg.norm(whole)
+            left = around[:, 2 + dy, 2 + dx] - whole
+            assert np.linalg.norm(left) < 0.5 * np.linalg.norm(whole)
+            by_hand = np.tensordot(
+                near_disc.planes,
+                cut(copy, near_disc.top + 12 - dy, near_disc.left - 20 - dx, near_disc.planes.shape[1:]),
+                2,
+            )
+            assert around[:, 2 + dy, 2 + dx] == pytest.approx(by_hand, rel=1e-3, abs=1e-3)
 
 
 def test_a_field_smaller_than_a_patch_is_used_whole() -> None:
     plan = default_plan(12, 76, oversampling=1, brightness=8.0)
     small = View(invert(simulate(plan, TRUTH, diffraction(), seed=3).transit))
     shape, n = small.solution.transit.shape, small.solution.part[0]
-    near = near_of(small, n)
+    (disc,) = near_discs(small, [n])
     change = along_line(small.kernel) - small.kernel
-    moved = near.of_copies(n, small.blurred(n, Blur(change, shape)), [(0, 0)])[:, 0]
-    assert near.residual.shape == moved.shape
-    assert np.linalg.norm(near.of_kernel(change) - moved) < 0.05 * np.linalg.norm(moved)
+    moved = disc.of_copies(small.blurred(n, Blur(change, shape)), 0, 0, 0)[:, 0, 0]
+    assert disc.residual.shape == moved.shape
+    assert np.linalg.norm(disc.of_kernel(change) - moved) < 0.05 * np.linalg.norm(moved)
 
 
 def test_whitening_handles_cells_without_independent_noise() -> None:

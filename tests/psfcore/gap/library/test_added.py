@@ -16,8 +16,7 @@ from psfcore.errors import DataError
 from psfcore.gap.effect import Effect
 from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.gap.evidence.evidence import gather
-from psfcore.gap.library.added import added_effects, library_with
-from psfcore.gap.library.registry import LIBRARY
+from psfcore.gap.library.registry import LIBRARY, added_effects, library_with
 from psfcore.gap.view import View
 from tests.gap_files import EDGE_GLOW as GLOW
 from tests.psfcore.gap.small_gaps import found
