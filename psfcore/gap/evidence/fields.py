@@ -259,8 +259,7 @@ class FieldColumns:
             sides = 2 if field.form == "kernel_over_field" else 1
             of_rings = KERNEL_LIKELY * np.kron(self._rings.T, factor.get(field.form, np.eye(1)))
             at = np.asarray(np.tile(2.0**self._octaves * edge, sides)[:, None], dtype=np.float64)
-            to_shape = np.kron(np.eye(sides), of_rings)
-            to_shape = np.asarray(to_shape, dtype=np.float64)
+            to_shape = np.asarray(np.kron(np.eye(sides), of_rings), dtype=np.float64)
             return _shape(field, ("radius_px",), at, to_shape, coefficients, covariance, "1/octave")
         if field.stage == "time":
             now = bumps(self._times, self._width(field))
