@@ -13,7 +13,7 @@ strength of an effect. The residuals in the truth of a case come from a full inv
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from psfcore.noise import Noise
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.optics import Blur, Lanes, Optics, Pixels, pick, put
-from psfcore.scatter.reconstruction import DARK_MARGIN_PX
+from psfcore.scatter.optics import Blur, Optics, pick
+from psfcore.scatter.reconstruction import DARK_MARGIN_PX, Reconstruction, TransitScenes
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.scatter.total_psf import TotalPsf
 from psfcore.simulate.scatter_truth import ScatterTruth
@@ -33,22 +33,6 @@ Plane = NDArray[np.floating]
 Kernel = NDArray[np.float64]
 Vector = NDArray[np.float64]
 _WARM_STEPS = 3
-_LEAST_LEVEL = 0.2
-
-
-@dataclass(frozen=True)
-class _Discs:
-    """One image without the effect: its dark pixels, its scene, and the residual, Jacobian and weight of the dark pixels.
-
-    residual, weight: (pixels,). jacobian: (parameters, pixels). observed: the mean of the dark pixels, DN/s.
-    """
-
-    dark: Pixels
-    scene: Lanes
-    residual: Vector
-    jacobian: NDArray[np.float64]
-    weight: Vector
-    observed: float
 
 
 @dataclass(frozen=True)
@@ -71,74 +55,49 @@ class LinearEstimator:
 
     def __init__(self, frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> None:
         shape = (frames[0].pixels.shape[0], frames[0].pixels.shape[1])
-        total = TotalPsf(diffraction, SOFTENED_POWER_LAW, shape)
-        at = true_coordinates(law)
-        self._optics = Optics(total.kernel(at), shape)
-        self._slopes = [Blur(slope, shape) for slope in total.slopes(at)]
-        self._noise = noise
-        self._discs = [self._look(frame) for frame in frames]
+        transit = Transit(frames=tuple(frames), diffraction=diffraction, noise=noise)
+        total, at = TotalPsf(diffraction, SOFTENED_POWER_LAW, shape), true_coordinates(law)
+        optics = Optics(total.kernel(at), shape)
+        sky = TransitScenes.reconstructed(transit, optics, lambda stage, step, steps: None)
+        masks = (fully_dark(shape, frame.place, DARK_MARGIN_PX) for frame in frames)
+        sky.dark = [(rows, columns) for rows, columns in map(np.nonzero, masks)]
+        images = range(len(frames))
+        clean = Reconstruction(transit, total, optics, sky, tuple(images), threads=1)
+        slopes = [Blur(slope, shape) for slope in total.slopes(at)]
+        self._clean = clean
+        self._residuals, expected = zip(*(clean.residual(n) for n in images), strict=True)
+        self._jacobians = [np.array([clean.jacobian(n, slope) for slope in slopes]) for n in images]
+        self._weights = [clean.weight(n, expected[n]) for n in images]
+        self._observed = [float(pick(sky.observed[n], sky.dark[n]).mean()) for n in images]
 
     def left(self, images: Sequence[Plane]) -> Left:
         """The residual that an effect leaves. images: all images with the effect [y, x], DN/s."""
-        changes = [
-            self._residual(disc, pixels) - disc.residual
-            for disc, pixels in zip(self._discs, images, strict=True)
+        optics, sky = self._clean.optics, self._clean.sky
+        observed = [optics.lanes(pixels) for pixels in images]
+        scenes = [
+            optics.invert(lanes, scene, steps=_WARM_STEPS)
+            for lanes, scene in zip(observed, sky.scenes, strict=True)
         ]
-        before, after = self._percent(changes), self._percent(self._refitted(changes))
-        return Left(rms(before), rms(after), after)
+        changed = replace(self._clean, sky=replace(sky, observed=observed, scenes=scenes))
+        changes = [changed.residual(n)[0] - before for n, before in enumerate(self._residuals)]
+        before_pct, after_pct = self._percent(changes), self._percent(self._refitted(changes))
+        return Left(rms(before_pct), rms(after_pct), after_pct)
 
     def clean_left_pct(self) -> list[float]:
         """e_i of Eq. (1) for every image without effects, after the refit, percent. The sampling on pixels causes it."""
-        return self._percent(self._refitted([disc.residual for disc in self._discs]))
-
-    def _look(self, frame: Frame) -> _Discs:
-        shape = (frame.pixels.shape[0], frame.pixels.shape[1])
-        rows, columns = np.nonzero(fully_dark(shape, frame.place, DARK_MARGIN_PX))
-        dark = (rows, columns)
-        observed = self._optics.lanes(frame.pixels)
-        scene = self._optics.invert(observed)
-        lit = _blanked(scene, dark)
-        expected = pick(self._optics.convolve(lit), dark)
-        level = np.maximum(expected, _LEAST_LEVEL * expected.mean())
-        return _Discs(
-            dark=dark,
-            scene=scene,
-            residual=pick(observed, dark) - expected,
-            jacobian=np.array([self._column(blur, lit, dark) for blur in self._slopes]),
-            weight=1 / self._noise.variance(level, frame.exposure_s),
-            observed=float(pick(observed, dark).mean()),
-        )
-
-    def _column(self, slope: Blur, lit: Lanes, dark: Pixels) -> Vector:
-        """One column of A: the direct change of the dark pixels, minus the change that the deconvolved scene causes in
-        them."""
-        changed = slope.convolve(lit)
-        scene = _blanked(self._optics.invert_once(changed), dark)
-        return pick(changed, dark) - pick(self._optics.convolve(scene), dark)
-
-    def _residual(self, disc: _Discs, pixels: Plane) -> Vector:
-        observed = self._optics.lanes(pixels)
-        scene = self._optics.invert(observed, disc.scene, steps=_WARM_STEPS)
-        return pick(observed, disc.dark) - pick(self._optics.convolve(_blanked(scene, disc.dark)), disc.dark)
+        return self._percent(self._refitted(self._residuals))
 
     def _refitted(self, residuals: Sequence[Vector]) -> list[Vector]:
         """Eq. (3)."""
-        normal, score = np.zeros((3, 3)), np.zeros(3)
-        for disc, residual in zip(self._discs, residuals, strict=True):
-            weighted = disc.jacobian * disc.weight
-            normal += weighted @ disc.jacobian.T
-            score += weighted @ residual
-        step = np.linalg.lstsq(normal, score, rcond=1e-12)[0]
-        return [
-            residual - disc.jacobian.T @ step for disc, residual in zip(self._discs, residuals, strict=True)
-        ]
+        jacobian = np.concatenate(self._jacobians, axis=1)
+        weighted = jacobian * np.concatenate(self._weights)
+        step = np.linalg.lstsq(weighted @ jacobian.T, weighted @ np.concatenate(residuals), rcond=1e-12)[0]
+        return [r - own.T @ step for r, own in zip(residuals, self._jacobians, strict=True)]
 
     def _percent(self, residuals: Sequence[Vector]) -> list[float]:
         """Eq. (1): simulated minus observed, for each image."""
-        return [
-            -100 * float(residual.mean()) / disc.observed
-            for disc, residual in zip(self._discs, residuals, strict=True)
-        ]
+        means = zip(residuals, self._observed, strict=True)
+        return [-100 * float(residual.mean()) / observed for residual, observed in means]
 
 
 def refitted(frames: Sequence[Frame], diffraction: Kernel, law: ScatterTruth, noise: Noise) -> dict[str, Any]:
@@ -165,9 +124,3 @@ def rms(values: Sequence[float]) -> float:
 def true_coordinates(law: ScatterTruth) -> Vector:
     """The parameters of the true power law, as coordinates of the fit."""
     return SOFTENED_POWER_LAW.coordinates({"b_px": law.b_px, "c": law.c, "total": law.total})
-
-
-def _blanked(scene: Lanes, dark: Pixels) -> Lanes:
-    lit = scene.copy()
-    put(lit, dark, 0.0)
-    return lit
