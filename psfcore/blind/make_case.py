@@ -8,7 +8,6 @@ that the effect really leaves is measured and stored in the truth.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,19 +21,17 @@ from psfcore.blind.chain import Chain, EffectFree
 from psfcore.blind.effects.effect import Effect
 from psfcore.blind.effects.fine_optics import binned_glass, fine_optics
 from psfcore.blind.leftover import Left, LinearEstimator, refitted, rms
-from psfcore.fits.images import Cards, CardValue, write_plane
-from psfcore.simulate.headers import HRI_EUV
 from psfcore.simulate.plan import HIGH, Plan
+from psfcore.simulate.transit import reported_places
+from psfcore.simulate.transit_files import write_observation
 from psfcore.transit.prepare import Exposure, prepare
-from psfcore.transit.transit import Frame, Place
+from psfcore.transit.transit import Frame
 
 Plane = NDArray[np.float64]
-SCHEMA = "transit/1"
 WITH_EFFECTS, WITHOUT_EFFECTS = "with_effects", "without_effects"
 TRIALS = 2
 STRENGTH_WITHIN = 1.4  # a strength is accepted if its residual is within this factor of the target
 MAP_POINTS = 64  # number of points of a map along each axis
-_PLACE_STREAM = 2003
 
 
 def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()) -> dict[str, Any]:
@@ -58,12 +55,10 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
     chain = Chain(effect_free, [effect for effect, _ in alone], level)
     rates = chain.all_expected()
     level = chain.saturation_dn(rates)
-    reported = _reported(case)
-
-    def write(folder: Path, exposures: Sequence[NDArray[Any]], level: float | None) -> None:
-        _write(folder, plan, diffraction, reported, exposures, level)
-
-    write(transit, [dn.astype(np.int32) for dn in chain.read_out(rates, case.seed)], level)
+    places = reported_places(plan, case.seed)
+    saturating = dataclasses.replace(plan, saturation_dn=level)
+    whole_dn = [dn.astype(np.int32) for dn in chain.read_out(rates, case.seed)]
+    write_observation(transit, saturating, whole_dn, places, diffraction)
     clean_left = estimator.clean_left_pct()
     truth = {
         "number": case.number,
@@ -74,7 +69,7 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
         "effects": [],
         "psf": {"b": case.law.b_px, "c": case.law.c, "total": case.law.total},
         "exact": [{"x": shot.x_px, "y": shot.y_px} for shot in plan.shots],
-        "plan": plan.as_json() | {"saturation_dn": level},
+        "plan": saturating.as_json(),
         "left_before_refit_pct": 0.0,
         "left_after_refit_pct": 0.0,
         "clean_left_pct": rms(clean_left),
@@ -82,9 +77,9 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
     if not alone:
         return truth
     mean = chain.mean_rate(rates, case.seed)
-    for name, planes, clip in ((WITH_EFFECTS, mean, level), (WITHOUT_EFFECTS, clean, None)):
-        shots = zip(planes, plan.shots, strict=True)
-        write(expected / name, [rate * shot.exposure_s for rate, shot in shots], clip)
+    for name, rate_planes, of in ((WITH_EFFECTS, mean, saturating), (WITHOUT_EFFECTS, clean, plan)):
+        exposures = [rate * shot.exposure_s for rate, shot in zip(rate_planes, plan.shots, strict=True)]
+        write_observation(expected / name, of, exposures, places, diffraction)
     frames = _frames(plan, mean, level)
     whole = refitted(frames, diffraction, case.law, plan.noise)
     both = [(whole["residual_pct"].get(str(n)), value) for n, value in enumerate(clean_left)]
@@ -182,49 +177,3 @@ def _level(case: Case, rates: Sequence[Plane]) -> float | None:
         return None
     shots = zip(rates, case.plan.shots, strict=True)
     return float(np.rint(case.headroom * max(float(rate.max()) * shot.exposure_s for rate, shot in shots)))
-
-
-def _reported(case: Case) -> list[Place]:
-    """The positions of the occulter as the transit states them: with an ephemeris error, rounded to 0.1 px."""
-    rng = np.random.default_rng([case.seed, _PLACE_STREAM])
-    plan = case.plan
-    errors = rng.normal(0.0, plan.ephemeris_error_px, (len(plan.shots), 2))
-    return [
-        Place(round(shot.x_px + float(dx), 1), round(shot.y_px + float(dy), 1), round(plan.radius_px, 3))
-        for shot, (dx, dy) in zip(plan.shots, errors, strict=True)
-    ]
-
-
-def _write(
-    folder: Path,
-    plan: Plan,
-    diffraction: Plane,
-    reported: Sequence[Place],
-    exposures: Sequence[NDArray[Any]],
-    level: float | None,
-) -> None:
-    """Write exposures [y, x] in DN as a transit. level: the level at which high-only images clip, DN; None: no clipping."""
-    folder.mkdir(parents=True)
-    entries = []
-    for n, (dn, shot, place) in enumerate(zip(exposures, plan.shots, reported, strict=True)):
-        values = HRI_EUV.shot_values(shot, "DN")
-        if level is not None and shot.gain_mode == HIGH:
-            values["SATURATE"] = level
-        file = f"{n:03d}.fits"
-        write_plane(folder / file, dn, cards=_cards(values))
-        entries.append(
-            {"file": file, "fov": shot.pointing, "x": place.x_px, "y": place.y_px, "r": place.radius_px}
-        )
-    write_plane(folder / "diffraction.fits", diffraction, cards=_cards(HRI_EUV.values()))
-    content = {
-        "schema": SCHEMA,
-        "instrument": HRI_EUV.name,
-        "known_psf": "diffraction.fits",
-        "noise": dataclasses.asdict(plan.noise),
-        "images": entries,
-    }
-    (folder / "transit.json").write_text(json.dumps(content, indent=1) + "\n", "utf-8")
-
-
-def _cards(values: dict[str, CardValue]) -> Cards:
-    return {key: (value, "simulated") for key, value in values.items()}
