@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from psfcore.convolution.convolver import linear_convolve
 
 Plane = NDArray[np.float64]
 _HALF_TURN = (0.0, 180.0)
+_FINER = 9  # number of samples in a fine pixel along each axis
 
 
 @declare(KNOWN, "optics", "stretch", 0.1, 0.6, angle_deg=_HALF_TURN)
@@ -90,40 +92,39 @@ def _blurred(optics: FineOptics, blur: Plane) -> FineOptics:
     return dataclasses.replace(optics, diffraction=linear_convolve(optics.diffraction, blur, (n, n)))
 
 
-def _square(reach_px: float, finer: int) -> tuple[Plane, Plane]:
-    """Coordinates of samples up to reach_px, in detector px: x (1, n) and y (n, 1). A fine pixel has `finer` samples per axis."""
+def _sampled(reach_px: float, profile: Callable[[Plane, Plane], Plane]) -> Plane:
+    """A kernel [y, x] on fine pixels with the sum 1. profile: its value at x and y, detector px, up to reach_px."""
     half = int(np.ceil(reach_px * FINE)) + 1
-    at = (np.arange((2 * half + 1) * finer) + 0.5) / finer - half - 0.5
-    return at[None, :] / FINE, at[:, None] / FINE
-
-
-def _collected(samples: Plane, finer: int) -> Plane:
-    """A kernel [y, x] on fine pixels with the sum 1."""
-    n = samples.shape[0] // finer
-    kernel = samples.reshape(n, finer, n, finer).sum(axis=(1, 3))
+    n = 2 * half + 1
+    at = ((np.arange(n * _FINER) + 0.5) / _FINER - half - 0.5) / FINE
+    kernel = profile(at[None, :], at[:, None]).reshape(n, _FINER, n, _FINER).sum(axis=(1, 3))
     return np.asarray(kernel / kernel.sum())
 
 
 def _moffat(width_px: float) -> Plane:
     """A Moffat profile of exponent 3 with a full width at half maximum of width_px."""
-    x, y = _square(8 * width_px + 1, 5)
     core = width_px / (2 * np.sqrt(2 ** (1 / 3) - 1))
-    return _collected((1 + (x**2 + y**2) / core**2) ** -3.0, 5)
+    return _sampled(8 * width_px + 1, lambda x, y: (1 + (x**2 + y**2) / core**2) ** -3.0)
 
 
 def _pillbox(diameter_px: float) -> Plane:
-    """A kernel that is a uniform disc."""
-    x, y = _square(diameter_px / 2 + 0.5, 9)
-    inside = np.clip((diameter_px / 2 - np.hypot(x, y)) * 9 * FINE + 0.5, 0.0, 1.0)
-    return _collected(inside if inside.sum() > 0 else np.exp(-((x**2 + y**2) * 400.0)), 9)
+    """A kernel that is a uniform disc; its edge is half a sample wide."""
+
+    def inside(x: Plane, y: Plane) -> Plane:
+        return np.clip((diameter_px / 2 - np.hypot(x, y)) * _FINER * FINE + 0.5, 0.0, 1.0)
+
+    return _sampled(diameter_px / 2 + 0.5, inside)
 
 
 def _line(length_px: float, angle_deg: float) -> Plane:
     """A kernel that spreads light evenly along a straight line, with the width of a fine pixel."""
-    x, y = _square(length_px / 2 + 1, 9)
     cos, sin = direction(angle_deg)
-    beyond = np.maximum(np.abs(x * cos + y * sin) - length_px / 2, 0.0)
-    return _collected(np.maximum(1 - FINE * np.hypot(beyond, y * cos - x * sin), 0.0), 9)
+
+    def near(x: Plane, y: Plane) -> Plane:
+        beyond = np.maximum(np.abs(x * cos + y * sin) - length_px / 2, 0.0)
+        return np.maximum(1 - FINE * np.hypot(beyond, y * cos - x * sin), 0.0)
+
+    return _sampled(length_px / 2 + 1, near)
 
 
 @declare(KNOWN, "optics", "share of the spacing", 0.05, 0.3, sign=sign)
