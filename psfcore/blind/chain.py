@@ -38,22 +38,24 @@ class EffectFree:
         self._light: dict[int, NDArray[np.float32]] = {}
         self._seen: dict[int, Plane] = {}
 
-    def seen_scene(self, pointing: int) -> Plane:
-        """The fine scene of a pointing, without an occulter, convolved with the PSF [y, x], DN/s."""
-        if pointing not in self._seen:
-            self._seen[pointing] = np.asarray(
-                self.optics.through.apply(self.scenes[pointing]), dtype=np.float64
-            )
-        return self._seen[pointing]
-
-    def clean_light(self, index: int) -> Plane:
-        """The light of an image in the focal plane, on fine pixels [y, x], DN/s, without effects."""
+    def light(self, index: int) -> Plane:
+        """The light of an image in the focal plane, on fine pixels [y, x], DN/s."""
         if index not in self._light:
-            pointing = self.plan.shots[index].pointing
-            lit = _lit(self, (), Moment(self.plan, index))
-            light = self.seen_scene(pointing) + self.optics.through.apply(lit - self.scenes[pointing])
+            moment = Moment(self.plan, index)
+            light = self.seen(lit_scene(self, (), moment), moment, self.optics, self._seen)
             self._light[index] = light.astype(np.float32)
         return self._light[index].astype(np.float64)
+
+    def seen(self, lit: Plane, moment: Moment, optics: FineOptics, kept: dict[int, Plane]) -> Plane:
+        """A fine scene through a telescope, [y, x], DN/s.
+
+        kept: the scene of each pointing through the same telescope, without an occulter; missing scenes are added.
+        """
+        pointing = moment.shot.pointing
+        scene = self.scenes[pointing]
+        if pointing not in kept:
+            kept[pointing] = np.asarray(optics.through.apply(scene), dtype=np.float64)
+        return np.asarray(kept[pointing] + optics.through.apply(lit - scene))
 
 
 class Chain:
@@ -72,36 +74,21 @@ class Chain:
     def expected(self, index: int) -> Plane:
         """The expected light on detector pixels [y, x], DN/s, before the readout. It contains no noise."""
         moment = Moment(self.plan, index)
-        light = self._focal_plane(moment) if self._changes_sky else self.clean.clean_light(index)
+        light = self._focal_plane(moment) if self._changes_sky else self.clean.light(index)
         light = apply_effects(self.effects, "light", light, moment)
         rate = apply_effects(self.effects, "expected", binned(np.maximum(light, 0.0), FINE), moment)
         return np.maximum(rate, 0.0)
 
+    def _focal_plane(self, moment: Moment) -> Plane:
+        if self._optics is None or self._varies:
+            self._optics, self._seen = apply_effects(self.effects, "optics", self.clean.optics, moment), {}
+        lit = lit_scene(self.clean, self.effects, moment)
+        seen = self.clean.seen(lit, moment, self._optics, self._seen)
+        return np.asarray(apply_effects(self.effects, "spread", seen, lit, self._optics, moment))
+
     def all_expected(self) -> list[Plane]:
         """The result of `expected` for every image."""
         return [self.expected(index) for index in range(len(self.plan.shots))]
-
-    def _focal_plane(self, moment: Moment) -> Plane:
-        pointing, optics = moment.shot.pointing, self._telescope(moment)
-        lit = _lit(self.clean, self.effects, moment)
-        if self._varies:
-            seen = np.asarray(optics.through.apply(lit), dtype=np.float64)
-        else:
-            if pointing not in self._seen:
-                same = optics is self.clean.optics
-                through = (
-                    self.clean.seen_scene(pointing)
-                    if same
-                    else optics.through.apply(self.clean.scenes[pointing])
-                )
-                self._seen[pointing] = np.asarray(through, dtype=np.float64)
-            seen = self._seen[pointing] + optics.through.apply(lit - self.clean.scenes[pointing])
-        return np.asarray(apply_effects(self.effects, "spread", seen, lit, optics, moment))
-
-    def _telescope(self, moment: Moment) -> FineOptics:
-        if self._optics is None or self._varies:
-            self._optics = apply_effects(self.effects, "optics", self.clean.optics, moment)
-        return self._optics
 
     def saturation_dn(self, expected: Sequence[Plane]) -> float | None:
         """The level (DN) at which high-only images clip; None: no clipping."""
@@ -159,7 +146,7 @@ class Chain:
         return out
 
 
-def _lit(clean: EffectFree, effects: Sequence[Effect], moment: Moment) -> Plane:
+def lit_scene(clean: EffectFree, effects: Sequence[Effect], moment: Moment) -> Plane:
     """The fine scene of an image, with its occulter in front [y, x], DN/s."""
     scene = apply_effects(effects, "scene", clean.scenes[moment.shot.pointing], moment)
     lit = scene.copy()
