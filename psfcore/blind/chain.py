@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.blind.effects.effect import Earlier, Effect, Moment, Window, apply_effects
+from psfcore.blind.effects.effect import Earlier, Effect, Moment, apply_effects
 from psfcore.blind.effects.fine_optics import FINE, FineOptics
 from psfcore.simulate.disc import behind, binned, covered_share
 from psfcore.simulate.plan import HIGH, Plan
@@ -151,13 +151,11 @@ def lit_scene(clean: EffectFree, effects: Sequence[Effect], moment: Moment) -> P
     scene = apply_effects(effects, "scene", clean.scenes[moment.shot.pointing], moment)
     lit = scene.copy()
     place = clean.plan.place(moment.index)
-    wide = Place(
-        place.x_px, place.y_px, place.radius_px + _MOST_MOTION_PX
-    )  # the patch must contain a moving disc
+    # The patch must contain a moving disc.
+    wide = Place(place.x_px, place.y_px, place.radius_px + _MOST_MOTION_PX)
     around = behind(scene, wide, fine=FINE, margin_px=0)
-    share = apply_effects(effects, "covered", None, Window(place, around.first, around.shape), moment)
-    if share is None:
-        share = covered_share(place, around.first, around.shape, FINE)
+    share = covered_share(place, around.first, around.shape, FINE)
+    share = apply_effects(effects, "covered", share, around, moment)
     rows, columns = (slice(s.start * FINE, s.stop * FINE) for s in around.window())
     lit[rows, columns] -= around.scene * share
     return np.asarray(apply_effects(effects, "foreground", np.maximum(lit, 0.0), moment))

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.simulate.plan import Plan, Shot
-from psfcore.transit.transit import Place
 
 Plane = NDArray[np.float64]
 Change = Callable[..., Any]
@@ -28,7 +27,7 @@ Draw = Callable[[Plan, np.random.Generator], Any] | tuple[float, float]
 KNOWN, CALIBRATION, TEST = "known", "calibration", "test"
 # For each step: the arguments of its functions after the effect, and the stage to which it belongs.
 #   scene: the fine scene [y, x], DN/s; moment
-#   covered: the fraction of each fine pixel of a window that the occulter covers, None for a disc at rest; window; moment
+#   covered: the fraction of each fine pixel around the disc that the occulter covers; these pixels (`Behind`); moment
 #   foreground: the fine scene with its occulter [y, x], DN/s; moment
 #   optics: the telescope; moment
 #   spread: the fine light [y, x], DN/s, if the PSF varies across the field; the fine scene with its occulter; telescope; moment
@@ -75,15 +74,6 @@ class Earlier:
 
     dn: Plane
     time_s: float
-
-
-@dataclass(frozen=True)
-class Window:
-    """The pixels around a disc. place: the position of the disc. first, shape: the first detector pixel (y, x), and the size."""
-
-    place: Place
-    first: tuple[int, int]
-    shape: tuple[int, int]
 
 
 @dataclass(frozen=True)

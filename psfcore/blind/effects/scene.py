@@ -15,14 +15,13 @@ from psfcore.blind.effects.effect import (
     KNOWN,
     Effect,
     Moment,
-    Window,
     declare,
     direction,
     seed,
     unit_coordinates,
 )
 from psfcore.blind.effects.fine_optics import FINE
-from psfcore.simulate.disc import covered_share
+from psfcore.simulate.disc import Behind, covered_share
 from psfcore.simulate.plan import HIGH, Plan
 from psfcore.transit.transit import Place
 
@@ -30,15 +29,15 @@ Plane = NDArray[np.float64]
 
 
 @declare(KNOWN, "covered", "px/s", 0.4, 1.5, angle_deg=lambda plan, rng: float(rng.normal(3.0, 8.0)))
-def occulter_motion(effect: Effect, share: Plane | None, window: Window, moment: Moment) -> Plane:
+def occulter_motion(effect: Effect, share: Plane, around: Behind, moment: Moment) -> Plane:
     """The disc moves along a straight line during the exposure, in steps of at most a fifth of a pixel."""
     way = effect.strength * moment.shot.exposure_s
     steps = max(5, int(np.ceil(5 * way)))
     along = way * ((np.arange(steps) + 0.5) / steps - 0.5)
     cos, sin = direction(effect["angle_deg"])
-    x_px, y_px, radius_px = window.place.x_px, window.place.y_px, window.place.radius_px
-    moved = (Place(x_px + s * cos, y_px + s * sin, radius_px) for s in along)
-    return np.asarray(sum(covered_share(at, window.first, window.shape, FINE) for at in moved) / steps)
+    disc = moment.plan.place(moment.index)
+    moved = (Place(disc.x_px + s * cos, disc.y_px + s * sin, disc.radius_px) for s in along)
+    return np.asarray(sum(covered_share(at, around.first, around.shape, FINE) for at in moved) / steps)
 
 
 @declare(KNOWN, "scene", "share, rms", 0.2, 0.6, seed=seed, patch=(0.02, 0.08), period=(0.15, 0.6))

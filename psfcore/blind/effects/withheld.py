@@ -17,7 +17,6 @@ from psfcore.blind.effects.effect import (
     Earlier,
     Effect,
     Moment,
-    Window,
     coin,
     declare,
     direction,
@@ -27,7 +26,7 @@ from psfcore.blind.effects.effect import (
 )
 from psfcore.blind.effects.fine_optics import FINE, FineOptics, turned_offsets
 from psfcore.blind.effects.optics import rescaled
-from psfcore.simulate.disc import covered_share
+from psfcore.simulate.disc import Behind
 
 Plane = NDArray[np.float64]
 
@@ -49,21 +48,20 @@ def occulter_tail(effect: Effect, lit: Plane, moment: Moment) -> Plane:
 
 
 @declare(TEST, "covered", "share at the limb", 0.1, 0.9, depth_px=(2.0, 6.0), angle_deg=ANGLE)
-def transparent_limb(effect: Effect, share: Plane | None, window: Window, moment: Moment) -> Plane:
+def transparent_limb(effect: Effect, share: Plane, around: Behind, moment: Moment) -> Plane:
     """Gas around the occulter refracts sunlight into the disc: a ring inside its limb, brighter on one side.
 
     The fraction of the light that passes decreases exponentially with the depth inside the limb.
     """
-    place = window.place
+    place = moment.plan.place(moment.index)
     rows, columns = (
         first + (np.arange(FINE * n) + 0.5) / FINE - 0.5
-        for first, n in zip(window.first, window.shape, strict=True)
+        for first, n in zip(around.first, around.shape, strict=True)
     )
     x, y = columns[None, :] - place.x_px, rows[:, None] - place.y_px
     depth = np.maximum(place.radius_px - np.hypot(x, y), 0.0) / effect["depth_px"]
     side = 0.5 + 0.5 * np.cos(np.arctan2(y, x) - np.deg2rad(effect["angle_deg"]))
-    covered = covered_share(place, window.first, window.shape, FINE) if share is None else share
-    return np.asarray(covered * (1 - effect.strength * side * np.exp(-depth)))
+    return np.asarray(share * (1 - effect.strength * side * np.exp(-depth)))
 
 
 @declare(TEST, "spread", "change of the exponent at the end", 0.1, 0.8, settling=(1.0, 5.0))
