@@ -93,7 +93,8 @@ def make(case: Case, transit: Path, expected: Path, images: Sequence[Plane] = ()
         "refitted": whole,
     }
     if any(effect.kind.adds_light for effect, _ in alone):
-        truth["map"] = _map(np.mean(mean, axis=0) - np.mean(clean, axis=0))
+        added = np.mean(mean, axis=0) - np.mean(clean, axis=0)
+        truth["light_map"] = {"size_px": plan.size_px, "values": _map(added)}
     return truth
 
 

@@ -206,9 +206,10 @@ class Judged:
         None if the truth or the report has no map.
         """
         at = np.asarray(self.unknown.get("at", ()), dtype=np.float64)
-        if "map" not in self.truth or at.ndim != 2 or at.shape[1] != 2:
+        if "light_map" not in self.truth or at.ndim != 2 or at.shape[1] != 2:
             return None
-        grid, size_px = np.asarray(self.truth["map"]), self.truth["plan"]["size_px"]
+        light = self.truth["light_map"]
+        grid, size_px = np.asarray(light["values"]), light["size_px"]
         x, y = np.clip((at.T + 0.5) / size_px * len(grid), 0, len(grid) - 1).astype(int)
         true, found = grid[y, x], np.asarray(self.unknown["values"], dtype=np.float64)
         way = at[np.argmax(np.abs(found))] - at[np.argmax(np.abs(true))]

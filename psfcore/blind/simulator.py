@@ -120,9 +120,10 @@ def checked_truth(source: str, truth: Any) -> dict[str, Any]:
     if len(names) > MOST_EFFECTS:
         raise _bad(source, f"expected at most {MOST_EFFECTS} effects; got {len(names)}")
     numbers = [copied.get(key) for key in _RESIDUALS]
-    numbers += [effect.get("left_alone_pct", 0.0) for effect in copied["effects"]]
+    alone = ("left_alone_pct", "left_alone_chi2")
+    numbers += [effect.get(key, 0.0) for effect in copied["effects"] for key in alone]
     if not all(number is None or _is_share(number) for number in numbers):
-        raise _bad(source, f"expected residuals in percent, at least 0; got {numbers!r:.100}")
+        raise _bad(source, f"expected residuals in percent and chi2, at least 0; got {numbers!r:.100}")
     kind = _kind_of(names)
     nothing_left = {"left_before_refit_pct": 0.0, "left_after_refit_pct": 0.0} if kind == CLEAN else {}
     return {**nothing_left, **copied, "kind": kind}

@@ -174,12 +174,12 @@ def test_the_truth_contains_what_an_effect_leaves_and_a_map_of_the_light_that_it
     assert truth["effects"][0]["left_alone_pct"] == pytest.approx(target_pct, rel=0.45)
     assert 0 < truth["clean_left_pct"] < 0.8
     assert len(truth["refitted"]["residual_pct"]) == IMAGES
-    light = np.array(truth["map"])
+    light = np.array(truth["light_map"]["values"])
     assert light.mean() == pytest.approx(truth["effects"][0]["strength"], rel=0.02)
     angle = np.deg2rad(truth["effects"][0]["parameters"]["angle_deg"])
     row, column = np.unravel_index(light.argmax(), light.shape)
     assert (column > 32, row > 32) == (np.cos(angle) > 0, np.sin(angle) > 0)
-    assert "map" not in made.truth(1)
+    assert "light_map" not in made.truth(1)
 
 
 def test_a_clean_case_has_a_transit_alone(tmp_path: Path) -> None:

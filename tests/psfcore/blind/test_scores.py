@@ -258,7 +258,7 @@ def with_cause(kind: str, members: list[list[str]], *, chi2: float = 90.0, **unk
     case = with_set(kind, names, members, rival=400.0)
     for effect in case.truth["effects"]:
         effect |= {"left_alone_chi2": chi2, "stage": "optics" if effect["name"] == "ghost" else "detector"}
-    case.truth.update(plan={"size_px": 20}, map=[[0.0, 1.0], [2.0, 9.0]])
+    case.truth["light_map"] = {"size_px": 20, "values": [[0.0, 1.0], [2.0, 9.0]]}
     case.report["unknown"] = unknown or None
     return case
 

@@ -128,6 +128,7 @@ def test_a_truth_of_another_form_is_refused() -> None:
         ({"effects": [{"name": "pair"}]}, "expected names of effects"),
         ({"effects": [ghost, {"name": "core_blur"}, {"name": "mine"}]}, "at most 2 effects"),
         ({"effects": [ghost | {"left_alone_pct": -1}]}, "residuals in percent"),
+        ({"effects": [ghost | {"left_alone_chi2": "many"}]}, "residuals in percent"),
         ({"effects": [], "left_after_refit_pct": "much"}, "residuals in percent"),
     ]
     for truth, said in truths:
