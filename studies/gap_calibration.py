@@ -29,8 +29,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from heliopsf.psfs import LIMITS
 from psfcore.blind.case_set import BlindSet, SetPlan, make_set
-from psfcore.blind.score import wilson
-from psfcore.blind.scoring import required_names
+from psfcore.blind.score import required_causes, wilson
 from psfcore.build import known_diffraction
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import linear_model_of
@@ -47,12 +46,12 @@ from psfcore.scatter.inversion import invert
 from psfcore.transit.folder import read_transit
 from psfcore.whole_files import write_whole
 
-KINDS = ("clean", "single", "pair", "unknown")
+KINDS = ("clean", "single", "pair", "unknown", "mixed")
 TEMPERATURES = (0.5, 10.0)
 LEAST_SHARE = 1e-5  # a true cause that is less probable counts as if it had this probability
 HOLDS_FOR = (
     "The coverage holds for transits like these: 18 images of 256 px in three pointings, with no effect, with one or two effects of the "
-    "library, or with one effect that is not in the library. Each effect leaves a residual of 0.5 to 30 % in the discs after "
+    "library, with one effect that is not in the library, or with one of each. Each effect leaves a residual of 0.5 to 30 % in the discs after "
     "the PSF is refitted, or is as strong as is plausible. The author of the simulated effects did not use the library."
 )
 
@@ -99,11 +98,6 @@ def weights_of(folder: Path) -> tuple[dict[Names, float], tuple[float, ...]]:
     refits = Refits(view, model)
     found, _ = settled_posterior(model, refits.weighed)
     return found.log_weights, tuple(refits.departures.values())
-
-
-def required(truth: Mapping[str, Any]) -> Names:
-    """The hypothesis that is the true cause of a case, by the rule of the score (`scoring.required_names`)."""
-    return UNKNOWN if truth["kind"] == "unknown" else required_names(truth)
 
 
 def calibrated(cases: Sequence[Case], about: Mapping[str, Any]) -> Calibration:
@@ -192,7 +186,7 @@ def _read(made: BlindSet, number: int, kept: Path) -> Case:
     truth = made.truth(number)
     found = json.loads(_file(kept, number).read_text("utf-8"))
     weights = {tuple(names): float(weight) for names, weight in found["log_weights"]}
-    return Case(number, str(truth["kind"]), required(truth), weights, tuple(found["departures"]))
+    return Case(number, str(truth["kind"]), required_causes(truth), weights, tuple(found["departures"]))
 
 
 def _keep(transit: Path, file: Path) -> str:
@@ -216,7 +210,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--write", action="store_true")
     asked = parser.parse_args()
-    plan = SetPlan(cases=asked.cases, seed=asked.seed)
+    plan = SetPlan(cases=asked.cases, seed=asked.seed, withheld="calibration")
     cases = list(cases_of(asked.output, plan, asked.processes))
     about = {
         "seed": asked.seed,

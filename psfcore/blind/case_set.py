@@ -14,8 +14,10 @@ DIR/score.json, .txt, .png    the score as JSON, as a table and as a picture; ea
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
+import secrets
 import shutil
 import threading
 import time
@@ -23,7 +25,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.blind.cases import DRAW, Case, draw_case
-from psfcore.blind.make_case import make, seal_of, sealed, write_expected, write_transit
+from psfcore.blind.cases import DRAW, SetPlan, draw_case
+from psfcore.blind.make_case import make
 from psfcore.blind.simulator import simulate_case, simulator_of, source_sha256
 from psfcore.comparison import array_sha256
 from psfcore.errors import DataError
@@ -41,46 +42,7 @@ from psfcore.whole_files import write_whole
 Plane = NDArray[np.float64]
 Progress = Callable[[str], None]
 
-
-@dataclass(frozen=True)
-class SetPlan:
-    """The plan of a set. cases: number of cases. first: the number of the first case.
-
-    simulator: the file or module of a user's simulator, which makes the cases of the set (`psfcore.blind.simulator`);
-    empty: cases are drawn. The other fields are parameters of `draw_case`; a simulator gets only seed, size_px and
-    images.
-    """
-
-    cases: int
-    seed: int
-    size_px: int = 256
-    images: int = 18
-    first: int = 0
-    only: tuple[str, ...] = ()
-    clean_only: bool = False
-    built_diffraction: bool = True
-    left_pct: tuple[float, ...] = ()
-    simulator: str = ""
-
-    @property
-    def numbers(self) -> range:
-        """The numbers of the cases."""
-        return range(self.first, self.first + self.cases)
-
-
-Job = Callable[[], "_Attempt"]  # makes one case
-
 LOCK = "lock"  # the file by which a run locks the folder of its set
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    """One attempt to make a case. seal: empty if the attempt failed. why_not: the reason why the attempt failed."""
-
-    case: int
-    seconds: float
-    seal: str = ""
-    why_not: str = ""
 
 
 @dataclass(frozen=True)
@@ -102,7 +64,7 @@ class BlindSet:
         return self.case_folder(number) / "report.json"
 
     def expected(self, number: int) -> Path:
-        """The folder with the noise-free transits of a case, which `make_case.write_expected` writes."""
+        """The folder with the noise-free transits of a case."""
         return self.case_folder(number) / "expected"
 
     def ideal(self, number: int) -> Path:
@@ -129,13 +91,26 @@ class BlindSet:
                 entry = json.loads(line)
                 number, seal = int(entry["case"]), str(entry["sha256"])
             except (ValueError, KeyError, TypeError) as error:
-                message = (
-                    f"expected lines with a case and its sha256 in {self.seals_file.name}; got {line!r:.60}"
-                )
-                raise DataError("bad-seals", message) from error
+                raise DataError(
+                    "bad-seals",
+                    f"expected lines with a case and its sha256 in {self.seals_file.name}; got {line!r:.60}",
+                ) from error
             if found.setdefault(number, seal) != seal:
                 raise DataError("bad-seals", f"expected one seal per case; got two for case {number:04d}")
         return found
+
+    def keep_truth(self, number: int, truth: dict[str, Any]) -> str:
+        """Write the truth of a case with a random salt. Returns its seal."""
+        salt = secrets.token_hex(16)
+        kept = json.dumps({"salt": salt, "truth": truth}, allow_nan=False)
+        write_whole(self.truth_file(number), kept)
+        return _seal_of(salt, truth)
+
+    def keep_seal(self, number: int, seal: str) -> None:
+        """Add the seal of a case to the seals. A last line that a power failure cut is removed."""
+        text = self.seals_file.read_text("utf-8") if self.seals_file.is_file() else ""
+        line = json.dumps({"case": number, "sha256": seal}) + "\n"
+        write_whole(self.seals_file, "".join(text.rpartition("\n")[:2]) + line)
 
     def truth(self, number: int) -> dict[str, Any]:
         """The truth of a case, after its seal was checked. Raises DataError "broken-seal", "bad-seals"."""
@@ -147,12 +122,12 @@ class BlindSet:
             raise DataError(
                 "broken-seal", f"case {number:04d}: expected salt and truth; got {error!s:.100}"
             ) from error
-        if seal is None or seal_of(salt, truth) != seal:
-            message = (
+        if seal is None or _seal_of(salt, truth) != seal:
+            raise DataError(
+                "broken-seal",
                 f"case {number:04d}: expected a truth with the hash {seal}; this truth was changed after it was sealed, "
-                "or it was never sealed"
+                "or it was never sealed",
             )
-            raise DataError("broken-seal", message)
         return truth
 
     def is_made(self, number: int) -> bool:
@@ -181,30 +156,71 @@ def make_set(
     made = BlindSet(folder)
     _remember(made, plan, scenes)
     (folder / "truth").mkdir(parents=True, exist_ok=True)
-    sealed_before = made.seals()
-    missing = [n for n in plan.numbers if not (n in sealed_before and made.truth_file(n).is_file())]
-    jobs: list[Job]
+    missing = [number for number in plan.numbers if not made.is_made(number)]
     if plan.simulator:
         simulator_of(plan.simulator)
-        jobs = [partial(_simulate_one, made, plan, number) for number in missing]
     else:
-        jobs = [partial(_make_one, made, _drawn(plan, number), scenes) for number in missing]
-    for number in missing:
-        shutil.rmtree(made.case_folder(number), ignore_errors=True)  # an interrupted run may have left it
+        for number in missing:
+            draw_case(plan, number)
     not_made: dict[int, str] = {}
-    for done, attempt in enumerate(_made(jobs, processes), 1):
-        so_far = f"in {attempt.seconds:.1f} s ({done} of {len(missing)})"
-        if attempt.why_not:
-            not_made[attempt.case] = attempt.why_not
-            progress(f"could not make case {attempt.case:04d} {so_far}: {attempt.why_not}")
-            continue
-        _end_cut_line(made.seals_file)
-        with made.seals_file.open("a", encoding="utf-8") as seals:
-            seals.write(json.dumps({"case": attempt.case, "sha256": attempt.seal}) + "\n")
-            seals.flush()
-            os.fsync(seals.fileno())
-        progress(f"made case {attempt.case:04d} {so_far}")
+    for done, (number, seal, why_not, seconds) in enumerate(
+        _attempts(made, plan, missing, scenes, processes), 1
+    ):
+        so_far = f"in {seconds:.1f} s ({done} of {len(missing)})"
+        if why_not:
+            not_made[number] = why_not
+            progress(f"could not make case {number:04d} {so_far}: {why_not}")
+        else:
+            made.keep_seal(number, seal)
+            progress(f"made case {number:04d} {so_far}")
     return made, not_made
+
+
+Attempt = tuple[int, str, str, float]  # number of the case; its seal, or why it could not be made; seconds
+
+
+def _attempts(
+    made: BlindSet, plan: SetPlan, numbers: Sequence[int], scenes: Sequence[Plane], processes: int
+) -> Iterator[Attempt]:
+    """Make cases. The attempts are yielded in the order in which they end."""
+    if processes <= 1 or len(numbers) <= 1:
+        yield from (_attempt(made, plan, number, scenes) for number in numbers)
+        return
+    # With the start method "fork", the child processes would inherit locks that threads of this process hold.
+    with ProcessPoolExecutor(
+        processes, mp_context=get_context("spawn"), initializer=_end_with_parent
+    ) as pool:
+        waiting = [pool.submit(_attempt, made, plan, number, scenes) for number in numbers]
+        for future in as_completed(waiting):
+            yield future.result()
+
+
+def _attempt(made: BlindSet, plan: SetPlan, number: int, scenes: Sequence[Plane]) -> Attempt:
+    started = time.perf_counter()
+    shutil.rmtree(made.case_folder(number), ignore_errors=True)  # an interrupted run may have left it
+    folders = made.transit(number), made.expected(number)
+    seal, why_not = "", ""
+    try:
+        if plan.simulator:
+            truth = simulate_case(plan, number, *folders)
+        else:
+            truth = make(draw_case(plan, number), *folders, scenes)
+        seal = made.keep_truth(number, truth)
+    except DataError as error:
+        why_not = f"{error.code}: {error.message}"
+    return number, seal, why_not, time.perf_counter() - started
+
+
+def _end_with_parent() -> None:
+    """End this process of the pool when its parent ends. Otherwise it would continue after the parent was killed."""
+
+    def wait() -> None:
+        parent = parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _remember(made: BlindSet, plan: SetPlan, scenes: Sequence[Plane]) -> None:
@@ -250,80 +266,7 @@ def alone_in(folder: Path) -> Iterator[None]:
         yield
 
 
-def _end_cut_line(file: Path) -> None:
-    """Remove the last line of a file if a power failure left it incomplete."""
-    if file.is_file() and not (text := file.read_text("utf-8")).endswith("\n"):
-        file.write_text(text.rpartition("\n")[0] + "\n" if "\n" in text else "", "utf-8")
-
-
-def _made(jobs: Sequence[Job], processes: int) -> Iterator[_Attempt]:
-    """Make cases. The attempts are yielded in the order in which they end."""
-    if processes <= 1 or len(jobs) <= 1:
-        yield from (job() for job in jobs)
-        return
-    # With the start method "fork", the child processes would inherit locks that threads of this process hold.
-    with ProcessPoolExecutor(
-        processes, mp_context=get_context("spawn"), initializer=_end_with_parent
-    ) as pool:
-        waiting = [pool.submit(job) for job in jobs]
-        for future in as_completed(waiting):
-            yield future.result()
-
-
-def _end_with_parent() -> None:
-    """End this process of the pool when its parent ends. Otherwise it would continue after the parent was killed."""
-
-    def wait() -> None:
-        parent = parent_process()
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
-def _drawn(plan: SetPlan, number: int) -> Case:
-    return draw_case(
-        plan.seed,
-        number,
-        plan.size_px,
-        plan.images,
-        only=plan.only,
-        clean_only=plan.clean_only,
-        built_diffraction=plan.built_diffraction,
-        left_pct=plan.left_pct,
-    )
-
-
-def _make_one(made: BlindSet, case: Case, scenes: Sequence[Plane]) -> _Attempt:
-    started = time.perf_counter()
-    try:
-        result = make(case, scenes)
-    except DataError as error:
-        return _Attempt(case.number, time.perf_counter() - started, why_not=f"{error.code}: {error.message}")
-    write_transit(result, case.plan, made.transit(case.number))
-    write_expected(result, case.plan, made.expected(case.number))
-    return _sealed(made, case.number, result.truth, started)
-
-
-def _simulate_one(made: BlindSet, plan: SetPlan, number: int) -> _Attempt:
-    started = time.perf_counter()
-    try:
-        truth = simulate_case(
-            plan.simulator,
-            seed=plan.seed,
-            number=number,
-            size_px=plan.size_px,
-            images=plan.images,
-            transit=made.transit(number),
-            expected=made.expected(number),
-        )
-    except DataError as error:
-        return _Attempt(number, time.perf_counter() - started, why_not=f"{error.code}: {error.message}")
-    return _sealed(made, number, truth, started)
-
-
-def _sealed(made: BlindSet, number: int, truth: dict[str, Any], started: float) -> _Attempt:
-    seal, kept = sealed(truth)
-    write_whole(made.truth_file(number), json.dumps(kept, allow_nan=False))
-    return _Attempt(number, time.perf_counter() - started, seal)
+def _seal_of(salt: str, truth: dict[str, Any]) -> str:
+    """SHA-256 (hex) of a salt and the canonical JSON of a truth."""
+    canonical = json.dumps(truth, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256((salt + canonical).encode()).hexdigest()

@@ -1,19 +1,23 @@
 """The content of each case of a blind set, drawn at random from the seed of the set and the number of the case.
 
-The same seed and number always give the same case. An effect is known if the gap library contains it. Of 24 consecutive cases
+The same seed and number always give the same case. An effect is known if the gap library contains it; the others are
+withheld. A set takes its withheld effects from one of two groups: those of the calibration or those of tests. Of 24
+consecutive cases
 
-- 8 are clean: they have no effect;
-- 9 have one known effect; every known effect occurs once before any occurs again;
-- 4 have one unknown effect, in turn as well;
+- 6 are clean: they have no effect;
+- 8 have one known effect; every known effect occurs once before any occurs again;
 - 3 have two known effects. The first has two effects that are drawn at random; the second has a strong effect and a
   changing Sun (`scene_evolution`); the third has two strong effects. The strong effects beside a changing Sun are taken
-  in turn.
+  in turn;
+- 4 have one withheld effect, in turn as well;
+- 3 are mixed: they have one known and one withheld effect, each in turn.
 
 The target of an effect is the residual that this effect alone should leave in the discs after a refit of the PSF. It is
-drawn log-uniformly from USUAL_PCT, for a strong effect from STRONG_PCT. In every fourth case with one known effect,
-this effect is strong. If the largest plausible strength of an effect leaves less than the target, the effect gets this
-strength. A changing Sun beside a strong effect has no target, because the discs hardly show the changes of the Sun. The
-relative rms of these changes is drawn log-uniformly from SUN_RMS.
+drawn log-uniformly from USUAL_PCT, for a strong effect from STRONG_PCT, and for both effects of a mixed case from
+MIXED_PCT. In every fourth case with one known effect, this effect is strong. A withheld effect of the tests gets the
+three ranges of TEST_PCT in turn. If the largest plausible strength of an effect leaves less than the target, the effect
+gets this strength. A changing Sun beside a strong effect has no target, because the discs hardly show the changes of the
+Sun. The relative rms of these changes is drawn log-uniformly from SUN_RMS.
 """
 
 from __future__ import annotations
@@ -21,15 +25,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from psfcore.blind.effects.effect import Effect
+from psfcore.blind.effects.effect import TEST, Effect
 from psfcore.blind.effects.fine_optics import FINE, INSTRUMENT, SYNTHETIC, Glass
-from psfcore.blind.effects.registry import KNOWN, UNKNOWN, effect_named
+from psfcore.blind.effects.registry import KNOWN, WITHHELD, effect_named
 from psfcore.blind.effects.scene import patches
 from psfcore.errors import DataError
 from psfcore.noise import Noise
@@ -39,28 +42,62 @@ from psfcore.simulate.scene import drawn_scene, scene_from_image
 
 Plane = NDArray[np.float64]
 Range = tuple[float, float]
-CLEAN, SINGLE, PAIR, FOREIGN = "clean", "single", "pair", "unknown"
-KINDS = (CLEAN, SINGLE, PAIR, FOREIGN)
-DRAW = 2  # raise it when the same seed and number give another case
-_BLOCK = (CLEAN,) * 8 + (SINGLE,) * 9 + (PAIR,) * 3 + (FOREIGN,) * 4
-USUAL_PCT, STRONG_PCT = (0.5, 10.0), (10.0, 30.0)
+CLEAN, SINGLE, PAIR, FOREIGN, MIXED = "clean", "single", "pair", "unknown", "mixed"
+DRAW = 3  # raise it when the same seed and number give another case
+_BLOCK = (CLEAN,) * 6 + (SINGLE,) * 8 + (PAIR,) * 3 + (FOREIGN,) * 4 + (MIXED,) * 3
+USUAL_PCT, STRONG_PCT, MIXED_PCT = (0.5, 10.0), (10.0, 30.0), (3.0, 15.0)
+TEST_PCT = ((0.8, 1.25), (2.4, 3.75), (8.0, 12.5))
 SUN_RMS = (0.02, 0.3)
 _STRONG_SINGLES = 4  # one case in this number of cases with one known effect has a strong effect
 _SUN = "scene_evolution"
 _BESIDE_SUN = tuple(name for name in KNOWN if name != _SUN)
+# Effects that leave less than MIXED_PCT in the discs at their largest plausible strength.
+_HARDLY_IN_DISCS = (_SUN, "occulter_motion", "gain_mismatch", "core_blur", "mesh_pitch")
+_IN_DISCS = tuple(name for name in KNOWN if name not in _HARDLY_IN_DISCS)
 _BUILT_SHARE = 0.5  # fraction of cases with the diffraction PSF of the instrument
 _SATURATING_SHARE = 0.25  # fraction of cases with a saturation level
 _KIND_STREAM, _TRUTH_STREAM, _EFFECT_STREAM = 1, 2, 3
 
 
 @dataclass(frozen=True)
+class SetPlan:
+    """The plan of a set.
+
+    cases: number of cases. size_px, images: of each transit. first: the number of the first case. only: names of
+    effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction: True: half of the
+    cases have the diffraction PSF of the instrument, and half a synthetic one. False: all have a synthetic one.
+    left_pct: the residuals (percent) that an effect should leave in the discs after a refit. The values are used in
+    turn, each for all names of `only`. Empty: the residuals are drawn at random; for the names of `only` from
+    USUAL_PCT. simulator: the file or module of a user's simulator, which makes the cases of the set
+    (`psfcore.blind.simulator`); empty: cases are drawn. withheld: the group of withheld effects, a key of WITHHELD.
+    """
+
+    cases: int
+    seed: int
+    size_px: int = 256
+    images: int = 18
+    first: int = 0
+    only: tuple[str, ...] = ()
+    clean_only: bool = False
+    built_diffraction: bool = True
+    left_pct: tuple[float, ...] = ()
+    simulator: str = ""
+    withheld: str = TEST
+
+    @property
+    def numbers(self) -> range:
+        """The numbers of the cases."""
+        return range(self.first, self.first + self.cases)
+
+
+@dataclass(frozen=True)
 class Case:
     """One case before it is made.
 
-    kind: one of KINDS. law, glass: the true scatter and the known part of the PSF. effects: the effects, at their
-    nominal strengths. target_pct: the residual that each effect alone should leave in the discs after a refit, percent;
-    None: the strength of the effect is already set. headroom: the saturation level divided by the value of the
-    brightest pixel; None: no pixel saturates.
+    kind: CLEAN, SINGLE, PAIR, FOREIGN or MIXED. law, glass: the true scatter and the known part of the PSF. effects: the
+    effects, at their nominal strengths. target_pct: the residual that each effect alone should leave in the discs after
+    a refit, percent; None: the strength of the effect is already set. headroom: the saturation level divided by the
+    value of the brightest pixel; None: no pixel saturates.
     """
 
     number: int
@@ -73,104 +110,71 @@ class Case:
     target_pct: tuple[float | None, ...]
     headroom: float | None
 
-    def as_json(self) -> dict[str, Any]:
-        """The part of the truth that describes how the case was drawn, as JSON."""
-        return {
-            "number": self.number,
-            "seed": self.seed,
-            "kind": self.kind,
-            "glass": dataclasses.asdict(self.glass),
-            "target_pct": list(self.target_pct),
-        }
 
-
-def draw_case(
-    seed: int,
-    number: int,
-    size_px: int,
-    images: int,
-    *,
-    only: Sequence[str] = (),
-    clean_only: bool = False,
-    built_diffraction: bool = True,
-    left_pct: Sequence[float] = (),
-) -> Case:
-    """Case `number` (from 0) of a set.
-
-    only: names of effects; every case has one of them, in turn. clean_only: no case has an effect. built_diffraction:
-    True: half of the cases have the diffraction PSF of the instrument, and half a synthetic diffraction PSF. False: all
-    cases have a synthetic diffraction PSF.
-    left_pct: the residuals (percent) that an effect should leave in the discs after a refit. The values are used in
-    turn, each for all names of `only`. Empty: the residuals are drawn at random; for the names of `only` they are drawn
-    from USUAL_PCT. Raises DataError "unknown-effect", "bad-plan".
-    """
-    kind, names, ranges = _what(seed, number, only, clean_only)
-    rng = np.random.default_rng([seed, number, _TRUTH_STREAM])
-    plan = _plan(size_px, images, rng)
+def draw_case(of: SetPlan, number: int) -> Case:
+    """Case `number` (from 0) of a set. Raises DataError "unknown-effect", "bad-plan"."""
+    kind, content = _content(of, number)
+    rng = np.random.default_rng([of.seed, number, _TRUTH_STREAM])
+    plan = _plan(of.size_px, of.images, rng)
     law = ScatterTruth(rng.uniform(3, 9), rng.uniform(2.3, 2.8), rng.uniform(0.25, 0.5))
-    glass = _glass(size_px, rng, built_diffraction)
+    glass = _glass(of.size_px, rng, of.built_diffraction)
     headroom = float(rng.uniform(1.2, 2.0)) if rng.random() < _SATURATING_SHARE else None
-    own = np.random.default_rng([seed, number, _EFFECT_STREAM])
-    effects = [effect_named(name).drawn(plan, own) for name in names]
+    own = np.random.default_rng([of.seed, number, _EFFECT_STREAM])
+    effects = [effect_named(name).drawn(plan, own) for name, _ in content]
     targets: list[float | None] = []
-    for n, (low, high) in enumerate(ranges):
+    for n, (_, (low, high)) in enumerate(content):
         value = float(np.exp(own.uniform(np.log(low), np.log(high))))
         if (low, high) == SUN_RMS:
             effects[n] = effects[n].at(value)
             targets.append(None)
         else:
-            targets.append(left_pct[number // max(len(only), 1) % len(left_pct)] if left_pct else value)
+            turn = number // max(len(of.only), 1)
+            targets.append(of.left_pct[turn % len(of.left_pct)] if of.left_pct else value)
     own_seed = int(own.integers(2**31))
     return Case(number, own_seed, kind, plan, law, glass, tuple(effects), tuple(targets), headroom)
 
 
-def _what(
-    seed: int, number: int, only: Sequence[str], clean_only: bool
-) -> tuple[str, tuple[str, ...], tuple[Range, ...]]:
-    """The kind of a case, the names of its effects, and for each effect the range from which its target is drawn.
+def _content(of: SetPlan, number: int) -> tuple[str, list[tuple[str, Range]]]:
+    """The kind of a case, and for each effect its name and the range (percent) from which its target is drawn.
 
-    The ranges are in percent. SUN_RMS is not a range of targets: it is a range of strengths.
+    SUN_RMS is not a range of targets: it is a range of strengths.
     """
-    if clean_only:
-        return CLEAN, (), ()
-    if only:
-        name = only[number % len(only)]
+    if of.clean_only:
+        return CLEAN, []
+    if of.only:
+        name = of.only[number % len(of.only)]
         effect_named(name)
-        return (SINGLE if name in KNOWN else FOREIGN), (name,), (USUAL_PCT,)
+        return (SINGLE if name in KNOWN else FOREIGN), [(name, USUAL_PCT)]
     block, place = divmod(number, len(_BLOCK))
-    kinds = _kinds(seed, block)
+    order = np.random.default_rng([of.seed, block, _KIND_STREAM]).permutation(len(_BLOCK))
+    kinds = [_BLOCK[n] for n in order]
     kind = kinds[place]
     count = block * _BLOCK.count(kind) + kinds[:place].count(kind)  # number of earlier cases of this kind
+    withheld = WITHHELD[of.withheld]
     if kind == SINGLE:
         strong = count % _STRONG_SINGLES == _STRONG_SINGLES - 1
-        return kind, (_in_turn(seed, count, KNOWN, 0),), (STRONG_PCT if strong else USUAL_PCT,)
+        return kind, [(_in_turn(of.seed, count, KNOWN, 0), STRONG_PCT if strong else USUAL_PCT)]
     if kind == FOREIGN:
-        return kind, (_in_turn(seed, count, UNKNOWN, 1),), (USUAL_PCT,)
-    if kind == PAIR:
-        return kind, *_pair(seed, count)
-    return CLEAN, (), ()
+        name = _in_turn(of.seed, count, withheld, 1)
+        step = withheld.index(name) + count // len(withheld)
+        return kind, [(name, TEST_PCT[step % len(TEST_PCT)] if of.withheld == TEST else USUAL_PCT)]
+    if kind == MIXED:
+        names = _in_turn(of.seed, count, _IN_DISCS, 3), _in_turn(of.seed, count, withheld, 4)
+        return kind, [(name, MIXED_PCT) for name in names]
+    return kind, _pair(of.seed, count) if kind == PAIR else []
 
 
-def _pair(seed: int, count: int) -> tuple[tuple[str, str], tuple[Range, Range]]:
-    """The two effects of a pair: their names, and the ranges of their targets as in the result of `_what`.
-
-    count: the number of pairs in the earlier cases.
-    """
+def _pair(seed: int, count: int) -> list[tuple[str, Range]]:
+    """The two effects of a pair, as in the result of `_content`. count: the number of pairs in the earlier cases."""
     turn, place = divmod(count, 3)
     if place == 1:
-        return (_in_turn(seed, turn, _BESIDE_SUN, 2), _SUN), (STRONG_PCT, SUN_RMS)
+        return [(_in_turn(seed, turn, _BESIDE_SUN, 2), STRONG_PCT), (_SUN, SUN_RMS)]
     rng = np.random.default_rng([seed, count, _KIND_STREAM, 2])
     # place 0: any two known effects. place 2: two strong effects, but not the changing Sun, because even its largest
     # plausible change leaves little in the discs.
     names = _BESIDE_SUN if place else KNOWN
     first, second = rng.choice(len(names), size=2, replace=False)
-    reach = STRONG_PCT if place else USUAL_PCT
-    return (names[first], names[second]), (reach, reach)
-
-
-def _kinds(seed: int, block: int) -> list[str]:
-    order = np.random.default_rng([seed, block, _KIND_STREAM]).permutation(len(_BLOCK))
-    return [_BLOCK[n] for n in order]
+    return [(names[n], STRONG_PCT if place else USUAL_PCT) for n in (first, second)]
 
 
 def _in_turn(seed: int, count: int, names: Sequence[str], stream: int) -> str:
@@ -231,22 +235,17 @@ def case_scenes(case: Case, images: Sequence[Plane] = ()) -> dict[int, Plane]:
             given = images[(case.number + pointing - 1) % len(images)]
             mirrored = len(images) == 1 and case.plan.views[pointing - 1] == WEST
             scene = scene_from_image(given[:, ::-1] if mirrored else given, case.plan)
-            scenes[pointing] = _calm(scene)
+            scene = np.asarray(gaussian_filter(scene, 0.5 * FINE))  # it is cut from an image with noise
         else:
-            scenes[pointing] = _with_own_statistics(
-                drawn_scene(case.plan, pointing, case.seed), case, pointing
-            )
-        if scenes[pointing].max() <= 0:
+            drawn = drawn_scene(case.plan, pointing, case.seed)
+            scene = _with_own_statistics(drawn, case, pointing)
+        if scene.max() <= 0:
             raise DataError(
                 "bad-scene",
                 f"expected light in the scene of pointing {pointing}; all pixels of this scene are 0: choose another image",
             )
+        scenes[pointing] = scene
     return scenes
-
-
-def _calm(scene: Plane) -> Plane:
-    """Smooth a scene by half a detector pixel, because it is cut from an image with noise."""
-    return np.asarray(gaussian_filter(scene, 0.5 * FINE))
 
 
 def _with_own_statistics(scene: Plane, case: Case, pointing: int) -> Plane:
@@ -264,6 +263,3 @@ def _with_own_statistics(scene: Plane, case: Case, pointing: int) -> Plane:
     width = rng.uniform(0.8, 2.0) * FINE
     lit += 2 * np.pi * width**2 * gaussian_filter(points, width)
     return np.asarray(lit + rng.uniform(0, 3))
-
-
-__all__ = ["CLEAN", "FOREIGN", "KINDS", "PAIR", "SINGLE", "Case", "case_scenes", "draw_case"]

@@ -4,8 +4,7 @@ The copy is in a temporary folder whose name does not contain the number of the 
 report is copied to the set when it is complete. A case that has a report is not diagnosed again. If a diagnosis fails, the
 failure is written to run.json, and the next run tries the case again.
 
-A further process computes what an ideal observer could know about the case, from its images without noise. These images stay
-in the set; the diagnosis runs elsewhere and gets no path of the set.
+A further process computes what an ideal observer could know about the case, from a copy of its images without noise.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from psfcore.blind.case_set import BlindSet
-from psfcore.blind.scoring import Judged
 from psfcore.errors import DataError
 from psfcore.whole_files import write_whole
 
-REPORT_SCHEMA = "gap/2"
-IDEAL_SCHEMA = "gap-ideal/1"
+# For each schema, the keys that a complete result has.
+REPORT_SCHEMA, IDEAL_SCHEMA = "gap/2", "gap-ideal/1"
+_KEYS = {REPORT_SCHEMA: {"verdict", "set"}, IDEAL_SCHEMA: {"noncentrality", "hypotheses"}}
 LONGEST_S = 1800.0
 _KIB = 1024
 _LAST_WORDS = 2000
@@ -39,8 +38,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Run:
-    """One diagnosis: its wall time, its largest memory and its exit status. error: the reason if the diagnosis gave no
-    report."""
+    """One diagnosis: its wall time, its largest memory and its exit status. error: the reason if it gave no report."""
 
     case: int
     wall_s: float
@@ -51,7 +49,7 @@ class Run:
     @property
     def failed(self) -> bool:
         """Whether the diagnosis gave no report."""
-        return self.status != 0 or bool(self.error)
+        return bool(self.error)
 
 
 def run_set(
@@ -74,9 +72,11 @@ def run_set(
     longest_s: a process that takes longer is killed. Raises DataError "bad-command", "bad-seals", and "not-sealed" if
     a case has no seal.
     """
-    _check(command, ("{transit}", "{report}"))
-    if ideal:
-        _check(ideal, ("{expected}", "{ideal}"))
+    for some, marks in ((command, ("{transit}", "{report}")), (ideal, ("{expected}", "{ideal}"))):
+        if some and not all(any(mark in part for part in some) for mark in marks):
+            raise DataError(
+                "bad-command", f"expected {' and '.join(marks)} in the command; got {' '.join(some)}"
+            )
     for number in numbers:
         if not made.is_made(number):
             raise DataError(
@@ -84,40 +84,37 @@ def run_set(
                 f"case {number:04d}: expected a truth that was sealed before the diagnosis; got no seal: make the case again",
             )
 
+    def diagnose(number: int) -> Run | None:
+        if result_in(made.report(number), REPORT_SCHEMA) is not None:
+            return None
+        run = _run(number, command, made.transit(number), made.report(number), REPORT_SCHEMA, longest_s)
+        write_whole(made.case_folder(number) / "run.json", json.dumps(asdict(run), indent=1))
+        if not run.failed and not keep:
+            shutil.rmtree(made.transit(number))
+        what = f"failed: {run.error.splitlines()[-1]:.100}" if run.failed else "diagnosed"
+        progress(f"case {number:04d} {what}, {run.wall_s:.1f} s, {run.peak_mib:.0f} MiB")
+        return run
+
+    def observe(number: int) -> None:
+        expected, file = made.expected(number), made.ideal(number)
+        if not ideal or not expected.is_dir():
+            return
+        if result_in(file, IDEAL_SCHEMA) is None:
+            run = _run(number, ideal, expected, file, IDEAL_SCHEMA, longest_s)
+            if run.failed:
+                progress(f"case {number:04d} has no ideal observer: {run.error.splitlines()[-1]:.100}")
+                return
+            progress(f"case {number:04d}: ideal observer computed, {run.wall_s:.1f} s")
+        if not keep:
+            shutil.rmtree(expected)
+
     def one(number: int) -> Run | None:
-        run = None if has_report(made, number) else _diagnose(made, number, command, longest_s)
-        if run is not None:
-            if not run.failed and not keep:
-                shutil.rmtree(made.transit(number))
-            what = f"failed: {run.error.splitlines()[-1]:.100}" if run.failed else "diagnosed"
-            progress(f"case {number:04d} {what}, {run.wall_s:.1f} s, {run.peak_mib:.0f} MiB")
-        if ideal and made.expected(number).is_dir():
-            _compute_ideal(made, number, ideal, keep, longest_s, progress)
+        run = diagnose(number)
+        observe(number)
         return run
 
     with ThreadPoolExecutor(max(1, processes)) as pool:
         return [run for run in pool.map(one, numbers) if run is not None]
-
-
-def _check(command: Sequence[str], marks: Sequence[str]) -> None:
-    if not all(any(mark in part for part in command) for mark in marks):
-        raise DataError(
-            "bad-command", f"expected {' and '.join(marks)} in the command; got {' '.join(command)}"
-        )
-
-
-def has_report(made: BlindSet, number: int) -> bool:
-    """Whether a case has a complete report."""
-    try:
-        report_of(made, number)
-    except DataError:
-        return False
-    return True
-
-
-def report_of(made: BlindSet, number: int) -> dict[str, Any]:
-    """The report of a case. Raises DataError "bad-report" if it is missing or incomplete."""
-    return _checked_report(made.report(number))
 
 
 def run_of(made: BlindSet, number: int) -> Run | None:
@@ -126,102 +123,33 @@ def run_of(made: BlindSet, number: int) -> Run | None:
     return Run(**json.loads(file.read_text("utf-8"))) if file.is_file() else None
 
 
-def ideal_of(made: BlindSet, number: int) -> dict[str, Any] | None:
-    """What an ideal observer could know about a case (gap-ideal/1); None if it was not computed."""
-    return _ideal_in(made.ideal(number))
-
-
-def judged_cases(made: BlindSet, numbers: Sequence[int]) -> tuple[list[Judged], dict[int, str]]:
-    """Two results: the cases that have a report; the reasons why the other cases have none, by number.
-
-    Each truth is read, and its seal is checked.
-    Raises DataError "broken-seal", "bad-seals".
-    """
-    judged, failures = [], {}
-    for number in numbers:
-        truth, run = made.truth(number), run_of(made, number)
-        try:
-            report = report_of(made, number)
-        except DataError as error:
-            failures[number] = run.error if run is not None and run.failed else error.message
-            continue
-        judged.append(Judged(number, truth, report, run.wall_s if run else 0.0, ideal_of(made, number)))
-    return judged, failures
-
-
-def _checked_report(file: Path) -> dict[str, Any]:
-    try:
-        report = json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(
-            "bad-report", f"expected a report of schema {REPORT_SCHEMA}; got {error!s:.120}"
-        ) from error
-    whole = isinstance(report, dict) and {"verdict", "set"} <= report.keys()
-    if not whole or report.get("schema") != REPORT_SCHEMA:
-        raise DataError(
-            "bad-report", f"expected schema {REPORT_SCHEMA}, a verdict and a set; got {report!s:.80}"
-        )
-    return report
-
-
-def _ideal_in(file: Path) -> dict[str, Any] | None:
+def result_in(file: Path, schema: str) -> dict[str, Any] | None:
+    """The complete result of this schema in a file; None if there is none. schema: REPORT_SCHEMA or IDEAL_SCHEMA."""
     try:
         found = json.loads(file.read_text("utf-8"))
     except (OSError, ValueError):
         return None
-    return found if isinstance(found, dict) and found.get("schema") == IDEAL_SCHEMA else None
+    whole = isinstance(found, dict) and found.get("schema") == schema and found.keys() >= _KEYS[schema]
+    return found if whole else None
 
 
-def _diagnose(made: BlindSet, number: int, command: Sequence[str], longest_s: float) -> Run:
-    with tempfile.TemporaryDirectory(prefix="transit-") as temporary:
-        transit, report = Path(temporary) / "transit", Path(temporary) / "report.json"
-        shutil.copytree(made.transit(number), transit)
-        filled = _filled(command, {"{transit}": transit, "{report}": report})
+def _run(number: int, command: Sequence[str], folder: Path, file: Path, schema: str, longest_s: float) -> Run:
+    """Run a program on a copy of a folder of a case. If its result is complete, it is written to the file."""
+    with tempfile.TemporaryDirectory(prefix=f"{folder.name}-") as temporary:
+        source, result = Path(temporary) / folder.name, Path(temporary) / file.name
+        shutil.copytree(folder, source)
+        paths = {f"{{{folder.name}}}": source, f"{{{file.stem}}}": result}
+        filled = list(command)
+        for mark, path in paths.items():
+            filled = [part.replace(mark, str(path)) for part in filled]
         status, wall_s, peak_mib, said = _watched(filled, Path(temporary), longest_s)
-        error = ""
-        if status:
-            error = f"exit status {status}: {said}"
-        else:
-            try:
-                _checked_report(report)
-            except DataError as problem:
-                error = problem.message
-        run = Run(number, wall_s, peak_mib, status, error)
-        folder = made.case_folder(number)
-        write_whole(folder / "run.json", json.dumps(asdict(run), indent=1))
-        if not run.failed:
-            write_whole(made.report(number), report.read_text("utf-8"))
-        return run
-
-
-def _compute_ideal(
-    made: BlindSet, number: int, command: Sequence[str], keep: bool, longest_s: float, progress: Progress
-) -> None:
-    """Compute what an ideal observer could know about a case, if ideal.json is missing. Then remove the images without
-    noise.
-
-    keep: keep these images. If the computation fails, the images are kept too.
-    """
-    if ideal_of(made, number) is None:
-        with tempfile.TemporaryDirectory(prefix="ideal-") as temporary:
-            result = Path(temporary) / "ideal.json"
-            paths = {"{expected}": made.expected(number).resolve(), "{ideal}": result}
-            status, wall_s, _, said = _watched(_filled(command, paths), Path(temporary), longest_s)
-            if status or _ideal_in(result) is None:
-                progress(f"case {number:04d} has no ideal observer: {said.splitlines()[-1]:.100}")
-                return
-            write_whole(made.ideal(number), result.read_text("utf-8"))
-            progress(f"case {number:04d}: ideal observer computed, {wall_s:.1f} s")
-    if not keep:
-        shutil.rmtree(made.expected(number))
-
-
-def _filled(command: Sequence[str], paths: Mapping[str, Path]) -> list[str]:
-    """Replace every mark in a command by its path. paths: the path for each mark."""
-    filled = list(command)
-    for mark, path in paths.items():
-        filled = [part.replace(mark, str(path)) for part in filled]
-    return filled
+        error = f"exit status {status}: {said}" if status else ""
+        if not error and result_in(result, schema) is None:
+            text = result.read_text("utf-8", errors="replace") if result.is_file() else "no file"
+            error = f"expected a result of schema {schema} with {' and '.join(sorted(_KEYS[schema]))}; got {text:.80}"
+        if not error:
+            write_whole(file, result.read_text("utf-8"))
+        return Run(number, wall_s, peak_mib, status, error)
 
 
 def _watched(command: Sequence[str], folder: Path, longest_s: float) -> tuple[int, float, float, str]:

@@ -30,7 +30,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE
+from psfcore.blind.cases import CLEAN, FOREIGN, MIXED, PAIR, SINGLE, SetPlan
 from psfcore.blind.effects.registry import KNOWN
 from psfcore.blind.make_case import WITH_EFFECTS, WITHOUT_EFFECTS
 from psfcore.errors import DataError
@@ -39,7 +39,7 @@ from psfcore.transit.manifest import MANIFEST_NAME, read_manifest
 
 FUNCTION = "make_case"
 MOST_EFFECTS = 2
-_NO_NAMES = {CLEAN, PAIR, FOREIGN, "none"}  # no effect may have these names: the score uses them
+_NO_NAMES = {CLEAN, PAIR, MIXED, FOREIGN, "none"}  # no effect may have these names: the score uses them
 _RESIDUALS = ("left_before_refit_pct", "left_after_refit_pct")
 
 
@@ -66,19 +66,17 @@ def simulator_of(source: str) -> Callable[..., Any]:
     return found
 
 
-def simulate_case(
-    source: str, *, seed: int, number: int, size_px: int, images: int, transit: Path, expected: Path
-) -> dict[str, Any]:
-    """Let a simulator write a case. Returns the truth of the case. The module docstring explains the arguments.
+def simulate_case(plan: SetPlan, number: int, transit: Path, expected: Path) -> dict[str, Any]:
+    """Let the simulator of a plan write a case. Returns the truth of the case. The module docstring explains the arguments.
 
     Raises DataError "bad-simulator", and the errors of `psfcore.transit.manifest.read_manifest`.
     """
+    source, seed = plan.simulator, plan.seed
     function = simulator_of(source)
     transit.mkdir(parents=True)
+    arguments = {"seed": seed, "number": number, "size_px": plan.size_px, "images": plan.images}
     with named_errors(source, _bad):
-        truth = function(
-            seed=seed, number=number, size_px=size_px, images=images, transit=transit, expected=expected
-        )
+        truth = function(**arguments, transit=transit, expected=expected)
     _check_transit(source, transit)
     if expected.exists():
         names = sorted(path.name for path in expected.iterdir())
@@ -122,9 +120,10 @@ def checked_truth(source: str, truth: Any) -> dict[str, Any]:
     if len(names) > MOST_EFFECTS:
         raise _bad(source, f"expected at most {MOST_EFFECTS} effects; got {len(names)}")
     numbers = [copied.get(key) for key in _RESIDUALS]
-    numbers += [effect.get("left_alone_pct", 0.0) for effect in copied["effects"]]
+    alone = ("left_alone_pct", "left_alone_chi2")
+    numbers += [effect.get(key, 0.0) for effect in copied["effects"] for key in alone]
     if not all(number is None or _is_share(number) for number in numbers):
-        raise _bad(source, f"expected residuals in percent, at least 0; got {numbers!r:.100}")
+        raise _bad(source, f"expected residuals in percent and chi2, at least 0; got {numbers!r:.100}")
     kind = _kind_of(names)
     nothing_left = {"left_before_refit_pct": 0.0, "left_after_refit_pct": 0.0} if kind == CLEAN else {}
     return {**nothing_left, **copied, "kind": kind}
@@ -136,11 +135,10 @@ def _is_share(number: object) -> bool:
 
 
 def _kind_of(names: list[str]) -> str:
-    if not names:
-        return CLEAN
-    if not set(names) <= set(KNOWN):
-        return FOREIGN
-    return SINGLE if len(names) == 1 else PAIR
+    withheld = len(set(names) - set(KNOWN))
+    if withheld:
+        return FOREIGN if withheld == len(names) else MIXED
+    return (CLEAN, SINGLE, PAIR)[len(names)]
 
 
 def _bad(source: str, what: str) -> DataError:

@@ -109,7 +109,7 @@ def observed_transit(sky: TrueSky, seed: int, imitated: Imitated = HRI_EUV) -> S
     This is faster than `simulate`, because the scenes are already convolved.
     """
     plan = sky.plan
-    reported = _ephemeris(plan, seed)
+    reported = reported_places(plan, seed)
     start_s = plan.shots[0].time_s
     frames = tuple(
         Frame(
@@ -144,8 +144,8 @@ def _read_out(plan: Plan, index: int, expected: Plane, seed: int) -> Plane:
     return np.asarray(np.rint(seen_dn) if plan.whole_dn else seen_dn)
 
 
-def _ephemeris(plan: Plan, seed: int) -> list[Place]:
-    """The exact positions plus errors of the ephemeris, rounded to a tenth of a pixel."""
+def reported_places(plan: Plan, seed: int) -> list[Place]:
+    """The positions of the occulter that a transit states: the exact positions plus errors of the ephemeris, rounded to a tenth of a pixel."""
     rng = np.random.default_rng([seed, _EPHEMERIS])
     errors = rng.normal(0.0, plan.ephemeris_error_px, (len(plan.shots), 2))
     return [

@@ -1,24 +1,52 @@
-"""An effect of the blind set: a strength, drawn parameters, and the steps of the simulation that it changes.
+"""An effect of the blind set: a strength, drawn parameters, and the step of the simulation that it changes.
 
     scene -> occulter -> optics -> light on fine pixels -> light on detector pixels -> photons -> readout
 
-An effect changes one or two of these steps. An effect of strength 0 changes nothing.
+Each kind of effect is a function that changes one step; `declare` adds it to the table EFFECTS. The docstring of the
+function states the physical cause. An effect of strength 0 changes nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.blind.effects.fine_optics import FineOptics
 from psfcore.simulate.plan import Plan, Shot
-from psfcore.transit.transit import Place
 
 Plane = NDArray[np.float64]
+Change = Callable[..., Any]
+Function = TypeVar("Function", bound=Change)
+# How a parameter is drawn: a function, or the ends of the interval of a uniform distribution.
+Draw = Callable[[Plan, np.random.Generator], Any] | tuple[float, float]
+
+# Groups: effects that the gap library also contains, by the same names; effects that it lacks, for its calibration and for tests.
+KNOWN, CALIBRATION, TEST = "known", "calibration", "test"
+# For each step: the arguments of its functions after the effect, and the stage to which it belongs.
+#   scene: the fine scene [y, x], DN/s; moment
+#   covered: the fraction of each fine pixel around the disc that the occulter covers; these pixels (`Behind`); moment
+#   foreground: the fine scene with its occulter [y, x], DN/s; moment
+#   optics: the telescope; moment
+#   spread: the fine light [y, x], DN/s, if the PSF varies across the field; the fine scene with its occulter; telescope; moment
+#   light: the fine light in the focal plane [y, x], DN/s; moment
+#   expected: the light on detector pixels [y, x], DN/s, before photon noise; moment
+#   read_out: one exposure [y, x], in DN with noise; moment; the images that were read before
+STAGES = {
+    "scene": "scene",
+    "covered": "scene",
+    "foreground": "scene",
+    "optics": "optics",
+    "spread": "optics",
+    "light": "detector",
+    "expected": "detector",
+    "read_out": "detector",
+}
+ANGLE = (0.0, 360.0)  # degrees
+# Options of kinds (`Kind`).
+ADDS_LIGHT, DEPENDS_ON_NOISE, VARIES = {"adds_light": True}, {"noise_realisations": 12}, {"varies": True}
 
 
 @dataclass(frozen=True)
@@ -49,53 +77,61 @@ class Earlier:
 
 
 @dataclass(frozen=True)
-class Window:
-    """The pixels around a disc. place: the position of the disc. first, shape: the first detector pixel (y, x), and the size."""
-
-    place: Place
-    first: tuple[int, int]
-    shape: tuple[int, int]
-
-
-@dataclass(frozen=True)
 class Kind:
-    """A kind of effect. Every step is a function of the effect and of what it changes; None: the kind does not change this step.
+    """A kind of effect: the function `change` changes the step `step` of the simulation (a key of STAGES).
 
-    unit: the unit of the strength. cause: the physical cause, as text. nominal: a strength whose change is visible in
-    the discs. largest: the largest plausible strength. draw: draws the parameters. power: the residual that the effect leaves is
-    proportional to strength**power. varies: whether its optics differ from image to image. noise_realisations: number of noise
-    realisations over which its change is averaged; 0 if the change does not depend on noise.
-
-    scene: changes the fine scene [y, x], DN/s. covered: changes the fraction of each fine pixel of a window that the occulter
-    covers; None: the fraction that a disc at rest covers. optics: changes the telescope. spread: changes the fine light [y, x],
-    DN/s, if the PSF varies across the field; it also gets the fine scene with its occulter, and the telescope. light: changes the
-    fine light in the focal plane [y, x], DN/s. expected: changes the light on detector pixels [y, x], DN/s, before photon noise.
-    read_out: changes one exposure [y, x], in DN with noise; it also gets the images that were read before. saturation_dn: the level
-    in DN at which high-only images clip, from all exposures.
+    group: one of KNOWN, CALIBRATION, TEST. unit: the unit of the strength. nominal: a strength whose change is visible
+    in the discs. largest: the largest plausible strength. draw: how each parameter is drawn. power: the residual that
+    the effect leaves is proportional to strength**power. varies: whether its optics differ from image to image.
+    noise_realisations: number of noise realisations over which its change is averaged; 0 if the change does not depend
+    on noise. adds_light: whether it adds light at places of the detector that stay the same; the truth then has a map
+    of this light. saturation_dn: the level in DN at which high-only images clip, from the effect, all exposures and the
+    plan.
     """
 
     name: str
-    stage: str
+    group: str
+    step: str
     unit: str
-    cause: str
     nominal: float
     largest: float
-    draw: Callable[[Plan, np.random.Generator], dict[str, Any]] = lambda plan, rng: {}
+    change: Change
+    draw: Mapping[str, Draw]
     power: float = 1.0
     varies: bool = False
     noise_realisations: int = 0
-    scene: Callable[[Effect, Plane, Moment], Plane] | None = None
-    covered: Callable[[Effect, Plane | None, Window, Moment], Plane | None] | None = None
-    optics: Callable[[Effect, FineOptics, Moment], FineOptics] | None = None
-    spread: Callable[[Effect, Plane, Plane, FineOptics, Moment], Plane] | None = None
-    light: Callable[[Effect, Plane, Moment], Plane] | None = None
-    expected: Callable[[Effect, Plane, Moment], Plane] | None = None
-    read_out: Callable[[Effect, Plane, Moment, list[Earlier]], Plane] | None = None
+    adds_light: bool = False
     saturation_dn: Callable[[Effect, list[Plane], Plan], float] | None = None
 
     def drawn(self, plan: Plan, rng: np.random.Generator) -> Effect:
         """An effect of this kind at the nominal strength, with random parameters."""
-        return Effect(self, self.nominal, self.draw(plan, rng))
+        parameters = {
+            name: float(rng.uniform(*draw)) if isinstance(draw, tuple) else draw(plan, rng)
+            for name, draw in self.draw.items()
+        }
+        return Effect(self, self.nominal, parameters)
+
+
+EFFECTS: dict[str, Kind] = {}
+
+
+def declare(
+    group: str,
+    step: str,
+    unit: str,
+    nominal: float,
+    largest: float,
+    options: Mapping[str, Any] | None = None,
+    **draw: Draw,
+) -> Callable[[Function], Function]:
+    """Add the decorated function to EFFECTS, under its own name. options: further fields of `Kind`. draw: its parameters."""
+
+    def add(change: Function) -> Function:
+        name = change.__name__
+        EFFECTS[name] = Kind(name, group, step, unit, nominal, largest, change, draw, **(options or {}))
+        return change
+
+    return add
 
 
 @dataclass(frozen=True)
@@ -115,34 +151,33 @@ class Effect:
         return replace(self, strength=strength)
 
     def as_json(self) -> dict[str, Any]:
-        """Name, strength, unit and parameters of the effect, as JSON."""
-        parameters = dict(self.parameters)
+        """Name, stage, strength, unit and parameters of the effect, as JSON."""
         return {
             "name": self.kind.name,
+            "stage": STAGES[self.kind.step],
             "strength": self.strength,
             "unit": self.kind.unit,
-            "parameters": parameters,
+            "parameters": dict(self.parameters),
         }
 
 
 def apply_effects(effects: Sequence[Effect], step: str, value: Any, *beside: Any) -> Any:
-    """The value after a step of the simulation: every effect that acts on this step changes it. step: a field of `Kind`."""
+    """The value after a step of the simulation: every effect that acts on this step changes it. step: a key of STAGES."""
     for effect in effects:
-        change = getattr(effect.kind, step)
-        if change is not None and effect.strength:
-            value = change(effect, value, *beside)
+        if effect.kind.step == step and effect.strength:
+            value = effect.kind.change(effect, value, *beside)
     return value
 
 
-def acts_on(effect: Effect, *steps: str) -> bool:
-    """Whether an effect changes at least one of these steps."""
-    return effect.strength != 0 and any(getattr(effect.kind, step) is not None for step in steps)
+def unit_coordinates(shape: tuple[int, ...], angle_deg: float = 0.0) -> tuple[Plane, Plane]:
+    """Coordinates of the pixels [y, x] along and across a direction, in widths of the field, from its centre.
 
-
-def unit_coordinates(shape: tuple[int, ...]) -> tuple[Plane, Plane]:
-    """Coordinates of the pixels: u (1, nx) along x and v (ny, 1) along y, each from -0.5 to 0.5 across the field."""
+    angle_deg: the direction, from +x towards +y.
+    """
     ny, nx = shape
-    return (np.arange(nx)[None, :] + 0.5) / nx - 0.5, (np.arange(ny)[:, None] + 0.5) / ny - 0.5
+    u, v = (np.arange(nx)[None, :] + 0.5) / nx - 0.5, (np.arange(ny)[:, None] + 0.5) / ny - 0.5
+    cos, sin = direction(angle_deg)
+    return u * cos + v * sin, v * cos - u * sin
 
 
 def direction(angle_deg: float) -> tuple[float, float]:
@@ -150,16 +185,27 @@ def direction(angle_deg: float) -> tuple[float, float]:
     return float(np.cos(np.deg2rad(angle_deg))), float(np.sin(np.deg2rad(angle_deg)))
 
 
-def angle(rng: np.random.Generator) -> float:
-    """A random direction, degrees."""
-    return float(rng.uniform(0, 360))
-
-
-def sign(rng: np.random.Generator) -> int:
+def sign(plan: Plan, rng: np.random.Generator) -> int:
     """1 or -1, drawn at random."""
     return int(rng.choice([-1, 1]))
 
 
-def seed(rng: np.random.Generator) -> int:
+def coin(plan: Plan, rng: np.random.Generator) -> bool:
+    """True or False, drawn at random."""
+    return bool(rng.random() < 0.5)
+
+
+def seed(plan: Plan, rng: np.random.Generator) -> int:
     """A random seed."""
     return int(rng.integers(2**31))
+
+
+def near_a_disc(spread: float) -> Callable[[Plan, np.random.Generator], tuple[float, float]]:
+    """Draws a point (x, y), fractions of the field, near a random position of the occulter. spread: rms distance per axis."""
+
+    def draw(plan: Plan, rng: np.random.Generator) -> tuple[float, float]:
+        shot = plan.shots[int(rng.integers(len(plan.shots)))]
+        dx, dy = rng.normal(0, spread, 2)
+        return float(shot.x_px / plan.size_px + dx), float(shot.y_px / plan.size_px + dy)
+
+    return draw

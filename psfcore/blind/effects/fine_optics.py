@@ -24,17 +24,23 @@ from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
 
 from psfcore.build import build_psf
 from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.diffraction.mesh_series import rotated_mesh_kernel
-from psfcore.instruments.model import Instrument, load_instrument
+from psfcore.instruments.model import load_instrument
 from psfcore.simulate.scatter_truth import ScatterTruth
 
 Kernel = NDArray[np.float64]
 FINE = 2
+# The weights in Eq. (1) along one axis: the fraction of pairs (s, t) of fine pixels with each offset.
+_TRIANGLE = 1 - np.abs(np.arange(1 - FINE, FINE)) / FINE
 SYNTHETIC, INSTRUMENT = "synthetic", "hri_euv"
-_ORDERS = 40  # number of orders of a synthetic mesh in each direction
+_ORDERS, _SPOT_PX = (
+    40,
+    0.45,
+)  # of a synthetic mesh: number of orders in each direction, standard deviation of a spot
 _LARGEST_BUILT_PX = 2048
 
 
@@ -66,38 +72,23 @@ class Glass:
         return np.asarray(kernel / kernel.sum())
 
     def _drawn(self, size: int, turn_deg: float, pitch_factor: float) -> Kernel:
-        """A synthetic pattern: a core with wings, and orders along two axes.
+        """A synthetic pattern: a core with wings, and orders along two axes, which are Gaussian spots.
 
         The intensity of order n decreases with |n|.
         """
         d = (np.arange(size) - size // 2) / FINE
-        x, y = d[None, :], d[:, None]
-        core, wing = (np.exp(-np.hypot(x, y) / scale) for scale in (self.core_px, self.wing_px))
-        cos, sin = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
-        orders = np.zeros((size, size))
+        r = np.hypot(d[None, :], d[:, None])
+        core, wing = np.exp(-r / self.core_px), np.exp(-r / self.wing_px)
+        centred = (1 - self.wing_share) * core / core.sum() + self.wing_share * wing / wing.sum()
         numbers = np.array([n for n in range(-_ORDERS, _ORDERS + 1) if n])
         light = 1 / (1 + numbers**2 / 9.0)
-        for n, weight in zip(numbers, light / (2 * light.sum()), strict=True):
-            at = n * self.pitch_px * pitch_factor
-            for order_x, order_y in ((at * cos, at * sin), (-at * sin, at * cos)):
-                _add_spot(orders, order_x, order_y, weight)
-        centred = (1 - self.wing_share) * core / core.sum() + self.wing_share * wing / wing.sum()
+        way = numbers * self.pitch_px * pitch_factor
+        cos, sin = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
+        x, y = np.append(way * cos, -way * sin), np.append(way * sin, way * cos)
+        along_x, along_y = (np.exp(-((d - at[:, None]) ** 2) / (2 * _SPOT_PX**2)) for at in (x, y))
+        orders = along_y.T @ (np.append(light, light)[:, None] * along_x)
+        orders /= 2 * light.sum() * 2 * np.pi * (_SPOT_PX * FINE) ** 2
         return np.asarray((1 - self.arm_share) * centred + self.arm_share * orders)
-
-
-def _add_spot(plane: Kernel, x_px: float, y_px: float, light: float) -> None:
-    """Add one mesh order: a Gaussian with a standard deviation of 0.45 px, at an offset from the centre."""
-    size = plane.shape[0]
-    column, row = (round(at * FINE) + size // 2 for at in (x_px, y_px))
-    reach = 3 * FINE
-    rows = np.arange(max(0, row - reach), min(size, row + reach + 1))
-    columns = np.arange(max(0, column - reach), min(size, column + reach + 1))
-    if rows.size and columns.size:
-        dy, dx = ((at - size // 2) / FINE for at in (rows, columns))
-        spot = np.exp(-((dy[:, None] - y_px) ** 2 + (dx[None, :] - x_px) ** 2) / (2 * 0.45**2))
-        plane[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += (
-            light * spot / (2 * np.pi * (0.45 * FINE) ** 2)
-        )
 
 
 def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel:
@@ -126,20 +117,13 @@ def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel
 def _pupil(name: str, size: int) -> Kernel:
     """The diffraction PSF of an instrument without its entrance mesh, on fine pixels. The result is kept, because the
     computation takes seconds."""
-    fine = _with_fine_pixels(load_instrument(name))
-    built = min(size, _LARGEST_BUILT_PX)
+    instrument = load_instrument(name)
+    detector = instrument.detector
+    pitch_um, scale_arcsec = detector.pixel_pitch_um / FINE, detector.plate_scale_arcsec / FINE
+    detector = replace(detector, pixel_pitch_um=pitch_um, plate_scale_arcsec=scale_arcsec)
+    fine, built = replace(instrument, detector=detector), min(size, _LARGEST_BUILT_PX)
     parts = [build_psf(fine, size=built, component=part).kernel for part in ("MOUNT", "FILTER_WHEEL")]
     return linear_convolve(parts[0], parts[1], (size, size))
-
-
-def _with_fine_pixels(instrument: Instrument) -> Instrument:
-    detector = instrument.detector
-    fine = replace(
-        detector,
-        pixel_pitch_um=detector.pixel_pitch_um / FINE,
-        plate_scale_arcsec=detector.plate_scale_arcsec / FINE,
-    )
-    return replace(instrument, detector=fine)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,44 +187,20 @@ def scaled_scatter(falloff: Kernel, law: ScatterTruth, amplitude: float) -> Kern
     middle = scatter.shape[0] // 2
     scatter[middle, middle] = 0.0
     within = scatter[middle - FINE + 1 : middle + FINE, middle - FINE + 1 : middle + FINE]
-    scatter[middle, middle] = 1 - law.total - float((within * np.outer(_triangle(), _triangle())).sum())
+    scatter[middle, middle] = 1 - law.total - float(_TRIANGLE @ within @ _TRIANGLE)
     return scatter
 
 
 def binned_kernel(fine: Kernel) -> Kernel:
     """Eq. (1): bin a fine kernel [y, x] of even size to detector pixels. Light is lost only at the edges of the array."""
-    n = fine.shape[0]
-    columns = sum(
-        weight * _shifted(fine, shift, 1)[:, ::FINE]
-        for shift, weight in zip(range(1 - FINE, FINE), _triangle(), strict=True)
-    )
-    rows = sum(
-        weight * _shifted(np.asarray(columns), shift, 0)[::FINE]
-        for shift, weight in zip(range(1 - FINE, FINE), _triangle(), strict=True)
-    )
-    return np.asarray(rows).reshape(n // FINE, n // FINE)
+    columns = convolve1d(fine, _TRIANGLE, axis=1, mode="constant")[:, ::FINE]
+    return np.asarray(convolve1d(columns, _TRIANGLE, axis=0, mode="constant")[::FINE])
 
 
 def binned_glass(glass: Glass) -> Kernel:
     """The known PSF on detector pixels, sum 1: the content of diffraction.fits of a transit."""
     kernel = binned_kernel(glass.fine())
     return np.asarray(kernel / kernel.sum())
-
-
-def _triangle() -> NDArray[np.float64]:
-    """The weights in Eq. (1) along one axis, for each offset: the fraction of pairs (s, t) of fine pixels with this
-    offset."""
-    return np.asarray(1 - np.abs(np.arange(1 - FINE, FINE)) / FINE)
-
-
-def _shifted(plane: Kernel, by: int, axis: int) -> Kernel:
-    """A shifted plane: element n of the result is element n + by of the plane; 0 beyond the edge."""
-    moved = np.roll(plane, -by, axis=axis)
-    lost = [slice(None), slice(None)]
-    lost[axis] = slice(-by, None) if by > 0 else slice(0, -by)
-    if by:
-        moved[tuple(lost)] = 0.0
-    return moved
 
 
 def turned_offsets(optics: FineOptics, angle_deg: float) -> tuple[Kernel, Kernel]:

@@ -1,40 +1,23 @@
-"""All effects of the blind set. KNOWN: effects that the gap library also contains, by the same names. UNKNOWN: the others."""
+"""The table of all effects, by name, and the names of each group."""
 
 from __future__ import annotations
 
-import copyreg
-from collections.abc import Callable
-
-from psfcore.blind.effects.detector import DETECTOR_EFFECTS
-from psfcore.blind.effects.effect import Kind
-from psfcore.blind.effects.optics import OPTICS_EFFECTS
-from psfcore.blind.effects.scene import SCENE_EFFECTS
+from psfcore.blind.effects import detector, effect, optics, scene, withheld
+from psfcore.blind.effects.effect import EFFECTS, Kind
 from psfcore.errors import DataError
 
-EFFECTS: dict[str, Kind] = {
-    effect.name: effect for effect in (*SCENE_EFFECTS, *OPTICS_EFFECTS, *DETECTOR_EFFECTS)
-}
-KNOWN = (
-    "dark_offset",
-    "intensity_gradient",
-    "gain_mismatch",
-    "nonlinearity",
-    "flat_field_residual",
-    "column_smear",
-    "persistence",
-    "ghost",
-    "anisotropic_scatter",
-    "field_dependent_scatter",
-    "wide_halo",
-    "core_blur",
-    "mesh_rotation",
-    "mesh_pitch",
-    "occulter_motion",
-    "out_of_field_light",
-    "saturation_fill",
-    "scene_evolution",
-)
-UNKNOWN = tuple(sorted(set(EFFECTS) - set(KNOWN)))
+# An import of these files declares their effects.
+DECLARED_IN = (scene, optics, detector, withheld)
+
+
+def names_of(group: str) -> tuple[str, ...]:
+    """The names of the effects of a group."""
+    return tuple(kind.name for kind in EFFECTS.values() if kind.group == group)
+
+
+KNOWN = names_of(effect.KNOWN)  # effects that the gap library also contains, by the same names
+WITHHELD = {group: names_of(group) for group in (effect.CALIBRATION, effect.TEST)}
+UNKNOWN = tuple(name for names in WITHHELD.values() for name in names)
 
 
 def effect_named(name: str) -> Kind:
@@ -42,11 +25,3 @@ def effect_named(name: str) -> Kind:
     if name not in EFFECTS:
         raise DataError("unknown-effect", f"expected one of {', '.join(sorted(EFFECTS))}; got {name!r}")
     return EFFECTS[name]
-
-
-def _by_name(kind: Kind) -> tuple[Callable[[str], Kind], tuple[str]]:
-    return effect_named, (kind.name,)
-
-
-# A process that makes cases gets the name of a kind: functions without a name have no pickle.
-copyreg.pickle(Kind, _by_name)

@@ -1,35 +1,47 @@
-"""Effects of the scene: changes of the Sun and of the occulter."""
+"""Effects of the scene: changes of the Sun and of the occulter, and light that comes from the Sun around the field."""
 
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
-from psfcore.blind.effects.effect import Effect, Kind, Moment, Window, angle, direction, seed
+from psfcore.blind.effects.effect import (
+    ADDS_LIGHT,
+    ANGLE,
+    CALIBRATION,
+    KNOWN,
+    Effect,
+    Moment,
+    declare,
+    direction,
+    seed,
+    unit_coordinates,
+)
 from psfcore.blind.effects.fine_optics import FINE
-from psfcore.simulate.disc import covered_share
+from psfcore.simulate.disc import Behind, covered_share
 from psfcore.simulate.plan import HIGH, Plan
 from psfcore.transit.transit import Place
 
 Plane = NDArray[np.float64]
 
 
-def _occulter_motion(effect: Effect, share: Plane | None, window: Window, moment: Moment) -> Plane:
+@declare(KNOWN, "covered", "px/s", 0.4, 1.5, angle_deg=lambda plan, rng: float(rng.normal(3.0, 8.0)))
+def occulter_motion(effect: Effect, share: Plane, around: Behind, moment: Moment) -> Plane:
     """The disc moves along a straight line during the exposure, in steps of at most a fifth of a pixel."""
     way = effect.strength * moment.shot.exposure_s
     steps = max(5, int(np.ceil(5 * way)))
     along = way * ((np.arange(steps) + 0.5) / steps - 0.5)
     cos, sin = direction(effect["angle_deg"])
-    x_px, y_px, radius_px = window.place.x_px, window.place.y_px, window.place.radius_px
-    moved = (Place(x_px + s * cos, y_px + s * sin, radius_px) for s in along)
-    return np.asarray(sum(covered_share(at, window.first, window.shape, FINE) for at in moved) / steps)
+    disc = moment.plan.place(moment.index)
+    moved = (Place(disc.x_px + s * cos, disc.y_px + s * sin, disc.radius_px) for s in along)
+    return np.asarray(sum(covered_share(at, around.first, around.shape, FINE) for at in moved) / steps)
 
 
-def _scene_evolution(effect: Effect, scene: Plane, moment: Moment) -> Plane:
+@declare(KNOWN, "scene", "share, rms", 0.2, 0.6, seed=seed, patch=(0.02, 0.08), period=(0.15, 0.6))
+def scene_evolution(effect: Effect, scene: Plane, moment: Moment) -> Plane:
     """Patches of the Sun brighten and fade with the same period, but with different phases."""
     phase = 2 * np.pi * moment.elapsed / effect["period"]
     first, second = (
@@ -40,7 +52,19 @@ def _scene_evolution(effect: Effect, scene: Plane, moment: Moment) -> Plane:
     return np.asarray(scene * np.exp(change - change.var() / 2))
 
 
-def _out_of_field_light(effect: Effect, seen: Plane, moment: Moment) -> Plane:
+@declare(
+    KNOWN,
+    "light",
+    "DN/s",
+    400.0,
+    4000.0,
+    edges=lambda plan, rng: tuple(int(edge) for edge in rng.integers(0, 4, len(plan.views))),
+    levels=lambda plan, rng: tuple(float(level) for level in rng.uniform(0.3, 1.0, len(plan.views))),
+    b_px=(4.0, 8.0),
+    c=(2.4, 2.6),
+    a=(0.3, 0.7),
+)
+def out_of_field_light(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     """In each pointing, a bright band beyond one edge of the field scatters light into the field.
 
     The brightness of the band in a pointing is the strength times the entry of `levels`. The band is half as wide as the
@@ -50,17 +74,6 @@ def _out_of_field_light(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     pointing = moment.shot.pointing - 1
     band = _band(seen.shape[0], effect["edges"][pointing], effect["b_px"], effect["c"], effect["a"])
     return seen + effect.strength * effect["levels"][pointing] * band
-
-
-def _draw_out_of_field_light(plan: Plan, rng: np.random.Generator) -> dict[str, Any]:
-    count = len(plan.views)
-    return {
-        "edges": tuple(int(edge) for edge in rng.integers(0, 4, count)),
-        "levels": tuple(float(level) for level in rng.uniform(0.3, 1.0, count)),
-        "b_px": float(rng.uniform(4, 8)),
-        "c": float(rng.uniform(2.4, 2.6)),
-        "a": float(rng.uniform(0.3, 0.7)),
-    }
 
 
 @cache
@@ -84,39 +97,31 @@ def _band(fine_size: int, edge: int, b_px: float, c: float, a: float) -> Plane:
     return np.ascontiguousarray(np.maximum(turned, 0.0))
 
 
-def _limb_glint(effect: Effect, seen: Plane, moment: Moment) -> Plane:
-    """Additional light in one pointing: rays that spread from a point beyond the edge of the field."""
+@declare(
+    CALIBRATION,
+    "light",
+    "DN/s",
+    1.0,
+    60.0,
+    ADDS_LIGHT,
+    pointing=lambda plan, rng: int(rng.choice([1, len(plan.views)])),
+    angle_deg=ANGLE,
+    rays=lambda plan, rng: int(rng.integers(2, 6)),
+    phase_deg=ANGLE,
+)
+def limb_glint(effect: Effect, seen: Plane, moment: Moment) -> Plane:
+    """In one pointing an edge of the baffle reflects sunlight: rays that spread from a point beyond the edge of the field."""
     if moment.shot.pointing != effect["pointing"]:
         return seen
-    n = seen.shape[0]
+    u, v = unit_coordinates(seen.shape)
     cos, sin = direction(effect["angle_deg"])
-    x = (np.arange(n)[None, :] + 0.5) / n - 0.5 - 0.8 * cos
-    y = (np.arange(n)[:, None] + 0.5) / n - 0.5 - 0.8 * sin
+    x, y = u - 0.8 * cos, v - 0.8 * sin
     fan = np.cos(2 * effect["rays"] * np.arctan2(y, x) + np.deg2rad(effect["phase_deg"])) ** 2
     return seen + effect.strength * (0.2 + fan) * np.exp(-np.hypot(x, y) / 0.5) / np.exp(-1.6)
 
 
-def _draw_limb_glint(plan: Plan, rng: np.random.Generator) -> dict[str, Any]:
-    pointing = int(rng.choice([1, len(plan.views)]))
-    return {
-        "pointing": pointing,
-        "angle_deg": angle(rng),
-        "rays": int(rng.integers(2, 6)),
-        "phase_deg": angle(rng),
-    }
-
-
-def _saturation_fill(effect: Effect, scene: Plane, moment: Moment) -> Plane:
-    """The bright pixels that clip also flicker, so other images show other values in them."""
-    bright = scene > np.quantile(scene[::4, ::4], 0.98)
-    phase = patches(scene.shape[0], effect["seed"] + moment.shot.pointing, 0.1)
-    swing = effect["flicker"] * effect.strength / (effect.strength + 0.005)
-    factor = 1 + swing * np.sin(40 * moment.elapsed + 2 * phase)
-    return np.where(bright, scene * factor, scene)
-
-
 def _saturation_level(effect: Effect, exposures: list[Plane], plan: Plan) -> float:
-    """The level at which high-only images clip. The strength is the fraction of the light that is lost by clipping."""
+    """The level at which high-only images clip."""
     high = [dn for dn, shot in zip(exposures, plan.shots, strict=True) if shot.gain_mode == HIGH]
     values = np.concatenate([np.maximum(dn, 0.0).ravel() for dn in high])
     low, top = 0.0, float(values.max())
@@ -127,6 +132,28 @@ def _saturation_level(effect: Effect, exposures: list[Plane], plan: Plan) -> flo
     return float(np.rint(top))
 
 
+@declare(
+    KNOWN,
+    "scene",
+    "share of the light above the level",
+    0.03,
+    0.15,
+    {"saturation_dn": _saturation_level},
+    seed=seed,
+    flicker=(0.15, 0.5),
+)
+def saturation_fill(effect: Effect, scene: Plane, moment: Moment) -> Plane:
+    """Clipped pixels are filled from another image, or stay clipped. The strength is the fraction of the light that is lost by clipping.
+
+    The bright pixels that clip also flicker, so other images show other values in them.
+    """
+    bright = scene > np.quantile(scene[::4, ::4], 0.98)
+    phase = patches(scene.shape[0], effect["seed"] + moment.shot.pointing, 0.1)
+    swing = effect["flicker"] * effect.strength / (effect.strength + 0.005)
+    factor = 1 + swing * np.sin(40 * moment.elapsed + 2 * phase)
+    return np.where(bright, scene * factor, scene)
+
+
 @cache
 def patches(size: int, seed: int, patch: float) -> Plane:
     """A smooth random plane [y, x] with mean 0 and rms 1. patch: the size of its patches, as a fraction of the field."""
@@ -135,62 +162,3 @@ def patches(size: int, seed: int, patch: float) -> Plane:
     drawn = gaussian_filter(rng.standard_normal((coarse, coarse)), 1.5)
     plane = zoom(drawn, size / coarse, order=3, grid_mode=True, mode="nearest")
     return np.asarray((plane - plane.mean()) / plane.std())
-
-
-SCENE_EFFECTS = (
-    Kind(
-        "occulter_motion",
-        "scene",
-        "px/s",
-        "the occulter moves across the field during the exposure",
-        nominal=0.4,
-        largest=1.5,
-        draw=lambda plan, rng: {"angle_deg": float(rng.normal(3.0, 8.0))},
-        covered=_occulter_motion,
-    ),
-    Kind(
-        "scene_evolution",
-        "scene",
-        "share, rms",
-        "the Sun changes between the images of a pointing",
-        nominal=0.2,
-        largest=0.6,
-        draw=lambda plan, rng: {
-            "seed": seed(rng),
-            "patch": float(rng.uniform(0.02, 0.08)),
-            "period": float(rng.uniform(0.15, 0.6)),
-        },
-        scene=_scene_evolution,
-    ),
-    Kind(
-        "out_of_field_light",
-        "scene",
-        "DN/s",
-        "light from the Sun beyond the edge of the detector is scattered into the field",
-        nominal=400.0,
-        largest=4000.0,
-        draw=_draw_out_of_field_light,
-        light=_out_of_field_light,
-    ),
-    Kind(
-        "saturation_fill",
-        "scene",
-        "share of the light above the level",
-        "clipped pixels are filled from another image, or stay clipped",
-        nominal=0.03,
-        largest=0.15,
-        draw=lambda plan, rng: {"seed": seed(rng), "flicker": float(rng.uniform(0.15, 0.5))},
-        scene=_saturation_fill,
-        saturation_dn=_saturation_level,
-    ),
-    Kind(
-        "limb_glint",
-        "scene",
-        "DN/s",
-        "in one pointing an edge of the baffle reflects sunlight",
-        nominal=1.0,
-        largest=60.0,
-        draw=_draw_limb_glint,
-        light=_limb_glint,
-    ),
-)

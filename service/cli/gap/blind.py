@@ -93,7 +93,8 @@ def blind(
 ) -> None:
     """Test the diagnosis on simulated cases whose effect is withheld from the diagnosis. To continue a stopped run,
     repeat the command."""
-    from psfcore.blind.case_set import SetPlan, alone_in, make_set
+    from psfcore.blind.case_set import alone_in, make_set
+    from psfcore.blind.cases import SetPlan
     from psfcore.blind.run_set import run_set
     from psfcore.blind.score import write_score
     from psfcore.simulate.inputs import image_rate

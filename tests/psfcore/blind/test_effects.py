@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import Any
 
 import numpy as np
@@ -19,12 +18,15 @@ from psfcore.blind.effects.fine_optics import (
     binned_kernel,
     fine_optics,
 )
-from psfcore.blind.effects.registry import EFFECTS, KNOWN, UNKNOWN, effect_named
+from psfcore.blind.effects.registry import EFFECTS, KNOWN, UNKNOWN, WITHHELD, effect_named
+from psfcore.blind.leftover import LinearEstimator
 from psfcore.errors import DataError
+from psfcore.gap.library.registry import LIBRARY
 from psfcore.simulate.disc import binned
 from psfcore.simulate.plan import COMBINED, HIGH, Plan, default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, anisotropic_kernel
 from psfcore.simulate.scene import drawn_scene
+from psfcore.transit.transit import Frame
 
 LAW = ScatterTruth(5.0, 2.5, 0.4)
 GLASS = Glass(SYNTHETIC, 64)
@@ -55,18 +57,17 @@ def clean(effect_free: EffectFree) -> list[np.ndarray]:
     return Chain(effect_free, ()).all_expected()
 
 
-def test_every_effect_can_be_sent_to_another_process(plan: Plan) -> None:
-    for kind in EFFECTS.values():
-        effect = kind.drawn(plan, np.random.default_rng(1))
-        sent = pickle.loads(pickle.dumps(effect))
-        assert sent.kind is kind and sent.as_json() == effect.as_json()
-
-
-def test_there_are_eighteen_known_effects_and_at_least_eight_unknown() -> None:
-    assert len(KNOWN) == 18
-    assert set(KNOWN) <= set(EFFECTS)
-    assert len(UNKNOWN) >= 8
-    assert all(effect.cause and effect.unit for effect in EFFECTS.values())
+def test_the_effects_of_the_library_and_two_groups_of_others(plan: Plan) -> None:
+    assert set(KNOWN) == {effect.name for effect in LIBRARY}
+    assert {group: len(names) >= 8 for group, names in WITHHELD.items()} == {
+        "calibration": True,
+        "test": True,
+    }
+    assert sorted([*KNOWN, *UNKNOWN]) == sorted(EFFECTS)
+    rng = np.random.default_rng(1)
+    stages = {EFFECTS[name].drawn(plan, rng).as_json()["stage"] for name in WITHHELD["test"]}
+    assert stages == {"scene", "optics", "detector"}
+    assert all(effect.unit and effect.change.__doc__ for effect in EFFECTS.values())
     with pytest.raises(DataError, match="unknown-effect"):
         effect_named("gremlins")
 
@@ -160,11 +161,12 @@ def test_a_moving_disc_uncovers_light_only_at_its_ends(
 def test_effects_of_the_readout_change_dn_as_defined(plan: Plan) -> None:
     """Persistence decays, a gain mismatch changes combined images only, a nonlinearity reduces faint signals only."""
     nothing, earlier = np.zeros((4, 4)), Earlier(np.full((4, 4), 100.0), plan.shots[0].time_s)
-    persistence = effect_of("persistence", 0.1, decay_s=300.0)
+    persistence = effect_of("persistence", 0.1, decay=1.5)
     assert np.all(apply_effects([persistence], "read_out", nothing, Moment(plan, 0), []) == 0)
     wait_s = plan.shots[1].time_s - plan.shots[0].time_s
     left = apply_effects([persistence], "read_out", nothing, Moment(plan, 1), [earlier])
-    np.testing.assert_allclose(left, 10.0 * np.exp(-wait_s / 300.0))
+    cadence_s = (plan.shots[-1].time_s - plan.shots[0].time_s) / (len(plan.shots) - 1)
+    np.testing.assert_allclose(left, 10.0 * np.exp(-wait_s / (1.5 * cadence_s)))
     mismatch, dn = effect_of("gain_mismatch", 0.1, sign=1), np.full((4, 4), 50.0)
     for index, shot in enumerate(plan.shots):
         factor = {COMBINED: 1.1, HIGH: 1.0}[shot.gain_mode]
@@ -186,3 +188,43 @@ def test_saturation_loses_the_share_of_light_given_by_its_strength(
         [dn.ravel() for dn, shot in zip(exposures, plan.shots, strict=True) if shot.gain_mode == HIGH]
     )
     assert np.maximum(high - level, 0).sum() / high.sum() == pytest.approx(0.03, abs=0.002)
+
+
+def test_every_effect_of_the_tests_leaves_a_residual_in_the_discs(
+    plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
+) -> None:
+    frames = [
+        Frame(f"{n}.fits", rate.astype("f4"), shot.pointing, plan.place(n), shot.exposure_s, shot.time_s)
+        for n, (rate, shot) in enumerate(zip(clean, plan.shots, strict=True))
+    ]
+    estimator = LinearEstimator(frames, binned_glass(GLASS), LAW, plan.noise)
+    for name in WITHHELD["test"]:
+        effect = EFFECTS[name].drawn(plan, np.random.default_rng(4))
+        left_pct = []
+        for strength in (effect.strength, effect.kind.largest):
+            chain = Chain(effect_free, [effect.at(strength)])
+            left_pct.append(estimator.left(chain.mean_rate(chain.all_expected(), 5)).after_refit_pct)
+        assert 0.1 < left_pct[0] < left_pct[1] and left_pct[1] > 3, (name, left_pct)
+
+
+def test_the_light_of_a_tail_moves_with_the_disc_and_fades(
+    plan: Plan, effect_free: EffectFree, clean: list[np.ndarray]
+) -> None:
+    tail = effect_of("occulter_tail", 10.0, angle_deg=0.0, length=2.0, fading=1.0)
+    chain, last = Chain(effect_free, [tail]), len(plan.shots) - 1
+    added = [chain.expected(index) - clean[index] for index in (0, last)]
+    for index, light in zip((0, last), added, strict=True):
+        row, column = np.unravel_index(light.argmax(), light.shape)
+        assert np.hypot(row - plan.shots[index].y_px, column - plan.shots[index].x_px) < 3
+    assert added[1].max() == pytest.approx(added[0].max() / 2, rel=0.1)
+
+
+def test_traps_move_charge_to_later_rows_and_the_last_rows_lose_most(plan: Plan) -> None:
+    trails = effect_of("charge_trails", 0.1, trail_px=5.0)
+    for row, lost in ((99, 10.0), (9, 1.0)):
+        dn = np.zeros((100, 3))
+        dn[row, 1] = 100.0
+        after = apply_effects([trails], "read_out", dn, Moment(plan, 0), [])
+        assert after[row, 1] == pytest.approx(100 - lost)
+        assert (after[:row] == 0).all() and (after[:, [0, 2]] == 0).all()
+    assert after.sum() == pytest.approx(100.0, abs=1e-6)  # of row 9, whose trail ends before the last row

@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.blind.case_set import BlindSet, Plane, SetPlan, alone_in, make_set
-from psfcore.blind.cases import CLEAN, FOREIGN, PAIR, SINGLE, Case, case_scenes, draw_case
-from psfcore.blind.effects.registry import EFFECTS, KNOWN
-from psfcore.blind.make_case import Made, make
+from psfcore.blind.case_set import BlindSet, alone_in, make_set
+from psfcore.blind.cases import (
+    CLEAN,
+    FOREIGN,
+    MIXED,
+    PAIR,
+    SINGLE,
+    Case,
+    Plane,
+    SetPlan,
+    case_scenes,
+    draw_case,
+)
+from psfcore.blind.effects.registry import EFFECTS, KNOWN, WITHHELD
+from psfcore.blind.make_case import make
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.gap import ideal_observer
@@ -32,36 +45,49 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> BlindSet:
     return make_set(tmp_path_factory.mktemp("blind") / "set", TWO)[0]
 
 
-@pytest.fixture(scope="module")
-def clean_case() -> Case:
-    return draw_case(4, 0, SIZE_PX, IMAGES, clean_only=True, built_diffraction=False)
-
-
-@pytest.fixture(scope="module")
-def clean(clean_case: Case) -> Made:
-    return make(clean_case)
+def drawn(seed: int, number: int = 0, **changes: Any) -> Case:
+    """A case of a small set. changes: further fields of its plan."""
+    return draw_case(SetPlan(1, seed, SIZE_PX, IMAGES, **{"built_diffraction": False} | changes), number)
 
 
 def test_kinds_have_their_shares_and_effects_occur_in_turn() -> None:
-    cases = [draw_case(1, n, SIZE_PX, IMAGES) for n in range(72)]
-    assert Counter(case.kind for case in cases) == {CLEAN: 24, SINGLE: 27, PAIR: 9, FOREIGN: 12}
+    cases = [drawn(1, n) for n in range(72)]
+    assert Counter(case.kind for case in cases) == {CLEAN: 18, SINGLE: 24, PAIR: 9, FOREIGN: 12, MIXED: 9}
     names = Counter(case.effects[0].kind.name for case in cases if case.kind == SINGLE)
     assert set(names) == set(KNOWN)
     assert max(names.values()) - min(names.values()) <= 1
     assert all(len({effect.kind.name for effect in case.effects}) == 2 for case in cases if case.kind == PAIR)
     # A case is the same for its seed and number.
-    assert draw_case(1, 5, SIZE_PX, IMAGES) == cases[5] != draw_case(2, 5, SIZE_PX, IMAGES)
+    assert drawn(1, 5) == cases[5] != drawn(2, 5)
     with pytest.raises(DataError, match="unknown-effect"):
-        draw_case(1, 0, SIZE_PX, IMAGES, only=("gremlins",))
+        drawn(1, only=("gremlins",))
     # Each target is used in turn for every effect.
     only, left_pct = ("ghost", "wide_halo"), (2.0, 4.0, 8.0)
-    cases = [draw_case(1, n, SIZE_PX, IMAGES, only=only, left_pct=left_pct) for n in range(7)]
+    cases = [drawn(1, n, only=only, left_pct=left_pct) for n in range(7)]
     targets = [(case.effects[0].kind.name, *case.target_pct) for case in cases]
     assert targets == [(name, pct) for pct in (*left_pct, 2.0) for name in only][:7]
 
 
+def test_withheld_effects_of_the_tests_occur_in_three_strengths_and_others_in_the_calibration() -> None:
+    blocks = range(9 * 24)
+    cases = {group: [drawn(3, n, withheld=group) for n in blocks] for group in WITHHELD}
+    seen: dict[str, set[int]] = {name: set() for name in WITHHELD["test"]}
+    for case in cases["test"]:
+        if case.kind == FOREIGN:
+            (target_pct,) = case.target_pct
+            assert target_pct is not None
+            seen[case.effects[0].kind.name].add(round(math.log(target_pct, 3)))
+    assert all(powers == {0, 1, 2} for powers in seen.values()), "about 1, 3 and 10 percent"
+    for group, some in cases.items():
+        withheld = [case.effects[-1].kind for case in some if case.kind in (FOREIGN, MIXED)]
+        assert {kind.name for kind in withheld} == set(WITHHELD[group])
+        mixed = [case for case in some if case.kind == MIXED]
+        assert all([e.kind.name in KNOWN for e in case.effects] == [True, False] for case in mixed)
+        assert all(3 <= pct <= 15 for case in mixed for pct in case.target_pct if pct is not None)
+
+
 def test_strong_effects_occur_alone_in_pairs_and_beside_a_changing_sun() -> None:
-    cases = [draw_case(2, n, SIZE_PX, IMAGES) for n in range(17 * 24)]
+    cases = [drawn(2, n) for n in range(17 * 24)]
     pairs = [case for case in cases if case.kind == PAIR]
     beside_sun = [case for case in pairs[1::3] if case.effects[1].kind.name == "scene_evolution"]
     assert len(beside_sun) == len(pairs[1::3]) == 17
@@ -77,10 +103,9 @@ def test_strong_effects_occur_alone_in_pairs_and_beside_a_changing_sun() -> None
     np.testing.assert_array_equal(single >= 10, np.arange(single.size) % 4 == 3)
 
 
-def test_the_sun_beside_a_strong_effect_keeps_the_strength_that_was_drawn() -> None:
-    cases = (draw_case(2, n, SIZE_PX, IMAGES, built_diffraction=False) for n in range(96))
-    case = next(case for case in cases if case.target_pct[1:] == (None,))
-    truth = make(case).truth
+def test_the_sun_beside_a_strong_effect_keeps_the_strength_that_was_drawn(tmp_path: Path) -> None:
+    case = next(case for case in (drawn(2, n) for n in range(96)) if case.target_pct[1:] == (None,))
+    truth = make(case, tmp_path / "transit", tmp_path / "expected")
     assert truth["effects"][1]["strength"] == case.effects[1].strength
     assert truth["effects"][0]["strength"] != case.effects[0].strength
     assert truth["target_pct"][1] is None
@@ -141,20 +166,28 @@ def test_the_images_without_noise_are_kept_apart_from_the_transit(made: BlindSet
     assert np.abs(change).max() > 0.01
 
 
-def test_the_truth_contains_what_an_effect_leaves_and_a_clean_case_has_none(
-    made: BlindSet, clean: Made
-) -> None:
+def test_the_truth_contains_what_an_effect_leaves_and_a_map_of_the_light_that_it_adds(made: BlindSet) -> None:
     truth = made.truth(0)
     (target_pct,) = truth["target_pct"]
-    assert truth["effects"][0]["name"] == "intensity_gradient"
+    assert (truth["effects"][0]["name"], truth["effects"][0]["stage"]) == ("intensity_gradient", "detector")
     assert truth["left_after_refit_pct"] == pytest.approx(target_pct, rel=0.6)
     assert truth["effects"][0]["left_alone_pct"] == pytest.approx(target_pct, rel=0.45)
     assert 0 < truth["clean_left_pct"] < 0.8
     assert len(truth["refitted"]["residual_pct"]) == IMAGES
-    assert (clean.truth["effects"], clean.truth["left_after_refit_pct"]) == ([], 0.0)
-    assert clean.truth["clean_left_pct"] < 0.8
-    assert clean.expected == {}, "an ideal observer of clean data needs no images"
-    assert all(np.array_equal(dn, np.rint(dn)) for dn in clean.exposures)
+    light = np.array(truth["light_map"]["values"])
+    assert light.mean() == pytest.approx(truth["effects"][0]["strength"], rel=0.02)
+    angle = np.deg2rad(truth["effects"][0]["parameters"]["angle_deg"])
+    row, column = np.unravel_index(light.argmax(), light.shape)
+    assert (column > 32, row > 32) == (np.cos(angle) > 0, np.sin(angle) > 0)
+    assert "light_map" not in made.truth(1)
+
+
+def test_a_clean_case_has_a_transit_alone(tmp_path: Path) -> None:
+    truth = make(drawn(4, clean_only=True), tmp_path / "transit", tmp_path / "expected")
+    assert (truth["effects"], truth["left_after_refit_pct"]) == ([], 0.0)
+    assert truth["clean_left_pct"] < 0.8
+    assert not (tmp_path / "expected").exists(), "an ideal observer of clean data needs no images"
+    assert len(read_transit(tmp_path / "transit", LIMITS).frames) == IMAGES
 
 
 def test_the_ideal_observer_measures_what_the_maker_of_a_case_measured(
@@ -175,7 +208,8 @@ def test_the_ideal_observer_measures_what_the_maker_of_a_case_measured(
     assert left[("intensity_gradient",)] < 0.2 * left[()]
 
 
-def test_scenes_can_be_taken_from_images(clean_case: Case) -> None:
+def test_scenes_can_be_taken_from_images() -> None:
+    clean_case = drawn(4, clean_only=True)
     image = 100 + 20 * np.random.default_rng(1).standard_normal((300, 300))
     image[5, 5] = np.nan
     scenes = case_scenes(clean_case, [image])
@@ -223,15 +257,15 @@ def test_a_set_is_continued_only_with_its_own_plan_and_by_one_run(made: BlindSet
 
 
 def test_a_case_that_fails_is_named_and_the_others_are_made(
-    tmp_path: Path, clean: Made, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan = SetPlan(3, 3, SIZE_PX, IMAGES, clean_only=True, built_diffraction=False)
+    plan = SetPlan(3, 3, SIZE_PX, IMAGES, clean_only=True)
     failing = {1}
 
-    def make_but_one(case: Case, scenes: Sequence[Plane]) -> Made:
+    def make_but_one(case: Case, *folders: Path | Sequence[Plane]) -> dict[str, Any]:
         if case.number in failing:
             raise DataError("bad-scene", "expected light in the scene")
-        return clean
+        return {"kind": CLEAN, "effects": []}
 
     monkeypatch.setattr("psfcore.blind.case_set.make", make_but_one)
     said: list[str] = []

@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 from psfcore.blind.case_set import BlindSet
-from psfcore.blind.make_case import sealed
-from psfcore.blind.run_set import has_report, ideal_of, judged_cases, report_of, run_of, run_set
+from psfcore.blind.run_set import IDEAL_SCHEMA, REPORT_SCHEMA, result_in, run_of, run_set
+from psfcore.blind.score import judged_cases
 from psfcore.errors import DataError
 
 TRUTH = {"kind": "clean", "effects": [], "left_before_refit_pct": 0.0, "left_after_refit_pct": 0.0}
+IDEAL_FOUND = {"schema": "gap-ideal/1", "noncentrality": 3.0, "hypotheses": [], "found": ["with_effects"]}
 # A diagnosis that logs its transit and reports the files that it can see.
 DIAGNOSIS = """
 import json, os, pathlib, sys
@@ -35,10 +36,7 @@ def blind(tmp_path: Path) -> BlindSet:
         made.transit(number).mkdir(parents=True)
         made.expected(number).mkdir()
         (made.transit(number) / "transit.json").write_text(f"case {number}")
-        seal, kept = sealed(TRUTH)
-        made.truth_file(number).write_text(json.dumps(kept))
-        with made.seals_file.open("a") as seals:
-            seals.write(json.dumps({"case": number, "sha256": seal}) + "\n")
+        made.keep_seal(number, made.keep_truth(number, TRUTH))
     return made
 
 
@@ -46,8 +44,9 @@ IDEAL = """
 import json, pathlib, sys
 expected, ideal, log = map(pathlib.Path, sys.argv[1:4])
 with open(log, "a") as lines:
-    lines.write(f"ideal of {expected.parent.name}\\n")
-ideal.write_text(json.dumps({"schema": "gap-ideal/1", "found": sorted(p.name for p in expected.iterdir())}))
+    lines.write("ideal\\n")
+about = {"schema": "gap-ideal/1", "noncentrality": 3.0, "hypotheses": []}
+ideal.write_text(json.dumps(about | {"found": sorted(p.name for p in expected.iterdir())}))
 """
 
 
@@ -64,7 +63,8 @@ def test_a_diagnosis_sees_only_a_copy_of_the_transit(blind: BlindSet, tmp_path: 
     assert not run.failed
     assert run.wall_s > 0
     assert run.peak_mib > 1
-    report = report_of(blind, 1)
+    report = result_in(blind.report(1), REPORT_SCHEMA)
+    assert report is not None
     assert report["seen"] == ["transit", "transit/transit.json", "words.txt"]
     assert not Path(report["at"]).is_relative_to(blind.folder)
     assert not Path(report["at"]).exists()
@@ -79,7 +79,7 @@ def test_only_cases_without_a_complete_report_are_diagnosed(blind: BlindSet, tmp
     assert not blind.transit(0).exists(), "a transit is deleted after its diagnosis"
     run_set(blind, [0, 1, 2], command(log), processes=2)
     assert sorted(log.read_text().splitlines()) == ["case 0", "case 1", "case 2"]
-    assert all(has_report(blind, number) for number in range(3))
+    assert all(result_in(blind.report(number), REPORT_SCHEMA) for number in range(3))
     assert run_set(blind, [0, 1, 2], command(log)) == []
 
 
@@ -104,23 +104,23 @@ def test_the_ideal_observer_sees_the_images_without_noise_once(blind: BlindSet, 
     (blind.expected(1) / "with_effects").mkdir()
     (run,) = run_set(blind, [1], command(log), ideal=ideal(log))
     assert not run.failed
-    assert ideal_of(blind, 1) == {"schema": "gap-ideal/1", "found": ["with_effects"]}
+    assert result_in(blind.ideal(1), IDEAL_SCHEMA) == IDEAL_FOUND
     assert not blind.expected(1).exists(), "the images are deleted after their use"
     assert run_set(blind, [1], command(log), ideal=ideal(log)) == []
-    assert log.read_text().splitlines() == ["case 1", "ideal of 0001"]
+    assert log.read_text().splitlines() == ["case 1", "ideal"]
     judged, _ = judged_cases(blind, [1])
-    assert judged[0].ideal == ideal_of(blind, 1)
+    assert judged[0].ideal == IDEAL_FOUND
     # An ideal observer that fails is tried again without a new diagnosis.
     log.write_text("")
     said: list[str] = []
     run_set(blind, [0], command(log), ideal=ideal(log, "import sys; sys.exit('dark')"), progress=said.append)
-    assert said[-1] == "case 0000 has no ideal observer: dark"
-    assert ideal_of(blind, 0) is None
-    assert has_report(blind, 0) and blind.expected(0).is_dir()
+    assert said[-1] == "case 0000 has no ideal observer: exit status 1: dark"
+    assert result_in(blind.ideal(0), IDEAL_SCHEMA) is None
+    assert result_in(blind.report(0), REPORT_SCHEMA) and blind.expected(0).is_dir()
     run_set(blind, [0], command(log), ideal=ideal(log), keep=True)
-    assert ideal_of(blind, 0) is not None
+    assert result_in(blind.ideal(0), IDEAL_SCHEMA) is not None
     assert blind.expected(0).is_dir(), "kept on request"
-    assert log.read_text().splitlines() == ["case 0", "ideal of 0000"]
+    assert log.read_text().splitlines() == ["case 0", "ideal"]
 
 
 def test_a_diagnosis_that_takes_too_long_is_killed(blind: BlindSet, tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_other_reports_bad_commands_and_changed_or_missing_truths_are_refused(
     log = tmp_path / "log"
     run_set(blind, [0], command(log))
     (other,) = run_set(blind, [1], command(log, DIAGNOSIS.replace("gap/2", "gap/9")))
-    assert "expected schema gap/2" in other.error
+    assert "gap/2" in other.error and "gap/9" in other.error
     with pytest.raises(DataError, match="bad-command"):
         run_set(blind, [0], ["heliopsf", "gap", "{transit}"])
     with pytest.raises(DataError, match="bad-command"):

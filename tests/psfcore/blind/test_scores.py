@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib.image import imread
 
 from psfcore.blind.bounds import LEVEL
-from psfcore.blind.score import score, score_png, set_figures, share, table, wilson
-from psfcore.blind.scoring import (
+from psfcore.blind.picture import score_png
+from psfcore.blind.score import (
     Judged,
     covers,
     is_right_and_alone,
+    required_causes,
+    score,
+    set_figures,
+    share,
     shown_chi2,
+    table,
     true_closure,
     verdict_is_right,
+    wilson,
 )
 
 
@@ -85,6 +93,10 @@ FIGURES = {
 }
 
 
+def by_figure(rows: Iterable[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {row["figure"]: row for row in rows}
+
+
 def test_wilson_agrees_with_the_textbook() -> None:
     assert wilson(0, 0) == (0.0, 1.0)
     assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
@@ -93,12 +105,12 @@ def test_wilson_agrees_with_the_textbook() -> None:
 
 
 def test_every_figure_of_the_answers_equals_the_one_computed_by_hand() -> None:
-    rows = {row.figure: row for row in score(JUDGED).rows}
-    assert set(rows) - {row.figure for row in set_figures(JUDGED)} == set(FIGURES)
+    rows = by_figure(score(JUDGED)["rows"])
+    assert set(rows) - set(by_figure(set_figures(JUDGED))) == set(FIGURES)
     for figure, (cases, value, met) in FIGURES.items():
-        assert (rows[figure].cases, rows[figure].met) == (cases, met), figure
-        assert rows[figure].value == (value if value is None else pytest.approx(value)), figure
-    interval = rows["one wrong effect named with confidence"].interval95
+        assert (rows[figure]["n"], rows[figure]["met"]) == (cases, met), figure
+        assert rows[figure]["value"] == (value if value is None else pytest.approx(value)), figure
+    interval = rows["one wrong effect named with confidence"]["wilson95"]
     assert interval == pytest.approx(wilson(3, 13))
     # The true closure excludes what the sampling leaves.
     assert true_closure(MEASURED) == pytest.approx(1 - 1 / 25)
@@ -110,18 +122,18 @@ def test_what_the_discs_show_is_what_exceeds_their_noise() -> None:
     assert shown_chi2(shown) == pytest.approx(36 + 9)
     assert shown_chi2({}) is None
     case = Judged(0, truth("single", "ghost", left=3.0, **shown), report("attributed", "ghost"), 1.0)
-    row = score([case]).rows[4]
-    assert (row.figure, row.cases, row.value) == (BY_DISCS, 1, 1.0)
+    row = score([case])["rows"][4]
+    assert (row["figure"], row["n"], row["value"]) == (BY_DISCS, 1, 1.0)
 
 
 def test_of_a_pair_only_the_effects_that_show_must_be_named() -> None:
     said = report("attributed", "ghost")
     pair = truth("pair", "ghost", "scene_evolution", left=4.0)
     pair["effects"][0]["left_alone_pct"], pair["effects"][1]["left_alone_pct"] = 4.0, 0.1
-    contains = score([Judged(0, pair, said, 1.0)]).rows[2]
-    assert (contains.cases, contains.value) == (1, 1.0)
+    contains = score([Judged(0, pair, said, 1.0)])["rows"][2]
+    assert (contains["n"], contains["value"]) == (1, 1.0)
     pair["effects"][1]["left_alone_pct"] = 1.2
-    assert score([Judged(0, pair, said, 1.0)]).rows[2].value == 0.0
+    assert score([Judged(0, pair, said, 1.0)])["rows"][2]["value"] == 0.0
     # A pair is shown by the discs if each required effect alone is.
     shown = MEASURED | {"refitted": {"residual_pct": {"0": 3.0, "1": 4.0}, "noise_pct": {"0": 0.5, "1": 0.5}}}
     pair = truth("pair", "ghost", "scene_evolution", left=4.0, **shown)
@@ -129,27 +141,27 @@ def test_of_a_pair_only_the_effects_that_show_must_be_named() -> None:
     strong["left_alone_chi2"] = 90.0
     for more, cases in (({"left_alone_chi2": 29.0}, 0), ({"left_alone_chi2": 31.0}, 1)):
         weak |= more
-        assert score([Judged(0, pair, said, 1.0)]).rows[4].cases == cases, more
+        assert score([Judged(0, pair, said, 1.0)])["rows"][4]["n"] == cases, more
     weak |= {"left_alone_chi2": 29.0, "left_alone_pct": 0.5}  # too weak: it need not be named
-    assert score([Judged(0, pair, said, 1.0)]).rows[4].cases == 1
+    assert score([Judged(0, pair, said, 1.0)])["rows"][4]["n"] == 1
 
 
 def test_confusion_power_and_table_count_every_case_once() -> None:
     found = score(JUDGED)
-    assert found.confusion["clean"] == {"none": 2, "inconclusive": 1, "ghost": 1}
-    assert found.confusion["wide_halo"] == {"wide_halo": 1}
-    assert found.confusion["pair"] == {"dark_offset": 1}
-    assert sum(sum(row.values()) for row in found.confusion.values()) == len(JUDGED)
-    assert sum(bin_of["n"] for bin_of in found.power) == 9
-    two_to_four = next(b for b in found.power if b["left_after_refit_pct"] == [2.0, 4.0])
+    assert found["confusion"]["clean"] == {"none": 2, "inconclusive": 1, "ghost": 1}
+    assert found["confusion"]["wide_halo"] == {"wide_halo": 1}
+    assert found["confusion"]["pair"] == {"dark_offset": 1}
+    assert sum(sum(row.values()) for row in found["confusion"].values()) == len(JUDGED)
+    assert sum(bin_of["n"] for bin_of in found["power"]) == 9
+    two_to_four = next(b for b in found["power"] if b["left_after_refit_pct"] == [2.0, 4.0])
     assert (two_to_four["n"], two_to_four["noticed"], two_to_four["contains_truth"]) == (2, 2, 1)
-    top = found.power[-1]
+    top = found["power"][-1]
     assert (top["left_after_refit_pct"], top["n"], top["contains_truth"]) == ([8.0, None], 1, 1)
     clean = [case for case in JUDGED if case.kind == "clean" and case.verdict == "none"] * 5
     text = table(score(clean, {7: "exit status 1: no light"}))
     assert "no false alarm in 10 clean cases: the rate is below 0.300" in text
     assert "0007: exit status 1: no light" in text
-    assert score([]).rows[0].value is None
+    assert score([])["rows"][0]["value"] is None
 
 
 def test_the_picture_is_drawn_with_and_without_cases(tmp_path: Path) -> None:
@@ -204,8 +216,17 @@ FIGURES_OF_SETS = {
     "clean data: set without []": (3, 1 / 3),
     # A ghost in clean data, a halo for a ghost, and a ghost for stripes.
     "one wrong effect alone in the set": (11, 3 / 11),
+    "only wrong effects in the set": (11, 3 / 11),
+    "only wrong effects in the set, not in the library": (2, 1 / 2),
+    "known, noncentrality >= 30: named and alone": (4, 2 / 4),
     "not in the library, noncentrality >= 30: unknown in set": (1, 1.0),
     "the same, nearest rival >= 30": (1, 1.0),
+    # These truths state no stage and no light; `test_what_reports_tell_of_an_unknown_cause` has others.
+    "the same, known and withheld effect": (0, None),
+    "the same, its stage is right": (0, None),
+    "known and withheld, each >= 30: both told": (0, None),
+    "map of light: peak within 0.15": (0, None),
+    "map of light: correlation, median": (0, None),
     "set covers the truth, >= 10 % left": (2, 1 / 2),
 }
 COMPARED = (
@@ -216,15 +237,83 @@ COMPARED = (
 
 
 def test_every_figure_of_the_sets_equals_the_one_computed_by_hand() -> None:
-    rows = {row.figure: row for row in set_figures(SETS)}
+    rows = by_figure(set_figures(SETS))
     for figure, (cases, value) in FIGURES_OF_SETS.items():
-        assert (rows[figure].cases, rows[figure].value) == (cases, pytest.approx(value)), figure
-    assert rows["set covers the truth"].interval95 == pytest.approx(wilson(7, 11))
+        assert rows[figure]["n"] == cases, figure
+        assert rows[figure]["value"] == (value if value is None else pytest.approx(value)), figure
+    assert rows["set covers the truth"]["wilson95"] == pytest.approx(wilson(7, 11))
     assert set(rows) - set(FIGURES_OF_SETS) == set(COMPARED)
 
 
+LIGHT = {
+    "stage": "detector",
+    "axes": ["x_px", "y_px"],
+    "at": [[x, y] for y in (4.5, 14.5) for x in (4.5, 14.5)],
+}
+
+
+def with_cause(kind: str, members: list[list[str]], *, chi2: float = 90.0, **unknown: Any) -> Judged:
+    """A glow alone, or beside a ghost; each leaves the chi2. unknown: what the report states about an unknown cause."""
+    names = {"unknown": ["glow"], "mixed": ["ghost", "glow"]}[kind]
+    case = with_set(kind, names, members, rival=400.0)
+    for effect in case.truth["effects"]:
+        effect |= {"left_alone_chi2": chi2, "stage": "optics" if effect["name"] == "ghost" else "detector"}
+    case.truth["light_map"] = {"size_px": 20, "values": [[0.0, 1.0], [2.0, 9.0]]}
+    case.report["unknown"] = unknown or None
+    return case
+
+
+def test_what_reports_tell_of_an_unknown_cause() -> None:
+    cases = [
+        with_cause("unknown", [["unknown"]], **LIGHT, values=[0.0, 2.0, 4.0, 18.0]),
+        with_cause("unknown", [["ghost", "unknown"]], **LIGHT, values=[9.0, 2.0, 1.0, 0.0]),
+        with_cause("unknown", [["ghost"]]),
+        with_cause(
+            "unknown", [["unknown"]], stage="optics", axes=["time_s"], at=[[0.0], [9.0]], values=[1.0, 2.0]
+        ),
+        with_cause("mixed", [["ghost", "unknown"]], stage="detector", at=[]),
+        with_cause("mixed", [["ghost"], ["unknown"]], stage="detector", at=[]),
+        with_cause("mixed", [["unknown", "ghost"]], stage="scene", at=[]),
+        with_cause(
+            "mixed", [["persistence", "unknown"], ["unknown", "ghost"]], stage="detector", chi2=29.0, at=[]
+        ),
+    ]
+    rows = by_figure(set_figures(cases))
+    for figure, count, value in (
+        ("not in the library, noncentrality >= 30: unknown in set", 4, 3 / 4),
+        ("the same, its stage is right", 4, 2 / 4),
+        ("the same, not in the library", 4, 2 / 4),
+        ("the same, known and withheld effect", 4, 3 / 4),
+        ("known and withheld, each >= 30: both told", 3, 1 / 3),
+        ("only wrong effects in the set", 8, 1 / 8),
+        ("only wrong effects in the set, not in the library", 4, 1 / 4),
+        ("map of light: peak within 0.15", 2, 1 / 2),
+    ):
+        assert (rows[figure]["n"], rows[figure]["value"]) == (count, pytest.approx(value)), figure
+    agrees = np.corrcoef([0, 1, 2, 9], [9, 2, 1, 0])[0, 1]
+    assert rows["map of light: correlation, median"]["value"] == pytest.approx((1 + agrees) / 2)
+    assert cases[1].map == pytest.approx((np.hypot(10, 10) / 10, agrees))
+    assert [is_right_and_alone(case) for case in cases] == [
+        True,
+        False,
+        False,
+        True,
+        True,
+        False,
+        True,
+        False,
+    ]
+    assert [required_causes(case.truth) for case in cases[3:5]] == [("unknown",), ("ghost", "unknown")]
+    told = score(cases)["cases"][4]
+    assert (told["unknown"]["stage"], told["covered"], told["left_alone_chi2"]) == (
+        "detector",
+        True,
+        [90.0, 90.0],
+    )
+
+
 def test_what_is_right_is_compared_with_what_could_be_known() -> None:
-    rows = {row.figure: row for row in set_figures(SETS)}
+    rows = by_figure(set_figures(SETS))
     alone = [one.known.alone for one in SETS if one.known is not None]
     assert alone[:3] == [1 - LEVEL] * 3
     assert alone[3] > 0.999 > 0.5 > alone[5]
@@ -235,15 +324,16 @@ def test_what_is_right_is_compared_with_what_could_be_known() -> None:
         (COMPARED[1], 7, 3, alone[3:]),
         (COMPARED[2], 10, 2, alone),
     ):
-        assert (rows[figure].cases, rows[figure].value) == (cases, pytest.approx(right / math.fsum(known))), (
-            figure
-        )
+        assert (rows[figure]["n"], rows[figure]["value"]) == (
+            cases,
+            pytest.approx(right / math.fsum(known)),
+        ), figure
     low, high = wilson(3, 7)
     mean = math.fsum(alone[3:]) / 7
-    assert rows[COMPARED[1]].interval95 == pytest.approx((low / mean, high / mean))
+    assert rows[COMPARED[1]]["wilson95"] == pytest.approx((low / mean, high / mean))
     # Nothing is compared where nothing could be known.
     row = share("nothing", SETS[:1], is_right_and_alone, expected=lambda one: 0.0)
-    assert (row.cases, row.value, row.interval95) == (1, None, None)
+    assert (row["n"], row["value"], row["wilson95"]) == (1, None, None)
 
 
 def test_a_pair_whose_second_effect_is_not_seen_is_covered_by_the_first() -> None:
@@ -263,7 +353,7 @@ def test_a_pair_whose_second_effect_is_not_seen_is_covered_by_the_first() -> Non
 
 def test_the_score_tells_the_set_and_what_could_be_known() -> None:
     found = score(SETS)
-    told = found.to_json()["cases"]
+    told = found["cases"]
     assert told[8]["set"] == [["ghost"], ["unknown"]]
     assert (told[8]["noncentrality"], told[8]["rival"]) == (400.0, 400.0)
     assert told[6]["ideal_alone"] is None
@@ -277,7 +367,7 @@ def test_a_truth_without_a_residual_takes_that_of_the_ideal_observer() -> None:
     unmeasured = with_set("single", ["ghost"], [["ghost"]])
     del unmeasured.truth["left_after_refit_pct"]
     assert math.isnan(unmeasured.left_pct)
-    assert score([unmeasured]).to_json()["cases"][0]["left_after_refit_pct"] is None
+    assert score([unmeasured])["cases"][0]["left_after_refit_pct"] is None
 
 
 def test_a_verdict_is_right_if_it_states_the_truth_and_nothing_else() -> None:
@@ -291,6 +381,9 @@ def test_a_verdict_is_right_if_it_states_the_truth_and_nothing_else() -> None:
         ("single", ["ghost"], "tie", ["ghost"], False),
         ("pair", ["ghost", "core_blur"], "attributed", ["ghost"], False),
         ("pair", ["ghost", "core_blur"], "attributed", ["core_blur", "ghost"], True),
+        ("mixed", ["ghost", "stripes"], "unknown", ["ghost"], True),
+        ("mixed", ["ghost", "stripes"], "unknown", [], False),
+        ("mixed", ["ghost", "stripes"], "attributed", ["ghost"], False),
     ]
     for kind, names, verdict, answer, right in verdicts:
         case = with_set(kind, names, [[]])

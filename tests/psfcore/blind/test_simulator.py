@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from psfcore.blind.case_set import SetPlan, make_set
-from psfcore.blind.score import score
-from psfcore.blind.scoring import Judged
+from psfcore.blind.case_set import make_set
+from psfcore.blind.cases import SetPlan
+from psfcore.blind.score import Judged, score
 from psfcore.blind.simulator import checked_truth, simulator_of, source_sha256
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
@@ -128,6 +128,7 @@ def test_a_truth_of_another_form_is_refused() -> None:
         ({"effects": [{"name": "pair"}]}, "expected names of effects"),
         ({"effects": [ghost, {"name": "core_blur"}, {"name": "mine"}]}, "at most 2 effects"),
         ({"effects": [ghost | {"left_alone_pct": -1}]}, "residuals in percent"),
+        ({"effects": [ghost | {"left_alone_chi2": "many"}]}, "residuals in percent"),
         ({"effects": [], "left_after_refit_pct": "much"}, "residuals in percent"),
     ]
     for truth, said in truths:
@@ -141,13 +142,14 @@ def test_the_kind_follows_from_the_names() -> None:
         ("ghost",): "single",
         ("ghost", "core_blur"): "pair",
         ("my_glow",): "unknown",
-        ("ghost", "my_glow"): "unknown",
+        ("ghost", "my_glow"): "mixed",
+        ("my_glow", "my_haze"): "unknown",
     }
     for names, kind in kinds.items():
         assert checked_truth("mine.py", {"effects": [{"name": name} for name in names]})["kind"] == kind
     # Effects with other names have a row in the confusion matrix.
     truth = checked_truth("mine.py", {"effects": [{"name": "my_glow"}], "left_after_refit_pct": 4.0})
     found = score([Judged(0, truth, {"verdict": "unknown", "set": {"members": [["unknown"]]}}, 1.0)])
-    assert found.confusion == {"my_glow": {"unknown": 1}}
-    rows = {row.figure: row for row in found.rows}
-    assert rows["unknown effects called unknown or inconclusive"].value == 1.0
+    assert found["confusion"] == {"my_glow": {"unknown": 1}}
+    rows = {row["figure"]: row for row in found["rows"]}
+    assert rows["unknown effects called unknown or inconclusive"]["value"] == 1.0

@@ -59,7 +59,7 @@ def test_bad_input_is_said_in_a_line(subtests: pytest.Subtests, tmp_path: Path) 
 
 
 def test_where_no_case_can_be_made_that_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def cannot(case: object, scenes: object) -> None:
+    def cannot(case: object, *folders: object) -> None:
         raise DataError("bad-scene", "expected a scene with light for pointing 2; got none")
 
     monkeypatch.setattr("psfcore.blind.case_set.make", cannot)
