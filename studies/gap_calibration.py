@@ -38,7 +38,16 @@ from psfcore.gap.evidence.measured_noise import measured_noise
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict import calibration
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration, true_share
-from psfcore.gap.verdict.posterior import NONE, PRIOR, UNKNOWN, Kind, Names, Posterior, kind_of, without_idle
+from psfcore.gap.verdict.posterior import (
+    NONE,
+    PRIOR,
+    UNKNOWN,
+    Kind,
+    Names,
+    kind_of,
+    probabilities,
+    without_idle,
+)
 from psfcore.gap.verdict.refits import Refits
 from psfcore.gap.verdict.settled import settled_posterior
 from psfcore.gap.view import View
@@ -47,6 +56,7 @@ from psfcore.transit.folder import read_transit
 from psfcore.whole_files import write_whole
 
 KINDS = ("clean", "single", "pair", "unknown", "mixed")
+FITTED: tuple[Kind, ...] = ("single", "unknown", "mixed")  # kinds whose prior probabilities are fitted
 TEMPERATURES = (0.5, 10.0)
 LEAST_SHARE = 1e-5  # a true cause that is less probable counts as if it had this probability
 HOLDS_FOR = (
@@ -75,7 +85,7 @@ class Case:
             names: weight + math.log(prior[kind_of(names)] / PRIOR[kind_of(names)])
             for names, weight in self.log_weights.items()
         }
-        return without_idle(Posterior(weights, {}, {}).probabilities(temperature))
+        return without_idle(probabilities(weights, temperature))
 
     def true_share(self, temperature: float, prior: Mapping[Kind, float] = PRIOR) -> float:
         """The probability of the true cause."""
@@ -97,7 +107,7 @@ def weights_of(folder: Path) -> tuple[dict[Names, float], tuple[float, ...]]:
     model, _ = linear_model_of(view, LIBRARY)
     refits = Refits(view, model)
     found, _ = settled_posterior(model, refits.weighed)
-    return found.log_weights, tuple(refits.departures.values())
+    return found.log_weights, tuple(refits.departures)
 
 
 def calibrated(cases: Sequence[Case], about: Mapping[str, Any]) -> Calibration:
@@ -115,19 +125,19 @@ def calibrated(cases: Sequence[Case], about: Mapping[str, Any]) -> Calibration:
 def best_prior(cases: Sequence[Case], temperature: float) -> dict[Kind, float]:
     """The prior probabilities of the kinds whose mean logarithm of the probability of the true cause is largest.
 
-    Only those of one effect and of an unknown cause are fitted; the ratios of the others stay.
+    Only those of FITTED are fitted; the ratios of the others stay.
     """
 
     def prior(factors: NDArray[np.float64]) -> dict[Kind, float]:
-        single, unknown = np.exp(factors)
-        scaled = dict(PRIOR) | {"single": PRIOR["single"] * single, "unknown": PRIOR["unknown"] * unknown}
+        fitted = zip(FITTED, np.exp(factors), strict=True)
+        scaled = dict(PRIOR) | {kind: PRIOR[kind] * factor for kind, factor in fitted}
         return {kind: float(share / sum(scaled.values())) for kind, share in scaled.items()}
 
     def loss(factors: NDArray[np.float64]) -> float:
         other = prior(factors)
         return _loss(case.true_share(temperature, other) for case in cases)
 
-    return prior(minimize(loss, np.zeros(2), method="Powell", options={"xtol": 0.02, "ftol": 1e-4}).x)
+    return prior(minimize(loss, np.zeros(len(FITTED)), method="Powell", options={"xtol": 0.02, "ftol": 1e-4}).x)
 
 
 def _loss(true_shares: Iterable[float]) -> float:

@@ -180,14 +180,16 @@ class Judged:
 
     @property
     def unknown(self) -> dict[str, Any]:
-        """What the report states about an unknown cause; empty if it states nothing."""
-        return self.report.get("unknown") or {}
+        """What the report states about the most probable field of an unknown cause; empty if it states none."""
+        fields = (self.report.get("unknown") or {}).get("fields") or [{}]
+        return dict(fields[0])
 
     @property
     def stages(self) -> set[str]:
-        """The stages of the withheld effects; a simulator of a user need not state them."""
-        withheld = (e for e in self.truth["effects"] if cause_of(e["name"]) == OTHER)
-        return {str(effect["stage"]) for effect in withheld if "stage" in effect}
+        """The stages of the withheld effects, and "time" if one of them grows or fades; a simulator of a user need not state them."""
+        withheld = [e for e in self.truth["effects"] if cause_of(e["name"]) == OTHER]
+        stages = {str(effect["stage"]) for effect in withheld if "stage" in effect}
+        return stages | ({"time"} if any(effect.get("in_time") for effect in withheld) else set())
 
     @property
     def stage_is_right(self) -> bool:
@@ -205,16 +207,16 @@ class Judged:
 
         None if the truth or the report has no map.
         """
-        at = np.asarray(self.unknown.get("at", ()), dtype=np.float64)
-        if "light_map" not in self.truth or at.ndim != 2 or at.shape[1] != 2:
+        if "light_map" not in self.truth or "map" not in self.unknown:
             return None
-        light = self.truth["light_map"]
+        light, stated = self.truth["light_map"], self.unknown["map"]
         grid, size_px = np.asarray(light["values"]), light["size_px"]
+        at = np.stack(np.meshgrid(stated["x_px"], stated["y_px"]), axis=-1).reshape(-1, 2)
         x, y = np.clip((at.T + 0.5) / size_px * len(grid), 0, len(grid) - 1).astype(int)
-        true, found = grid[y, x], np.asarray(self.unknown["values"], dtype=np.float64)
-        way = at[np.argmax(np.abs(found))] - at[np.argmax(np.abs(true))]
-        both_vary = true.std() > 0 and found.std() > 0
-        correlation = float(np.corrcoef(true, found)[0, 1]) if both_vary else 0.0
+        true, values = grid[y, x], np.ravel(np.asarray(stated["value"], dtype=np.float64))
+        way = at[np.argmax(np.abs(values))] - at[np.argmax(np.abs(true))]
+        both_vary = true.std() > 0 and values.std() > 0
+        correlation = float(np.corrcoef(true, values)[0, 1]) if both_vary else 0.0
         return float(np.hypot(*way)) / (size_px / 2), correlation
 
 

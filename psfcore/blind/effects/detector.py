@@ -14,6 +14,7 @@ from psfcore.blind.effects.effect import (
     ANGLE,
     CALIBRATION,
     DEPENDS_ON_NOISE,
+    IN_TIME,
     KNOWN,
     Earlier,
     Effect,
@@ -92,7 +93,7 @@ def shutter_gradient(effect: Effect, rate: Plane, moment: Moment) -> Plane:
     return rate * np.maximum(1 + effect.strength * along / moment.shot.exposure_s, 0.0)
 
 
-@declare(CALIBRATION, "expected", "DN/s at the end", 1.0, 30.0, steepness=(0.5, 3.0))
+@declare(CALIBRATION, "expected", "DN/s at the end", 1.0, 30.0, IN_TIME, steepness=(0.5, 3.0))
 def dark_current_drift(effect: Effect, rate: Plane, moment: Moment) -> Plane:
     """The detector warms: a dark current grows during the transit and reaches the strength at its end."""
     steepness = effect["steepness"]

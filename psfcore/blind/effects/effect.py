@@ -47,6 +47,7 @@ STAGES = {
 ANGLE = (0.0, 360.0)  # degrees
 # Options of kinds (`Kind`).
 ADDS_LIGHT, DEPENDS_ON_NOISE, VARIES = {"adds_light": True}, {"noise_realisations": 12}, {"varies": True}
+IN_TIME = {"in_time": True}
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class Kind:
     the effect leaves is proportional to strength**power. varies: whether its optics differ from image to image.
     noise_realisations: number of noise realisations over which its change is averaged; 0 if the change does not depend
     on noise. adds_light: whether it adds light at places of the detector that stay the same; the truth then has a map
-    of this light. saturation_dn: the level in DN at which high-only images clip, from the effect, all exposures and the
+    of this light. in_time: whether it grows or fades during the transit. saturation_dn: the level in DN at which high-only images clip, from the effect, all exposures and the
     plan.
     """
 
@@ -101,6 +102,7 @@ class Kind:
     varies: bool = False
     noise_realisations: int = 0
     adds_light: bool = False
+    in_time: bool = False
     saturation_dn: Callable[[Effect, list[Plane], Plan], float] | None = None
 
     def drawn(self, plan: Plan, rng: np.random.Generator) -> Effect:
@@ -155,6 +157,7 @@ class Effect:
         return {
             "name": self.kind.name,
             "stage": STAGES[self.kind.step],
+            "in_time": self.kind.in_time,
             "strength": self.strength,
             "unit": self.kind.unit,
             "parameters": dict(self.parameters),

@@ -12,6 +12,7 @@ from scipy.ndimage import affine_transform, gaussian_filter
 from psfcore.blind.effects.effect import (
     ANGLE,
     CALIBRATION,
+    IN_TIME,
     KNOWN,
     VARIES,
     Effect,
@@ -80,7 +81,7 @@ def core_blur(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     return _blurred(optics, _line(width, effect["angle_deg"]) if effect["jitter"] else _moffat(width))
 
 
-@declare(CALIBRATION, "optics", "px at the end", 2.0, 8.0, VARIES | {"power": 1.5})
+@declare(CALIBRATION, "optics", "px at the end", 2.0, 8.0, VARIES | IN_TIME | {"power": 1.5})
 def focus_drift(effect: Effect, optics: FineOptics, moment: Moment) -> FineOptics:
     """The telescope's structure warms: blur by a uniform disc, whose diameter grows from 0 to the strength at the last image."""
     diameter = effect.strength * moment.elapsed

@@ -13,6 +13,7 @@ from psfcore.blind.effects.effect import (
     ADDS_LIGHT,
     ANGLE,
     DEPENDS_ON_NOISE,
+    IN_TIME,
     TEST,
     Earlier,
     Effect,
@@ -31,7 +32,9 @@ from psfcore.simulate.disc import Behind
 Plane = NDArray[np.float64]
 
 
-@declare(TEST, "foreground", "DN/s", 2.0, 100.0, angle_deg=ANGLE, length=(1.0, 6.0), fading=(0.5, 4.0))
+@declare(
+    TEST, "foreground", "DN/s", 2.0, 100.0, IN_TIME, angle_deg=ANGLE, length=(1.0, 6.0), fading=(0.5, 4.0)
+)
 def occulter_tail(effect: Effect, lit: Plane, moment: Moment) -> Plane:
     """Gas of the occulter emits light in front of it and in a tail, which moves with the disc. The light fades during the transit.
 
@@ -64,7 +67,7 @@ def transparent_limb(effect: Effect, share: Plane, around: Behind, moment: Momen
     return np.asarray(share * (1 - effect.strength * side * np.exp(-depth)))
 
 
-@declare(TEST, "spread", "change of the exponent at the end", 0.1, 0.8, settling=(1.0, 5.0))
+@declare(TEST, "spread", "change of the exponent at the end", 0.1, 0.8, IN_TIME, settling=(1.0, 5.0))
 def warming_wings(effect: Effect, seen: Plane, lit: Plane, optics: FineOptics, moment: Moment) -> Plane:
     """The mirrors warm towards a constant temperature: the wings of the scatter widen to a power law of smaller exponent."""
     warm = np.expm1(-effect["settling"] * moment.elapsed) / np.expm1(-effect["settling"])
@@ -91,7 +94,15 @@ def groove_streak(effect: Effect, optics: FineOptics, moment: Moment) -> FineOpt
 
 
 @declare(
-    TEST, "spread", "share of the scatter", 0.1, 1.0, angle_deg=ANGLE, reach=(0.4, 0.9), edge=(0.02, 0.08)
+    TEST,
+    "spread",
+    "share of the scatter",
+    0.1,
+    1.0,
+    IN_TIME,
+    angle_deg=ANGLE,
+    reach=(0.4, 0.9),
+    edge=(0.02, 0.08),
 )
 def creeping_frost(effect: Effect, seen: Plane, lit: Plane, optics: FineOptics, moment: Moment) -> Plane:
     """Frost grows inwards from one side of a filter near the focus, as fast as diffusion. The scatter there is stronger.
@@ -163,7 +174,7 @@ def stray_beam(effect: Effect, seen: Plane, moment: Moment) -> Plane:
     return seen + effect.strength * (np.arctan(left) - np.arctan(right)) / np.pi
 
 
-@declare(TEST, "expected", "DN/s at its peak", 2.0, 100.0, start=(-0.1, 0.5), rise=(0.05, 0.25))
+@declare(TEST, "expected", "DN/s at its peak", 2.0, 100.0, IN_TIME, start=(-0.1, 0.5), rise=(0.05, 0.25))
 def particle_shower(effect: Effect, rate: Plane, moment: Moment) -> Plane:
     """A solar particle event hits the detector: a uniform light that rises fast and decays slowly, with noise."""
     since = max(moment.elapsed - effect["start"], 0.0) / effect["rise"]

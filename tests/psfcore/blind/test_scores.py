@@ -247,9 +247,12 @@ def test_every_figure_of_the_sets_equals_the_one_computed_by_hand() -> None:
 
 LIGHT = {
     "stage": "detector",
-    "axes": ["x_px", "y_px"],
-    "at": [[x, y] for y in (4.5, 14.5) for x in (4.5, 14.5)],
+    "map": {"x_px": [4.5, 14.5], "y_px": [4.5, 14.5]},
 }
+
+
+def light(*values: float) -> dict[str, Any]:
+    return LIGHT | {"map": LIGHT["map"] | {"value": np.reshape(values, (2, 2)).tolist()}}
 
 
 def with_cause(kind: str, members: list[list[str]], *, chi2: float = 90.0, **unknown: Any) -> Judged:
@@ -259,24 +262,22 @@ def with_cause(kind: str, members: list[list[str]], *, chi2: float = 90.0, **unk
     for effect in case.truth["effects"]:
         effect |= {"left_alone_chi2": chi2, "stage": "optics" if effect["name"] == "ghost" else "detector"}
     case.truth["light_map"] = {"size_px": 20, "values": [[0.0, 1.0], [2.0, 9.0]]}
-    case.report["unknown"] = unknown or None
+    case.report["unknown"] = {"fields": [unknown] if unknown else []}
     return case
 
 
 def test_what_reports_tell_of_an_unknown_cause() -> None:
     cases = [
-        with_cause("unknown", [["unknown"]], **LIGHT, values=[0.0, 2.0, 4.0, 18.0]),
-        with_cause("unknown", [["ghost", "unknown"]], **LIGHT, values=[9.0, 2.0, 1.0, 0.0]),
+        with_cause("unknown", [["unknown"]], **light(0.0, 2.0, 4.0, 18.0)),
+        with_cause("unknown", [["ghost", "unknown"]], **light(9.0, 2.0, 1.0, 0.0)),
         with_cause("unknown", [["ghost"]]),
         with_cause(
-            "unknown", [["unknown"]], stage="optics", axes=["time_s"], at=[[0.0], [9.0]], values=[1.0, 2.0]
+            "unknown", [["unknown"]], stage="optics", curve={"time_s": [0.0, 9.0], "value": [1.0, 2.0]}
         ),
-        with_cause("mixed", [["ghost", "unknown"]], stage="detector", at=[]),
-        with_cause("mixed", [["ghost"], ["unknown"]], stage="detector", at=[]),
-        with_cause("mixed", [["unknown", "ghost"]], stage="scene", at=[]),
-        with_cause(
-            "mixed", [["persistence", "unknown"], ["unknown", "ghost"]], stage="detector", chi2=29.0, at=[]
-        ),
+        with_cause("mixed", [["ghost", "unknown"]], stage="detector"),
+        with_cause("mixed", [["ghost"], ["unknown"]], stage="detector"),
+        with_cause("mixed", [["unknown", "ghost"]], stage="scene"),
+        with_cause("mixed", [["persistence", "unknown"], ["unknown", "ghost"]], stage="detector", chi2=29.0),
     ]
     rows = by_figure(set_figures(cases))
     for figure, count, value in (

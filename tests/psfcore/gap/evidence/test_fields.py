@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from psfcore.gap.evidence.discrepancy import LIKELY
 from scipy.signal import fftconvolve
 
 from psfcore.gap.evidence.cells import DiscCells, disc_cells
-from psfcore.gap.evidence.discrepancy import LIKELY
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.fields import (
     KERNEL_LIKELY,
