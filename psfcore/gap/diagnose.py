@@ -200,7 +200,7 @@ def diagnose_solution(
         settled, calibration, images=len(model.evidence.discs), coverage=coverage, failed=failed
     )
     told = unknown_fields(model, settled) if any(UNKNOWN in names for names in judged.members) else ()
-    fits = _fits(refits, model, judged, told)
+    fits = linear_fits(refits, model, judged, told)
     best = next((form for form in fits if judged.best and form == judged.form(judged.best)), None)
     named = judged.verdict in ("attributed", "tie")
     corrected = refits.of([judged.form(names) for names in judged.named]) if refit and named else ()
@@ -297,7 +297,7 @@ def _limits(
     return found
 
 
-def _fits(
+def linear_fits(
     refits: Refits, model: LinearModel, judged: Judgement, told: Sequence[UnknownField]
 ) -> dict[Form, EffectFit]:
     """The linear fits of all single effects, the most probable first; then of the best hypothesis and the named ones, in their

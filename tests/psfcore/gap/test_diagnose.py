@@ -19,7 +19,7 @@ from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.report.report import gap_report
 from psfcore.gap.verdict import where
 from psfcore.gap.verdict.calibration import Calibration
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form
 from psfcore.noise import Noise
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Solution
@@ -86,7 +86,7 @@ def test_a_dark_offset_is_found_with_its_size_and_taken_out() -> None:
     (fit,) = full.corrected
     value, sigma, unit = fit.values["offset"]
     assert unit == "DN" and value == pytest.approx(small_gaps.OFFSET_DN, abs=4 * sigma) and sigma < 0.5
-    shrinking = full.shrinking["dark_offset"]
+    shrinking = full.shrinking[Form(("dark_offset",))]
     assert shrinking.closure_by_pointing is not None and shrinking.closure_by_pointing.low > 0.7
     assert shrinking.held_out_fall is not None and shrinking.held_out_fall > 10
     assert full.after.value < min(1.0, full.rms.value / 2)
@@ -116,7 +116,7 @@ def test_light_lost_by_clipping_is_attributed_to_saturation_fill(clean: Transit)
     )
     found = diagnose(replace(clean, frames=frames), library=FEW, refit=False)
     assert found.judgement.answer == ("saturation_fill",)
-    (fit,) = (fit for fit in found.fits if fit.names == ("saturation_fill",))
+    fit = found.fits[Form(("saturation_fill",))]
     # The loss is larger inside than at the rim, as simulated.
     value, sigma, _ = fit.values["excess_inside"]
     assert value < -2 * sigma

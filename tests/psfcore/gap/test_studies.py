@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Solution
 from psfcore.transit.transit import Transit
 from studies import gap_limits
-from studies.gap_calibration import KINDS, TEMPERATURES, Case, best_prior, calibrated, required, table
+from studies.gap_calibration import KINDS, TEMPERATURES, Case, best_prior, calibrated, table
 from tests.psfcore.gap.small_transits import effect
 
 A, B, AB = ("a",), ("b",), ("a", "b")
@@ -32,25 +31,6 @@ def drawn_cases(count: int, temperature: float, prior: Mapping[Kind, float] = PR
         kind = {NONE: "clean", UNKNOWN: "unknown"}.get(true, "single")
         cases.append(Case(number, kind, true, logs))
     return cases
-
-
-def test_an_answer_must_contain_what_leaves_enough() -> None:
-    rows: list[tuple[str, list[float | None], Names]] = [
-        ("clean", [], NONE),
-        ("single", [0.3], A),
-        ("pair", [3.0, 2.0], AB),
-        ("pair", [3.0, 0.4], A),
-        ("pair", [0.4, 3.0], B),
-        ("pair", [0.4, 0.3], AB),
-        ("pair", [None, None], AB),
-        ("unknown", [4.0], UNKNOWN),
-    ]
-    for kind, left_pct, names in rows:
-        effects: list[dict[str, Any]] = [
-            {"name": name} | ({} if left is None else {"left_alone_pct": left})
-            for name, left in zip("ab", left_pct, strict=False)
-        ]
-        assert required({"kind": kind, "effects": effects}) == names, (kind, left_pct)
 
 
 def test_the_true_share_is_that_of_a_hypothesis_with_all_effects() -> None:

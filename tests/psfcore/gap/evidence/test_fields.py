@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from psfcore.gap.evidence.discrepancy import LIKELY
 from scipy.signal import fftconvolve
 
 from psfcore.gap.evidence.cells import DiscCells, disc_cells
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.fields import (
     KERNEL_LIKELY,
+    LIKELY,
     NEAREST_BOXES,
     OCTAVES,
     Field,
@@ -21,6 +21,7 @@ from psfcore.gap.evidence.fields import (
     fields_of,
 )
 from psfcore.gap.verdict.posterior import UNKNOWN, posterior
+from psfcore.gap.verdict.unknown import bounds, unknown_fields
 from psfcore.gap.view import View
 from psfcore.scatter.reconstruction import Solution
 from tests.psfcore.gap.linear_models import noise_of, with_left, with_residuals
@@ -65,7 +66,7 @@ def test_a_ring_changes_the_cells_as_a_convolution_does(solution: Solution, evid
 
 def test_in_the_blocks_a_field_in_time_changes_what_it_changes_in_the_discs(evidence: Evidence) -> None:
     light, gain = (
-        FieldColumns(evidence).of(Field("detector", f"{form}_in_time", 0.8)) for form in ("light", "gain")
+        FieldColumns(evidence).of(Field("time", f"{form}_in_time", 0.8)) for form in ("light", "gain")
     )
     assert light.width == gain.width == LIKELY
     uniform = light.unocculted[0]
@@ -95,13 +96,34 @@ def test_a_spot_of_light_is_an_unknown_cause_at_its_place(evidence: Evidence) ->
     model = replace(with_left(with_residuals(evidence, {}), residual), scale_error=0.1)
     found = posterior(model)
     assert next(iter(found.probabilities())) == UNKNOWN
-    best = max(found.fields, key=lambda field: found.fields[field])
-    assert (best.stage, best.form) == ("detector", "light") and found.fields[best] > 0.5
-    assert found.shape is not None and found.shape.field == best
-    k = found.shape.clearest
-    assert np.hypot(*(found.shape.at[k] - (place.x_px, place.y_px))) < 0.15 * columns * evidence.box_px
-    assert found.shape.values[k] == pytest.approx(spot.max(), rel=0.5)
-    assert sum(found.orders.values()) + sum(found.fields.values()) == pytest.approx(1.0)
+    best = unknown_fields(model, found)[0]
+    assert (best.field.stage, best.field.form, best.beside) == (
+        "detector",
+        "light",
+        (),
+    ) and best.probability > 0.5
+    k = best.shape.clearest
+    assert np.hypot(*(best.shape.at[k] - (place.x_px, place.y_px))) < 0.15 * columns * evidence.box_px
+    assert best.strength is not None
+    value, sigma = best.strength
+    assert value == pytest.approx(spot.max(), rel=0.5) and sigma < value / 3
+    assert sum(found.fields().values()) == pytest.approx(1.0)
+    # No effect of the library makes this spot, and the bound of the light is above it.
+    distances = [distance for _, distance in best.resembles]
+    assert distances == sorted(distances) and distances[0] > 3.0
+    assert bounds(model, [best.field])[best.field][0] > value
+    shifted = bounds(replace(with_residuals(evidence, {}), scale_error=0.1), [best.field])[best.field][0]
+    assert shifted < value / 2
+
+
+def test_light_beside_the_field_lights_its_own_pointing_most_near_that_side(evidence: Evidence) -> None:
+    columns = FieldColumns(evidence)
+    first = evidence.image_info[0].pointing
+    field = Field("scene", "outside", None, first)
+    below = columns.planes(field, 0)[4]  # the middle bump below the field
+    assert np.argmax(below.mean(axis=1)) == 0 and (below > 0).all()
+    other = next(n for n, info in enumerate(evidence.image_info) if info.pointing != first)
+    assert not columns.planes(field, other).any()
 
 
 def test_data_have_only_the_fields_that_they_can_show(evidence: Evidence) -> None:

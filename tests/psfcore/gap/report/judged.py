@@ -6,11 +6,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from psfcore.gap import diagnose
-from psfcore.gap.diagnose import Diagnosis, Shrinking
+from psfcore.gap.diagnose import Diagnosis, Shrinking, linear_fits
 from psfcore.gap.verdict.calibration import Calibration
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names
+from psfcore.gap.verdict.refits import Refits
+from psfcore.gap.verdict.unknown import unknown_fields
 from psfcore.gap.verdict.verdict import verdict_of
+from psfcore.gap.view import View
+from tests.psfcore.gap.posteriors import of_weights
 from tests.psfcore.gap.small_gaps import found
 
 OFFSET, GAIN, BLUR = ("dark_offset",), ("gain_mismatch",), ("core_blur",)
@@ -23,7 +26,6 @@ SHARES: dict[str, dict[Names, float]] = {
     "unknown": {UNKNOWN: 0.95, OFFSET: 0.03, NONE: 0.02},
     "inconclusive": {OFFSET: 0.5, UNKNOWN: 0.3, NONE: 0.12, GAIN: 0.08},
 }
-ORDERS: dict[Names, float] = {("x", "pointing"): 0.8, ("time",): 0.15, ("y",): 0.05 - 1e-6}
 LEAST = 0.06  # the probability that a hypothesis of the answer set needs
 HOLDS_FOR = "The coverage holds for transits like these."
 
@@ -36,10 +38,19 @@ def with_shares(shares: Mapping[Names, float], images: int = 12) -> Diagnosis:
         (LEAST,) * 19,
         {"seed": 5, "version": "1.2.3", "command": "python -m made", "holds_for": HOLDS_FOR},
     )
-    judgement = verdict_of(Posterior(logs, {}, ORDERS), calibration, images=images)
-    fits = diagnose.linear_fits(found().model, judgement)
-    shrinking = {fit.label: found().shrinking.get(fit.label, Shrinking(None, None, None)) for fit in fits}
-    changed = replace(found(), judgement=judgement, calibration=calibration, fits=fits, shrinking=shrinking)
+    judgement = verdict_of(of_weights(logs), calibration, images=images)
+    model = found().model
+    told = unknown_fields(model, judgement.posterior) if UNKNOWN in judgement.members else ()
+    fits = linear_fits(Refits(View(found().solution), model), model, judgement, told)
+    shrinking = {form: found().shrinking.get(form, Shrinking(None, None, None)) for form in fits}
+    changed = replace(
+        found(),
+        judgement=judgement,
+        calibration=calibration,
+        fits=fits,
+        shrinking=shrinking,
+        unknown=told,
+    )
     answered = judgement.verdict in ("attributed", "tie")
     return changed if answered else replace(changed, corrected=(), residual_after=None)
 

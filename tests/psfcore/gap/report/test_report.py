@@ -15,11 +15,11 @@ from psfcore.gap.report.report import (
     LEAST_SHARE,
     gap_report,
     hypothesis_words,
-    order_words,
     percent_words,
 )
 from psfcore.gap.verdict.limits import Alike
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN
+from tests.psfcore.gap.posteriors import FIELD
 from tests.psfcore.gap.report.judged import (
     BLUR,
     GAIN,
@@ -99,13 +99,26 @@ def test_the_report_of_every_verdict(verdict: str) -> None:
         assert members[:1] == [[]] or ["unknown"] in members
     assert report["ties"] == ([report["answer"]] if verdict == "tie" else [])
     assert bool(report["would_separate"]) is (verdict == "tie")
-    # What the gap looks like is said only if its cause may be unknown; the third pattern is too improbable.
-    like = [(one["form"].split(" the ", 1)[1], one["probability"]) for one in report["looks_like"]]
-    patterns = [
-        ("position along detector x and the pointing", pytest.approx(0.8)),
-        ("time", pytest.approx(0.15)),
-    ]
-    assert like == (patterns if ["unknown"] in members else [])
+    # What the gap looks like is said only if its cause may be unknown.
+    unknown = report["unknown"]
+    assert unknown["probability"] == report["probabilities"]["unknown"]
+    assert len(unknown["fields"]) == len(report["looks_like"]) == (["unknown"] in members)
+    for field in unknown["fields"]:
+        assert (field["stage"], field["form"], field["width"], field["probability"]) == (
+            FIELD.stage,
+            FIELD.form,
+            FIELD.width,
+            pytest.approx(1.0),
+        )
+        shape = len(field["map"]["y_px"]), len(field["map"]["x_px"])
+        assert np.shape(field["map"]["value"]) == np.shape(field["map"]["sigma"]) == shape
+        value = np.array(field["map"]["value"]) / np.array(field["map"]["sigma"])
+        clearest = np.unravel_index(np.argmax(np.abs(value)), shape)
+        assert field["strength"]["value"] == np.array(field["map"]["value"])[clearest]
+        assert len(field["resembles"]) == 3
+    kinds = {(one["stage"], one["form"]) for one in unknown["excluded_95"]}
+    assert {("detector", "light"), ("detector", "dark"), ("time", "gain_in_time")} <= kinds
+    assert all(one["strength"] > 0 for one in unknown["excluded_95"])
     # The summary is one to four plain sentences.
     sentence = report["sentence"]
     assert all(part in sentence for part in SAID[verdict]), sentence
@@ -187,10 +200,9 @@ def test_a_gap_of_the_unocculted_field_alone_is_not_said_of_the_discs() -> None:
     assert "The discs do not show it (the gap in the discs is 0.1 %" in sentence
 
 
-def test_words_for_probabilities_orders_and_hypotheses() -> None:
+def test_words_for_probabilities_and_hypotheses() -> None:
     percents = {1.0: "> 99 %", 0.9949: "99 %", 0.5: "50 %", 0.006: "1 %", 0.004: "< 1 %", 0.0: "< 1 %"}
     assert {share: percent_words(share) for share in percents} == percents
-    assert order_words(("time",)) == "a change that varies with the time"
-    assert "many orders" in order_words(("x", "y", "time", "pointing"))
     assert (hypothesis_words(NONE), hypothesis_words(UNKNOWN)) == ("no gap", "a cause outside the library")
     assert hypothesis_words(OFFSET_BLUR) == "dark offset together with core blur"
+    assert hypothesis_words(("ghost", "unknown")) == "ghost together with a cause outside the library"

@@ -6,17 +6,17 @@ import itertools
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence, gather
-from psfcore.gap.evidence.likelihood import Weighed
+from psfcore.gap.evidence.fields import Field
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.library.detector import EFFECTS
 from psfcore.gap.verdict.posterior import (
     NONE,
     PRIOR,
     UNKNOWN,
+    Form,
     Names,
     Posterior,
     kind_of,
@@ -25,6 +25,7 @@ from psfcore.gap.verdict.posterior import (
 )
 from psfcore.scatter.reconstruction import Solution
 from tests.psfcore.gap.linear_models import with_residuals
+from tests.psfcore.gap.posteriors import of_evidence, weighed
 
 OFFSET: Names = ("dark_offset",)
 
@@ -46,15 +47,45 @@ def test_noise_alone_is_no_gap_and_an_offset_is_an_offset(evidence: Evidence) ->
 
 def test_the_hypotheses_of_a_kind_share_the_prior_of_their_kind() -> None:
     """However many effects the library has: with equal evidence, its pairs together have the prior of a pair."""
-    blank = Weighed(0.0, (), np.zeros(0), 0.0)
     for effects in (4, 7):
         names = [tuple(one) for k in range(4) for one in itertools.combinations("abcdefg"[:effects], k)]
-        weights = (
-            Posterior({}, {}, {}).with_evidence(dict.fromkeys([*names, UNKNOWN], blank), effects).log_weights
-        )
+        mixed = [(*one, "unknown") for one in names if len(one) < 2]
+        weights = of_evidence(dict.fromkeys([*names, *mixed], 0.0)).log_weights
         for kind, prior in PRIOR.items():
             share = sum(math.exp(weights[one]) for one in weights if kind_of(one) == kind)
             assert share == pytest.approx(prior), kind
+
+
+def test_an_effect_has_the_form_of_the_library_or_of_a_field_with_its_name() -> None:
+    order = ("intensity_gradient", "flat_field_residual")
+    wide, gain, fine = (
+        Field("detector", form, width) for form, width in (("light", 0.8), ("gain", 0.2), ("gain", 0.8))
+    )
+    spot = Field("detector", "light", 0.2)
+    logs = {
+        Form(("intensity_gradient",)): 1.0,
+        Form((), wide): 3.0,
+        Form(("flat_field_residual",)): 0.0,
+        Form((), gain): 2.0,
+        Form((), fine): 4.0,
+        Form((), spot): 5.0,
+        Form(("intensity_gradient",), spot): 6.0,
+    }
+    made = Posterior({form: weighed(log) for form, log in logs.items()}, order)
+    single = math.log(PRIOR["single"] / 2)
+    assert made.log_weights == pytest.approx(
+        {
+            ("intensity_gradient",): single + math.log((math.exp(1) + math.exp(3)) / 2),
+            ("flat_field_residual",): single + math.log(1 / 2 + (math.exp(2) + math.exp(4)) / 4),
+            UNKNOWN: math.log(PRIOR["unknown"]) + 5.0,
+            ("intensity_gradient", "unknown"): math.log(PRIOR["mixed"] / 2) + 6.0,
+        }
+    )
+    assert made.leading(("flat_field_residual",)) == Form((), fine)
+    both = {((), spot): PRIOR["unknown"] * math.exp(5), (order[:1], spot): PRIOR["mixed"] / 2 * math.exp(6)}
+    assert made.fields() == pytest.approx({one: share / sum(both.values()) for one, share in both.items()})
+    # Data that cannot show the effect of the library: its fields are an unknown cause.
+    assert Form((), wide).names(()) == UNKNOWN
 
 
 def test_hypotheses_that_the_data_do_not_show_count_to_one_with_fewer_effects() -> None:

@@ -11,9 +11,11 @@ import pytest
 
 from psfcore.errors import DataError
 from psfcore.gap.evidence.evidence import gather
+from psfcore.gap.evidence.fields import LIKELY, Field, fields_of
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.verdict import refits as refitting
-from psfcore.gap.verdict.posterior import posterior, without_idle
+from psfcore.gap.verdict.closure import hold_out, time_blocks
+from psfcore.gap.verdict.posterior import Form, posterior, without_idle
 from psfcore.gap.verdict.refits import Refits
 from psfcore.gap.verdict.settled import settled_posterior
 from psfcore.gap.view import View
@@ -21,7 +23,9 @@ from psfcore.scatter.inversion import invert
 from tests.psfcore.gap.small_gaps import OFFSET_DN, changed, found
 from tests.psfcore.gap.small_transits import clean, effect
 
-OFFSET = ("dark_offset",)
+OFFSET, BOTH, BLUR = (
+    Form(names) for names in (("dark_offset",), ("dark_offset", "core_blur"), ("core_blur",))
+)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -38,31 +42,43 @@ def test_a_refit_weighs_its_effect_all_pairs_with_it_and_the_triples_of_the_best
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = refits_of_found()
-    weighed = made.weighed(OFFSET)
-    assert weighed is not None
-    others = {e.name for e in found().evidence.effects} - set(OFFSET)
-    pairs = {frozenset((*OFFSET, name)) for name in others}
-    best = max((names for names in weighed if len(names) == 2), key=lambda names: weighed[names].log_evidence)
+    at_refit = made.weighed(OFFSET)
+    assert at_refit is not None
+    weighed, model = at_refit
+    others = {e.name for e in found().evidence.effects} - {"dark_offset"}
+    of_library = {form.effects: one for form, one in weighed.items() if form.field is None}
+    pairs = {frozenset(("dark_offset", name)) for name in others}
+    best = max((n for n in of_library if len(n) == 2), key=lambda names: of_library[names].log_evidence)
     triples = {frozenset((*best, name)) for name in others - set(best)}
-    assert {frozenset(names) for names in weighed} == {frozenset(OFFSET), *pairs, *triples} and triples
-    assert set(weighed) <= set(posterior(found().model).log_weights)  # the names keep their order
-    (fit,) = made.made
+    assert {frozenset(names) for names in of_library} == {
+        frozenset(("dark_offset",)),
+        *pairs,
+        *triples,
+    } and triples
+    assert {form.field for form in weighed} == {None, *fields_of(model.evidence)}, (
+        "every field beside the offset"
+    )
+    before = posterior(found().model)
+    assert {form.names(before.order) for form in weighed} <= set(
+        before.log_weights
+    )  # the names keep their order
+    (fit,) = made.made.values()
     value, sigma = fit.parameters("dark_offset")["offset"]
     assert value == pytest.approx(OFFSET_DN, abs=4 * sigma)
     # An offset is linear, so that the refit leaves the hypothesis as probable as it is in the linear model.
-    settled = posterior(found().model).with_evidence(weighed, len(others) + 1)
-    assert next(iter(without_idle(settled.probabilities()))) == OFFSET
+    settled = before.with_evidence(weighed, model)
+    assert next(iter(without_idle(settled.probabilities()))) == ("dark_offset",)
     # The offset changes the cells by less than their noise, which hides how far the refit departs from first order.
-    assert made.departures == {}
+    assert made.departures == []
     monkeypatch.setattr(refitting, "VISIBLE_SIGMA", 0.5)
-    assert 0 < made.departures[OFFSET] < 0.5
+    assert len(made.departures) == 1 and 0 < made.departures[0] < 0.5
 
     # A refit is made once, and rivals are not refitted for the report.
     def again(*given: Any, **named: Any) -> None:
         raise AssertionError("a refit was repeated")
 
     monkeypatch.setattr(refitting, "add_to_model", again)
-    assert made.of([OFFSET, ("dark_offset", "core_blur")]) == (fit,) and made.made == (fit,)
+    assert made.of([OFFSET, BOTH]) == (fit,) and made.made == {OFFSET: fit}
     assert made.failures == []
 
 
@@ -72,8 +88,9 @@ def test_a_refit_whose_first_order_is_not_exact_enough_counts_for_nothing(
     (fit,) = found().corrected
     monkeypatch.setattr(refitting, "add_to_model", lambda *given, **named: fit)
     refits = refits_of_found()
-    assert refits.weighed(OFFSET, most_visible=-1.0) == {}
-    assert refits.made == () and refits.of([OFFSET]) == ()
+    at_refit = refits.weighed(OFFSET, most_visible=-1.0)
+    assert at_refit is not None and at_refit[0] == {}
+    assert refits.made == {} and refits.of([OFFSET]) == ()
     (failure,) = refits.failures
     assert "dark_offset in the model did not settle" in failure
 
@@ -89,12 +106,35 @@ def test_a_failed_refit_is_named_once_and_left_out(monkeypatch: pytest.MonkeyPat
     refits = refits_of_found()
     assert refits.weighed(OFFSET) is None and refits.weighed(OFFSET) is None
     # After two failed refits no third one is tried for the report.
-    assert refits.of([OFFSET, ("dark_offset", "core_blur"), ("core_blur",)]) == ()
+    assert refits.of([OFFSET, BOTH, BLUR]) == ()
     assert asked == [["dark_offset"], ["dark_offset", "core_blur"]]
-    assert refits.made == () and refits.departures == {}
+    assert refits.made == {} and refits.departures == []
     first, second = refits.failures
     assert "dark_offset in the model failed: " in first and "expected dark_offset to add light" in first
     assert "dark_offset + core_blur" in second
+
+
+def test_a_field_is_refitted_as_an_effect() -> None:
+    """The fit with a field in the model subtracts it from the images, and the field closes what it stands for."""
+    field = Field("detector", "dark", 0.8)
+    refits = refits_of_found()
+    at_refit = refits.weighed(Form((), field))
+    assert at_refit is not None
+    evidence = at_refit[0][Form((), field)].log_evidence
+    assert evidence > posterior(found().model).forms[Form()].log_evidence
+    (fit,) = refits.made.values()
+    assert [effect.name for effect in fit.effects] == ["unknown"]
+    model = refits.model_with(Form((), field))
+    likely = model.evidence.prior.likely[list(model.evidence.columns["unknown"])]
+    assert np.all((likely >= LIKELY) & (likely <= 10 * LIKELY)) and np.ptp(likely) == 0
+    before, after = (
+        hold_out(model, columns, time_blocks(model)) for columns in ((), model.evidence.columns["unknown"])
+    )
+    assert (
+        before is not None
+        and after is not None
+        and after.unocculted_chi2.sum() < before.unocculted_chi2.sum()
+    )
 
 
 @pytest.mark.slow  # test_settled.py has the fast case of a second effect

@@ -7,27 +7,22 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
-import numpy as np
 import pytest
 
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict import settled
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior, posterior, without_idle
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form, Names, Posterior, posterior, without_idle
 from psfcore.gap.verdict.settled import MOST_REFITS, VISIBLE, settled_posterior
 from tests.psfcore.gap.linear_models import with_residuals
+from tests.psfcore.gap.posteriors import form_of, of_evidence, weighed
 
 OFFSET: Names = ("dark_offset",)
 A, B, AB, AC, ABC = ("a",), ("b",), ("a", "b"), ("a", "c"), ("a", "b", "c")
-EFFECTS = 3
-MODEL = cast(LinearModel, SimpleNamespace(evidence=SimpleNamespace(effects=(None,) * EFFECTS)))
+MODEL = cast(LinearModel, SimpleNamespace())
 
 Settle = Callable[..., tuple[Posterior, list[Names], tuple[Names, ...]]]
-
-
-def weighed(log_evidence: float, visible_error: float = 0.0) -> Weighed:
-    return Weighed(log_evidence, (), np.zeros(0), visible_error)
 
 
 class Refitted:
@@ -36,13 +31,15 @@ class Refitted:
     def __init__(self, evidence: Mapping[Names, Mapping[Names, Weighed | float]]) -> None:
         self.evidence, self.asked, self.bounds = evidence, list[Names](), list[float]()
 
-    def __call__(self, names: Names, most_visible: float) -> Mapping[Names, Weighed] | None:
+    def __call__(self, form: Form, most_visible: float) -> tuple[Mapping[Form, Weighed], LinearModel] | None:
+        names = form.names(tuple(dict.fromkeys((*"abc", *form.effects))))
         self.asked.append(names)
         self.bounds.append(most_visible)
         found = self.evidence.get(names)
         if found is None:
             return None
-        return {one: log if isinstance(log, Weighed) else weighed(log) for one, log in found.items()}
+        real = {n: log if isinstance(log, Weighed) else weighed(log) for n, log in found.items()}
+        return {form_of(names): one for names, one in real.items()}, MODEL
 
 
 @pytest.fixture
@@ -53,8 +50,8 @@ def settle(monkeypatch: pytest.MonkeyPatch) -> Settle:
     def settled_from(
         logs: Mapping[Names, float], refit: Refitted, visible: float = 2 * VISIBLE
     ) -> tuple[Posterior, list[Names], tuple[Names, ...]]:
-        evidence = {names: weighed(log, visible if names else 0.0) for names, log in logs.items()}
-        linear = Posterior({UNKNOWN: -50.0}, {}, {}).with_evidence(evidence, EFFECTS)
+        others = dict.fromkeys(((name,) for name in "abc"), -1e4)
+        linear = of_evidence(others | {UNKNOWN: -50.0} | dict(logs), visible)
         monkeypatch.setattr(settled, "posterior", lambda model: linear)
         found, failed = settled_posterior(MODEL, refit)
         return found, refit.asked, failed
@@ -68,7 +65,7 @@ def best_of(found: Posterior) -> Names:
 
 def test_a_strong_effect_is_refitted_and_a_weak_one_is_not(evidence: Evidence) -> None:
     strong = replace(with_residuals(evidence, {"dark_offset": 300.0}), scale_error=0.1)
-    assert posterior(strong).visible_error[OFFSET] > VISIBLE
+    assert posterior(strong).forms[Form(OFFSET)].visible_error > VISIBLE
     refit = Refitted({OFFSET: {OFFSET: -1e6}})
     found, failed = settled_posterior(strong, refit)
     assert refit.asked[0] == OFFSET and OFFSET not in failed
@@ -148,6 +145,16 @@ def test_a_refit_that_did_not_settle_counts_for_nothing(settle: Settle) -> None:
     found, asked, failed = settle({NONE: 0.0, A: 30.0, B: 20.0}, refit, 3 * VISIBLE)
     assert failed == () and next(iter(found.probabilities())) == A
     assert asked == [A] and refit.bounds == [3 * VISIBLE], "not made again"
+
+
+def test_a_field_that_leads_is_refitted_and_stays_if_its_refit_fails(settle: Settle) -> None:
+    """The plausible effects are refitted too: the field may only stand for the error of their templates."""
+    logs = {NONE: 0.0, A: 30.0, UNKNOWN: 60.0}
+    found, asked, failed = settle(logs, Refitted({A: {A: 90.0}}))
+    assert asked == [UNKNOWN, A] and failed == () and best_of(found) == A
+    found, asked, failed = settle(logs, Refitted({A: {A: 30.0}}))
+    assert asked == [UNKNOWN, A]
+    assert failed == () and best_of(found) == UNKNOWN
 
 
 def test_a_leading_effect_is_refitted_although_its_error_is_invisible(settle: Settle) -> None:

@@ -11,15 +11,17 @@ import pytest
 
 from psfcore.errors import DataError
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration, shipped_calibration, true_share
+from psfcore.gap.verdict.closure import Interval
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior
-from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement, of_effects, verdict_of
+from psfcore.gap.verdict.verdict import EARNED, LEAST_IMAGES, Judgement, earned, of_effects, verdict_of
+from tests.psfcore.gap.posteriors import of_weights
 
 A, B, C, AB, AC = ("a",), ("b",), ("c",), ("a", "b"), ("a", "c")
-ORDERS: dict[Names, float] = {("x",): 0.7, ("time",): 0.3}
+AU, BU = ("a", "unknown"), ("b", "unknown")
 
 
 def posterior_of(shares: Mapping[Names, float]) -> Posterior:
-    return Posterior({names: math.log(share) for names, share in shares.items()}, {}, ORDERS)
+    return of_weights({names: math.log(share) for names, share in shares.items()})
 
 
 def judged(
@@ -45,17 +47,39 @@ def test_the_verdict_of_every_kind_of_posterior() -> None:
         # The most probable hypothesis that names effects is stated, although it is not in the set.
         ({UNKNOWN: 0.6, NONE: 0.35, A: 0.05}, "inconclusive", A, (UNKNOWN, NONE)),
         ({UNKNOWN: 0.6, NONE: 0.4}, "inconclusive", (), (UNKNOWN, NONE)),
+        # An effect beside an unknown cause.
+        ({AU: 0.93, A: 0.04, UNKNOWN: 0.03}, "attributed", AU, (AU,)),
+        ({AU: 0.5, BU: 0.45, NONE: 0.05}, "tie", ("a", "unknown", "b"), (AU, BU)),
+        ({UNKNOWN: 0.6, AU: 0.35, NONE: 0.05}, "unknown", (), (UNKNOWN, AU)),
+        ({AU: 0.6, A: 0.35, NONE: 0.05}, "tie", AU, (AU, A)),
     ]
     # An effect in every member of a tie is certain.
-    tied: dict[Names, tuple[Names, Names]] = {B: (("b", "a"), ()), AB: (("b", "c"), A)}
+    tied: dict[tuple[Names, ...], tuple[Names, Names]] = {
+        (B, A): (("b", "a"), ()),
+        (AB, AC): (("b", "c"), A),
+        (AU, BU): (("a", "b"), UNKNOWN),
+        (AU, A): (UNKNOWN, A),
+    }
     for shares, verdict, answer, members in rows:
         found = judged(shares)
         assert (found.verdict, found.answer, found.members) == (verdict, answer, members), shares
-        assert (found.tied, found.certain) == (tied[members[0]] if verdict == "tie" else ((), ())), shares
+        assert (found.tied, found.certain) == (tied[members] if verdict == "tie" else ((), ())), shares
         assert list(found.hypotheses) == sorted(shares, key=lambda names: -shares[names])
         named = [names for names in members if names not in (NONE, UNKNOWN)]
-        assert list(found.named) == named and found.orders == ORDERS
+        assert list(found.named) == named
         assert found.best == next((n for n in found.hypotheses if n not in (NONE, UNKNOWN)), None)
+
+
+def test_a_name_that_closes_too_little_is_not_named_alone() -> None:
+    sure = judged({A: 0.93, UNKNOWN: 0.04, NONE: 0.03})
+    for low, high, verdict in ((-0.9, EARNED - 0.01, "inconclusive"), (0.1, EARNED, "attributed")):
+        found = earned(sure, Interval((low + high) / 2, low, high))
+        assert (found.verdict, found.answer) == (verdict, A)
+        assert (UNKNOWN in found.members) == (UNKNOWN in found.deciding) == (verdict == "inconclusive")
+    assert earned(sure, None) is sure, "the discs show no gap"
+    low = Interval(0.0, 0.0, 0.0)
+    for other in (judged({NONE: 0.95, A: 0.05}), judged({AU: 0.93, A: 0.04, UNKNOWN: 0.03})):
+        assert earned(other, low) is other
 
 
 def test_improbable_members_of_the_set_do_not_change_the_verdict() -> None:
