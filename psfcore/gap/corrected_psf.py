@@ -39,13 +39,13 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
     input files. Raises DataError "no-answer" if the diagnosis made no full refit, "bad-effects" if an added effect fails,
     and the errors of `Psf`.
     """
-    if not found.corrected:
+    added = found.corrected[0] if found.corrected else found.with_field
+    if added is None:
         raise DataError(
             "no-answer",
             "expected a diagnosis that names an effect and fitted it together with the PSF; got the verdict "
             f"{found.judgement.verdict}: this diagnosis has no corrected PSF",
         )
-    added = found.corrected[0]
     transit, inversion = added.solution.transit, added.solution.inversion
     return Psf(
         kernel=_kernel(added),
@@ -93,7 +93,8 @@ def _kernel(added: Corrected) -> Kernel:
     grid = (REACH_GRID_PX, REACH_GRID_PX)
     total = TotalPsf(solution.transit.diffraction, solution.inversion.shape, grid, threads=solution.threads)
     kernel = np.maximum(total.kernel(solution.inversion.coordinates), 0.0)
-    optical = [effect for effect in added.effects if effect.stage == "optics"]
+    # A field of the optics (`evidence.fields`) changes the PSF over the field, and not in the centre of the field.
+    optical = [effect for effect in added.effects if effect.stage == "optics" and not effect.exact]
     if not optical:
         return kernel
     view = _point(added, total, kernel)

@@ -83,7 +83,9 @@ class Diagnosis:
     fits, by form: of all single effects, the most probable first; then of the hypotheses that are best or decide the verdict, and of
     the fields of an unknown cause. p_value:
     the p-value of the gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by
-    form. corrected: the full refits with the named effects that were made; the refit with the best effects comes first. unknown: the
+    form. corrected: the full refits with the named effects that were made; the refit with the best effects comes first.
+    with_field: for the verdict `unknown`, the full refit with the most probable field; None if the field changes the PSF or was not
+    refitted. unknown: the
     fields of an unknown cause, if it is in the answer set. bounds: the bound of each field (`unknown.bounds`). residual,
     residual_after: the residuals of held-out images without and with the best effects. cautions: sentences on
     everything that weakens the result.
@@ -105,6 +107,7 @@ class Diagnosis:
     noise_pct: float
     shrinking: Mapping[Form, Shrinking]
     corrected: tuple[Corrected, ...]
+    with_field: Corrected | None
     unknown: tuple[UnknownField, ...]
     bounds: Mapping[Field, tuple[float, str]]
     residual: HeldOut | None
@@ -204,6 +207,9 @@ def diagnose_solution(
     best = next((form for form in fits if judged.best and form == judged.form(judged.best)), None)
     named = judged.verdict in ("attributed", "tie")
     corrected = refits.of([judged.form(names) for names in judged.named]) if refit and named else ()
+    with_field = None
+    if judged.verdict == "unknown" and told and told[0].field.stage != "optics":
+        with_field = refits.made.get(told[0].form)
     held_out = [hold_out(model, (), scheme) for scheme in (time_blocks(model), pointings(model))]
     shrinking, after = _shrinking(model, judged, fits, refits, held_out, rng)
     judged = earned(judged, None if best is None else shrinking[best].closure)
@@ -239,6 +245,7 @@ def diagnose_solution(
         else _noise_pct(model.evidence),
         shrinking=shrinking,
         corrected=corrected,
+        with_field=with_field,
         unknown=told,
         bounds=bounds(model, fields_of(model.evidence)),
         residual=before,

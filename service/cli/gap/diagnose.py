@@ -133,9 +133,21 @@ def _lines(report: dict[str, Any]) -> list[str]:
             for name, p in effect["parameters"].items()
         )
         out.append(f"  {effect['name']:<24} P = {effect['probability']:.2f}{closed}: {numbers}")
-    out += [f"  looks like: {one['form']} (P = {one['probability']:.2f})" for one in report["looks_like"]]
+    out += [f"  looks like: {_field(one)}" for one in report["unknown"]["fields"]]
     out += [f"  not testable: {one['name']} ({one['why']})" for one in report["untestable"]]
     return out + [f"  caution: {caution}" for caution in report["cautions"]]
+
+
+def _field(field: dict[str, Any]) -> str:
+    """A field of an unknown cause as text."""
+    beside = "".join(f", beside {name}" for name in field["beside"])
+    said = f"{field['words']}{beside} (P = {field['probability']:.2f})"
+    if field["strength"] is not None:
+        value, sigma = field["strength"]["value"], field["strength"]["sigma"]
+        said += f": {value:.3g} ± {sigma:.2g} {field['unit']}".rstrip()
+    if field["closure"] is not None:
+        said += f", held-out closure {100 * field['closure']['value']:.0f} %"
+    return said
 
 
 gap.add_command(blind)
