@@ -194,7 +194,7 @@ def test_the_limits_as_json(model: LinearModel) -> None:
 def test_the_leading_parameter_is_the_first_that_would_be_found_at_its_likely_size() -> None:
     def leading(**strengths: float | None) -> ParameterLimits:
         parameters = (ParameterLimits(name, "", 2.0, found, None) for name, found in strengths.items())
-        return EffectLimits("e", tuple(parameters)).leading
+        return EffectLimits(tuple(parameters)).leading
 
     assert leading(a=5.0, b=1.9, c=0.1).name == "b"
     assert leading(a=None, b=9.0, c=3.0).name == "c"
