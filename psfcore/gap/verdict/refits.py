@@ -13,10 +13,9 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of
 from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.unused_memory import return_unused_memory
 from psfcore.gap.verdict.correction import Corrected, add_to_model
 from psfcore.gap.verdict.posterior import Names, at_refit
-from psfcore.gap.view import View
+from psfcore.gap.view import View, return_unused_memory
 from psfcore.scatter.reconstruction import Progress
 
 VISIBLE_SIGMA = 2.0
