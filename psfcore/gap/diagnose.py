@@ -24,11 +24,10 @@ import numpy as np
 from psfcore.errors import DataError
 from psfcore.gap.cautions import caution_of_closure, cautions_of
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects
+from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, p_value_of_gap
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.expected_gap import ExpectedGap, expected_gap
 from psfcore.gap.evidence.fields import UNKNOWN, Field, fields_of, refittable
-from psfcore.gap.evidence.gap_test import p_value_of_gap
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
 from psfcore.gap.library.registry import LIBRARY

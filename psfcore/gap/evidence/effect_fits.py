@@ -1,8 +1,13 @@
-"""The linear fit of one or several effects, as a report states it: parameters, gain and p-value.
+"""The linear fit of one or several effects, as a report states it: parameters, gain and p-value; and the p-value of the gap.
 
 The gain of an effect is the decrease of chi2 when its parameters are fitted together with the PSF. From noise alone, a
 free parameter gains a chi2 variable with one degree of freedom, and the parameters of a random field gain less
 (`linear_model`, Eq. (3)). If an effect searched among many templates, its p-value is multiplied by their number.
+
+The p-value of the gap is the probability of residuals at least as large as these if there is no gap. The fit of the PSF alone
+is tested with four values of chi2: of the patterns that a gap of any cause produces (`patterns`), of the means of the
+discs, of all cells, and of the blocks of the unocculted field. The result is the smallest p-value of these tests, times the
+number of tests.
 """
 
 from __future__ import annotations
@@ -20,6 +25,8 @@ from psfcore.gap.evidence.linear_model import LinearModel, Step
 
 Vector = NDArray[np.float64]
 
+# Chi2 of the unocculted field may exceed its degrees of freedom by this fraction without a gap: the Sun always changes a little.
+UNOCCULTED_WIDTH = 0.03
 COST_OF_NUMBERS = 2.0  # a change that was measured in the blocks must gain this much for each measured number
 
 
@@ -65,19 +72,17 @@ def fit_effects(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool
     step = model.fit(tuple(columns))
     base = len(model.evidence.base)
     while not any_sign:
-        idle = _not_worth_its_numbers(model, step)
-        if idle is not None:
-            del columns[idle]
-            step = model.fit(tuple(columns))
-            continue
-        below = {
-            column: float(value)
-            for column, value in zip(step.columns[base:], step.values[base:], strict=True)
-            if columns[column][1].positive and value <= 0
-        }
-        if not below:
+        out = _not_worth_its_numbers(model, step)
+        if out is None:
+            below = {
+                column: float(value)
+                for column, value in zip(step.columns[base:], step.values[base:], strict=True)
+                if columns[column][1].positive and value <= 0
+            }
+            out = min(below, key=lambda column: below[column], default=None)
+        if out is None:
             break
-        del columns[min(below, key=lambda column: below[column])]
+        del columns[out]
         step = model.fit(tuple(columns))
     sigma = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
     values = {}
@@ -85,14 +90,9 @@ def fit_effects(model: LinearModel, effects: Sequence[Effect], *, any_sign: bool
         label = parameter.name if len(effects) == 1 else f"{effect.name}.{parameter.name}"
         values[label] = (float(step.values[k]), float(sigma[k]), parameter.unit)
     gain = model.gain(step)
-    return EffectFit(
-        names=tuple(effect.name for effect in effects),
-        values=values,
-        gain=gain,
-        p_value=_p_value(model, tuple(columns), gain, math.prod(effect.trials for effect in effects)),
-        step=step,
-        model=model,
-    )
+    trials = math.prod(effect.trials for effect in effects)
+    p_value = _p_value(model, tuple(columns), gain, trials)
+    return EffectFit(tuple(effect.name for effect in effects), values, gain, p_value, step, model)
 
 
 def left_chi2(model: LinearModel, step: Step) -> Vector:
@@ -117,16 +117,26 @@ def _p_value(model: LinearModel, columns: Sequence[int], gain: float, trials: fl
 
 
 def _not_worth_its_numbers(model: LinearModel, step: Step) -> int | None:
-    """Find the columns whose gain is smaller than the cost of their measured numbers. Return the one with the smallest
-    gain.
-
-    None if there is no such column.
-    """
+    """Of the columns whose gain is smaller than the cost of their measured numbers, the one with the smallest gain; None if
+    there is no such column."""
     columns = step.columns[len(model.evidence.base) :]
-    idle = {}
+    gains = {}
     for column in columns:
         numbers = model.evidence.numbers_of([column])
         gain = step.fall - model.fit([c for c in columns if c != column]).fall if numbers else 0.0
         if numbers and gain < COST_OF_NUMBERS * (1 + numbers):
-            idle[column] = gain
-    return min(idle, key=lambda column: idle[column]) if idle else None
+            gains[column] = gain
+    return min(gains, key=lambda column: gains[column], default=None)
+
+
+def p_value_of_gap(model: LinearModel) -> float:
+    """The p-value of the gap of a linear model."""
+    cells, blocks = left_chi2(model, model.base)
+    left = model.left(model.base)
+    tests = (
+        model.gain_of_patterns(model.base, model.patterns, left),
+        model.gain_of_patterns(model.base, model.means, left),
+        (cells, max(sum(one.size for one in left) - len(model.base.columns), 1)),
+        (max(blocks / (1 + UNOCCULTED_WIDTH), 0.0), max(model.evidence.steady_unocculted.freedom, 1)),
+    )
+    return min(1.0, len(tests) * min(float(chdtrc(freedom, chi2)) for chi2, freedom in tests))

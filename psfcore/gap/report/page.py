@@ -6,29 +6,18 @@ those that the verdict names as the cause of the gap ("answer" in the report).
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Callable
+import sys
 from typing import Any
 
 from psfcore.drawing.page import DASH, render, with_error
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.linear_model import FLOOR
-from psfcore.gap.report import plot
-from psfcore.gap.report.limits import PAIRS, limit_rows
-from psfcore.gap.report.report import (
-    AXIS_WORDS,
-    best_words,
-    fits_of,
-    hypothesis_words,
-    in_short_if_many,
-    percent_words,
-    tied_words,
-    words,
-)
+from psfcore.gap.report import limits, plot
+from psfcore.gap.report import report as texts
+from psfcore.gap.report.report import fits_of, hypothesis_words, in_short_if_many, percent_words, words
 from psfcore.gap.verdict.correction import ROUNDS
 from psfcore.gap.verdict.where import SIGN_FLIPS
-from psfcore.scatter.inversion import Inversion
 
 Report = dict[str, Any]
 Row = list[str]
@@ -58,7 +47,6 @@ def gap_page(found: Diagnosis, report: Report) -> str:
     started.
     """
     version = report.get("provenance", {}).get("software_version", "")
-    members = [hypothesis_words(tuple(names)) for names in report["set"]["members"]]
     optical = [words(e.name) for one in found.corrected[:1] for e in one.effects if e.stage == "optics"]
     return render(
         "gap/report/page.html",
@@ -68,19 +56,14 @@ def gap_page(found: Diagnosis, report: Report) -> str:
         found=found,
         report=report,
         plot=plot,
-        after=plot.has_after(report),
-        answer=", ".join(words(name) for name in report["answer"]),
-        answer_set="; ".join(members),
+        page=sys.modules[__name__],
+        tables=limits,
+        texts=texts,
+        answer_set="; ".join(hypothesis_words(tuple(names)) for names in report["set"]["members"]),
         optical=" and ".join(optical),
         floor_pct=f"{100 * FLOOR:g}",
-        AXIS_WORDS=AXIS_WORDS,
-        MOST_EFFECTS=plot.MOST_EFFECTS,
-        MOST_HYPOTHESES=MOST_HYPOTHESES,
-        ROUNDS=ROUNDS,
-        SIGN_FLIPS=SIGN_FLIPS,
-        VERDICTS=VERDICTS,
-        **PAIRS,
-        **_FUNCTIONS,
+        rounds=ROUNDS,
+        sign_flips=SIGN_FLIPS,
     )
 
 
@@ -160,40 +143,27 @@ def _effect_row(effect: Report) -> Row:
     ]
 
 
-def psf_table(found: Diagnosis) -> tuple[Row, list[Row]]:
+def psf_table(found: Diagnosis, report: Report) -> tuple[Row, list[Row]]:
     """The parameters and 1 - encircled energy of the PSF, without and with the named effects."""
-    before = found.solution.inversion
-    columns = [(before, found.model.base.covariance)]
-    if found.corrected:
-        columns.append((found.corrected[0].solution.inversion, found.corrected[0].covariance))
-    header = ["", "fitted", *(["with the named effects", "change (sigma)"] if found.corrected else [])]
-    rows = [_parameter_row(k, columns) for k in range(len(before.shape.parameters))]
-    return header, rows + [_curve_row(k, radius, columns) for k, radius in enumerate(before.radii_px)]
+    fits = [one for one in (report["psf"]["refitted"], report["psf"]["with_answer"]) if one is not None]
+    rows = []
+    for name, first in fits[0].items():
+        values = [(fit[name]["value"], fit[name]["sigma"]) for fit in fits]
+        rows.append([f"{name} ({first['unit']})" if first["unit"] else name, *_compared(values)])
+    curves = [found.solution.inversion, *(one.solution.inversion for one in found.corrected[:1])]
+    for k, radius in enumerate(curves[0].radii_px):
+        values = [(float(one.curve_pct[k]), float(one.curve_sigma[k])) for one in curves]
+        rows.append([f"1 - encircled energy at {radius:g} px (%)", *_compared(values)])
+    return ["", "fitted", *["with the named effects", "change (sigma)"][: len(rows[0]) - 2]], rows
 
 
-def _parameter_row(k: int, columns: list[tuple[Inversion, Any]]) -> Row:
-    parameter = columns[0][0].shape.parameters[k]
-    name = f"{parameter.name} ({parameter.unit})" if parameter.unit else f"{parameter.name}"
-    values = [inversion.values[parameter.name] for inversion, _ in columns]
-    sigma = [
-        abs(parameter.slope(float(inversion.coordinates[k]))) * math.sqrt(max(float(covariance[k, k]), 0.0))
-        for inversion, covariance in columns
-    ]
-    return [name, *_compared(values, sigma)]
-
-
-def _curve_row(k: int, radius: float, columns: list[tuple[Inversion, Any]]) -> Row:
-    values = [float(inversion.curve_pct[k]) for inversion, _ in columns]
-    sigma = [float(inversion.curve_sigma[k]) for inversion, _ in columns]
-    return [f"1 - encircled energy at {radius:g} px (%)", *_compared(values, sigma)]
-
-
-def _compared(values: list[float], sigma: list[float]) -> Row:
+def _compared(values: list[tuple[float, float]]) -> Row:
     """The values with their errors. For two values, also the second minus the first, in units of the error of the
     first."""
-    cells = [with_error(value, s) for value, s in zip(values, sigma, strict=True)]
+    cells = [with_error(*one) for one in values]
     if len(values) == 2:
-        cells.append(f"{(values[1] - values[0]) / sigma[0]:+.1f}" if sigma[0] > 0 else DASH)
+        (first, sigma), (second, _) = values
+        cells.append(f"{(second - first) / sigma:+.1f}" if sigma > 0 else DASH)
     return cells
 
 
@@ -218,12 +188,3 @@ def image_rows(report: Report) -> list[Row]:
         ]
         for row in report["images"]
     ]
-
-
-_FUNCTIONS: dict[str, Callable[..., Any]] = {
-    one.__name__: one
-    for one in (
-        *(best_words, effect_rows, hypothesis_rows, image_rows, interval_words, limit_rows),
-        *(field_rows, percent_words, psf_table, range_words, tied_words, untestable_rows),
-    )
-}

@@ -7,8 +7,9 @@ symbols the model with the named effects. Each pointing has a colour and a symbo
 
 from __future__ import annotations
 
+import itertools
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,40 +39,63 @@ CERTAIN_P = 1e-12  # a smaller p-value is written as "p < 1e-12"
 _ANSWER, _OTHER = "#0072B2", "#9a9a9a"
 # Smallest and largest closure that the chart shows; longer bars are cut.
 _NO_CLOSURE, _MOST_CLOSURE = -0.35, 1.3
-_FITTED, _ANSWERED = "Fitted model", "With the named effects"
+_TITLES = ("Fitted model", "With the named effects")
+# The cells of a disc: inner and outer radius of the ring (in radii of the dark disc), number of the sector, sectors in the ring.
+_CELLS = [(low, high, k, sectors) for low, high, sectors in RINGS for k in range(sectors)]
+
+
+def _png(width_in: float, height_in: float, draw: Callable[..., None], *data: Any) -> bytes:
+    """The figure of `draw` as PNG. data: the arguments of `draw` after the figure."""
+    figure = Figure(figsize=(width_in, height_in), dpi=PLOT_DPI, facecolor="white", layout="constrained")
+    draw(figure, *data)
+    return png_of(figure)
+
+
+def _panels(figure: Any, after: bool, **how: Any) -> list[Any]:
+    """Charts of the fitted model and, if `after`, of the model with the named effects."""
+    charts = list(np.ravel(figure.subplots(1, 1 + after, squeeze=False, **how)))
+    for axes, title in zip(charts, _TITLES, strict=False):
+        axes.set_title(title, fontsize=11)
+    return charts
 
 
 def residuals_png(report: Report) -> bytes:
     """Residuals of the discs' means against detector x, y and time, without and with the named effects."""
-    figure = _figure(WIDTH_IN, 3.7)
-    draw_residuals(figure, list(figure.subplots(1, 3, sharey=True)), report)
-    return png_of(figure)
+    return _png(WIDTH_IN, 3.7, draw_residuals, report)
 
 
-def draw_residuals(figure: Any, charts: Sequence[Any], report: Report) -> None:
+def draw_residuals(figure: Any, report: Report) -> None:
     """Draw the residuals on three charts, and one legend on the figure."""
+    charts = list(figure.subplots(1, 3, sharey=True))
     rows = report["images"]
-    before, after = _column(rows, "residual_pct"), _column(rows, "residual_after_pct")
-    noise, noise_after = _column(rows, "noise_pct"), _column(rows, "noise_after_pct")
-    pointings = sorted({row["fov"] for row in rows})
+    looks = _looks(rows)
     along = (
         ("Detector x of the disc (px)", _column(rows, "x_px")),
         ("Detector y of the disc (px)", _column(rows, "y_px")),
         ("Time from the first image (min)", _column(rows, "time_s") / 60),
     )
+    hollow: dict[str, Any] = {"mfc": "white", "mew": 1.2}
     for axes, (label, at) in zip(charts, along, strict=True):
         axes.axhline(0, color="#555555", linewidth=1.0)
-        for fov in pointings:
-            here = np.array([row["fov"] == fov for row in rows])
-            colour, symbol = _look(pointings.index(fov))
+        for here, colour, symbol in looks.values():
             style: dict[str, Any] = {"fmt": symbol, "color": colour}
-            axes.errorbar(at[here], before[here], noise[here], ms=5, elinewidth=1.1, mew=0, **style)
-            style |= {"mfc": "white", "mew": 1.2}
-            axes.errorbar(at[here], after[here], noise_after[here], ms=4.5, elinewidth=0.5, **style)
+            for what, more in (
+                ("", {"ms": 5, "elinewidth": 1.1, "mew": 0}),
+                ("after_", {"ms": 4.5, "elinewidth": 0.5, **hollow}),
+            ):
+                residual, noise = (_column(rows, f"{name}_{what}pct") for name in ("residual", "noise"))
+                axes.errorbar(at[here], residual[here], noise[here], **style, **more)
         axes.set(xlabel=label)
     charts[0].set(ylabel="Simulated - observed (%)")
+    entries: list[dict[str, Any]] = [
+        {"label": f"pointing {fov}", "color": colour, "marker": symbol}
+        for fov, (_, colour, symbol) in looks.items()
+    ]
+    if has_after(report):
+        both = [{"label": title.lower(), "color": "#555555", "marker": "o"} for title in _TITLES]
+        entries += [both[0], both[1] | hollow]
     figure.legend(
-        handles=_legend(pointings, after=has_after(report)),
+        handles=[Line2D([], [], ls="none", ms=6, **style) for style in entries],
         loc="outside upper center",
         ncols=8,
         fontsize=9,
@@ -84,47 +108,31 @@ def draw_residuals(figure: Any, charts: Sequence[Any], report: Report) -> None:
 
 def map_png(report: Report) -> bytes:
     """Every disc at its position on the detector. The colour shows its residual, without and with the named effects."""
-    panels = 2 if has_after(report) else 1
-    figure = _figure(4.95 * panels + 0.6, 4.6)
-    charts = list(np.ravel(figure.subplots(1, panels, squeeze=False)))
-    draw_map(figure, charts, report)
-    return png_of(figure)
+    return _png(4.95 * (1 + has_after(report)) + 0.6, 4.6, draw_map, report)
 
 
-def draw_map(figure: Any, charts: Sequence[Any], report: Report) -> None:
+def draw_map(figure: Any, report: Report) -> None:
     """Draw the residual of each image at the position of its disc on the detector.
 
-    First chart: the fitted model without effects. Second chart, if there is one: the model with the named effects, on
-    the same colour scale.
+    First chart: the fitted model without effects. Second chart, if there are residuals with the named effects: the model with
+    these effects, on the same colour scale.
     """
-    rows = report["images"]
-    before, after = _column(rows, "residual_pct"), _column(rows, "residual_after_pct")
+    charts, rows = _panels(figure, has_after(report)), report["images"]
+    before = _column(rows, "residual_pct")
     top = _scale(before, _column(rows, "noise_pct"))
     x, y = _column(rows, "x_px"), _column(rows, "y_px")
-    pointings = sorted({row["fov"] for row in rows})
     ny, nx = report["shape"]
     drawn = None
-    for axes, values, title in zip(charts, (before, after), (_FITTED, _ANSWERED), strict=False):
-        for fov in pointings:
-            here = np.array([row["fov"] == fov for row in rows]) & np.isfinite(values)
-            drawn = axes.scatter(
-                x[here],
-                y[here],
-                c=values[here],
-                marker=_look(pointings.index(fov))[1],
-                s=62,
-                cmap=CHANGE,
-                vmin=-top,
-                vmax=top,
-                edgecolors="#444444",
-                linewidths=0.6,
-            )
-            axes.plot([], [], _look(pointings.index(fov))[1], color="#777777", ms=7, label=f"pointing {fov}")
-        axes.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal", title=title)
+    for axes, values in zip(charts, (before, _column(rows, "residual_after_pct")), strict=False):
+        for fov, (here, _, symbol) in _looks(rows).items():
+            here = here & np.isfinite(values)
+            style = {"marker": symbol, "s": 62, "edgecolors": "#444444", "linewidths": 0.6}
+            drawn = axes.scatter(x[here], y[here], c=values[here], cmap=CHANGE, vmin=-top, vmax=top, **style)
+            axes.plot([], [], symbol, color="#777777", ms=7, label=f"pointing {fov}")
+        axes.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal")
         axes.set(xlabel="Detector x (px)", ylabel="Detector y (px)" if axes is charts[0] else "")
-        axes.title.set_fontsize(11)
     charts[0].legend(fontsize=8.5, loc="best", framealpha=0.85, edgecolor="none")
-    figure.colorbar(drawn, ax=list(charts), label="Simulated - observed (%)", shrink=0.85)
+    figure.colorbar(drawn, ax=charts, label="Simulated - observed (%)", shrink=0.85)
     tidy(charts)
 
 
@@ -132,77 +140,67 @@ def unknown_png(report: Report) -> bytes:
     """The most probable field of an unknown cause: a map of the detector with its errors, or a curve."""
     field = report["unknown"]["fields"][0]
     label = f"{field['form'].replace('_', ' ').capitalize()} {field['unit'] and '(' + field['unit'] + ')'}".rstrip()
-    if "curve" in field:
-        at, values, sigma = field["curve"].values()
-        in_psf = "radius_px" in field["curve"]
-        figure = _figure(7.0, 3.4)
-        axes = figure.subplots()
-        axes.errorbar(at, values, sigma, fmt="o", ms=4, color=_ANSWER, ecolor=_OTHER)
-        axes.axhline(0.0, color="#777777", lw=0.8)
-        axes.set(xlabel="Radius in the PSF (px)" if in_psf else "Time (s)", ylabel=label)
-        if in_psf:
-            axes.set_xscale("log")
-        tidy([axes])
-        return png_of(figure)
+    size, draw = ((7.0, 3.4), _draw_curve) if "curve" in field else ((10.0, 4.4), _draw_field)
+    return _png(*size, draw, report, field, label)
+
+
+def _draw_curve(figure: Any, report: Report, field: Report, label: str) -> None:
+    at, values, sigma = field["curve"].values()
+    in_psf = "radius_px" in field["curve"]
+    axes = figure.subplots()
+    axes.errorbar(at, values, sigma, fmt="o", ms=4, color=_ANSWER, ecolor=_OTHER)
+    axes.axhline(0.0, color="#777777", lw=0.8)
+    axes.set(xlabel="Radius in the PSF (px)" if in_psf else "Time (s)", ylabel=label)
+    if in_psf:
+        axes.set_xscale("log")
+    tidy([axes])
+
+
+def _draw_field(figure: Any, report: Report, field: Report, label: str) -> None:
     values, sigma = (np.array(field["map"][name]) for name in ("value", "sigma"))
-    figure = _figure(10.0, 4.4)
     charts = figure.subplots(1, 2)
     ny, nx = report["shape"]
-    edges = (-0.5, nx - 0.5, -0.5, ny - 0.5)
     clearest = abs(field["strength"]["value"])
     seen = np.where(sigma < clearest, values, np.nan)  # elsewhere the prior decides, not the data
     for axes, plane, title, top, name in (
         (charts[0], seen, "The field, where its error is smaller", 1.2 * clearest, label),
         (charts[1], values / sigma, "The field divided by its error", 5.0, "sigma"),
     ):
-        drawn = axes.imshow(plane, origin="lower", extent=edges, cmap=CHANGE, vmin=-top, vmax=top)
+        style = {"extent": (-0.5, nx - 0.5, -0.5, ny - 0.5), "cmap": CHANGE, "vmin": -top, "vmax": top}
+        drawn = axes.imshow(plane, origin="lower", **style)
         axes.set(title=title, xlabel="Detector x (px)", ylabel="Detector y (px)")
         axes.plot(*(_column(report["images"], name) for name in ("x_px", "y_px")), ".", color="#333333", ms=3)
         figure.colorbar(drawn, ax=axes, label=name, shrink=0.85)
     tidy(list(charts))
-    return png_of(figure)
 
 
 def cells_png(found: Diagnosis) -> bytes:
     """The residual of each cell, averaged over all images, without and with the named effects."""
-    panels = 2 if found.corrected else 1
-    figure = _figure(4.2 * panels + 0.9, 4.2)
-    draw_cells(figure, list(np.ravel(figure.subplots(1, panels, squeeze=False))), found)
-    return png_of(figure)
+    return _png(4.2 * (1 + bool(found.corrected)) + 0.9, 4.2, draw_cells, found)
 
 
-def draw_cells(figure: Any, charts: Sequence[Any], found: Diagnosis) -> None:
-    """Draw each cell as a sector of a ring. The second chart, if there is one, shows the model with the named effects."""
-    maps = [cell_means(found.evidence.discs)]
-    if found.corrected:
-        maps.append(cell_means(found.corrected[0].evidence.discs))
+def draw_cells(figure: Any, found: Diagnosis) -> None:
+    """Draw each cell as a sector of a ring. The second chart, if effects are named, shows the model with the named effects."""
+    charts = _panels(figure, bool(found.corrected))
+    evidences = [found.evidence, *(one.evidence for one in found.corrected[:1])]
+    maps = [cell_means(evidence.discs) for evidence in evidences]
     top = _scale(*maps[0])
-    for axes, (means, errors), title in zip(charts, maps, (_FITTED, _ANSWERED), strict=False):
-        for number, (low, high, sector, sectors) in enumerate(_places()):
-            if not np.isfinite(means[number]):
+    for axes, (means, errors) in zip(charts, maps, strict=True):
+        for (low, high, sector, sectors), mean, error in zip(_CELLS, means, errors, strict=True):
+            if not np.isfinite(mean):
                 continue
             width = 360 / sectors
             first = sector * width - width / 2
-            share = float(np.clip(means[number] / top, -1, 1))
-            colour = CHANGE((share + 1) / 2)
-            axes.add_patch(
-                Wedge((0, 0), high, first, first + width, width=high - low, fc=colour, ec="white", lw=1.0)
-            )
+            share = float(np.clip(mean / top, -1, 1))
+            style = {"fc": CHANGE((share + 1) / 2), "ec": "white", "lw": 1.0}
+            axes.add_patch(Wedge((0, 0), high, first, first + width, width=high - low, **style))
             angle, middle = np.radians(sector * width), (low + high) / 2 if low else 0.0
-            axes.text(
-                middle * np.cos(angle),
-                middle * np.sin(angle),
-                f"{means[number]:+.1f}\n±{errors[number]:.1f}",
-                ha="center",
-                va="center",
-                fontsize=8,
-                linespacing=1.05,
-                color="white" if abs(share) > _DARK else INK,
-            )
+            style = {"color": "white" if abs(share) > _DARK else INK, "fontsize": 8, "linespacing": 1.05}
+            place = middle * np.cos(angle), middle * np.sin(angle)
+            axes.text(*place, f"{mean:+.1f}\n±{error:.1f}", ha="center", va="center", **style)
         axes.add_patch(Circle((0, 0), 1.0, fc="none", ec="#555555", lw=1.0))
-        axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal", title=title)
+        axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
         axes.set(xlabel="x from the centre (radii of the dark disc)")
-        axes.title.set_fontsize(11)
         for side in axes.spines.values():
             side.set_visible(False)
     charts[0].set(ylabel="y from the centre (radii of the dark disc)")
@@ -213,8 +211,7 @@ def cell_means(discs: Sequence[DiscCells]) -> tuple[Vector, Vector]:
 
     NaN if no disc has the cell.
     """
-    places = _places()
-    sums, variance, count = (np.zeros(len(places)) for _ in range(3))
+    sums, variance, count = (np.zeros(len(_CELLS)) for _ in range(3))
     for disc in discs:
         noise = np.sqrt(np.diag(disc.covariance))
         for k, number in enumerate(_numbers(disc)):
@@ -234,16 +231,8 @@ def _scale(values: Vector, noise: Vector) -> float:
     return max(float(np.nanmax(np.abs(values), initial=0.0)), 3 * typical, 1e-3)
 
 
-def _places() -> list[tuple[float, float, int, int]]:
-    """The cells of a disc: inner and outer radius of the ring, number of the sector, number of sectors in the ring.
-
-    Radii are in units of the radius of the dark disc.
-    """
-    return [(low, high, k, sectors) for low, high, sectors in RINGS for k in range(sectors)]
-
-
 def _numbers(disc: DiscCells) -> list[int]:
-    """For each cell of a disc, its index in `_places`. Cells with too few pixels are missing from the disc."""
+    """For each cell of a disc, its index in `_CELLS`. Cells with too few pixels are missing from the disc."""
     out = []
     for radius, azimuth in zip(disc.radius, disc.azimuth, strict=True):
         ring = next(k for k, (_, high, _) in enumerate(RINGS) if radius < high or k == len(RINGS) - 1)
@@ -255,29 +244,22 @@ def _numbers(disc: DiscCells) -> list[int]:
 
 def where_png(report: Report) -> bytes:
     """The share of the gap along each axis."""
-    figure = _figure(7.4, 0.9 + 0.32 * len(report["where"]))
-    draw_where(figure.subplots(), report)
-    return png_of(figure)
+    return _png(7.4, 0.9 + 0.32 * len(report["where"]), lambda figure: draw_where(figure.subplots(), report))
 
 
 def effects_png(report: Report) -> bytes:
     """The closure by each effect on held-out images, best effect first."""
-    figure = _figure(WIDTH_IN, 1.1 + 0.34 * min(len(fits_of(report)), MOST_EFFECTS))
-    draw_effects(figure.subplots(), report)
-    return png_of(figure)
+    height_in = 1.1 + 0.34 * min(len(fits_of(report)), MOST_EFFECTS)
+    return _png(WIDTH_IN, height_in, lambda figure: draw_effects(figure.subplots(), report))
 
 
 def slices_png(found: Diagnosis) -> bytes:
     """Light along x through the occulter with the largest residual: observed, and simulated without and with the named effects."""
-    panels = 2 if found.corrected else 1
-    figure = _figure(4.95 * panels + 0.1, 3.7)
-    draw_slices(list(np.ravel(figure.subplots(1, panels, squeeze=False, sharey=True))), found)
-    return png_of(figure)
+    return _png(4.95 * (1 + bool(found.corrected)) + 0.1, 3.7, _draw_slices, found)
 
 
-def draw_slices(charts: Sequence[Any], found: Diagnosis) -> None:
-    """Draw the slice without effects on the first chart; with the named effects on the second chart, if there is one."""
-    n = largest_residual(found)
+def _draw_slices(figure: Any, found: Diagnosis) -> None:
+    charts, n = _panels(figure, bool(found.corrected), sharey=True), largest_residual(found)
     solution = found.solution
     frame, place = solution.transit.frames[n], solution.sky.found[n].place
     rows, columns = solution.sky.dark[n]
@@ -289,26 +271,22 @@ def draw_slices(charts: Sequence[Any], found: Diagnosis) -> None:
     seen = frame.pixels[band, first:last].astype(np.float64)
     noise = np.sqrt(solution.transit.noise.variance(seen, frame.exposure_s).sum(axis=0)) / seen.shape[0]
     inside = columns[rows == middle] - centre
-    simulated = [(_BEFORE, simulated_of(found, n))]
-    if found.corrected:
-        simulated.append((_AFTER, simulated_of(found, n, with_answer=True)))
+    simulated = [
+        simulated_of(found, n, with_answer=answer)[band, first:last].mean(axis=0)
+        for answer in (False, True)[: len(charts)]
+    ]
     # The scale shows the light in the disc: the light around the disc may be a hundred times as bright.
     dark = np.isin(np.arange(first, last), columns[rows == middle])
-    inner = [seen.mean(axis=0)[dark], *(plane[band, first:last].mean(axis=0)[dark] for _, plane in simulated)]
-    top = 2.2 * float(np.max(inner, initial=1e-9))
-    for axes, (colour, plane), title in zip(charts, simulated, (_FITTED, _ANSWERED), strict=False):
+    observed = seen.mean(axis=0)
+    top = 2.2 * float(np.max([one[dark] for one in (observed, *simulated)], initial=1e-9))
+    for axes, colour, line in zip(charts, (_BEFORE, _AFTER), simulated, strict=False):
         if inside.size:
             axes.axvspan(inside.min() - 0.5, inside.max() + 0.5, color="#eeeeee", linewidth=0, zorder=0)
-        points: dict[str, Any] = {"fmt": "o", "color": _OBSERVED, "ms": 3.8, "elinewidth": 0.9}
-        axes.errorbar(x, seen.mean(axis=0), noise, label="observed", **points)
-        axes.plot(x, plane[band, first:last].mean(axis=0), color=colour, linewidth=1.8, label="simulated")
-        axes.set(
-            xlim=(-_SLICE_PX, _SLICE_PX),
-            ylim=(min(0.0, float(seen.mean(axis=0).min())) - 0.05 * top, top),
-            title=title,
-        )
+        style = {"fmt": "o", "color": _OBSERVED, "ms": 3.8, "elinewidth": 0.9}
+        axes.errorbar(x, observed, noise, label="observed", **style)
+        axes.plot(x, line, color=colour, linewidth=1.8, label="simulated")
+        axes.set(xlim=(-_SLICE_PX, _SLICE_PX), ylim=(min(0.0, float(observed.min())) - 0.05 * top, top))
         axes.set(xlabel="Offset from the occulter's centre along x (px)")
-        axes.title.set_fontsize(11)
         axes.legend(fontsize=8.5, loc="upper center", framealpha=0.85, edgecolor="none", ncols=2)
     charts[0].set(ylabel="Intensity (DN/s)")
     tidy(charts)
@@ -340,11 +318,10 @@ def gap_figure(found: Diagnosis, report: Report) -> Figure:
     words = "\n".join(textwrap.wrap(report["sentence"], 165))
     figure.suptitle(words, fontsize=12.5, color=INK, x=0.012, ha="left", linespacing=1.4)
     bands: Any = figure.subfigures(3, 1, height_ratios=(1.0, 1.05, 1.1))
-    draw_residuals(bands[0], list(bands[0].subplots(1, 3, sharey=True)), report)
+    draw_residuals(bands[0], report)
     left, right = bands[1].subfigures(1, 2, width_ratios=(1.25, 1.0))
-    draw_map(left, list(np.ravel(left.subplots(1, 2 if has_after(report) else 1, squeeze=False))), report)
-    panels = 2 if found.corrected else 1
-    draw_cells(right, list(np.ravel(right.subplots(1, panels, squeeze=False))), found)
+    draw_map(left, report)
+    draw_cells(right, found)
     where, effects = bands[2].subfigures(1, 2, width_ratios=(0.85, 1.15))
     draw_where(where.subplots(), report)
     draw_effects(effects.subplots(), report)
@@ -361,28 +338,11 @@ def _column(rows: Sequence[dict[str, Any]], name: str) -> Vector:
     return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
 
 
-def _look(number: int) -> tuple[str, str]:
-    return _COLOURS[number % len(_COLOURS)], _SYMBOLS[number % len(_SYMBOLS)]
-
-
-def _legend(pointings: Sequence[int], *, after: bool) -> list[Any]:
-    handles = []
-    for number, fov in enumerate(pointings):
-        colour, symbol = _look(number)
-        handles.append(Line2D([], [], color=colour, marker=symbol, ls="none", ms=6, label=f"pointing {fov}"))
-    if after:
-        handles.append(Line2D([], [], color="#555555", marker="o", ls="none", ms=6, label="fitted model"))
-        style: dict[str, Any] = {"mfc": "white", "mew": 1.2}
-        handles.append(
-            Line2D(
-                [], [], color="#555555", marker="o", ls="none", ms=6, label="with the named effects", **style
-            )
-        )
-    return handles
-
-
-def _figure(width_in: float, height_in: float) -> Any:
-    return Figure(figsize=(width_in, height_in), dpi=PLOT_DPI, facecolor="white", layout="constrained")
+def _looks(rows: Sequence[dict[str, Any]]) -> dict[int, tuple[NDArray[np.bool_], str, str]]:
+    """For each pointing: which images belong to it (images,), its colour and its symbol."""
+    pointing = _column(rows, "fov")
+    looks = itertools.cycle(zip(_COLOURS, _SYMBOLS, strict=True))
+    return {int(fov): (pointing == fov, *look) for fov, look in zip(np.unique(pointing), looks, strict=False)}
 
 
 # --- bars -------------------------------------------------------------------------------------------------

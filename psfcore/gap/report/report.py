@@ -15,10 +15,10 @@ from scipy.special import chdtrc
 
 from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.effect import Effect
+from psfcore.gap.evidence.effect_fits import left_chi2
 from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
 from psfcore.gap.evidence.fields import Field, FieldShape
-from psfcore.gap.verdict.closure import Interval
-from psfcore.gap.verdict.correction import Corrected
+from psfcore.gap.verdict.closure import HeldOut
 from psfcore.gap.verdict.posterior import NONE, Form, Names
 from psfcore.gap.verdict.unknown import UnknownField
 from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement
@@ -46,9 +46,9 @@ AXIS_WORDS = {
 def gap_report(found: Diagnosis) -> dict[str, Any]:
     """The report of a diagnosis, schema gap/2."""
     judged = found.judgement
-    refits = {c.label: c for c in found.corrected}
-    fits = [(form, _effect(found, form, refits.get(fit.label))) for form, fit in found.fits.items()]
+    fits = [(form, _fit(found, form)) for form in found.fits]
     stated = found.limits.as_json()
+    refit = found.corrected[0] if found.corrected else None
     return {
         "schema": SCHEMA,
         "sentence": sentence(found),
@@ -88,9 +88,7 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "psf": {
             "shape": found.solution.inversion.shape.name,
             "refitted": _values(found.solution.inversion, found.model.base.covariance),
-            "with_answer": _values(found.corrected[0].solution.inversion, found.corrected[0].covariance)
-            if found.corrected
-            else None,
+            "with_answer": refit and _values(refit.solution.inversion, refit.covariance),
         },
         "shape": list(found.solution.transit.shape),
         "images": _images(found),
@@ -140,7 +138,7 @@ def _field(found: Diagnosis, one: UnknownField) -> dict[str, Any]:
         "words": one.field.words,
         "strength": None if value is None else dict(zip(("value", "sigma"), value, strict=True)),
         **axes,
-        "closure": None if shrinking is None else _interval(shrinking.closure),
+        "closure": shrinking and shrinking.closure and shrinking.closure.to_json(),
         "resembles": [{"effect": name, "distance": distance} for name, distance in one.resembles],
     }
 
@@ -168,10 +166,10 @@ def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, 
 
     covariance: the covariance of the coordinates, from the linear model.
     """
-    values, sigma = inversion.values, np.sqrt(np.diag(covariance))
+    sigma = np.sqrt(np.diag(covariance))
     return {
         p.name: {
-            "value": values[p.name],
+            "value": inversion.values[p.name],
             "sigma": float(abs(p.slope(float(at))) * s),
             "unit": p.unit,
         }
@@ -179,47 +177,44 @@ def _values(inversion: Inversion, covariance: NDArray[np.float64]) -> dict[str, 
     }
 
 
-def _by_name(found: Diagnosis, name: str) -> Effect:
-    return next(effect for effect in found.evidence.effects if effect.name == name)
+def _by_name(found: Diagnosis, names: Names) -> list[Effect]:
+    effects = {effect.name: effect for effect in found.evidence.effects}
+    return [effects[name] for name in names]
 
 
-def _effect(found: Diagnosis, form: Form, refit: Corrected | None) -> dict[str, Any]:
-    fit, shrinking = found.fits[form], found.shrinking[form]
-    values = fit.values if refit is None else refit.values
+def _fit(found: Diagnosis, form: Form) -> dict[str, Any]:
+    """The fit of one or several effects, with the parameters of their full refit if there is one."""
+    fit, shrinking, judged = found.fits[form], found.shrinking[form], found.judgement
+    refit = next((one for one in found.corrected if one.label == fit.label), None)
     alone = len(fit.names) == 1 and form.field is None
-    share = found.judgement.effects.get(fit.names[0], 0.0) if alone else None
     effects = {effect.name: effect for effect in fit.model.evidence.effects}
     return {
         "name": fit.label,
-        "probability": found.judgement.hypotheses.get(fit.names, 0.0) if share is None else share,
+        "probability": judged.effects.get(fit.names[0], 0.0)
+        if alone
+        else judged.hypotheses.get(fit.names, 0.0),
         "parameters": {
             name: {"value": value, "sigma": sigma, "unit": unit}
-            for name, (value, sigma, unit) in values.items()
+            for name, (value, sigma, unit) in (refit or fit).values.items()
         },
         "p_value": fit.p_value,
         "delta_chi2": fit.gain,
         "delta_chi2_held_out": shrinking.held_out_fall,
-        "closure": _interval(shrinking.closure),
-        "closure_by_pointing": _interval(shrinking.closure_by_pointing),
+        "closure": shrinking.closure and shrinking.closure.to_json(),
+        "closure_by_pointing": shrinking.closure_by_pointing and shrinking.closure_by_pointing.to_json(),
         "refitted": refit is not None,
         "cause": " ".join(effects[name].cause for name in fit.names),
     }
 
 
-def _interval(interval: Interval | None) -> dict[str, Any] | None:
-    return None if interval is None else interval.to_json()
-
-
 def _images(found: Diagnosis) -> list[dict[str, Any]]:
     """The disc of every image: its position, its brightness, and its held-out residuals without and with the named effects."""
-    before, after = found.residual, found.residual_after
-    at_before = {} if before is None else dict(zip(before.images, before.residual_pct, strict=True))
-    noise = {} if before is None else dict(zip(before.images, before.noise_pct, strict=True))
-    at_after = {} if after is None else dict(zip(after.images, after.residual_pct, strict=True))
-    noise_after = {} if after is None else dict(zip(after.images, after.noise_pct, strict=True))
+    before, after = _residuals(found.residual), _residuals(found.residual_after)
     out = []
     for disc in found.evidence.discs:
         taken = found.evidence.image_info[disc.index]
+        residual, noise = before.get(disc.index, (None, None))
+        residual_after, noise_after = after.get(disc.index, (None, None))
         out.append(
             {
                 "file": taken.file,
@@ -230,25 +225,29 @@ def _images(found: Diagnosis) -> list[dict[str, Any]]:
                 "exposure_s": taken.exposure_s,
                 "gain_mode": taken.gain_mode,
                 "observed_dn_s": disc.observed,
-                "residual_pct": _number(at_before.get(disc.index)),
-                "noise_pct": _number(noise.get(disc.index)),
-                "residual_after_pct": _number(at_after.get(disc.index)),
-                "noise_after_pct": _number(noise_after.get(disc.index)),
+                "residual_pct": residual,
+                "noise_pct": noise,
+                "residual_after_pct": residual_after,
+                "noise_after_pct": noise_after,
             }
         )
     return out
 
 
-def _number(value: Any) -> float | None:
-    return None if value is None else float(value)
+def _residuals(held_out: HeldOut | None) -> dict[int, tuple[float, float]]:
+    """The residual and the noise of each held-out image, in percent, by the number of the image."""
+    if held_out is None:
+        return {}
+    percents = zip(held_out.residual_pct.tolist(), held_out.noise_pct.tolist(), strict=True)
+    return dict(zip(held_out.images, percents, strict=True))
 
 
 def would_separate(found: Diagnosis) -> str:
     """The observations that would separate the tied effects, as text; empty for other verdicts."""
     if found.judgement.verdict != "tie":
         return ""
-    said = [_by_name(found, name).settled_by for name in found.judgement.tied if name != UNKNOWN_NAME]
-    return "; ".join(dict.fromkeys(said))
+    tied = tuple(name for name in found.judgement.tied if name != UNKNOWN_NAME)
+    return "; ".join(dict.fromkeys(effect.settled_by for effect in _by_name(found, tied)))
 
 
 def sentence(found: Diagnosis) -> str:
@@ -337,15 +336,10 @@ def percent_words(share: float) -> str:
 def _unocculted_alone(found: Diagnosis) -> bool:
     """Whether the blocks of the unocculted field show a gap, but the cells of the discs do not."""
     model = found.model
-    left = model.left(model.base)
-    cells = sum(float(one @ one) for one in left)
-    freedom = sum(one.size for one in left)
-    unocculted = model.evidence.steady_unocculted
-    return bool(
-        chdtrc(freedom, cells)
-        > VISIBLE_P
-        > chdtrc(unocculted.freedom, max(model.left_unocculted(model.base), 0.0))
-    )
+    cells, blocks = left_chi2(model, model.base)
+    freedom = sum(disc.residual.size for disc in model.discs)
+    free_blocks = model.evidence.steady_unocculted.freedom
+    return bool(chdtrc(freedom, cells) > VISIBLE_P > chdtrc(free_blocks, max(blocks, 0.0)))
 
 
 def _explained(found: Diagnosis) -> str:

@@ -23,8 +23,7 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, left_chi2
 from psfcore.gap.evidence.evidence import Evidence, gather, residuals_at
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.unused_memory import return_unused_memory
-from psfcore.gap.view import View
+from psfcore.gap.view import View, return_unused_memory
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.transit.transit import Transit

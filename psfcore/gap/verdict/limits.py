@@ -293,7 +293,7 @@ class _Hypotheses:
             fewer = self._acting(effect, [c for c in columns if c == column or not prior.positive[c]])
             # A single positive parameter has twice the weight.
             fewer = replace(fewer, offset=fewer.offset + 2 * math.log(2) * bool(prior.positive[column]))
-            change, seen = self._normal[:, number], float(self._normal[number, number])
+            change, seen = self._normal[:, [number]], float(self._normal[number, number])
             likely_size = float(prior.likely[column])
             found.append(self._strength(effect, change, seen, (single, fewer), likely_size, margin))
         return found
@@ -301,7 +301,7 @@ class _Hypotheses:
     def _strength(
         self,
         effect: Effect,
-        change: Matrix | Vector,
+        change: Matrix,
         seen: float,
         own: Sequence[_Hypothesis],
         likely: float,
@@ -310,9 +310,9 @@ class _Hypotheses:
         """The smallest strength that would be found. change: the columns of N of the true effect. seen: the chi2 of a strength
         of 1. own: hypotheses that the effect acts; the mean of their ln E counts."""
         rivals = [*(h for name, h in self._single.items() if name != effect.name), *self._unknown]
-        if change.ndim == 1:  # a rival that would have to be negative cannot act
-            rivals = [h for h in rivals if not (h.one_sided and change[h.columns[0]] <= 0)]
-        odds = [_odds_of(h, change, self._likelihood.gained) for h in (*own, *rivals)]
+        if not effect.field:  # a rival that would have to be negative cannot act
+            rivals = [h for h in rivals if not (h.one_sided and change[h.columns[0], 0] <= 0)]
+        odds = [_odds_of(h, change, self._likelihood.gained, effect.field) for h in (*own, *rivals)]
 
         def margin_at(strengths: Vector) -> Vector:
             found = np.array([one(strengths) for one in odds])
@@ -417,54 +417,46 @@ def _explained(inner: Matrix, score: Vector, positive: NDArray[np.bool_]) -> flo
 
 
 def _odds_of(
-    hypothesis: _Hypothesis, change: Matrix | Vector, gained: Callable[[Vector], Vector]
+    hypothesis: _Hypothesis, change: Matrix, gained: Callable[[Vector], Vector], random: bool
 ) -> Callable[[Vector], Vector]:
     """A function of the strength: Eq. (2) with the 1 - FOUND quantile of q_h.
 
-    change: the columns of N that belong to the true effect: one column for a fixed change, several for a random field.
-    gained: the gain of ln L by a decrease of chi2.
+    change: the columns of N that belong to the true effect (columns of N, columns of the effect). random: whether the effect is
+    a random field. gained: the gain of ln L by a decrease of chi2.
     """
-    spread, cumulants = [], []
+    spread, sums = [], []
     for values, along in hypothesis.modes:
-        to_score = along @ change[hypothesis.columns]
         spread.append(float(np.log1p(values).sum()))
-        cumulants.append(
-            _cumulants(values, to_score) if change.ndim == 1 else cumulants_of_field(values, to_score)
-        )
+        sums.append(cumulants(values, along @ change[hypothesis.columns], random=random))
     offsets = hypothesis.offset - np.array(spread) / 2
 
     def odds(strengths: Vector) -> Vector:
         powers = strengths[:, None] ** (2 * np.arange(4))
         found = [
             offset + gained(quantile_of_sum(powers @ c.T, 1 - FOUND))
-            for offset, c in zip(offsets, cumulants, strict=True)
+            for offset, c in zip(offsets, sums, strict=True)
         ]
         return np.asarray(np.logaddexp.reduce(found) - math.log(len(found)))
 
     return odds
 
 
-def _cumulants(values: Vector, score: Vector) -> Matrix:
-    """c_1, c_2, c_3 of Eq. (1) as polynomials of the squared strength (3, powers). score: V^T W N_Hj."""
+def cumulants(values: Vector, score: Matrix, *, random: bool) -> Matrix:
+    """c_1, c_2, c_3 of Eq. (1) as polynomials of the squared strength (3, powers).
+
+    score: V^T W N_HE (eigenvectors, columns of the true effect). random: whether the effect is a random field; otherwise it
+    has one column.
+    """
     out = np.zeros((3, 4))
-    for r in (1, 2, 3):
-        out[r - 1, 0] = np.sum((values / (1 + values)) ** r)
-        out[r - 1, 1] = r * np.sum(values ** (r - 1) * score**2 / (1 + values) ** r)
-    return out
-
-
-def cumulants_of_field(values: Vector, score: Matrix) -> Matrix:
-    """The same for a random field. score: (eigenvectors, columns of the field)."""
     shrink = 1 / (1 + values)
-    noise = np.diag(values * shrink)
-    field = shrink[:, None] * (score @ score.T)
-    out = np.zeros((3, 4))
-    out[0, :2] = np.trace(noise), np.trace(field)
-    out[1, :3] = np.sum(noise * noise), 2 * np.sum(noise * field), np.sum(field * field.T)
-    out[2, 0] = np.trace(noise @ noise @ noise)
-    out[2, 1] = 3 * np.trace(noise @ noise @ field)
-    out[2, 2] = 3 * np.trace(noise @ field @ field)
-    out[2, 3] = np.trace(field @ field @ field)
+    noise, size = values * shrink, shrink * (score**2).sum(axis=1)
+    for r in (1, 2, 3):
+        out[r - 1, :2] = np.sum(noise**r), r * np.sum(noise ** (r - 1) * size)
+    if random:
+        field = shrink[:, None] * (score @ score.T)
+        out[1, 2] = np.sum(field * field.T)
+        out[2, 2] = 3 * np.sum((noise[:, None] * field) * field.T)
+        out[2, 3] = np.sum((field @ field) * field.T)
     return out
 
 

@@ -15,10 +15,9 @@ from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of
 from psfcore.gap.evidence.fields import LIKELY, Field, FieldColumns, with_field, with_likely
 from psfcore.gap.evidence.likelihood import SCALES, Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.unused_memory import return_unused_memory
 from psfcore.gap.verdict.correction import Corrected, add_to_model
 from psfcore.gap.verdict.posterior import Form, at_refit, name_of
-from psfcore.gap.view import View
+from psfcore.gap.view import View, return_unused_memory
 from psfcore.scatter.reconstruction import Progress
 
 VISIBLE_SIGMA = 2.0

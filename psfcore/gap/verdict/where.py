@@ -68,38 +68,46 @@ def where(
     the residuals.
     """
     designs = _designs(model.evidence)
-    cells, unocculted = _of_cells(model, designs), _of_unocculted(model, designs)
-    disc = cells.equations([one.residual for one in model.discs])
-    seen = disc if explained is None else cells.equations(_explained(model, explained))
+    spans, columns = {}, 0
+    for name, patterns in designs.items():
+        spans[name] = list(range(columns, columns := columns + patterns[0].shape[0]))
     names = list(designs)
-    spans = _spans(designs)
-    subset = {
-        chosen: _fall(seen, unocculted, [c for name in chosen for c in spans[name]])
-        for size in range(len(names) + 1)
-        for chosen in itertools.combinations(names, size)
-    }
+    design, absorbed = _of_cells(model, designs)
+    normal = design @ design.T
+
+    def left(of_discs: Sequence[Vector]) -> Vector:
+        """The residuals of all discs in one vector, without the component that a change of the PSF can absorb."""
+        residual = np.concatenate(of_discs)
+        return np.asarray(residual - absorbed @ (absorbed.T @ residual))
+
+    residual = left([one.residual for one in model.discs])
+    score = (design @ residual)[None]
+    seen = score if explained is None else (design @ left(_explained(model, explained)))[None]
+    in_blocks, score_of_blocks = _of_unocculted(model, designs)
+    subset = {}
+    for chosen in itertools.chain(*(itertools.combinations(names, size) for size in range(len(names) + 1))):
+        here = [c for name in chosen for c in spans[name]]
+        subset[chosen] = float((_falls(normal, seen, here) + _falls(in_blocks, score_of_blocks, here))[0])
     shares = shapley(names, subset)
     total = max(sum(max(share, 0.0) for share in shares.values()), 1e-300)
-    flips = _sign_flipped_scores(model, cells, rng)
-    out = []
-    for name in names:
-        alone = subset[(name,)]
-        beaten = int((_falls(disc.normal, flips, spans[name]) >= _fall_of(disc, spans[name])).sum())
-        p_value = min(1.0, (1 + beaten) / (1 + SIGN_FLIPS) * len(names))
-        if _fall_of(unocculted, spans[name]) > 0:
-            p_value = min(p_value, _p_of_unocculted(unocculted, spans[name], len(names)))
-        out.append(Axis(name, max(shares[name], 0.0) / total, p_value, alone, _at(model, name)))
-    best = max((axis.alone for axis in out), default=0.0)
-    return tuple(
-        sorted(
-            out,
-            key=lambda a: (
-                not (a.name in favoured and a.alone >= AS_GOOD * best),
-                a.p_value > SIGNIFICANT,
-                -a.share,
-            ),
-        )
-    )
+    signs = np.array([rng.choice((-1.0, 1.0), len(model.discs)) for _ in range(SIGN_FLIPS)])
+    flips = (np.repeat(signs, [d.residual.size for d in model.discs], axis=1) * residual) @ design.T
+    axes = []
+    for name, here in spans.items():
+        as_good = int((_falls(normal, flips, here) >= _falls(normal, score, here)).sum())
+        p_value = min(1.0, (1 + as_good) / (1 + SIGN_FLIPS) * len(names))
+        of_blocks = float(_falls(in_blocks, score_of_blocks, here)[0])
+        if of_blocks > 0:
+            p_value = min(p_value, len(names) * float(chdtrc(len(here), of_blocks + len(here))))
+        share = max(shares[name], 0.0) / total
+        axes.append(Axis(name, share, p_value, subset[(name,)], _at(model, name)))
+    best = max((axis.alone for axis in axes), default=0.0)
+
+    def rank(axis: Axis) -> tuple[bool, bool, float]:
+        first = axis.name in favoured and axis.alone >= AS_GOOD * best
+        return not first, axis.p_value > SIGNIFICANT, -axis.share
+
+    return tuple(sorted(axes, key=rank))
 
 
 def _designs(evidence: Evidence) -> dict[str, list[Matrix]]:
@@ -157,42 +165,9 @@ def _kinds(values: Vector) -> Matrix | None:
     return np.array([(values == kind) - np.mean(values == kind) for kind in kinds[1:]])
 
 
-def _spans(designs: dict[str, list[Matrix]]) -> dict[str, list[int]]:
-    first, out = 0, {}
-    for name, patterns in designs.items():
-        out[name] = list(range(first, first + patterns[0].shape[0]))
-        first += patterns[0].shape[0]
-    return out
-
-
-@dataclass(frozen=True, eq=False)
-class _Normal:
-    normal: Matrix
-    score: Vector
-
-
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """The whitened cells of all discs.
-
-    design: the patterns of the axes (patterns, cells), without the component that a change of the PSF can absorb. absorbed: an
-    orthonormal basis of that component (cells, coordinates).
-    """
-
-    design: Matrix
-    absorbed: Matrix
-
-    def left(self, of_discs: Sequence[Vector]) -> Vector:
-        """The residuals of all discs in one vector, without the component that a change of the PSF can absorb."""
-        residual = np.concatenate(of_discs)
-        return np.asarray(residual - self.absorbed @ (self.absorbed.T @ residual))
-
-    def equations(self, of_discs: Sequence[Vector]) -> _Normal:
-        """The normal equations of the patterns of all axes, for the residuals of each disc."""
-        return _Normal(self.design @ self.design.T, self.design @ self.left(of_discs))
-
-
-def _of_cells(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Cells:
+def _of_cells(model: LinearModel, designs: dict[str, list[Matrix]]) -> tuple[Matrix, Matrix]:
+    """Two results for the whitened cells of all discs: the patterns of the axes (patterns, cells), without the component
+    that a change of the PSF can absorb; and an orthonormal basis of this component (cells, coordinates)."""
     base = list(model.evidence.base)
     rows = [
         np.vstack([patterns[k] for patterns in designs.values()]) @ disc.white
@@ -200,7 +175,7 @@ def _of_cells(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Cells:
     ]
     design = np.hstack(rows)
     absorbed = np.linalg.qr(np.hstack([disc.jacobian[base] for disc in model.discs]).T)[0]
-    return _Cells(design - (design @ absorbed) @ absorbed.T, absorbed)
+    return design - (design @ absorbed) @ absorbed.T, absorbed
 
 
 def _explained(model: LinearModel, step: Step) -> list[Vector]:
@@ -210,35 +185,26 @@ def _explained(model: LinearModel, step: Step) -> list[Vector]:
     return [disc.jacobian[here].T @ values for disc in model.discs]
 
 
-def _of_unocculted(model: LinearModel, designs: dict[str, list[Matrix]]) -> _Normal:
-    """The normal equations of the patterns of all axes, for the brightness of the unocculted field.
+def _of_unocculted(model: LinearModel, designs: dict[str, list[Matrix]]) -> tuple[Matrix, Matrix]:
+    """The normal matrix and the right-hand side (1, patterns) of the patterns of all axes, for the brightness of the
+    unocculted field.
 
     The brightness of an image is relative to the mean of its pointing, and divided by its usual spread (`gain_width`).
     """
-    unocculted = model.evidence.unocculted
-    gains = model.evidence.all_unocculted.gains[list(model.evidence.images)] / unocculted.gain_width
-    columns = np.vstack(
+    evidence, images = model.evidence, list(model.evidence.images)
+    gains = evidence.all_unocculted.gains[images] / evidence.unocculted.gain_width
+    columns = np.array(
         [
-            np.array(
-                [patterns[k].mean(axis=1) / disc.mean_expected for k, disc in enumerate(model.evidence.discs)]
-            ).T
-            for patterns in designs.values()
+            np.concatenate([patterns[k].mean(axis=1) for patterns in designs.values()]) / disc.mean_expected
+            for k, disc in enumerate(evidence.discs)
         ]
-    )
-    pointing = unocculted.pointing[list(model.evidence.images)]
+    ).T
+    pointing = evidence.unocculted.pointing[images]
     for one in np.unique(pointing):  # only brightness relative to the same pointing is known
         here = pointing == one
         columns[:, here] -= columns[:, here].mean(axis=1, keepdims=True)
         gains = np.where(here, gains - gains[here].mean(), gains)
-    return _Normal(columns @ columns.T, columns @ gains)
-
-
-def _fall(disc: _Normal, unocculted: _Normal, columns: list[int]) -> float:
-    return _fall_of(disc, columns) + _fall_of(unocculted, columns)
-
-
-def _fall_of(of: _Normal, columns: list[int]) -> float:
-    return float(_falls(of.normal, of.score[None, :], columns)[0])
+    return columns @ columns.T, (columns @ gains)[None]
 
 
 def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
@@ -255,10 +221,6 @@ def _falls(normal: Matrix, scores: Matrix, columns: list[int]) -> Vector:
     return np.maximum(np.einsum("ni,ij,nj->n", scores, inverse, scores) - len(columns), 0.0)
 
 
-def _p_of_unocculted(unocculted: _Normal, columns: list[int], axes: int) -> float:
-    return min(1.0, axes * float(chdtrc(len(columns), _fall_of(unocculted, columns) + len(columns))))
-
-
 def shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, float]:
     """The Shapley value of each name. worth: the decrease of chi2 by each subset of the names."""
     count = len(names)
@@ -271,14 +233,6 @@ def shapley(names: list[str], worth: dict[tuple[str, ...], float]) -> dict[str, 
             weight = 1 / (count * math.comb(count - 1, len(chosen)))
             out[name] += weight * (worth[with_it] - value)
     return out
-
-
-def _sign_flipped_scores(model: LinearModel, cells: _Cells, rng: np.random.Generator) -> Matrix:
-    """Right-hand sides of the normal equations after each sign flip: (SIGN_FLIPS, columns)."""
-    residual = cells.left([disc.residual for disc in model.discs])
-    which = np.repeat(np.arange(len(model.discs)), [d.residual.size for d in model.discs])
-    signs = np.array([rng.choice((-1.0, 1.0), len(model.discs)) for _ in range(SIGN_FLIPS)])
-    return np.asarray((signs[:, which] * residual) @ cells.design.T)
 
 
 def _at(model: LinearModel, name: str) -> dict[str, Any]:

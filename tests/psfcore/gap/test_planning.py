@@ -98,8 +98,8 @@ def test_text_and_page_name_every_effect_and_pair() -> None:
 
 
 def test_a_strength_that_would_not_be_found_is_said() -> None:
-    hidden = EffectLimits("dark_offset", (ParameterLimits("offset", "DN", 2.0, None, None),))
-    strong = EffectLimits("wide_halo", (ParameterLimits("share", "", 0.1, 0.2, None),))
+    hidden = EffectLimits((ParameterLimits("offset", "DN", 2.0, None, None),))
+    strong = EffectLimits((ParameterLimits("share", "", 0.1, 0.2, None),))
     limits = replace(
         planned(LADDER).limits, effects={"dark_offset": hidden, "wide_halo": strong}, alike=(), untestable={}
     )

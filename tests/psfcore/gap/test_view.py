@@ -12,8 +12,7 @@ import numpy as np
 import psutil
 import pytest
 
-from psfcore.gap.unused_memory import return_unused_memory
-from psfcore.gap.view import View
+from psfcore.gap.view import View, return_unused_memory
 from psfcore.scatter.inversion import invert
 from tests.psfcore.gap.small_gaps import changed
 from tests.psfcore.gap.small_transits import clean, solution

@@ -132,10 +132,10 @@ def test_the_tables_list_effects_limits_psf_images_and_inputs() -> None:
         low, high = (round(100 * one) for one in effect["closure"]["ci90"])
         assert row[5] == f"{low + 0} to {high + 0}"
     assert ["saturation fill", "no pixel was filled in"] in rows
-    for limit in found().limits.effects.values():
+    for name, limit in found().limits.effects.items():
         one = limit.leading
         shown = [f"{one.found_90:.3g}", f"{one.excluded_95:.3g}", one.unit]
-        assert [limit.effect.replace("_", " "), one.name, *shown] in rows
+        assert [name.replace("_", " "), one.name, *shown] in rows
     # The PSF before and with the answer.
     before, after = (report["psf"][name]["total"] for name in ("refitted", "with_answer"))
     (total,) = (row for row in rows if row[0] == "total")
@@ -241,8 +241,8 @@ def test_a_malicious_file_name_is_shown_as_text(blank: None) -> None:
 
 def test_the_map_shows_every_disc_at_its_place() -> None:
     report, figure = report_of(found()), Figure()
-    charts = figure.subplots(1, 2)
-    draw_map(figure, list(charts), report)
+    draw_map(figure, report)
+    charts = figure.axes[:2]
     for axes, column in zip(charts, ("residual_pct", "residual_after_pct"), strict=True):
         drawn = {
             (round(float(x), 3), round(float(y), 3)): float(value)
@@ -282,8 +282,8 @@ def test_cells_show_means_of_all_discs_and_noise_has_no_strong_colour() -> None:
     ]
     evidence = replace(found().evidence, discs=tuple(quiet))
     figure = Figure()
-    axes = figure.subplots()
-    draw_cells(figure, [axes], replace(judged("none"), model=replace(found().model, evidence=evidence)))
+    draw_cells(figure, replace(judged("none"), model=replace(found().model, evidence=evidence)))
+    (axes,) = figure.axes
     colours = np.array([patch.get_facecolor()[:3] for patch in axes.patches[:-1]])
     assert colours.min() > 0.75  # near white
 

@@ -19,7 +19,7 @@ from psfcore.gap.verdict.limits import (
     EffectLimits,
     Limits,
     ParameterLimits,
-    cumulants_of_field,
+    cumulants,
     limits,
     quantile_of_sum,
     upper_limit,
@@ -131,11 +131,11 @@ def test_a_stricter_answer_needs_a_stronger_effect(model: LinearModel) -> None:
 def test_the_quantile_of_a_sum_of_noncentral_variables() -> None:
     for weights, d2 in (([1.0], [20.0]), ([0.9, 0.5, 0.1], [8.0, 3.0, 0.0]), ([1.0, 1.0], [0.0, 0.0])):
         w, d = np.array(weights), np.array(d2)
-        cumulants = np.array([[np.sum(w**r * (1 + r * d)) for r in (1, 2, 3)]])
+        of_sum = np.array([[np.sum(w**r * (1 + r * d)) for r in (1, 2, 3)]])
         rng = np.random.default_rng(1)
         sums = ((rng.normal(size=(200_000, w.size)) + np.sqrt(d)) ** 2) @ w
         exact = np.quantile(sums, 0.1)
-        assert quantile_of_sum(cumulants, 0.1)[0] == pytest.approx(exact, rel=0.04, abs=0.05), weights
+        assert quantile_of_sum(of_sum, 0.1)[0] == pytest.approx(exact, rel=0.04, abs=0.05), weights
     plain = np.array([[5.0, 5.0, 5.0]])  # chi2 with five degrees of freedom
     assert quantile_of_sum(plain, 0.1)[0] == pytest.approx(chi2.ppf(0.1, 5), rel=0.01)
     # The cumulants of a random field, from sums drawn with random coefficients; they leave out the factors 1, 2 and 8.
@@ -145,7 +145,7 @@ def test_the_quantile_of_a_sum_of_noncentral_variables() -> None:
     changed += strength * rng.normal(size=(400_000, 4)) @ score.T
     sums = (changed**2) @ (1 / (1 + values))
     third = float(np.mean((sums - sums.mean()) ** 3))
-    found = cumulants_of_field(values, score) @ strength ** (2 * np.arange(4))
+    found = cumulants(values, score, random=True) @ strength ** (2 * np.arange(4))
     assert found == pytest.approx([sums.mean(), sums.var() / 2, third / 8], rel=0.05)
 
 
@@ -194,7 +194,7 @@ def test_the_limits_as_json(model: LinearModel) -> None:
 def test_the_leading_parameter_is_the_first_that_would_be_found_at_its_likely_size() -> None:
     def leading(**strengths: float | None) -> ParameterLimits:
         parameters = (ParameterLimits(name, "", 2.0, found, None) for name, found in strengths.items())
-        return EffectLimits("e", tuple(parameters)).leading
+        return EffectLimits(tuple(parameters)).leading
 
     assert leading(a=5.0, b=1.9, c=0.1).name == "b"
     assert leading(a=None, b=9.0, c=3.0).name == "c"

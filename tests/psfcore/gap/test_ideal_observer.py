@@ -10,8 +10,8 @@ import pytest
 
 from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence
-from psfcore.gap.evidence.ideal import IdealObserver, Left, ideal_observer, left_by_hypotheses
 from psfcore.gap.evidence.linear_model import UNLIKELY
+from psfcore.gap.ideal_observer import IdealObserver, Left, ideal_observer, left_by_hypotheses
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Transit
