@@ -22,6 +22,7 @@ from psfcore.gap.verdict.limits import Alike
 from psfcore.gap.verdict.posterior import UNKNOWN
 from tests.blank_figures import blank_figures
 from tests.html_page import check_stands_alone, read_page
+from tests.psfcore.gap.posteriors import FIELD
 from tests.psfcore.gap.report.judged import (
     HOLDS_FOR,
     LEAST,
@@ -165,7 +166,9 @@ def test_every_verdict_is_explained_on_its_page(verdict: str, blank: None) -> No
     assert ("To separate the tied effects, take a dark exposure" in text) is (verdict == "tie")
     assert ("the best of the tied effects: dark offset" in text) is (verdict == "tie")
     unknown = UNKNOWN in diagnosis.judgement.members
-    assert ("varies with the position along detector x and the pointing" in text) is unknown
+    assert ("the changes of unknown form that explain the gap best" in text) is unknown
+    assert ("The most probable field of an unknown cause" in pictures(page)) is unknown
+    assert any(row[:3] == [FIELD.words, "detector", "> 99 %"] for row in rows_of(page)) is unknown
     # The hypotheses, and for which data the coverage holds.
     assert HOLDS_FOR in text and "19 simulated transits" in text and "in 90 % of the cases" in text
     rows = rows_of(page)
@@ -215,7 +218,7 @@ def test_the_bars_mark_the_named_and_the_tied_effects(blank: None) -> None:
 
 
 def test_without_held_out_images_the_page_shows_no_residuals(blank: None) -> None:
-    few = replace(judged("none"), residual=None)
+    few = replace(judged("none"), residual=None, unknown=())
     page = page_of(few)
     check_stands_alone(page)
     assert "No image could be held out" in text_of(page)

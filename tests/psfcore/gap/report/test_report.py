@@ -46,7 +46,7 @@ SAID = {
     ),
     "attributed": ("There is a gap of ", "dark offset (offset ", " 93 %", "falls from "),
     "tie": ("There is a gap of ", ": dark offset or gain mismatch.", "To separate these effects, take "),
-    "unknown": ("There is a gap of ", "not in the library", "varies with the position along detector x"),
+    "unknown": ("There is a gap of ", "not in the library", FIELD.words),
     "inconclusive": (
         "There may be a gap.",
         "dark offset (50 %), a cause outside the library (30 %), no gap (12 %) ",

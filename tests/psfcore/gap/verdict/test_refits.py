@@ -14,7 +14,6 @@ from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.evidence.fields import LIKELY, Field, fields_of
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.verdict import refits as refitting
-from psfcore.gap.verdict.closure import hold_out, time_blocks
 from psfcore.gap.verdict.posterior import Form, posterior, without_idle
 from psfcore.gap.verdict.refits import Refits
 from psfcore.gap.verdict.settled import settled_posterior
@@ -115,7 +114,7 @@ def test_a_failed_refit_is_named_once_and_left_out(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_field_is_refitted_as_an_effect() -> None:
-    """The fit with a field in the model subtracts it from the images, and the field closes what it stands for."""
+    """The fit with a field in the model subtracts it from the images; the size of its coefficients follows from the data."""
     field = Field("detector", "dark", 0.8)
     refits = refits_of_found()
     at_refit = refits.weighed(Form((), field))
@@ -127,14 +126,6 @@ def test_a_field_is_refitted_as_an_effect() -> None:
     model = refits.model_with(Form((), field))
     likely = model.evidence.prior.likely[list(model.evidence.columns["unknown"])]
     assert np.all((likely >= LIKELY) & (likely <= 10 * LIKELY)) and np.ptp(likely) == 0
-    before, after = (
-        hold_out(model, columns, time_blocks(model)) for columns in ((), model.evidence.columns["unknown"])
-    )
-    assert (
-        before is not None
-        and after is not None
-        and after.unocculted_chi2.sum() < before.unocculted_chi2.sum()
-    )
 
 
 @pytest.mark.slow  # test_settled.py has the fast case of a second effect
