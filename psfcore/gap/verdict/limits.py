@@ -75,9 +75,10 @@ class ParameterLimits:
     found_90: float | None
     excluded_95: float | None
 
-    def as_json(self) -> dict[str, Any]:
-        """The limits for a report."""
-        return {"unit": self.unit, "found_90": self.found_90, "excluded_95": self.excluded_95}
+    def as_json(self, *, observed: bool = True) -> dict[str, Any]:
+        """The limits for a report. observed: whether there are data, which can exclude strengths."""
+        content = {"unit": self.unit, "found_90": self.found_90}
+        return content | ({"excluded_95": self.excluded_95} if observed else {})
 
 
 @dataclass(frozen=True)
@@ -99,11 +100,11 @@ class EffectLimits:
         first = next((one for one in self.parameters if multiple(one) <= 1), None)
         return first or min(self.parameters, key=multiple)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self, *, observed: bool = True) -> dict[str, Any]:
         """The limits of the leading parameter. If the effect has several parameters, the limits of all parameters are added."""
-        content = {"parameter": self.leading.name} | self.leading.as_json()
+        content = {"parameter": self.leading.name} | self.leading.as_json(observed=observed)
         if len(self.parameters) > 1:
-            content["parameters"] = {one.name: one.as_json() for one in self.parameters}
+            content["parameters"] = {one.name: one.as_json(observed=observed) for one in self.parameters}
         return content
 
 
@@ -144,10 +145,10 @@ class Limits:
         )
         return replace(self, effects={**self.effects, effect.name: EffectLimits(parameters)})
 
-    def as_json(self) -> dict[str, Any]:
-        """`limits`, `alike` and `untestable` as in a report."""
+    def as_json(self, *, observed: bool = True) -> dict[str, Any]:
+        """`limits`, `alike` and `untestable` as in a report. observed: as in `ParameterLimits`."""
         return {
-            "limits": {name: one.as_json() for name, one in self.effects.items()},
+            "limits": {name: one.as_json(observed=observed) for name, one in self.effects.items()},
             "alike": [one.as_json() for one in self.alike],
             "untestable": [{"name": name, "why": why} for name, why in self.untestable.items()],
         }
