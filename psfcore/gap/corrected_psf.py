@@ -93,9 +93,9 @@ def _kernel(added: Corrected) -> Kernel:
     changed = kernel.copy()
     for effect in added.effects:
         theta = [next(values)[0] for _ in effect.parameters]
-        for value, change in zip(
-            theta, effect.changes(view) if effect.stage == "optics" else (), strict=False
-        ):
+        if effect.stage != "optics":
+            continue
+        for value, change in zip(theta, effect.changes(view), strict=True):
             changed += value * np.asarray(change.change(0, view.expected), dtype=np.float64)
     changed = np.maximum(changed, 0.0)
     return np.asarray(changed * (kernel.sum() / changed.sum()))
