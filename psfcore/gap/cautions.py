@@ -22,29 +22,22 @@ def cautions_of(solution: Solution, noise: MeasuredNoise | None, evidence: Evide
             f"The variance of the noise in the images is {noise.ratio:.2f} times the stated variance. The measured noise was used: "
             f"{noise.noise.photon_gain_dn:.2f} DN per photon, read noise {noise.noise.read_noise_dn:.2f} DN."
         )
-    left_out = solution.inversion.left_out
+    left_out = [f"{name}: {why}" for name, why in solution.inversion.left_out.items()]
     if left_out:
-        out.append(
-            f"{len(left_out)} images were not used. Examples: "
-            + "; ".join(f"{k}: {v}" for k, v in list(left_out.items())[:3])
-        )
-    unmatched = [
-        evidence.image_info[disc.index].file
-        for disc in evidence.discs
-        if not evidence.image_info[disc.index].described
-    ]
+        out.append(f"{len(left_out)} images were not used. Examples: {'; '.join(left_out[:3])}")
+    infos = [evidence.image_info[disc.index] for disc in evidence.discs]
+    unmatched = [info.file for info in infos if not info.described]
     if unmatched:
         out.append(
             f"In {len(unmatched)} images ({', '.join(unmatched[:3])}{', …' if len(unmatched) > 3 else ''}) the scene around the "
             "occulter differs from the scene in the neighbouring images, or no neighbouring image shows it. The fitted position of the "
             "occulter may be wrong in these images, and the wrong position may cause the residuals in their discs."
         )
-    images = len(evidence.discs)
-    if images < LEAST_IMAGES:
+    if len(infos) < LEAST_IMAGES:
         out.append(
-            f"With only {images} images, no image can be held out. Closure and the gap on held-out images are therefore missing."
+            f"With only {len(infos)} images, no image can be held out. Closure and the gap on held-out images are therefore missing."
         )
-    aimed = len({taken.pointing for taken in evidence.image_info})
+    aimed = len({info.pointing for info in evidence.image_info})
     if aimed > MOST_POINTINGS:
         out.append(
             f"Light from outside the field was tested only in the first {MOST_POINTINGS} of the {aimed} pointings."
@@ -53,8 +46,7 @@ def cautions_of(solution: Solution, noise: MeasuredNoise | None, evidence: Evide
         out.append(
             "All images have the same pointing: effects that differ between pointings cannot be detected, and no pointing can be held out."
         )
-    exposures = {taken.exposure_s for taken in evidence.image_info}
-    if len(exposures) == 1:
+    if len({info.exposure_s for info in evidence.image_info}) == 1:
         out.append(
             "All images have the same exposure time: an error of every readout (in DN) and an error of the rate (in DN/s) look the same."
         )

@@ -35,9 +35,9 @@ Kernel = NDArray[np.float64]
 def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[str, Any]) -> Psf:
     """The corrected PSF of a diagnosis, on the full reach, with the components DIFFRACTION and SCATTER.
 
-    provenance: the software and the parents of the PSF. This function adds the effects, their parameters, the gap and the
-    input files. Raises DataError "no-answer" if the diagnosis made no full refit, "bad-effects" if an added effect fails,
-    and the errors of `Psf`.
+    provenance: the software and the parents of the PSF. This function adds the effects, their parameters with errors, the gap
+    without and with these effects, and the input files. Raises DataError "no-answer" if the diagnosis made no full refit,
+    "bad-effects" if an added effect fails, and the errors of `Psf`.
     """
     added = found.corrected[0] if found.corrected else found.with_field
     if added is None:
@@ -47,6 +47,18 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
             f"{found.judgement.verdict}: this diagnosis has no corrected PSF",
         )
     transit, inversion = added.solution.transit, added.solution.inversion
+    history = {
+        "effects": [effect.name for effect in added.effects],
+        "effect_in_kernel": [effect.name for effect in added.effects if effect.stage == "optics"],
+        "effect_parameters": {
+            parameter: {"value": value, "sigma": sigma, "unit": unit}
+            for parameter, (value, sigma, unit) in added.values.items()
+        },
+        "verdict": found.judgement.verdict,
+        "gap_before_pct": found.rms.to_json(),
+        "gap_after_pct": found.after.to_json(),
+        "inputs_sha256": transit.sha256,
+    }
     return Psf(
         kernel=_kernel(added),
         name=name,
@@ -58,7 +70,7 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
             "DIFFRACTION": crop_or_pad(transit.diffraction, REACH_GRID_PX),
             "SCATTER": inversion.shape.kernel(inversion.coordinates, REACH_GRID_PX),
         },
-        provenance={**provenance, **_history(found, added)},
+        provenance=provenance | history,
         fitted=FittedShape(
             shape=inversion.shape.name,
             parameters=inversion.shape.names,
@@ -66,25 +78,6 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
             covariance=tuple(tuple(row) for row in added.covariance.tolist()),
         ),
     )
-
-
-def _history(found: Diagnosis, added: Corrected) -> dict[str, Any]:
-    """The added effects, their parameters with errors, the gap without and with these effects, and the input files.
-
-    This goes into the provenance of the corrected PSF.
-    """
-    return {
-        "effects": [effect.name for effect in added.effects],
-        "effect_in_kernel": [effect.name for effect in added.effects if effect.stage == "optics"],
-        "effect_parameters": {
-            parameter: {"value": value, "sigma": sigma, "unit": unit}
-            for parameter, (value, sigma, unit) in added.values.items()
-        },
-        "verdict": found.judgement.verdict,
-        "gap_before_pct": found.rms.to_json(),
-        "gap_after_pct": found.after.to_json(),
-        "inputs_sha256": found.solution.transit.sha256,
-    }
 
 
 def _kernel(added: Corrected) -> Kernel:
@@ -99,10 +92,12 @@ def _kernel(added: Corrected) -> Kernel:
         return kernel
     view = _point(added, total, kernel)
     values = iter(added.values.values())
-    theta = {effect.name: [next(values)[0] for _ in effect.parameters] for effect in added.effects}
     changed = kernel.copy()
-    for effect in optical:
-        for value, change in zip(theta[effect.name], effect.changes(view), strict=True):
+    for effect in added.effects:
+        theta = [next(values)[0] for _ in effect.parameters]
+        if effect not in optical:
+            continue
+        for value, change in zip(theta, effect.changes(view), strict=True):
             changed += value * np.asarray(change.change(0, view.expected), dtype=np.float64)
     changed = np.maximum(changed, 0.0)
     return np.asarray(changed * (kernel.sum() / changed.sum()))

@@ -68,44 +68,26 @@ class Planned:
         s."""
         rows = []
         for pointing in self.plan.pointings:
-            shots = [shot for shot in self.plan.shots if shot.pointing == pointing]
-            exposures = sorted({shot.exposure_s for shot in shots})
-            view = self.plan.views[pointing - 1]
-            rows.append({"pointing": pointing, "view": view, "images": len(shots), "exposures_s": exposures})
+            exposures = [shot.exposure_s for shot in self.plan.shots if shot.pointing == pointing]
+            row = {"pointing": pointing, "view": self.plan.views[pointing - 1], "images": len(exposures)}
+            rows.append(row | {"exposures_s": sorted(set(exposures))})
         return rows
 
     def as_json(self) -> dict[str, Any]:
         """The plan and its limits, schema gap-plan/1. A limit `excluded_95` needs data, so it is missing here."""
-        found = self.limits.as_json()
+        plan = {"images": len(self.plan.shots), "size_px": self.plan.size_px, "pointings": self.pointings}
+        calibration = shipped_calibration()
+        distances = sorted(self.limits.distances.items(), key=lambda one: one[1])
         return {
             "schema": SCHEMA,
-            "plan": {
-                "images": len(self.plan.shots),
-                "size_px": self.plan.size_px,
-                "pointings": self.pointings,
-            },
-            "answer": {
-                "threshold": shipped_calibration().threshold(),
-                "temperature": shipped_calibration().temperature,
-            },
-            "limits": {name: _without_excluded(one) for name, one in found["limits"].items()},
-            "alike": found["alike"],
-            "distances": [
-                {"pair": list(pair), "distance": distance}
-                for pair, distance in sorted(self.limits.distances.items(), key=lambda one: one[1])
-            ],
+            "plan": plan,
+            "answer": {"threshold": calibration.threshold(), "temperature": calibration.temperature},
+            **self.limits.as_json(observed=False),
+            "distances": [{"pair": list(pair), "distance": distance} for pair, distance in distances],
             "settled_by": self.settled_by,
             "searched": list(self.searched),
             "left_out": self.left_out,
-            "untestable": found["untestable"],
         }
-
-
-def _without_excluded(limit: dict[str, Any]) -> dict[str, Any]:
-    kept = {key: value for key, value in limit.items() if key != "excluded_95"}
-    if "parameters" in kept:
-        kept["parameters"] = {name: _without_excluded(one) for name, one in kept["parameters"].items()}
-    return kept
 
 
 def limits_of_file(
@@ -154,11 +136,11 @@ def planned_limits(
     solution = invert(transit, start=start, near=True, threads=threads, progress=progress)
     model, _ = linear_model_of(View(solution), library, seed=seed, progress=progress)
     model = _without_measured(model)
-    effects = model.evidence.effects
-    made = shipped_calibration()
+    effects, calibration = model.evidence.effects, shipped_calibration()
+    threshold, temperature = calibration.threshold(), calibration.temperature
     return Planned(
         plan,
-        limits(model, threshold=made.threshold(), temperature=made.temperature, observed=False),
+        limits(model, threshold=threshold, temperature=temperature, observed=False),
         tuple(effect.name for effect in effects if effect.held is not None),
         {effect.name: effect.settled_by for effect in effects},
         dict(solution.inversion.left_out),

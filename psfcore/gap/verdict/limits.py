@@ -75,9 +75,10 @@ class ParameterLimits:
     found_90: float | None
     excluded_95: float | None
 
-    def as_json(self) -> dict[str, Any]:
-        """The limits for a report."""
-        return {"unit": self.unit, "found_90": self.found_90, "excluded_95": self.excluded_95}
+    def as_json(self, *, observed: bool = True) -> dict[str, Any]:
+        """The limits for a report. observed: whether there are data, which can exclude strengths."""
+        content = {"unit": self.unit, "found_90": self.found_90}
+        return content | ({"excluded_95": self.excluded_95} if observed else {})
 
 
 @dataclass(frozen=True)
@@ -99,11 +100,11 @@ class EffectLimits:
         first = next((one for one in self.parameters if multiple(one) <= 1), None)
         return first or min(self.parameters, key=multiple)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self, *, observed: bool = True) -> dict[str, Any]:
         """The limits of the leading parameter. If the effect has several parameters, the limits of all parameters are added."""
-        content = {"parameter": self.leading.name} | self.leading.as_json()
+        content = {"parameter": self.leading.name} | self.leading.as_json(observed=observed)
         if len(self.parameters) > 1:
-            content["parameters"] = {one.name: one.as_json() for one in self.parameters}
+            content["parameters"] = {one.name: one.as_json(observed=observed) for one in self.parameters}
         return content
 
 
@@ -144,10 +145,10 @@ class Limits:
         )
         return replace(self, effects={**self.effects, effect.name: EffectLimits(parameters)})
 
-    def as_json(self) -> dict[str, Any]:
-        """`limits`, `alike` and `untestable` as in a report."""
+    def as_json(self, *, observed: bool = True) -> dict[str, Any]:
+        """`limits`, `alike` and `untestable` as in a report. observed: as in `ParameterLimits`."""
         return {
-            "limits": {name: one.as_json() for name, one in self.effects.items()},
+            "limits": {name: one.as_json(observed=observed) for name, one in self.effects.items()},
             "alike": [one.as_json() for one in self.alike],
             "untestable": [{"name": name, "why": why} for name, why in self.untestable.items()],
         }
@@ -171,21 +172,19 @@ def limits(
     endless = [e.name for e in every if not all(math.isfinite(p.likely) for p in e.parameters)]
     evidence = replace(model.evidence, effects=tuple(e for e in every if e.name not in endless))
     hypotheses = _Hypotheses(replace(model, evidence=evidence), prior)
-    effects, settled_by = {}, {}
+    margin = partial(_margin, threshold=threshold, temperature=temperature)
+    effects = {}
     for effect in evidence.effects:
-        strengths = hypotheses.strengths(
-            effect, partial(_margin, threshold=threshold, temperature=temperature)
-        )
+        strengths = hypotheses.strengths(effect, margin)
         excluded = hypotheses.excluded(effect) if observed else [None] * len(strengths)
-        fields = [(RMS, effect.parameters[0].unit, effect.parameters[0].likely)]
-        fields = fields if effect.field else [(p.name, p.unit, p.likely) for p in effect.parameters]
+        rows = zip(effect.parameters, strengths, excluded, strict=False)
         effects[effect.name] = EffectLimits(
             tuple(
-                ParameterLimits(*one, *limit)
-                for one, *limit in zip(fields, strengths, excluded, strict=False)
+                ParameterLimits(RMS if effect.field else p.name, p.unit, p.likely, *limit)
+                for p, *limit in rows
             )
         )
-        settled_by[effect.name] = effect.settled_by
+    settled_by = {effect.name: effect.settled_by for effect in evidence.effects}
     distances = hypotheses.distances(effects)
     alike = (
         Alike(pair, distance, "; or ".join(dict.fromkeys(settled_by[name] for name in pair)))
@@ -252,16 +251,12 @@ class _Hypotheses:
         single = math.log(prior["single"] / max(len(evidence.effects), 1) / prior["none"])
         self._log_prior = {effect.name: single - math.log(effect.trials) for effect in evidence.effects}
         self._single = {effect.name: self._acting(effect) for effect in evidence.effects}
-        log_prior = math.log(prior["unknown"] / len(unknown) / prior["none"])
+        offset = math.log(prior["unknown"] / len(unknown) / prior["none"])
+        scales = LIKELY * np.array(SCALES)[:, None]
         self._unknown = [
-            self._hypothesis(columns, np.full(len(columns), LIKELY), log_prior) for columns in unknown
+            _Hypothesis(self._numbers(one), np.tile(scales, len(one)), offset, self._normal)
+            for one in unknown
         ]
-
-    def _hypothesis(
-        self, columns: Sequence[int], likely: Vector, offset: float, one_sided: bool = False
-    ) -> _Hypothesis:
-        widths = np.array(SCALES)[:, None] * likely
-        return _Hypothesis(self._numbers(columns), widths, offset, self._normal, one_sided)
 
     def _numbers(self, columns: Sequence[int]) -> NDArray[np.intp]:
         """The numbers of columns of the evidence in the normal matrix."""
@@ -272,53 +267,44 @@ class _Hypotheses:
         columns = self._columns[effect.name] if part is None else part
         prior = self._evidence.prior
         offset = self._log_prior[effect.name] - MEASURED * self._evidence.numbers_of(columns) / 2
+        widths = np.array(SCALES)[:, None] * prior.likely[list(columns)]
         one_sided = len(columns) == 1 and bool(prior.positive[columns[0]])
-        return self._hypothesis(columns, prior.likely[list(columns)], offset, one_sided)
+        return _Hypothesis(self._numbers(columns), widths, offset, self._normal, one_sided)
+
+    def _of_strength(self, columns: Sequence[int]) -> tuple[Matrix, float]:
+        """For a strength of 1 of the parameters in these columns: the change of the scores (columns of N, columns), and its
+        mean chi2. The strength of several parameters is the standard deviation of the first one."""
+        likely, numbers = self._evidence.prior.likely[list(columns)], self._numbers(columns)
+        return self._normal[:, numbers] * (likely / likely[0]), float(np.diag(self._normal)[numbers].mean())
 
     # --- strengths that would be found ------------------------------------------------------------------
 
     def strengths(self, effect: Effect, margin: Callable[[Matrix], Vector]) -> list[float | None]:
         """found_90 of every parameter of an effect. If the effect is a random field: that of its rms."""
         columns, prior = self._columns[effect.name], self._evidence.prior
-        numbers, single = self._numbers(columns), self._single[effect.name]
-        if effect.field:
-            likely = prior.likely[columns]
-            change = self._normal[:, numbers] * (likely / likely[0])
-            seen = float(np.diag(self._normal)[numbers].mean())
-            return [self._strength(effect, change, seen, (single,), float(likely[0]), margin)]
+        others = [*(h for name, h in self._single.items() if name != effect.name), *self._unknown]
         found = []
-        for column, number in zip(columns, numbers, strict=True):
-            # A fit leaves out a positive parameter if its fitted value is negative. If the true value is 0, this happens in half of
-            # all cases. ln E is therefore the mean of two values: with all parameters, and without those that may be left out.
-            fewer = self._acting(effect, [c for c in columns if c == column or not prior.positive[c]])
-            # A single positive parameter has twice the weight.
-            fewer = replace(fewer, offset=fewer.offset + 2 * math.log(2) * bool(prior.positive[column]))
-            change, seen = self._normal[:, [number]], float(self._normal[number, number])
-            likely_size = float(prior.likely[column])
-            found.append(self._strength(effect, change, seen, (single, fewer), likely_size, margin))
+        for part in [columns] if effect.field else [[column] for column in columns]:
+            change, seen = self._of_strength(part)
+            own, rivals, sided = [self._single[effect.name]], others, 0.0
+            if not effect.field:
+                # A fit leaves out a positive parameter if its fitted value is negative. If the true value is 0, this happens in half
+                # of all cases. ln E is therefore the mean of two values: with all parameters, and without those that may be left out.
+                own += [self._acting(effect, [c for c in columns if c in part or not prior.positive[c]])]
+                sided = math.log(2) if prior.positive[part[0]] else 0.0
+                # A rival that would have to be negative cannot act.
+                rivals = [h for h in others if not (h.one_sided and change[h.columns[0], 0] <= 0)]
+            odds = [_odds_of(h, change, self._likelihood.gained, effect.field) for h in (*own, *rivals)]
+
+            def margin_at(
+                strengths: Vector, odds: Any = odds, own: int = len(own), more: float = sided
+            ) -> Vector:
+                every = np.array([one(strengths) for one in odds])
+                return margin(np.vstack([every[:own].mean(axis=0) + more, every[own:]]))
+
+            most = CREDIBLE * float(prior.likely[part[0]])
+            found.append(_first_found(margin_at, 1 / math.sqrt(seen), most) if seen > 0 else None)
         return found
-
-    def _strength(
-        self,
-        effect: Effect,
-        change: Matrix,
-        seen: float,
-        own: Sequence[_Hypothesis],
-        likely: float,
-        margin: Callable[[Matrix], Vector],
-    ) -> float | None:
-        """The smallest strength that would be found. change: the columns of N of the true effect. seen: the chi2 of a strength
-        of 1. own: hypotheses that the effect acts; the mean of their ln E counts."""
-        rivals = [*(h for name, h in self._single.items() if name != effect.name), *self._unknown]
-        if not effect.field:  # a rival that would have to be negative cannot act
-            rivals = [h for h in rivals if not (h.one_sided and change[h.columns[0], 0] <= 0)]
-        odds = [_odds_of(h, change, self._likelihood.gained, effect.field) for h in (*own, *rivals)]
-
-        def margin_at(strengths: Vector) -> Vector:
-            found = np.array([one(strengths) for one in odds])
-            return margin(np.vstack([found[: len(own)].mean(axis=0), found[len(own) :]]))
-
-        return _first_found(margin_at, 1 / math.sqrt(seen), CREDIBLE * likely) if seen > 0 else None
 
     # --- strengths that are excluded ----------------------------------------------------------------------
 
@@ -391,10 +377,10 @@ class _Hypotheses:
         columns = self._columns[acting.name]
         if not acting.field:
             columns = [columns[[parameter.name for parameter in acting.parameters].index(at.name)]]
-        numbers, likely = self._numbers(columns), prior.likely[columns]
-        size = at.found_90 * likely / likely[0]
-        own = float((np.diag(self._normal)[numbers] * size**2).sum())
-        change = self._normal[np.ix_(rival.columns, numbers)] * size
+        change = at.found_90 * self._of_strength(columns)[0]
+        likely = prior.likely[columns]
+        own = float(np.diag(change[self._numbers(columns)]) @ (at.found_90 * likely / likely[0]))
+        change = change[rival.columns]
         if acting.field:
             explained = float(np.sum(change * np.linalg.solve(inner, change)))
         else:
