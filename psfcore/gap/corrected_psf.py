@@ -39,7 +39,7 @@ def corrected_psf(found: Diagnosis, name: str, version: str, provenance: dict[st
     without and with these effects, and the input files. Raises DataError "no-answer" if the diagnosis made no full refit,
     "bad-effects" if an added effect fails, and the errors of `Psf`.
     """
-    added = found.corrected[0] if found.corrected else found.with_field
+    added = found.correctable
     if added is None:
         raise DataError(
             "no-answer",

@@ -83,8 +83,7 @@ class Diagnosis:
     the fields of an unknown cause. p_value:
     the p-value of the gap. limits: the limits of all effects. shrinking: how far the effects close the gap, by
     form. corrected: the full refits with the named effects that were made; the refit with the best effects comes first.
-    with_field: for the verdict `unknown`, the full refit with the most probable field; None if the field changes the PSF or was not
-    refitted. unknown: the
+    with_field: for the verdict `unknown`, the full refit with the most probable field, if it was made. unknown: the
     fields of an unknown cause, if it is in the answer set. bounds: the bound of each field (`unknown.bounds`). residual,
     residual_after: the residuals of held-out images without and with the best effects. cautions: sentences on
     everything that weakens the result.
@@ -117,6 +116,14 @@ class Diagnosis:
     def evidence(self) -> Evidence:
         """The discs, blocks and Jacobians that the diagnosis uses."""
         return self.model.evidence
+
+    @property
+    def correctable(self) -> Corrected | None:
+        """The full refit whose PSF is the corrected PSF: with the named effects, or with a field that does not change the PSF."""
+        if self.corrected:
+            return self.corrected[0]
+        field = self.with_field
+        return None if field is None or field.effects[-1].stage == "optics" else field
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -207,8 +214,8 @@ def diagnose_solution(
     named = judged.verdict in ("attributed", "tie")
     corrected = refits.of([judged.form(names) for names in judged.named]) if refit and named else ()
     with_field = None
-    if judged.verdict == "unknown" and told and told[0].field.stage != "optics":
-        with_field = refits.made.get(told[0].form)
+    if refit and judged.verdict == "unknown" and told and refittable(told[0].field):
+        with_field = next(iter(refits.of([told[0].form])), None)
     held_out = [hold_out(model, (), scheme) for scheme in (time_blocks(model), pointings(model))]
     shrinking, after = _shrinking(model, judged, fits, refits, held_out, rng)
     judged = earned(judged, None if best is None else shrinking[best].closure)

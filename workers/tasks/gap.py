@@ -103,7 +103,7 @@ def diagnosis_of(
     )
     provenance = _provenance(request, parent, added, job_id)
     corrected = None
-    if request.correct and (found.corrected or found.with_field):
+    if request.correct and found.correctable:
         try:
             corrected = _corrected(found, provenance)
         except DataError as error:

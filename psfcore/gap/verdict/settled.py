@@ -12,8 +12,8 @@ cause, until this effect is refitted. So the plausible hypotheses are those that
 
 The report names the effects of a hypothesis that is more probable than all others together. Its refit is made even if the
 linear model is exact enough, and if this refit fails, the hypothesis is excluded. If it succeeds, the evidence of the linear
-model stays: the evidence of a refit scatters by a few units, and the other hypotheses have no refit. A field whose refit fails is
-not excluded: it is a change of the data, not a model of a cause.
+model stays: the evidence of a refit scatters by a few units, and the other hypotheses have no refit. A field is a change of the data,
+not a model of a cause, so no failed refit excludes it.
 
 If the refit of a pair fails, the triples with this pair are excluded too. A refit that did not settle counts for nothing: the
 evidence of the linear model stays.
@@ -107,10 +107,10 @@ def _to_refit(now: Posterior, done: set[Form]) -> Form | None:
 
 
 def _leading(now: Posterior, done: set[Form]) -> Form | None:
-    """The form of the hypothesis that is more probable than all others together, if it was not refitted yet."""
+    """The form of the hypothesis that is more probable than all others together, if it has no field and was not refitted yet."""
     names, share = next(iter(now.probabilities().items()))
     form = now.leading(names)
-    return form if share > LEADING and names != NONE and form not in done and _can_refit(form) else None
+    return form if share > LEADING and names != NONE and form not in done and form.field is None else None
 
 
 def _can_refit(form: Form) -> bool:
