@@ -224,7 +224,7 @@ def diagnose_solution(
     named = judged.verdict in ("attributed", "tie") and gone is not None
     rms = gap(before, rng) if before is not None else Interval(0.0, 0.0, 0.0)
     cautions = [*cautions_of(solution, noise, model.evidence), *refits.failures]
-    if named and best is not None and gone is not None:
+    if named and best is not None and gone is not None and rms.low > 0:  # the discs show the gap
         error_pct = float(np.sqrt(np.mean(gone.noise_pct**2)))
         cautions += caution_of_closure(fits[best].label, rms.value, error_pct)
     return Diagnosis(

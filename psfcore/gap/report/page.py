@@ -15,7 +15,14 @@ from psfcore.gap.diagnose import Diagnosis
 from psfcore.gap.evidence.linear_model import FLOOR
 from psfcore.gap.report import limits, plot
 from psfcore.gap.report import report as texts
-from psfcore.gap.report.report import fits_of, hypothesis_words, in_short_if_many, percent_words, words
+from psfcore.gap.report.report import (
+    fits_of,
+    hypothesis_words,
+    in_short_if_many,
+    p_words,
+    percent_words,
+    words,
+)
 from psfcore.gap.verdict.correction import ROUNDS
 from psfcore.gap.verdict.where import SIGN_FLIPS
 
@@ -139,7 +146,7 @@ def _effect_row(effect: Report) -> Row:
         in_short_if_many([p["value"] for p in effect["parameters"].values()]) or numbers,
         DASH if fall is None else f"{fall:.1f}",
         *cells,
-        f"{effect['p_value']:.2g}",
+        p_words(effect["p_value"]),
     ]
 
 

@@ -19,7 +19,7 @@ from psfcore.gap.evidence.effect_fits import left_chi2
 from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
 from psfcore.gap.evidence.fields import Field, FieldShape
 from psfcore.gap.verdict.closure import HeldOut
-from psfcore.gap.verdict.posterior import NONE, Form, Names
+from psfcore.gap.verdict.posterior import NONE, Form, Names, known_effects
 from psfcore.gap.verdict.unknown import UnknownField
 from psfcore.gap.verdict.verdict import LEAST_IMAGES, Judgement
 from psfcore.scatter.reconstruction import Inversion
@@ -243,11 +243,13 @@ def _residuals(held_out: HeldOut | None) -> dict[int, tuple[float, float]]:
 
 
 def would_separate(found: Diagnosis) -> str:
-    """The observations that would separate the tied effects, as text; empty for other verdicts."""
-    if found.judgement.verdict != "tie":
-        return ""
-    tied = tuple(name for name in found.judgement.tied if name != UNKNOWN_NAME)
-    return "; ".join(dict.fromkeys(effect.settled_by for effect in _by_name(found, tied)))
+    """The observations that would separate the tied effects, or decide an inconclusive verdict, as text; empty for other verdicts."""
+    judged = found.judgement
+    open_effects: Names = judged.tied
+    if judged.verdict == "inconclusive":
+        open_effects = tuple(dict.fromkeys(name for names in judged.named for name in names))
+    known = known_effects(open_effects)
+    return "; or ".join(dict.fromkeys(effect.settled_by for effect in _by_name(found, known)))
 
 
 def sentence(found: Diagnosis) -> str:
@@ -267,11 +269,11 @@ def sentence(found: Diagnosis) -> str:
             f"{found.noise_pct:.1f} %.{_not_excluded(judged)}"
         )
     strongest = found.where[0]
-    lead = f"There is a gap of {left}. It varies most {AXIS_WORDS[strongest.name]} and is largest in {_pointings(strongest.at)}."
-    if found.rms.value < found.noise_pct and _unocculted_alone(found):
+    along = AXIS_WORDS[strongest.name] + (", as the best effect does," if strongest.of_best else "")
+    lead = f"There is a gap of {left}. It varies most {along} and is largest in {_pointings(strongest.at)}."
+    if _shown_by_blocks(found):
         lead = (
-            f"There is a gap in the unocculted field, and it varies most {AXIS_WORDS[strongest.name]}. The discs do not show it "
-            f"(the gap in the discs is {left})."
+            f"There is a gap in the unocculted field, and it varies most {along}. The discs do not show it."
         )
     if judged.verdict == "unknown":
         return f"{lead} Its cause is not in the library{_unknown_words(found)}."
@@ -283,9 +285,15 @@ def sentence(found: Diagnosis) -> str:
     if judged.verdict == "inconclusive":
         return (
             f"{lead if NONE not in judged.members else 'There may be a gap.'} These data do not decide its cause: "
-            f"{_listed(judged.members, judged)}."
+            f"{_listed(judged.members, judged)}.{_next_step(found)}"
         )
     return f"{lead} {_explained(found)}.{_not_excluded(judged)}"
+
+
+def _next_step(found: Diagnosis) -> str:
+    """A sentence that names the observation that would decide an inconclusive verdict; empty if none is known."""
+    observation = would_separate(found)
+    return f" To decide, take {observation}." if observation else ""
 
 
 def _unknown_words(found: Diagnosis) -> str:
@@ -325,6 +333,11 @@ def hypothesis_words(names: Names) -> str:
     )
 
 
+def p_words(p_value: float) -> str:
+    """A p-value as text. The text never says 0."""
+    return f"{p_value:.2g}" if p_value > 1e-300 else "< 1e-300"
+
+
 def percent_words(share: float) -> str:
     """A probability as text. The text never says 0 % or 100 %."""
     percent = 100 * share
@@ -333,9 +346,11 @@ def percent_words(share: float) -> str:
     return "< 1 %" if percent < 0.5 else f"{percent:.0f} %"
 
 
-def _unocculted_alone(found: Diagnosis) -> bool:
-    """Whether the blocks of the unocculted field show a gap, but the cells of the discs do not."""
+def _shown_by_blocks(found: Diagnosis) -> bool:
+    """Whether the blocks of the unocculted field show a gap, but the discs and their cells do not."""
     model = found.model
+    if found.rms.value >= found.noise_pct:
+        return False
     cells, blocks = left_chi2(model, model.base)
     freedom = sum(disc.residual.size for disc in model.discs)
     free_blocks = model.evidence.steady_unocculted.freedom
@@ -351,11 +366,20 @@ def _explained(found: Diagnosis) -> str:
         for name, (value, sigma, unit) in values.items()
     ]
     in_short = in_short_if_many([value for value, _, _ in values.values()])
-    # If the discs do not show the gap, the gap in the discs can only change within the noise.
+    told = (
+        f"The gap is explained by {words(best.label)} ({in_short or ', '.join(numbers)}), with a probability of "
+        f"{percent_words(judged.hypotheses[best.names])}"
+    )
+    closure = found.shrinking[judged.form(judged.named[0])].closure
+    if _shown_by_blocks(found):
+        return (
+            told
+            if closure is None
+            else f"{told}; on held-out images it closes {100 * closure.value:.0f} % of the gap"
+        )
     shrinks = "falls" if found.after.value < found.rms.value else "changes"
     return (
-        f"The gap is explained by {words(best.label)} ({in_short or ', '.join(numbers)}), with a probability of "
-        f"{percent_words(judged.hypotheses[best.names])}: on held-out images the gap in the discs {shrinks} from "
+        f"{told}: on held-out images the gap in the discs {shrinks} from "
         f"{found.rms.value:.1f} % to {found.after.value:.1f} %, and the noise is {found.noise_pct:.1f} %"
     )
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,8 @@ class Axis:
     """How much of the gap varies along one axis, and where the gap is largest.
 
     share: fraction, 0 to 1. alone: the decrease of chi2 by this axis alone. at: the pointings with the largest residuals, and
-    the range of the axis in them.
+    the range of the axis in them. of_best: the axis comes first because the best effect varies along it, although another axis has a
+    larger share.
     """
 
     name: str
@@ -50,10 +51,17 @@ class Axis:
     p_value: float
     alone: float
     at: dict[str, Any]
+    of_best: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """The axis as JSON, for the gap report."""
-        return {"axis": self.name, "share": self.share, "p_value": self.p_value, "at": self.at}
+        return {
+            "axis": self.name,
+            "share": self.share,
+            "p_value": self.p_value,
+            "at": self.at,
+            "of_best": self.of_best,
+        }
 
 
 def where(
@@ -103,11 +111,15 @@ def where(
         axes.append(Axis(name, share, p_value, subset[(name,)], _at(model, name)))
     best = max((axis.alone for axis in axes), default=0.0)
 
-    def rank(axis: Axis) -> tuple[bool, bool, float]:
-        first = axis.name in favoured and axis.alone >= AS_GOOD * best
-        return not first, axis.p_value > SIGNIFICANT, -axis.share
+    def rank(axis: Axis) -> tuple[bool, float]:
+        return axis.p_value > SIGNIFICANT, -axis.share
 
-    return tuple(sorted(axes, key=rank))
+    axes.sort(key=rank)
+    chosen = [axis for axis in axes if axis.name in favoured and axis.alone >= AS_GOOD * best]
+    others = [axis for axis in axes if axis not in chosen]
+    if chosen and chosen[0] != axes[0]:
+        chosen[0] = replace(chosen[0], of_best=True)
+    return (*chosen, *others)
 
 
 def _designs(evidence: Evidence) -> dict[str, list[Matrix]]:
