@@ -115,11 +115,11 @@ def where(
         return axis.p_value > SIGNIFICANT, -axis.share
 
     axes.sort(key=rank)
-    chosen = [axis for axis in axes if axis.name in favoured and axis.alone >= AS_GOOD * best]
-    others = [axis for axis in axes if axis not in chosen]
-    if chosen and chosen[0] != axes[0]:
-        chosen[0] = replace(chosen[0], of_best=True)
-    return (*chosen, *others)
+    leading = [axis for axis in axes if axis.name in favoured and axis.alone >= AS_GOOD * best]
+    others = [axis for axis in axes if axis not in leading]
+    if leading and leading[0] != axes[0]:
+        leading[0] = replace(leading[0], of_best=True)
+    return (*leading, *others)
 
 
 def _designs(evidence: Evidence) -> dict[str, list[Matrix]]:
