@@ -23,12 +23,10 @@ from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form
 from psfcore.noise import Noise
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Solution
-from psfcore.simulate.plan import default_plan
-from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import Transit
-from tests.psfcore.gap import small_gaps
+from tests.psfcore.gap import small_gaps, small_transits
 from tests.psfcore.gap.small_gaps import changed
-from tests.transit_files import TRUTH, diffraction
+from tests.transit_files import TRUTH
 
 # Without those that search for a position or a form, and without those of many parameters: they take most of the time.
 QUICK = tuple(effect for effect in LIBRARY if effect.held is None and len(effect.parameters) < 4)
@@ -42,9 +40,7 @@ def fewer_sign_flips(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def clean() -> Transit:
-    """Twelve images of 160 px with some tens of photons per pixel in the discs."""
-    plan = default_plan(12, 160, oversampling=1, brightness=4.0)
-    return simulate(plan, TRUTH, diffraction(), seed=8).transit
+    return small_transits.clean(12)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +102,7 @@ def test_a_dark_offset_is_found_with_its_size_and_taken_out() -> None:
 def test_light_lost_by_clipping_is_attributed_to_saturation_fill(clean: Transit) -> None:
     """One pointing's images are clipped around a place, so no image shows the true scene there."""
     y, x = np.indices(clean.shape)
-    inside = 30 - np.hypot(y - 60, x - 80)
+    inside = 24 - np.hypot(y - 48, x - 64)
     lost = np.sqrt(np.maximum(inside, 0)) / 7
     frames = tuple(
         replace(f, pixels=(f.pixels * (1 - lost)).astype(np.float32), filled=inside > 0)

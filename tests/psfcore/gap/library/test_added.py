@@ -17,9 +17,8 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.effect_sources import sha256_of_source
 from psfcore.gap.evidence.evidence import gather
 from psfcore.gap.library.registry import LIBRARY, added_effects, library_with
-from psfcore.gap.view import View
 from tests.gap_files import EDGE_GLOW as GLOW
-from tests.psfcore.gap.small_gaps import found
+from tests.psfcore.gap.small_transits import solution, view
 
 DOCUMENTATION = Path(__file__).parents[4] / "docs" / "gap.md"
 
@@ -43,7 +42,7 @@ def test_the_effects_of_a_file_follow_the_library_and_have_its_hash(tmp_path: Pa
     assert added.sha256 == hashlib.sha256(Path(source).read_bytes()).hexdigest() == sha256_of_source(source)
     assert library_with([]) == LIBRARY
     # The discs show the effect, strongest at the right.
-    evidence = gather(found().solution, [added.effects[0]])
+    evidence = gather(solution(), [added.effects[0]])
     (column,) = evidence.columns["edge_glow"]
     by_place = sorted(
         (evidence.image_info[d.index].x_px, float(d.share @ d.jacobian[column])) for d in evidence.discs
@@ -109,8 +108,7 @@ def test_an_error_in_a_source_is_reported_with_its_name(tmp_path: Path) -> None:
 
 
 def test_a_change_that_is_not_an_image_is_reported_when_it_is_computed(tmp_path: Path) -> None:
-    view = View(found().solution)
-    ny, nx = view.solution.transit.shape
+    ny, nx = solution().transit.shape
     changes = {
         "plane[1:]": f"edge_glow: expected an image of shape ({ny}, {nx}) [y, x]; got an array of shape ({ny - 1}, {nx})",
         "plane * np.nan": "got an image with NaN or infinite values",
@@ -118,18 +116,18 @@ def test_a_change_that_is_not_an_image_is_reported_when_it_is_computed(tmp_path:
     }
     for n, (change, said) in enumerate(changes.items()):
         text = GLOW.replace("lambda n, images: plane", f"lambda n, images: {change}")
-        (faulty,) = one_of(source_in(tmp_path, text, f"mine_{n}.py")).changes(view)
+        (faulty,) = one_of(source_in(tmp_path, text, f"mine_{n}.py")).changes(view())
         with pytest.raises(DataError) as refusal:
-            faulty.change(0, view.expected)
+            faulty.change(0, view().expected)
         assert refusal.value.code == "bad-effects" and said in refusal.value.message
     two = GLOW.replace("unocculted=False)]", "unocculted=False)] * 2")
     with pytest.raises(DataError, match="edge_glow: expected 1 Change, one per parameter; got 2"):
-        one_of(source_in(tmp_path, two)).changes(view)
+        one_of(source_in(tmp_path, two)).changes(view())
     # `why_not` and `held` of an added effect are checked too.
     text = GLOW.replace("glow),)", "glow, lambda view: 1 / 0, held=lambda view: EFFECTS[0]),)")
     effect = one_of(source_in(tmp_path, text))
     with pytest.raises(DataError, match="ZeroDivisionError"):
-        effect.why_not(view)
+        effect.why_not(view())
     assert effect.held is not None
-    (held,) = effect.held(view).changes(view)
-    np.testing.assert_array_equal(held.change(0, view.expected)[0], held.change(3, view.expected)[9])
+    (held,) = effect.held(view()).changes(view())
+    np.testing.assert_array_equal(held.change(0, view().expected)[0], held.change(3, view().expected)[9])

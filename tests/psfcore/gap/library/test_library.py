@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,38 +12,33 @@ import pytest
 from psfcore.gap.evidence.unocculted_blocks import spread_blocks, unocculted_blocks
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.view import View
-from tests.psfcore.gap.small_transits import solution
+from tests.psfcore.gap.small_transits import effect, solution, view
 
 TEXT = (Path(__file__).parents[4] / "docs" / "gap.md").read_text("utf-8")
 # The list in the documentation: "The axes along which an effect can vary are ...".
 AXES = set(re.findall(r"`(\w+)`", TEXT.split("The axes along which")[1].split("\n- ")[0]))
 
 
-@cache
-def view() -> View:
-    return View(solution())
-
-
 def test_an_effect_declares_what_the_report_needs() -> None:
-    assert len({effect.name for effect in LIBRARY}) == len(LIBRARY)
-    for effect in LIBRARY:
-        name = effect.name
-        assert name.isidentifier() and effect.cause and effect.axes and effect.settled_by, name
+    assert len({one.name for one in LIBRARY}) == len(LIBRARY)
+    for one in LIBRARY:
+        name = one.name
+        assert name.isidentifier() and one.cause and one.axes and one.settled_by, name
         assert name not in ("none", "unknown")  # hypotheses of the posterior have these names
-        assert set(effect.axes) <= AXES, name
-        assert effect.parameters and all(parameter.likely > 0 for parameter in effect.parameters), name
-        assert len({parameter.name for parameter in effect.parameters}) == len(effect.parameters), name
+        assert set(one.axes) <= AXES, name
+        assert one.parameters and all(parameter.likely > 0 for parameter in one.parameters), name
+        assert len({parameter.name for parameter in one.parameters}) == len(one.parameters), name
 
 
 def test_its_changes_are_finite_images_that_are_not_all_zero() -> None:
     images = view().expected
-    for effect in LIBRARY:
-        name = effect.name
-        if (why := effect.why_not(view())) is not None:
+    for one in LIBRARY:
+        name = one.name
+        if (why := one.why_not(view())) is not None:
             assert why[0].islower() and not why.endswith("."), name
             continue
-        changes = effect.changes(view())
-        assert 0 < len(changes) <= len(effect.parameters), name
+        changes = one.changes(view())
+        assert 0 < len(changes) <= len(one.parameters), name
         for change in changes:
             fields = [change.change(n, images) for n in (0, len(images) // 2, len(images) - 1)]
             assert all(field.shape == images[0].shape and np.isfinite(field).all() for field in fields), name
@@ -76,26 +70,24 @@ def test_a_flickering_block_changes_as_measured_if_some_pixels_are_clipped() -> 
         )
         for n, frame in enumerate(frames)
     )
-    view = View(replace(plain, transit=replace(plain.transit, frames=flickering)))
-    effect = next(effect for effect in LIBRARY if effect.name == "saturation_fill")
-    flicker = effect.changes(view)[2]
+    seen = View(replace(plain, transit=replace(plain.transit, frames=flickering)))
+    flicker = effect("saturation_fill").changes(seen)[2]
     shown = here[1:]
     mean = np.mean([height[n] for n in shown])
     assert len(shown) >= 2 and flicker.numbers >= len(shown) - 1
     for n in shown:
-        change = flicker.change(n, view.expected)
+        change = flicker.change(n, seen.expected)
         assert change[bright] == pytest.approx(height[n] - mean, rel=0.1)
         assert np.abs(change[sign == 0]).max() < 0.1 * np.abs(change[bright]).max()
-    assert not flicker.change(here[0], view.expected)[bright].any()
+    assert not flicker.change(here[0], seen.expected)[bright].any()
     assert not any(
-        flicker.change(n, view.expected)[bright].any() for n in range(len(frames)) if n not in here
+        flicker.change(n, seen.expected)[bright].any() for n in range(len(frames)) if n not in here
     )
 
 
 def test_a_loss_of_faint_light_takes_light_away() -> None:
-    [effect] = [one for one in LIBRARY if one.name == "nonlinearity"]
     images = view().expected
-    for change in effect.changes(view()):
+    for change in effect("nonlinearity").changes(view()):
         lost = change.change(0, images)
         assert lost.min() < 0 and lost.max() <= 0
         assert abs(lost).max() <= images[0].max()
