@@ -234,7 +234,10 @@ def _with_fields(
     fields = fields_of(evidence)
     for field in fields:
         weigh_beside(field, beside)
-    best = {f: max(w.log_evidence for form, w in out.items() if form.field == f) for f in fields}
+    best = {
+        field: max((w.log_evidence for form, w in out.items() if form.field == field), default=-math.inf)
+        for field in fields
+    }
     missing = [form for form in others if form not in beside]
     for field in sorted(best, key=lambda one: -best[one])[:FIELDS_BESIDE] if missing else []:
         weigh_beside(field, missing)
