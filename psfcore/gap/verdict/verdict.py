@@ -33,7 +33,7 @@ from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form, Names, Posterior,
 Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
 
 LEAST_IMAGES = 6
-# A true effect closes more: in 144 simulated cases, the upper end of the interval is below this value for EARNED_FIGURE.
+# The interval of the closure by a true effect ends near 1, even if its lower end is low because the data are few.
 EARNED = 0.5
 
 
