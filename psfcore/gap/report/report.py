@@ -260,7 +260,9 @@ def sentence(found: Diagnosis) -> str:
             f"{found.noise_pct:.1f} %.{_not_excluded(judged)}"
         )
     strongest = found.where[0]
-    lead = f"There is a gap of {left}. It varies most {AXIS_WORDS[strongest.name]} and is largest in {_pointings(strongest.at)}."
+    numbers = strongest.at.get("pointings", [])
+    where = f"pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
+    lead = f"There is a gap of {left}. It varies most {AXIS_WORDS[strongest.name]} and is largest in {where}."
     if found.rms.value < found.noise_pct and _unocculted_alone(found):
         lead = (
             f"There is a gap in the unocculted field, and it varies most {AXIS_WORDS[strongest.name]}. The discs do not show it "
@@ -358,11 +360,6 @@ def in_short_if_many(values: Sequence[float]) -> str | None:
     if len(values) <= MOST_READ:
         return None
     return f"{len(values)} parameters, root sum of squares {float(np.linalg.norm(values)):.2g}"
-
-
-def _pointings(at: dict[str, Any]) -> str:
-    numbers = at.get("pointings", [])
-    return f"pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
 
 
 def words(name: str) -> str:
