@@ -34,15 +34,6 @@ def fitted(found: Diagnosis, name: str) -> dict[str, tuple[float, float, str]]:
     return next(fit for fit in found.fits if fit.names == (name,)).values
 
 
-def test_a_negative_dark_offset(clean: Transit) -> None:
-    found = diagnose(changed(clean, lambda n, f: f.pixels - 3.0 / f.exposure_s))
-    assert found.judgement.verdict == "attributed" and found.judgement.answer == ("dark_offset",)
-    value, sigma, _ = found.corrected[0].values["offset"]
-    assert value == pytest.approx(-3.0, abs=max(4 * sigma, 0.05))
-    closure = found.shrinking["dark_offset"].closure
-    assert closure is not None and closure.value > 0.7
-
-
 def test_a_gain_mismatch_shows_in_the_unocculted_field_and_hardly_in_the_discs(clean: Transit) -> None:
     found = verdict(changed(clean, lambda n, f: f.pixels * (1.08 if f.gain_mode == "combined" else 1.0)))
     assert found.judgement.answer == ("gain_mismatch",)
