@@ -90,7 +90,16 @@ def _kernel(added: Corrected) -> Kernel:
     optical = [effect for effect in added.effects if effect.stage == "optics" and not effect.exact]
     if not optical:
         return kernel
-    view = _point(added, total, kernel)
+    middle = REACH_GRID_PX // 2
+    point = replace(
+        solution.transit.frames[0],
+        pixels=kernel.astype(np.float32),
+        place=Place(middle, middle, 1.0),
+        filled=None,
+    )
+    transit = replace(solution.transit, frames=(point,))
+    optics = Optics(kernel, kernel.shape, threads=solution.threads)
+    view = _Point(replace(solution, transit=transit, total=total, optics=optics))
     values = iter(added.values.values())
     changed = kernel.copy()
     for effect in added.effects:
@@ -134,23 +143,3 @@ class _Point(View):
         """The point source, multiplied by `weight` at its position, and convolved with dH (`slope`)."""
         point = slope.lanes(self.scenes[n] if weight is None else self.scenes[n] * weight)
         return slope.field(slope.convolve(point))
-
-
-def _point(added: Corrected, total: TotalPsf, kernel: Kernel) -> View:
-    """The view of a solution whose only image is the image of a point source."""
-    solution = added.solution
-    middle = REACH_GRID_PX // 2
-    frame = replace(
-        solution.transit.frames[0],
-        pixels=kernel.astype(np.float32),
-        place=Place(middle, middle, 1.0),
-        filled=None,
-    )
-    return _Point(
-        replace(
-            solution,
-            transit=replace(solution.transit, frames=(frame,)),
-            total=total,
-            optics=Optics(kernel, kernel.shape, threads=solution.threads),
-        )
-    )

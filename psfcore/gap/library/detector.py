@@ -13,7 +13,6 @@ from psfcore.gap.effect import Change, Effect
 from psfcore.gap.effect import EffectParameter as Parameter
 from psfcore.gap.evidence.unocculted_blocks import spread_blocks, unocculted_blocks
 from psfcore.gap.view import Field, View
-from psfcore.transit.transit import Frame
 
 # The loss of the detector is a smooth function of the counts: a sum of bumps at these counts, Gaussian in the logarithm.
 COUNTS_DN = (8, 25, 80, 250, 800, 2500)
@@ -37,13 +36,9 @@ def _gradient(view: View) -> Sequence[Change]:
     return [Change(lambda n, images, plane=plane: plane, unocculted=False) for plane in planes]  # type: ignore[misc]
 
 
-def _is_combined(frame: Frame) -> bool:
-    return (frame.gain_mode or "").lower() == "combined"
-
-
 def _gain_mismatch(view: View) -> Sequence[Change]:
-    frames = view.solution.transit.frames
-    return [Change(lambda n, images: np.asarray(images[n] * np.float32(_is_combined(frames[n]))))]
+    modes = [(frame.gain_mode or "").lower() for frame in view.solution.transit.frames]
+    return [Change(lambda n, images: np.asarray(images[n] * np.float32(modes[n] == "combined")))]
 
 
 def _one_gain_mode(view: View) -> str | None:

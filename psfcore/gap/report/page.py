@@ -127,27 +127,21 @@ def hypothesis_rows(report: Report) -> list[Row]:
 
 def effect_rows(report: Report) -> list[Row]:
     """Every effect that was tested, with its parameters and its closure."""
-    return [_effect_row(effect) for effect in fits_of(report)]
-
-
-def _effect_row(effect: Report) -> Row:
-    numbers = "; ".join(
-        f"{words(name)} {with_error(p['value'], p['sigma'])} {unit_words(p['unit'])}".rstrip()
-        for name, p in effect["parameters"].items()
-    )
-    fall, closure = effect["delta_chi2_held_out"], effect["closure"]
-    cells = [DASH, DASH]
-    if closure is not None:
-        value, low, high = (f"{round(100 * one) + 0}" for one in (closure["value"], *closure["ci90"]))
-        cells = [value, f"{low} to {high}"]
-    return [
-        words(effect["name"]),
-        percent_words(effect["probability"]),
-        in_short_if_many([p["value"] for p in effect["parameters"].values()]) or numbers,
-        DASH if fall is None else f"{fall:.1f}",
-        *cells,
-        p_words(effect["p_value"]),
-    ]
+    rows = []
+    for effect in fits_of(report):
+        parameters, fall, closure = (effect[key] for key in ("parameters", "delta_chi2_held_out", "closure"))
+        numbers = (
+            f"{words(name)} {with_error(p['value'], p['sigma'])} {unit_words(p['unit'])}".rstrip()
+            for name, p in parameters.items()
+        )
+        in_short = in_short_if_many([p["value"] for p in parameters.values()])
+        cells = [DASH, DASH]
+        if closure is not None:
+            value, low, high = (f"{round(100 * one) + 0}" for one in (closure["value"], *closure["ci90"]))
+            cells = [value, f"{low} to {high}"]
+        row = [words(effect["name"]), percent_words(effect["probability"]), in_short or "; ".join(numbers)]
+        rows.append([*row, DASH if fall is None else f"{fall:.1f}", *cells, p_words(effect["p_value"])])
+    return rows
 
 
 def psf_table(found: Diagnosis, report: Report) -> tuple[Row, list[Row]]:

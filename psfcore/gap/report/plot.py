@@ -356,17 +356,12 @@ def draw_where(axes: Any, report: Report) -> None:
     colours = [_ANSWER if n == 0 and report["verdict"] != "none" else _OTHER for n in range(len(rows))]
     axes.barh(at, shares, color=colours, height=0.7)
     for y, share, row in zip(at, shares, rows, strict=True):
-        axes.annotate(
-            p_words(row["p_value"]), (share, y), (4, 0), textcoords="offset points", va="center", fontsize=8.5
-        )
+        p = row["p_value"]
+        text = f"p < {CERTAIN_P:.0e}" if p < CERTAIN_P else f"p = {p:.2g}"
+        axes.annotate(text, (share, y), (4, 0), textcoords="offset points", va="center", fontsize=8.5)
     axes.set_yticks(at, [row["axis"].replace("_", " ") for row in rows])
     axes.set(xlim=(0, 1.3 * max(float(shares.max(initial=0.0)), 1.0)), xlabel="Share of the gap (%)")
     tidy([axes])
-
-
-def p_words(p_value: float) -> str:
-    """A p-value as text, for the label of a bar."""
-    return f"p < {CERTAIN_P:.0e}" if p_value < CERTAIN_P else f"p = {p_value:.2g}"
 
 
 def draw_effects(axes: Any, report: Report) -> None:
@@ -376,8 +371,7 @@ def draw_effects(axes: Any, report: Report) -> None:
     names = []
     for y, row in zip(at, rows, strict=True):
         chosen = _chosen(row, report)
-        colour = _ANSWER if chosen else _OTHER
-        _draw_closure(axes, float(y), row["closure"], colour)
+        _draw_closure(axes, float(y), row["closure"], _ANSWER if chosen else _OTHER)
         axes.text(1.52, y, percent_words(row["probability"]), va="center", ha="right", fontsize=9)
         mark = {"attributed": "named", "tie": "tied"}.get(report["verdict"], "") if chosen else ""
         names.append(row["name"].replace("_", " ") + (f"  ({mark})" if mark else ""))

@@ -270,7 +270,9 @@ def sentence(found: Diagnosis) -> str:
         )
     strongest = found.where[0]
     along = AXIS_WORDS[strongest.name] + (", as the best effect does," if strongest.of_best else "")
-    lead = f"There is a gap of {left}. It varies most {along} and is largest in {_pointings(strongest.at)}."
+    numbers = strongest.at.get("pointings", [])
+    where = f"pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
+    lead = f"There is a gap of {left}. It varies most {along} and is largest in {where}."
     if _shown_by_blocks(found):
         lead = (
             f"There is a gap in the unocculted field, and it varies most {along}. The discs do not show it."
@@ -397,11 +399,6 @@ def in_short_if_many(values: Sequence[float]) -> str | None:
     if len(values) <= MOST_READ:
         return None
     return f"{len(values)} parameters, root sum of squares {float(np.linalg.norm(values)):.2g}"
-
-
-def _pointings(at: dict[str, Any]) -> str:
-    numbers = at.get("pointings", [])
-    return f"pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
 
 
 def words(name: str) -> str:

@@ -34,15 +34,6 @@ def fitted(found: Diagnosis, name: str) -> dict[str, tuple[float, float, str]]:
     return next(fit for fit in found.fits if fit.names == (name,)).values
 
 
-def test_a_negative_dark_offset(clean: Transit) -> None:
-    found = diagnose(changed(clean, lambda n, f: f.pixels - 3.0 / f.exposure_s))
-    assert found.judgement.verdict == "attributed" and found.judgement.answer == ("dark_offset",)
-    value, sigma, _ = found.corrected[0].values["offset"]
-    assert value == pytest.approx(-3.0, abs=max(4 * sigma, 0.05))
-    closure = found.shrinking["dark_offset"].closure
-    assert closure is not None and closure.value > 0.7
-
-
 def test_a_gain_mismatch_shows_in_the_unocculted_field_and_hardly_in_the_discs(clean: Transit) -> None:
     found = verdict(changed(clean, lambda n, f: f.pixels * (1.08 if f.gain_mode == "combined" else 1.0)))
     assert found.judgement.answer == ("gain_mismatch",)
@@ -73,15 +64,15 @@ def test_persistence_whatever_its_decay_time(clean: Transit) -> None:
 
 def test_a_patchy_flat_field_error(clean: Transit) -> None:
     uneven = 1 + 0.15 * patches(clean.shape[0], seed=3, patch=0.2)
-    # The linear model alone does not decide whether light from outside the field acts as well; the full refit does.
+    # The linear model alone does not decide whether light from outside the field acts as well; the full refit does. A field of an
+    # unknown cause may also explain the patches.
     found = diagnose(changed(clean, lambda n, f: f.pixels * uneven))
-    assert found.judgement.answer == ("flat_field_residual",)
+    assert found.judgement.answer == ("flat_field_residual",) == found.judgement.members[0]
     closure = found.shrinking["flat_field_residual"].closure
     assert closure is not None and closure.value > 0.3
     # Parameters that the discs do not constrain stay near 0, so together they are no larger than the patches.
     values = fitted(found, "flat_field_residual")
     assert np.linalg.norm([value for value, _, _ in values.values()]) < 0.2
-    assert f"{len(found.corrected[0].values)} parameters" in gap_report(found)["sentence"]
 
 
 def test_a_sun_that_changes_faster_than_the_images_follow_is_still_named() -> None:

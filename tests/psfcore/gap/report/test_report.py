@@ -15,6 +15,7 @@ from psfcore.gap.report.report import (
     LEAST_SHARE,
     gap_report,
     hypothesis_words,
+    in_short_if_many,
     percent_words,
 )
 from psfcore.gap.verdict.limits import Alike
@@ -203,6 +204,8 @@ def test_a_gap_of_the_unocculted_field_alone_is_not_said_of_the_discs() -> None:
 def test_words_for_probabilities_and_hypotheses() -> None:
     percents = {1.0: "> 99 %", 0.9949: "99 %", 0.5: "50 %", 0.006: "1 %", 0.004: "< 1 %", 0.0: "< 1 %"}
     assert {share: percent_words(share) for share in percents} == percents
+    assert in_short_if_many([1.0] * 12) is None
+    assert in_short_if_many([3.0] + 15 * [0.0] + [4.0]) == "17 parameters, root sum of squares 5"
     assert (hypothesis_words(NONE), hypothesis_words(UNKNOWN)) == ("no gap", "a cause outside the library")
     assert hypothesis_words(OFFSET_BLUR) == "dark offset together with core blur"
     assert hypothesis_words(("ghost", "unknown")) == "ghost together with a cause outside the library"
