@@ -14,9 +14,8 @@ from psfcore.gap.effect import EffectParameter as Parameter
 from psfcore.gap.evidence.unocculted_blocks import spread_blocks, unocculted_blocks
 from psfcore.gap.view import Field, View
 
-# The loss of the detector is a smooth function of the counts: a sum of bumps at these counts, Gaussian in the logarithm.
-COUNTS_DN = (8, 25, 80, 250, 800, 2500)
-COUNTS_WIDTH = math.log(COUNTS_DN[-1] / COUNTS_DN[0]) / (len(COUNTS_DN) - 1) / 1.2
+# Decay levels of two losses; their sum approximates a loss with any decay level in between.
+FAINT_DN = (30.0, 150.0)
 # Decay times, in units of the mean interval between images. Sums of these decays and of a fraction of the previous image
 # approximate charge traps.
 FADES_IN = {"one_wait": 1, "three_waits": 3}
@@ -47,12 +46,11 @@ def _one_gain_mode(view: View) -> str | None:
 
 
 def _nonlinearity(view: View) -> Sequence[Change]:
-    def loss(n: int, images: Sequence[Field], at_dn: float) -> Field:
-        counts = np.maximum(images[n] * np.float32(view.exposure_s(n)), np.float32(1.0))
-        away = np.log(counts / np.float32(at_dn)) / np.float32(COUNTS_WIDTH)
-        return np.asarray(-images[n] * np.exp(-0.5 * away**2))
+    def loss(n: int, images: Sequence[Field], faint_dn: float) -> Field:
+        counts = np.maximum(images[n] * np.float32(view.exposure_s(n)), 0)
+        return np.asarray(-images[n] * np.exp(-counts / np.float32(faint_dn)))
 
-    return [Change(partial(loss, at_dn=at_dn)) for at_dn in COUNTS_DN]
+    return [Change(partial(loss, faint_dn=faint_dn)) for faint_dn in FAINT_DN]
 
 
 def _half_waves() -> list[tuple[int, int]]:
@@ -169,8 +167,7 @@ EFFECTS: tuple[Effect, ...] = (
            ("detector_x", "detector_y"), _gradient),
     Effect("gain_mismatch", "detector", (Parameter("excess", "", 0.05),), "Combined-gain and high-gain images differ in their calibrated gain.",
            "images of the same scene in both gain modes", ("gain_mode", "exposure"), _gain_mismatch, _one_gain_mode),
-    Effect("nonlinearity", "detector", tuple(Parameter(f"loss_at_{dn}_dn", "", 0.05) for dn in COUNTS_DN),
-           "The signal of the detector is not proportional to the light: it loses a share that depends on the counts.",
+    Effect("nonlinearity", "detector", (Parameter("loss", "", 0.05), Parameter("loss_beyond", "", 0.05)), "The detector reads faint signals too low.",
            "a series of exposure times at one pointing", ("intensity",), _nonlinearity),
     Effect("flat_field_residual", "detector", tuple(Parameter(f"cos_{kx}x_{ky}y", "", 0.02) for kx, ky in _half_waves()),
            "The flat field leaves a smooth error of the detector's sensitivity.", "images of the same scene at several positions on the detector",
