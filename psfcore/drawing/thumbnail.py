@@ -1,4 +1,4 @@
-"""Small pictures of images for lists: a PNG with the colours of EUV images and an asinh stretch; and these colours.
+"""Pictures of images for lists and pages: a PNG with the colours of EUV images and an asinh stretch; and these colours.
 
 The stretch is asinh(I / (a T)) / asinh(1 / a), between 0 and 1, where
 
@@ -39,6 +39,7 @@ NO_DATA = "#3a4a5a"  # a blue grey, which the map does not contain
 LONGER_SIDE_PX = 192
 SOFTENING = 0.05
 TOP_PERCENTILE = 99.7
+DECADES = 6
 # The last level of the palette is the colour of pixels without data; all others are the colour map.
 _NO_DATA_LEVEL = 255
 
@@ -65,7 +66,19 @@ def write_thumbnail(pixels: Plane, path: Path) -> None:
 
     The longer side of the picture has ``LONGER_SIDE_PX`` pixels; a smaller image keeps its size.
     """
-    path.write_bytes(_png(levels_of(reduced(pixels))[::-1]))
+    path.write_bytes(png_of(reduced(pixels)))
+
+
+def png_of(pixels: Plane) -> bytes:
+    """An image [y, x] as PNG: one pixel of the picture for each pixel, row 0 at the bottom."""
+    return _png(levels_of(pixels)[::-1])
+
+
+def png_of_weights(weights: Plane) -> bytes:
+    """The weights of a PSF [y, x] as PNG, row 0 at the bottom, with a logarithmic stretch over ``DECADES`` decades."""
+    top = float(weights.max(initial=0.0))
+    share = np.log10(np.maximum(weights / top, 10.0**-DECADES)) / DECADES + 1 if top > 0 else 0 * weights
+    return _png(np.round(share * (_NO_DATA_LEVEL - 1)).astype(np.uint8)[::-1])
 
 
 def reduced(pixels: Plane) -> NDArray[np.float64]:

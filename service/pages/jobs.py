@@ -19,6 +19,7 @@ from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import page, page_of
 from service.pages.sentences import of_error
 from service.views import JobView
+from workers.catalogue.tables import ImageRow
 from workers.contract.phases import Phase
 from workers.contract.requests import Identity
 
@@ -68,6 +69,7 @@ def job(
     PSF chosen.
     """
     view = get_job(job_id, caller, state)
+    pictured = state.catalogue.get(ImageRow, image or view.parameters.get("image_id") or "", caller.owner)
     return page(
         request,
         "job.html",
@@ -78,6 +80,7 @@ def job(
         again=_again(view),
         error=None if view.error is None else of_error(view.error.code, view.error.message),
         image=image,
+        pictured=None if pictured is None else pictured.id,
         result=None if view.result is None else result_page(view.result, image),
         parameters=_pretty(view),
     )

@@ -11,10 +11,10 @@ from fastapi.responses import RedirectResponse
 from pydantic import ValidationError, validate_call
 from starlette.datastructures import FormData
 
-from psfcore.instruments.files import instrument_names
+from psfcore.instruments.files import instrument_names, telescope_of
 from psfcore.tables import lookup
 from service.api.lineage import get_psf_lineage, rerun_psf
-from service.api.psf_curves import get_cutout, tables_of
+from service.api.psf_curves import core_picture, get_cutout, tables_of
 from service.api.psf_status import (
     SeriesChange,
     SeriesView,
@@ -46,6 +46,7 @@ from workers.versions import TOTAL, PsfStatus, without_variant
 PER_PAGE = MOST_OTHERS = 50
 MOST_REPORTS = 10
 CUTOUT_PX = 257
+CORE_PX = 129
 FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_at")
 router = APIRouter(prefix="/psfs", include_in_schema=False)
 _filter: Callable[..., PsfFilter] = validate_call(psf_filter)
@@ -64,7 +65,7 @@ def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Curso
         asked={name: asked.get(name, "") for name in (*FILTERS, "context")},
         filtered=bool(asked),
         statuses=list(PsfStatus),
-        instruments=instrument_names(),
+        instruments={name: telescope_of(name) for name in instrument_names()},
         components=get_args(Component),
         usual_size=PsfBuild.model_fields["size"].default,
         most_bytes=state.settings.max_upload_bytes,
@@ -129,6 +130,7 @@ def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) 
         others=[one for one in others if one.id != psf_id][:MOST_OTHERS],
         rivals=_rivals(state, caller, view),
         reports=state.catalogue.page(ReportRow, owner=caller.owner, limit=MOST_REPORTS, about_id=psf_id),
+        core_px=CORE_PX,
         cutout_px=min(CUTOUT_PX, *view.details["shape"]),
         may_certify=Scope.CERTIFY in caller.scopes,
         may_submit=Scope.SUBMIT in caller.scopes,
@@ -155,6 +157,17 @@ async def cutout(
 ) -> Response:
     """The central part of the PSF as FITS; an error is shown as a page."""
     return await get_cutout(psf_id, size, request, caller, state)
+
+
+@router.get("/{psf_id}/core")
+async def core(psf_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """A picture of the core of the PSF; for a compressed file, the picture that a job drew."""
+    try:
+        return await core_picture(psf_id, CORE_PX, request, caller, state)
+    except Problem as problem:
+        if problem.code != "cutout-not-plain":
+            raise
+        return RedirectResponse(f"/v1/psfs/{psf_id}/preview", 303)
 
 
 @router.post("/{psf_id}/status")

@@ -121,20 +121,28 @@ function compareFiles(manifest, files, found) {
   if (extra > 0) found.unknown.push(`${extra} file${extra === 1 ? "" : "s"} of the folder that ${manifest.name} does not name: not sent`);
 }
 
-function go(file, name) {
-  send(file, name, "/v1/transits", "application/octet-stream", said, (transit) => location.assign(`/transits/${transit.id}`));
+async function go(file, name) {
+  const transit = await send(file, name, "/v1/transits", "application/octet-stream", said);
+  if (transit) location.assign(`/transits/${transit.id}`);
 }
 
-form.addEventListener("submit", (event) => {
-  event.preventDefault();
+function goArchive() {
   const file = archive.files[0];
+  say(said, null);
+  show([], []);
+  sendFolder.hidden = true;
   if (!file) return;
   const most = Number(form.dataset.most);
   if (!ARCHIVE.test(file.name)) say(said, `Expected an archive (.zip, .tar, .tar.gz); got ${file.name}. Choose another file, or choose the folder.`, "error");
   else if (file.size > most) say(said, `Expected at most ${size(most)}; ${file.name} has ${size(file.size)}.`, "error");
   else go(file, file.name);
+}
+
+form.addEventListener("submit", (event) => {
+  event.preventDefault();
+  goArchive();
 });
-archive.addEventListener("change", () => say(said, null));
+archive.addEventListener("change", goArchive);
 loose.addEventListener("change", () => {
   if (loose.files[0]) check(loose.files[0], null);
 });

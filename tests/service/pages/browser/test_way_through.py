@@ -34,13 +34,11 @@ def test_an_image_without_a_psf_says_what_to_do_and_goes_on_with_one(
 ) -> None:
     page.goto("/")
     page.set_input_files("#file", image_file)
-    page.get_by_role("button", name="Upload").click()
     expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
     expect(page.locator("#checked")).to_contain_text("No PSF for TEST is known here.")
     start = page.locator("#go")
-    expect(start).to_have_text("Check and start")
-    start.click()
-    expect(page.locator("#checked")).to_have_class("error")  # the page says again what is missing
+    expect(start).to_be_disabled()
+    expect(page.locator("form[action$='/build']")).to_have_count(0)
     good(page)
 
     page.locator("select[name=psf_id]").select_option(psf_id)
@@ -109,6 +107,64 @@ def test_a_dropped_file_is_sent(page: Page, image_file: Path) -> None:
     expect(page.get_by_role("heading", level=1)).to_have_text(re.compile("sun.fits|dropped.fits"))
 
 
+def test_several_files_are_sent_one_after_the_other_and_deconvolved(
+    page: Page, site: Site, tmp_path: Path
+) -> None:
+    """A letter among them is refused, an image of an unknown telescope is told so, and the others are started."""
+    known = {"DETECTOR": "HRI_EUV", "WAVELNTH": 174, "CDELT1": 0.492, "CDELT2": 0.492}
+    write_psf(tmp_path / "psf.fits", size=64)
+    psf = site.client.upload_psf(tmp_path / "psf.fits", instrument="hri_euv", channel="174", kind="total")["id"]
+    write_image(tmp_path / "known.fits", seed=41, **known)
+    write_image(tmp_path / "unknown.fits", seed=42)
+    (tmp_path / "letter.fits").write_text("Dear editor")
+    page.goto("/")
+    page.set_input_files("#file", [tmp_path / f"{name}.fits" for name in ("letter", "known", "unknown")])
+    lines = page.locator("#files li")
+    expect(lines.get_by_role("link")).to_have_text(["known.fits", "unknown.fits"])
+    expect(lines.filter(has_text="is not a FITS file")).to_have_count(1)
+    good(page)
+    page.get_by_role("button", name="Deconvolve all").click()
+    expect(lines.filter(has_text="unknown.fits")).to_contain_text("No PSF for TEST is known here.")
+    jobs = [one for one in site.client.jobs() if one["kind"] == "deconvolve"]
+    images = {site.client.image(one["parameters"]["image_id"])["filename"]: one for one in jobs}
+    assert "known.fits" in images and "unknown.fits" not in images
+    site.client.cancel(images["known.fits"]["id"])
+    assert psf
+
+
+def test_a_psf_is_uploaded_where_the_page_says_that_none_is_known(
+    page: Page, image_file: Path, tmp_path: Path
+) -> None:
+    write_psf(tmp_path / "mine.fits", size=64, scale=0.9)
+    page.goto("/")
+    page.set_input_files("#file", image_file)
+    expect(page.locator("#checked")).to_have_class("error")
+    page.get_by_label("Upload a PSF").set_input_files(tmp_path / "mine.fits")
+    expect(page).to_have_url(re.compile("[?]psf_id=[0-9a-f]{64}$"))
+    expect(page.locator("#checked")).to_have_class("good")
+    expect(page.locator("#go")).to_have_text("Start")
+    picture = page.get_by_role("img", name="The image as it was uploaded")
+    assert picture.evaluate("(one) => [one.naturalWidth, one.naturalHeight]") == [96, 128]
+
+
+def test_a_psf_of_another_channel_is_offered_only_when_it_is_allowed(
+    page: Page, site: Site, tmp_path: Path
+) -> None:
+    aia = {"TELESCOP": "SDO/AIA", "CDELT1": 0.6, "CDELT2": 0.6}
+    write_image(tmp_path / "a.fits", seed=51, WAVELNTH=193, **aia)
+    write_psf(tmp_path / "p.fits", size=64, scale=0.8)
+    image = site.client.upload_image(tmp_path / "a.fits")["id"]
+    psf = site.client.upload_psf(tmp_path / "p.fits", instrument="aia_171", channel="171")["id"]
+    page.goto(f"/images/{image}")
+    page.get_by_text("Options").click()
+    offer = page.locator(f"option[value='{psf}']")
+    expect(offer).to_be_disabled()
+    page.get_by_label("Allow a PSF of another telescope").check()
+    expect(offer).to_be_enabled()
+    page.locator("select[name=psf_id]").select_option(psf)
+    expect(page.locator("#checked")).to_have_class("good")
+
+
 def test_a_file_that_is_no_image_is_refused_before_it_is_sent(page: Page) -> None:
     page.goto("/")
     sent: list[str] = []
@@ -119,8 +175,7 @@ def test_a_file_that_is_no_image_is_refused_before_it_is_sent(page: Page) -> Non
         ("binary.fits", bytes(range(0x80, 0xA0)), "is not a FITS file"),
     ):
         page.set_input_files("#file", {"name": name, "mimeType": "application/fits", "buffer": content})
-        page.get_by_role("button", name="Upload").click()
-        expect(page.get_by_role("alert")).to_contain_text(f"{name} {reason}")
+        expect(page.locator("#files li")).to_contain_text([f"{name} {reason}"])  # and none of the earlier files
     assert sent == []
 
 
@@ -162,8 +217,6 @@ def test_the_keyboard_alone_leads_from_a_file_to_a_blinked_product(
     page.keyboard.press("Space")
     assert page.evaluate("window.asked"), "the key opens the dialog"
     page.set_input_files("#file", image_file)
-    tab_to(page, page.get_by_role("button", name="Upload"))
-    page.keyboard.press("Enter")
     expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
     psfs = page.locator("select[name=psf_id]")
     tab_to(page, psfs)
@@ -198,12 +251,11 @@ def test_the_keyboard_alone_leads_from_a_file_to_a_blinked_product(
 
 @pytest.mark.slow  # the PSF of the instrument is built in half a minute; the tests above go the same way with a small PSF
 def test_a_real_image_becomes_a_product_that_is_blinked(page: Page, shared: Path) -> None:
-    """Three clicks (choose, Upload, Start) and one key, without any option."""
+    """Two clicks (choose, Start) and one key, without any option."""
     page.goto("/")
     page.set_input_files(
         "#file", shared / "data/real/eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"
     )
-    page.get_by_role("button", name="Upload").click()
     expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"), timeout=LONG_MS)
     page.get_by_role("button", name="Start").click()
     expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=5 * LONG_MS)
