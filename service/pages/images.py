@@ -19,7 +19,6 @@ from psfcore.instruments.files import telescope_of, telescopes
 from service.api.images import ImageView, upload_image
 from service.api.jobs import EstimateView, estimate_job, submit_job
 from service.api.pixels import picture
-from service.api.psfs import upload_psf
 from service.http.callers import Caller
 from service.http.problems import Problem
 from service.http.quotas import Allowed
@@ -154,15 +153,6 @@ async def image_picture(
     """A picture of the image as it was uploaded."""
     row = await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
     return await picture(request, state, image_id, row.summary["shape"])
-
-
-@router.post("/images/{image_id}/psf")
-async def take_psf(
-    image_id: Identity, request: Request, response: Response, caller: PageSubmitting, state: Shared
-) -> Response:
-    """Take a PSF from the form, and show the page of the image with this PSF."""
-    view = await upload_psf(request, response, caller, state)
-    return RedirectResponse(f"/images/{image_id}?psf_id={view.id}", 303)
 
 
 @router.get("/images/{image_id}")

@@ -75,11 +75,18 @@ def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Curso
 
 @router.post("")
 async def upload(
-    request: Request, response: Response, caller: PageSubmitting, state: Shared, kind: KindOfUpload = None
+    request: Request,
+    response: Response,
+    caller: PageSubmitting,
+    state: Shared,
+    kind: KindOfUpload = None,
+    image: Annotated[Identity | None, Query()] = None,
 ) -> Response:
-    """Take a PSF from the form, and go to its page. kind: as for the API."""
+    """Take a PSF from the form, and go to its page, or to the page of the image for which it was sent. kind: as for the API."""
     view = await upload_psf(request, response, caller, state, kind=kind)
-    return RedirectResponse(f"/psfs/{view.id}", 303)
+    return RedirectResponse(
+        f"/psfs/{view.id}" if image is None else f"/images/{image}?psf_id={view.id}", 303
+    )
 
 
 @router.post("/build")

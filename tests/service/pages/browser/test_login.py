@@ -75,7 +75,7 @@ def test_a_person_with_a_key_comes_from_the_login_to_a_product(page: Page, key: 
     log_in(page, key)
     page.set_input_files("#psf-file", tmp_path / "psf.fits")
     page.get_by_role("button", name="Upload a PSF of unknown kind").click()
-    expect(page).to_have_url(re.compile("/psfs/[0-9a-f]{64}$"))
+    expect(page).to_have_url(re.compile("/psfs/[0-9a-f]{64}$"), timeout=20_000)
     psf_id = urlsplit(page.url).path.rpartition("/")[2]
     page.goto("/")
     page.set_input_files("#file", tmp_path / "sun.fits")
