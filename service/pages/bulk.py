@@ -43,7 +43,16 @@ from workers.catalogue.bulk_progress import MOST_EXPLAINED
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ProductRow, PsfContextRow, PsfRow
-from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, BulkRequest, BulkWork, ItemState
+from workers.contract.bulk import (
+    AT_WORK,
+    DELETABLE,
+    OPEN,
+    STOPPED,
+    BulkPhase,
+    BulkRequest,
+    BulkWork,
+    ItemState,
+)
 from workers.contract.layout import FIELDS
 from workers.files import archive
 
@@ -286,9 +295,15 @@ def change_run(
 def _request_facts(view: BulkView) -> list[tuple[str, str]]:
     """What the run was asked to do: name and value."""
     work = BulkWork.model_validate(view.request)
-    method, options = work.parameters.method, work.parameters.model_dump(exclude_defaults=True, exclude={"method"})
+    method, options = (
+        work.parameters.method,
+        work.parameters.model_dump(exclude_defaults=True, exclude={"method"}),
+    )
     facts = [("Files", f"{one.glob} {json.dumps(one.where) if one.where else ''}") for one in work.files]
-    facts += [("Method", f"{method.name}, {method.steps} steps"), *((name, str(options[name])) for name in options)]
+    facts += [
+        ("Method", f"{method.name}, {method.steps} steps"),
+        *((name, str(options[name])) for name in options),
+    ]
     if work.output is not None:
         facts += [("Output", work.output.folder), ("Names", work.output.layout or "")]
     if not work.keeps_products:

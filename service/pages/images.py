@@ -147,9 +147,7 @@ class Checked:
 
 
 @router.get("/images/{image_id}/picture")
-async def image_picture(
-    image_id: Identity, request: Request, caller: PageReading, state: Shared
-) -> Response:
+async def image_picture(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """A picture of the image as it was uploaded."""
     row = await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
     return await picture(request, state, image_id, row.summary["shape"])
@@ -232,9 +230,7 @@ def product_line(product: ProductView) -> dict[str, Any]:
     }
 
 
-def _psfs(
-    chosen: str, image: ImageRow, caller: Caller, state: State
-) -> tuple[list[PsfRow], list[PsfRow]]:
+def _psfs(chosen: str, image: ImageRow, caller: Caller, state: State) -> tuple[list[PsfRow], list[PsfRow]]:
     """The PSFs that the form offers, the newest and the chosen one: those that suit the image, and the others."""
     found = list(state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_PSFS))
     if chosen and chosen not in [psf.id for psf in found]:

@@ -84,9 +84,7 @@ async def upload(
 ) -> Response:
     """Take a PSF from the form, and go to its page, or to the page of the image for which it was sent. kind: as for the API."""
     view = await upload_psf(request, response, caller, state, kind=kind)
-    return RedirectResponse(
-        f"/psfs/{view.id}" if image is None else f"/images/{image}?psf_id={view.id}", 303
-    )
+    return RedirectResponse(f"/psfs/{view.id}" if image is None else f"/images/{image}?psf_id={view.id}", 303)
 
 
 @router.post("/build")

@@ -105,7 +105,9 @@ def test_an_error_plane_needs_figures_and_the_form_takes_them(api: TestClient, t
 def test_a_short_time_is_told_as_a_sentence(api: TestClient, psf_file: Path, tmp_path: Path) -> None:
     found = checked(api, image(api, tmp_path), psf_id=upload(api, psf_file, "/v1/psfs"), steps="1")
     assert re.fullmatch(r"(Less than 1 s|About \d+ s) and \d+ MiB\.", found[2])
-    assert re.match(r"PSF uploaded 0\.0\.0\+\w{8} \(draft\)\.", found[0]) and found[1].startswith("Draft means")
+    assert re.match(r"PSF uploaded 0\.0\.0\+\w{8} \(draft\)\.", found[0]) and found[1].startswith(
+        "Draft means"
+    )
 
 
 # One click to a PSF ---------------------------------------------------------------------------------

@@ -111,6 +111,11 @@ def test_an_uploaded_psf_gets_its_curves_by_a_job(
     run_jobs()
     page = api.get(f"/psfs/{psf_id}").text
     assert page.count("data-plot") == 2 and f"/v1/psfs/{psf_id}/preview" in page and "no curves" not in page
+    (core,) = re.findall(r'<img class="picture core" src="([^"]+)"', page)
+    picture = api.get(core)
+    assert picture.headers["content-type"] == "image/png" and picture.content.startswith(b"\x89PNG")
+    assert api.get(core, headers={"If-None-Match": picture.headers["etag"]}).status_code == 304
+    assert len(re.findall("<img class=.picture", page)) == 1, "the curves are not drawn twice"
     # The numbers of the table are those of the API.
     profile = api.get(f"/v1/psfs/{psf_id}/profile").json()["mean_weight"]["TOTAL"]
     shown = re.findall(r'<td class="number">0</td><td class="number">([^<]+)</td>', page)

@@ -173,7 +173,9 @@ def test_a_file_that_is_no_image_is_refused_before_it_is_sent(page: Page) -> Non
         ("binary.fits", bytes(range(0x80, 0xA0)), "is not a FITS file"),
     ):
         page.set_input_files("#file", {"name": name, "mimeType": "application/fits", "buffer": content})
-        expect(page.locator("#files li")).to_contain_text([f"{name} {reason}"])  # and none of the earlier files
+        expect(page.locator("#files li")).to_contain_text(
+            [f"{name} {reason}"]
+        )  # and none of the earlier files
     assert sent == []
 
 
