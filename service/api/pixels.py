@@ -7,7 +7,7 @@ request for pixels loads the numerical libraries.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, BinaryIO, Literal
 
@@ -153,19 +153,16 @@ async def prepare_image(state: State, digest: str) -> None:
         await _plane(state, digest, IMAGE)
 
 
-async def picture(request: Request, state: State, digest: str, shape: Sequence[int]) -> Response:
-    """A picture of the image (ny, nx) in a stored file as PNG, at most ``PICTURE_PX`` wide and high; or 304."""
+async def image_picture(request: Request, state: State, digest: str) -> Response:
+    """A picture of the image in a stored file as PNG, or 304 if the client already has it."""
     sent = files.headers_of(f"{ANSWERS_VERSION} {digest} picture")
     if (same := files.unchanged(request, sent)) is not None:
         return same
 
     def draw(plane: Plane) -> bytes:
-        import numpy as np
+        from psfcore.drawing.pictures import picture
 
-        from psfcore.drawing.thumbnail import png_of
-
-        blocks, _, pieces = _cut(plane, Part(step=-(-max(shape) // PICTURE_PX)), bits=False)
-        return png_of(np.frombuffer(b"".join(pieces), dtype="<f4").reshape(blocks))
+        return picture(plane, PICTURE_PX)
 
     with as_problems():
         png = await run_in_threadpool(draw, await _plane(state, digest, IMAGE))

@@ -177,7 +177,7 @@ async def get_cutout(
     return StreamingResponse(part.pieces(), media_type=files.FITS_TYPE, headers=headers)
 
 
-async def core_picture(psf_id: str, size: int, request: Request, caller: Caller, state: State) -> Response:
+async def psf_picture(psf_id: str, size: int, request: Request, caller: Caller, state: State) -> Response:
     """A picture of the central part of a PSF, at most ``size`` px wide and high, as PNG; or 304."""
     row = await run_in_threadpool(state.row, PsfRow, psf_id, caller.owner)
     headers = files.headers_of(f"{ANSWERS_VERSION} {row.file_sha256} core {size}")
@@ -186,13 +186,9 @@ async def core_picture(psf_id: str, size: int, request: Request, caller: Caller,
     edge = min(size, *row.details["shape"])
 
     def draw() -> bytes:
-        import numpy as np
+        from psfcore.drawing.pictures import core_picture
 
-        from psfcore.drawing.thumbnail import png_of_weights
-
-        part = cutout(files.found(state.store, row.file_sha256, row.bytes), edge, state.limits)
-        kind = f">f{abs(part.bitpix) // 8}"
-        return png_of_weights(np.frombuffer(b"".join(part.rows()), dtype=kind).reshape(edge, edge))
+        return core_picture(cutout(files.found(state.store, row.file_sha256, row.bytes), edge, state.limits))
 
     with as_problems():
         png = await anyio.to_thread.run_sync(draw, limiter=state.cutouts)

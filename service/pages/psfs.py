@@ -14,7 +14,7 @@ from starlette.datastructures import FormData
 from psfcore.instruments.files import instrument_names, telescope_of
 from psfcore.tables import lookup
 from service.api.lineage import get_psf_lineage, rerun_psf
-from service.api.psf_curves import core_picture, get_cutout, tables_of
+from service.api.psf_curves import get_cutout, psf_picture, tables_of
 from service.api.psf_status import (
     SeriesChange,
     SeriesView,
@@ -168,7 +168,7 @@ async def cutout(
 async def core(psf_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """A picture of the core of the PSF; for a compressed file, the picture that a job drew."""
     try:
-        return await core_picture(psf_id, CORE_PX, request, caller, state)
+        return await psf_picture(psf_id, CORE_PX, request, caller, state)
     except Problem as problem:
         if problem.code != "cutout-not-plain":
             raise
