@@ -1,4 +1,4 @@
-"""Logs of the service and its workers on standard error: one line for each record, as JSON or as text.
+"""Logs of the service and its workers on standard error or in a file: one line for each record, as JSON or as text.
 
 ``bind`` stores the request, the job or its owner once; all later log lines of the same context then contain these
 values. Headers, keys and contents of files are never logged: in a line, the secret of a key is replaced by ``***``.
@@ -6,8 +6,10 @@ values. Headers, keys and contents of files are never logged: in a line, the sec
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
+import logging.handlers
 import math
 import re
 import sys
@@ -18,6 +20,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -96,6 +100,41 @@ def _one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+class RotatedFile(logging.handlers.WatchedFileHandler):
+    """A log file of several processes. At ``most_bytes`` it is renamed to FILE.1, the file FILE.1 to FILE.2, and so on, and
+    a new file begins; FILE.``kept`` is replaced."""
+
+    def __init__(self, path: Path, most_bytes: int, kept: int) -> None:
+        super().__init__(path, encoding="utf-8")
+        self._path, self._most_bytes, self._kept = path, most_bytes, kept
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the record, in a new file if the present one is full."""
+        if self._full():
+            # Another process may rotate the file at the same moment.
+            with Path(f"{self._path}.lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                if self._full():
+                    self._rotate()
+        super().emit(record)
+
+    def _full(self) -> bool:
+        return self._path.exists() and self._path.stat().st_size >= self._most_bytes
+
+    def _rotate(self) -> None:
+        names = [self._path, *(Path(f"{self._path}.{number}") for number in range(1, self._kept + 1))]
+        for old, new in reversed(list(pairwise(names))):
+            if old.exists():
+                old.replace(new)
+
+
+def _tried_again(record: logging.LogRecord) -> bool:
+    """Lower errors of Celery to warnings: a lost broker or a lost process is no failure of a job, which is tried again."""
+    if record.levelno >= logging.ERROR:
+        record.levelno, record.levelname = logging.WARNING, logging.getLevelName(logging.WARNING)
+    return True
+
+
 class Seldom(logging.Filter):
     """Writes at most one record of each kind in ``every_s`` seconds. The next record says how many records were left out.
 
@@ -142,15 +181,18 @@ def _no_request(record: logging.LogRecord) -> bool:
 
 
 def configure(settings: Settings, *, verbose: bool = False) -> None:
-    """Write the logs of the process to standard error. Repeated calls change nothing.
+    """Write the logs of the process to standard error, or to the file of the settings. Repeated calls change nothing.
 
     A person who starts a service on a terminal sees a line for each request only if ``verbose`` is true or
     HELIOPSF_LOG_FORMAT is set: these lines would hide the address of the service.
     """
     stream = sys.__stderr__ or sys.stderr
-    form = settings.log_format or ("text" if stream.isatty() else "json")
-    handler = logging.StreamHandler(stream)
-    if settings.log_format is None and stream.isatty() and not verbose:
+    terminal = settings.log_file is None and stream.isatty()
+    form = settings.log_format or ("text" if terminal else "json")
+    handler: logging.Handler = logging.StreamHandler(stream)
+    if settings.log_file is not None:
+        handler = RotatedFile(settings.log_file, settings.log_file_mib * 2**20, settings.log_files)
+    if settings.log_format is None and terminal and not verbose:
         handler.addFilter(_no_request)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
@@ -158,6 +200,10 @@ def configure(settings: Settings, *, verbose: bool = False) -> None:
     # id. An upgrade of the database is logged in one line, see ``Schema.upgrade``.
     for chatty in ("httpx", "httpcore", "uvicorn.access", "alembic.runtime"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    # The library of Celery's processes has a logger of its own, which passes nothing on.
+    logging.getLogger("multiprocessing").handlers = [handler]
+    for retried in ("multiprocessing", "celery.worker.consumer.consumer", "celery.worker.request"):
+        logging.getLogger(retried).addFilter(_tried_again)
     # Clients without a key can cause these: requests that are not HTTP, and more connections than the system allows.
     logging.getLogger("uvicorn.error").addFilter(_SELDOM_WARNINGS)
     logging.getLogger("asyncio").addFilter(_SELDOM_ACCEPTS)

@@ -110,8 +110,16 @@ class Settings(BaseSettings):
         "`traces`); default: no traces",
     )
     log_format: Literal["text", "json"] | None = Field(
-        None, description="format of the logs on standard error; default: text on a terminal, otherwise json"
+        None, description="format of the logs; default: text on a terminal, otherwise json"
     )
+    log_file: Path | None = Field(
+        None,
+        description="file of the logs, which all servers and workers of a machine may share; default: standard error",
+    )
+    log_file_mib: int = Field(
+        100, ge=1, description="size at which the log file is renamed to FILE.1 and a new one begins, MiB"
+    )
+    log_files: int = Field(5, ge=1, description="number of renamed log files that are kept")
 
     uws_max_wait_s: float = Field(
         50.0, ge=0, le=3600, description="longest time that a UWS request with WAIT may wait, s"

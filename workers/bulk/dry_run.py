@@ -169,7 +169,9 @@ class _DryRun:
         image_id, summary = self._summary(image)
         resolved = resolved_image(self._run, image_id, summary, catalogue)
         needs = resolved.model_dump(mode="json") | {"image_shape": summary["shape"]}
-        estimate = estimates.checked("deconvolve", needs, catalogue, self._run.owner, self._settings)
+        estimate = estimates.checked(
+            "deconvolve", needs, catalogue, self._run.owner, self._settings, like=estimates.BULK
+        )
         exists = image.uploaded and (
             catalogue.get(ProductRow, product_identity(resolved), self._run.owner) is not None
         )
