@@ -21,6 +21,7 @@ from workers.contract.queues import Queue, queues_named
 from workers.machine import cores, memory_bytes
 
 EMBEDDED_BROKER = "filesystem://"
+KEPT_KINDS = ("image", "transit", "product", "report", "job", "bulk")
 MEMORY_OF_JOBS = 0.8  # share of the memory for jobs; the rest is for the system, the server and the database
 
 
@@ -47,6 +48,14 @@ class Settings(BaseSettings):
         ge=0,
         description="largest size of an owner's stored files, MiB; each MiB also allows 256 database rows without a file, such as "
         "jobs and images of bulk runs; 0: unlimited; `heliopsf store quota` sets another limit for an owner",
+    )
+    keep_days: str = Field(
+        "",
+        description="for how many days things are kept, by kind and owner, for example `product=365,image=90,ann/product=30`; "
+        f"older ones are deleted once an hour; kinds: {', '.join(KEPT_KINDS)}; default: everything is kept",
+    )
+    keep_dry_run: bool = Field(
+        True, description="only log what keep_days would delete, by owner and kind; false: delete it"
     )
     min_free_mib: int = Field(
         256,
@@ -219,6 +228,15 @@ class Settings(BaseSettings):
                 ) from error
         return proxies
 
+    @field_validator("keep_days")
+    @classmethod
+    def _days(cls, rules: str) -> str:
+        for rule in _named(rules):
+            name, _, days = rule.partition("=")
+            if name.rpartition("/")[2] not in KEPT_KINDS or not days.isdecimal() or not int(days):
+                raise ValueError(f"expected rules such as image=90 or ann/product=30; got {rule!r}")
+        return rules
+
     @classmethod
     def apart(cls, data_dir: Path, *, gap_effects: str = "") -> Settings:
         """Default settings with this data folder. These settings ignore the environment, so that the process cannot
@@ -229,6 +247,12 @@ class Settings(BaseSettings):
     def added_effects(self) -> tuple[str, ...]:
         """Modules or files with effects that a diagnosis tests in addition to the effects of the library."""
         return _named(self.gap_effects)
+
+    @property
+    def kept_days(self) -> dict[tuple[str, str], int]:
+        """For how many days things are kept, by owner and kind; the owner "" stands for all others."""
+        rules = (rule.partition("=") for rule in _named(self.keep_days))
+        return {(name.rpartition("/")[0], name.rpartition("/")[2]): int(days) for name, _, days in rules}
 
     @property
     def host_names(self) -> tuple[str, ...]:
