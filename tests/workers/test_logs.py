@@ -116,7 +116,9 @@ def test_a_log_file_is_rotated_by_the_processes_that_share_it(tmp_path: Path) ->
     files = [path, *(tmp_path / f"heliopsf.log.{number}" for number in range(1, 51))]
     there = [file.read_text().split("\n")[:-1] for file in files if file.exists()]
     assert len(there) > 2
-    assert [line for file in reversed(there) for line in file] == [f"line {number}" for number in range(lines)]
+    assert [line for file in reversed(there) for line in file] == [
+        f"line {number}" for number in range(lines)
+    ]
     one = logs.RotatedFile(path, most_bytes=1, kept=1)
     for number in range(3):
         one.emit(record(f"last {number}"))

@@ -207,7 +207,9 @@ def done_before(context: Context, destination: Destination) -> Outcome | None:
         return None
     columns = {name: getattr(earlier, name) for name in Outcome.__annotations__}
     statistics = {
-        name: value for name, value in (earlier.statistics or {}).items() if not name.endswith(("seconds", "_s"))
+        name: value
+        for name, value in (earlier.statistics or {}).items()
+        if not name.endswith(("seconds", "_s"))
     }
     return Outcome(**columns | {"reused": True, "kept": False, "statistics": statistics})
 

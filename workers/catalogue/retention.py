@@ -54,4 +54,6 @@ class Retention(Queries):
                 )
                 texts = (text for one in (jobs, items) for text in session.scalars(one))
                 used = {identity for text in texts for identity in _ID.findall(text)}
-            return [(of, identity, size) for of, identity, size in session.execute(query) if identity not in used]
+            return [
+                (of, identity, size) for of, identity, size in session.execute(query) if identity not in used
+            ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.dialects import postgresql, sqlite
@@ -54,4 +53,6 @@ class KeptStageTimes:
             .limit(limit)
         )
         with self._database.reading() as session:
-            return [((one or {}).get("start_s", 0.0), float(took_s)) for one, took_s in session.execute(query)]
+            return [
+                ((one or {}).get("start_s", 0.0), float(took_s)) for one, took_s in session.execute(query)
+            ]

@@ -217,7 +217,11 @@ def factor(kind: str, start_s: float, catalogue: Catalogue) -> float:
     times, until = known.get(kind, ([], -math.inf))
     if time.monotonic() >= until:
         progress = catalogue.bulks.progress
-        found = progress.image_times(MOST_JOBS) if kind == BULK else catalogue.stage_times.run_times(kind, MOST_JOBS)
+        found = (
+            progress.image_times(MOST_JOBS)
+            if kind == BULK
+            else catalogue.stage_times.run_times(kind, MOST_JOBS)
+        )
         times = [(estimated_s, took_s) for estimated_s, took_s in found if took_s > FOUND * estimated_s > 0]
         known[kind] = times, time.monotonic() + KEEP_FACTOR_S
     nearest = sorted(times, key=lambda one: abs(math.log(one[0] / max(start_s, 1e-3))))[:NEAREST]
