@@ -153,16 +153,17 @@ async def prepare_image(state: State, digest: str) -> None:
         await _plane(state, digest, IMAGE)
 
 
-async def image_picture(request: Request, state: State, digest: str) -> Response:
-    """A picture of the image in a stored file as PNG, or 304 if the client already has it."""
-    sent = files.headers_of(f"{ANSWERS_VERSION} {digest} picture")
+async def picture_of(request: Request, state: State, digest: str, core_px: int | None = None) -> Response:
+    """A picture of the image in a stored file as PNG, or 304 if the client already has it. core_px: of the central part of a
+    PSF, with this width."""
+    sent = files.headers_of(f"{ANSWERS_VERSION} {digest} picture {core_px}")
     if (same := files.unchanged(request, sent)) is not None:
         return same
 
     def draw(plane: Plane) -> bytes:
-        from psfcore.drawing.pictures import picture
+        from psfcore.drawing.pictures import core_picture, picture
 
-        return picture(plane, PICTURE_PX)
+        return core_picture(plane, core_px) if core_px else picture(plane, PICTURE_PX)
 
     with as_problems():
         png = await run_in_threadpool(draw, await _plane(state, digest, IMAGE))

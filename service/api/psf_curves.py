@@ -177,24 +177,6 @@ async def get_cutout(
     return StreamingResponse(part.pieces(), media_type=files.FITS_TYPE, headers=headers)
 
 
-async def psf_picture(psf_id: str, size: int, request: Request, caller: Caller, state: State) -> Response:
-    """A picture of the central part of a PSF, at most ``size`` px wide and high, as PNG; or 304."""
-    row = await run_in_threadpool(state.row, PsfRow, psf_id, caller.owner)
-    headers = files.headers_of(f"{ANSWERS_VERSION} {row.file_sha256} core {size}")
-    if (same := files.unchanged(request, headers)) is not None:
-        return same
-    edge = min(size, *row.details["shape"])
-
-    def draw() -> bytes:
-        from psfcore.drawing.pictures import core_picture
-
-        return core_picture(cutout(files.found(state.store, row.file_sha256, row.bytes), edge, state.limits))
-
-    with as_problems():
-        png = await anyio.to_thread.run_sync(draw, limiter=state.cutouts)
-    return Response(png, media_type="image/png", headers=headers)
-
-
 def tables_of(state: State, caller: Caller, psf_id: str) -> Mapping[str, Any]:
     """The tables of a PSF. Raises ``Problem`` 404 if there is no such PSF, 409 "no-tables" if it has no tables yet."""
     row = state.row(PsfRow, psf_id, caller.owner)

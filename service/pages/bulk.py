@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import PurePath
 from typing import Annotated, Any, Literal
@@ -50,7 +49,6 @@ from workers.contract.bulk import (
     STOPPED,
     BulkPhase,
     BulkRequest,
-    BulkWork,
     ItemState,
 )
 from workers.contract.layout import FIELDS
@@ -233,7 +231,6 @@ def bulk(
         "bulk.html",
         bulk=view,
         psf=None if view.psf_id is None else state.catalogue.get(PsfRow, view.psf_id, caller.owner),
-        request_facts=_request_facts(view),
         reasons=reasons,
         most_explained=MOST_EXPLAINED,
         results=_cards(rows[:PER_SHEET], caller, state),
@@ -290,25 +287,6 @@ def change_run(
     """Pause, resume, retry or cancel a run, and show it."""
     CHANGES[change](bulk_id, caller, state)
     return RedirectResponse(f"/bulk/{bulk_id}", 303)
-
-
-def _request_facts(view: BulkView) -> list[tuple[str, str]]:
-    """What the run was asked to do: name and value."""
-    work = BulkWork.model_validate(view.request)
-    method, options = (
-        work.parameters.method,
-        work.parameters.model_dump(exclude_defaults=True, exclude={"method"}),
-    )
-    facts = [("Files", f"{one.glob} {json.dumps(one.where) if one.where else ''}") for one in work.files]
-    facts += [
-        ("Method", f"{method.name}, {method.steps} steps"),
-        *((name, str(options[name])) for name in options),
-    ]
-    if work.output is not None:
-        facts += [("Output", work.output.folder), ("Names", work.output.layout or "")]
-    if not work.keeps_products:
-        facts.append(("Products", "only in the output folder"))
-    return [(name, said) for name, said in facts if said]
 
 
 def _reasons(bulk_id: str, caller: Caller, state: State) -> list[dict[str, Any]]:

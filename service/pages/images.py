@@ -18,7 +18,7 @@ from psfcore.fits.header import read_summary
 from psfcore.instruments.files import telescope_of, telescopes
 from service.api.images import ImageView, upload_image
 from service.api.jobs import EstimateView, estimate_job, submit_job
-from service.api.pixels import image_picture
+from service.api.pixels import picture_of
 from service.http.callers import Caller
 from service.http.problems import Problem
 from service.http.quotas import Allowed
@@ -150,7 +150,7 @@ class Checked:
 async def picture(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """A picture of the image as it was uploaded."""
     await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
-    return await image_picture(request, state, image_id)
+    return await picture_of(request, state, image_id)
 
 
 @router.get("/images/{image_id}")

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
 from pydantic import ValidationError, validate_call
 from starlette.datastructures import FormData
@@ -14,7 +15,8 @@ from starlette.datastructures import FormData
 from psfcore.instruments.files import instrument_names, telescope_of
 from psfcore.tables import lookup
 from service.api.lineage import get_psf_lineage, rerun_psf
-from service.api.psf_curves import get_cutout, psf_picture, tables_of
+from service.api.pixels import picture_of
+from service.api.psf_curves import get_cutout, tables_of
 from service.api.psf_status import (
     SeriesChange,
     SeriesView,
@@ -39,7 +41,7 @@ from service.pages.rendering import number, page
 from service.views import PsfView
 from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
-from workers.catalogue.tables import ReportRow
+from workers.catalogue.tables import PsfRow, ReportRow
 from workers.contract.requests import Component, Identity, PsfBuild
 from workers.versions import TOTAL, PsfStatus, without_variant
 
@@ -166,13 +168,9 @@ async def cutout(
 
 @router.get("/{psf_id}/core")
 async def core(psf_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
-    """A picture of the core of the PSF; for a compressed file, the picture that a job drew."""
-    try:
-        return await psf_picture(psf_id, CORE_PX, request, caller, state)
-    except Problem as problem:
-        if problem.code != "cutout-not-plain":
-            raise
-        return RedirectResponse(f"/v1/psfs/{psf_id}/preview", 303)
+    """A picture of the core of the PSF."""
+    row = await run_in_threadpool(state.row, PsfRow, psf_id, caller.owner)
+    return await picture_of(request, state, row.file_sha256, core_px=CORE_PX)
 
 
 @router.post("/{psf_id}/status")

@@ -13,13 +13,14 @@ async function refused(file, most) {
   return null;
 }
 
-/** Send dropped or chosen images, one after the other. One image alone leads to its page. Without this script the form sends one file. */
+/**
+ * Send dropped or chosen images, one after the other. One image alone leads to its page; several are deconvolved, if they need no
+ * option. Without this script the form sends one file.
+ */
 function sendImages(form) {
   const input = document.getElementById("file");
   const list = document.getElementById("files");
-  const all = document.getElementById("start-all");
   const waiting = []; // {file, line}
-  const arrived = []; // {id, line}
   let busy = false;
   input.multiple = true;
 
@@ -38,7 +39,6 @@ function sendImages(form) {
   async function sendAll() {
     if (busy) return;
     busy = true;
-    list.hidden = list.children.length < 2;
     while (waiting.length > 0) {
       const { file, line } = waiting[0];
       const reason = await refused(file, Number(form.dataset.most));
@@ -47,41 +47,27 @@ function sendImages(form) {
       if (image === undefined) break;
       waiting.shift();
       if (image === null) continue;
-      line.replaceChildren(element("a", { href: `/images/${image.id}` }, file.name));
-      arrived.push({ id: image.id, line });
+      if (list.children.length === 1) {
+        busy = false; // for whoever comes back
+        list.replaceChildren();
+        return location.assign(`/images/${image.id}`);
+      }
+      line.replaceChildren(element("a", { href: `/images/${image.id}` }, file.name), ": ", await begun(image.id));
     }
     busy = false;
     if (waiting.length === 0) input.value = ""; // the same name can be chosen again
-    if (arrived.length === 1 && list.children.length === 1) return leave(`/images/${arrived[0].id}`);
-    list.hidden = false;
-    all.hidden = arrived.length === 0;
   }
 
-  /** Start the deconvolutions that need no option, and tell why the others need one. */
-  async function startAll() {
-    const open = [];
-    for (const { id, line } of arrived.splice(0)) {
-      const tell = (text) => {
-        line.replaceChildren(line.firstChild, element("span", { class: "bad" }, ` ${text}`));
-        open.push({ id, line });
-      };
-      try {
-        const { good, lines } = await json(`/images/${id}/check`);
-        if (good) await json("/v1/jobs", { kind: "deconvolve", parameters: { image_id: id } });
-        else tell(lines[0]);
-      } catch (error) {
-        tell(told(error));
-      }
+  /** Start the deconvolution of an image. Returns a link to its job, or the reason why it needs an option. */
+  async function begun(id) {
+    try {
+      const { good, lines } = await json(`/images/${id}/check`);
+      if (!good) return lines[0];
+      const job = await json("/v1/jobs", { kind: "deconvolve", parameters: { image_id: id } });
+      return element("a", { href: `/jobs/${job.id}` }, "started");
+    } catch (error) {
+      return told(error);
     }
-    arrived.push(...open);
-    if (open.length === 0) leave("/jobs");
-  }
-
-  /** Go to another page. Whoever comes back finds no old files. */
-  function leave(address) {
-    arrived.length = 0;
-    list.replaceChildren();
-    location.assign(address);
   }
 
   form.addEventListener("submit", (event) => {
@@ -89,7 +75,6 @@ function sendImages(form) {
     sendAll();
   });
   input.addEventListener("change", () => take(input.files));
-  all.addEventListener("click", startAll);
   // A file that is dropped beside the form must not replace the page.
   for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
   document.addEventListener("dragover", () => form.classList.add("over"));

@@ -142,7 +142,7 @@ def test_a_check_says_what_the_run_then_does(
     said = {
         "Files": form["pattern"],
         "Method": "richardson-lucy, 2 steps",
-        "Output": form["folder"],
+        "Output": f"{form['folder']} only",
         "Names": LAYOUT,
     }
     assert {name: fact(page, name).strip() for name in said} == said

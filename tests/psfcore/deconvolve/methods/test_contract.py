@@ -44,7 +44,9 @@ def faults(name: str, module: Any) -> list[str]:
             told.append(f"{name}: add its entry to {figures} of psfcore/deconvolve/memory.py")
     if name not in COSTS.kinds.deconvolve.step_ns:
         told.append(f"{name}: measure its time: python -m benchmarks.estimates --write")
-    if not any(name in get_args(one.model_fields["name"].annotation) for one in get_args(get_args(Method)[0])):
+    if not any(
+        name in get_args(one.model_fields["name"].annotation) for one in get_args(get_args(Method)[0])
+    ):
         told.append(f"{name}: add a class with its parameters to Method in workers/contract/requests.py")
     if not told and not _approaches(module):
         told.append(
