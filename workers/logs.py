@@ -9,8 +9,8 @@ from __future__ import annotations
 import fcntl
 import json
 import logging
-import logging.handlers
 import math
+import os
 import re
 import sys
 import threading
@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
-from itertools import pairwise
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,32 +100,18 @@ def _one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-class RotatedFile(logging.handlers.WatchedFileHandler):
-    """A log file of several processes. At ``most_bytes`` it is renamed to FILE.1, the file FILE.1 to FILE.2, and so on, and
-    a new file begins; FILE.``kept`` is replaced."""
-
-    def __init__(self, path: Path, most_bytes: int, kept: int) -> None:
-        super().__init__(path, encoding="utf-8")
-        self._path, self._most_bytes, self._kept = path, most_bytes, kept
+class RotatedFile(RotatingFileHandler):
+    """A log file of several processes: full, it is renamed to FILE.1, the file FILE.1 to FILE.2, and so on."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write the record, in a new file if the present one is full."""
-        if self._full():
-            # Another process may rotate the file at the same moment.
-            with Path(f"{self._path}.lock").open("w") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                if self._full():
-                    self._rotate()
-        super().emit(record)
-
-    def _full(self) -> bool:
-        return self._path.exists() and self._path.stat().st_size >= self._most_bytes
-
-    def _rotate(self) -> None:
-        names = [self._path, *(Path(f"{self._path}.{number}") for number in range(1, self._kept + 1))]
-        for old, new in reversed(list(pairwise(names))):
-            if old.exists():
-                old.replace(new)
+        """Write the record, while no other process rotates the file."""
+        with Path(f"{self.baseFilename}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            there = Path(self.baseFilename).exists()
+            if not there or not os.path.samefile(self.baseFilename, self.stream.fileno()):
+                self.stream.close()  # another process has rotated the file
+                self.stream = self._open()
+            super().emit(record)
 
 
 def _tried_again(record: logging.LogRecord) -> bool:
@@ -191,7 +177,10 @@ def configure(settings: Settings, *, verbose: bool = False) -> None:
     form = settings.log_format or ("text" if terminal else "json")
     handler: logging.Handler = logging.StreamHandler(stream)
     if settings.log_file is not None:
-        handler = RotatedFile(settings.log_file, settings.log_file_mib * 2**20, settings.log_files)
+        size = settings.log_file_mib * 2**20
+        handler = RotatedFile(
+            settings.log_file, maxBytes=size, backupCount=settings.log_files, encoding="utf-8"
+        )
     if settings.log_format is None and terminal and not verbose:
         handler.addFilter(_no_request)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())

@@ -22,6 +22,7 @@ from workers.machine import cores, memory_bytes
 
 EMBEDDED_BROKER = "filesystem://"
 KEPT_KINDS = ("image", "transit", "product", "report", "job", "bulk")
+_KEPT = rf"([a-z0-9][a-z0-9._-]*/)?({'|'.join(KEPT_KINDS)})=[1-9][0-9]{{0,4}}"
 MEMORY_OF_JOBS = 0.8  # share of the memory for jobs; the rest is for the system, the server and the database
 
 
@@ -51,6 +52,7 @@ class Settings(BaseSettings):
     )
     keep_days: str = Field(
         "",
+        pattern=rf"^$|^({_KEPT})(, *{_KEPT})*$",
         description="for how many days things are kept, by kind and owner, for example `product=365,image=90,ann/product=30`; "
         f"older ones are deleted once an hour; kinds: {', '.join(KEPT_KINDS)}; default: everything is kept",
     )
@@ -227,15 +229,6 @@ class Settings(BaseSettings):
                     f"expected IP addresses or networks, separated by commas; {error}"
                 ) from error
         return proxies
-
-    @field_validator("keep_days")
-    @classmethod
-    def _days(cls, rules: str) -> str:
-        for rule in _named(rules):
-            name, _, days = rule.partition("=")
-            if name.rpartition("/")[2] not in KEPT_KINDS or not days.isdecimal() or not int(days):
-                raise ValueError(f"expected rules such as image=90 or ann/product=30; got {rule!r}")
-        return rules
 
     @classmethod
     def apart(cls, data_dir: Path, *, gap_effects: str = "") -> Settings:

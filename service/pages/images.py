@@ -28,7 +28,6 @@ from service.pages.forms import (
     SentForm,
     deconvolution,
     image_address,
-    job_request,
     shown_options,
     text,
     usual_steps,
@@ -40,7 +39,6 @@ from service.pages.sentences import draft, of_problem
 from service.views import JobView, ProductView
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow
-from workers.contract.phases import Phase
 from workers.contract.requests import Identity
 from workers.intake.compatibility import suits
 from workers.intake.psf_choice import ChosenPsf
@@ -167,11 +165,6 @@ def image(image_id: Identity, request: Request, caller: PageReading, state: Shar
         image=row,
         facts=_facts(row),
         checked=checked,
-        builds=[
-            one
-            for one in ({} if checked.problem is None else checked.problem.more).get("instruments", ())
-            if "telescope" in one["same"] and suits(one["name"], row.summary)
-        ],
         psfs=psfs,
         others=others,
         unknown=checked.code == "no-psf-for-instrument",
@@ -206,18 +199,6 @@ def start(
             raise
         return RedirectResponse(image_address(image_id, form), 303)
     return RedirectResponse(f"/jobs/{job.id}", 303)
-
-
-@router.post("/images/{image_id}/build")
-def build(
-    image_id: Identity, response: Response, caller: PageSubmitting, state: Shared, form: SentForm
-) -> Response:
-    """Build the PSF of an instrument; then the page of the image is shown with this PSF."""
-    build = job_request("psf-build", {"instrument": text(form, "instrument")})
-    job = submit_job(build, response, caller, state)
-    if job.phase == Phase.COMPLETED and job.result is not None:
-        return RedirectResponse(f"/images/{image_id}?psf_id={job.result.rpartition('/')[2]}", 303)
-    return RedirectResponse(f"/jobs/{job.id}?image={image_id}", 303)
 
 
 def product_line(product: ProductView) -> dict[str, Any]:

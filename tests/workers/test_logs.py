@@ -110,7 +110,7 @@ def test_what_celery_tries_again_is_a_warning_and_json(monkeypatch: pytest.Monke
 
 def test_a_log_file_is_rotated_by_the_processes_that_share_it(tmp_path: Path) -> None:
     path, lines = tmp_path / "heliopsf.log", 40
-    shared = [logs.RotatedFile(path, most_bytes=50, kept=50) for _ in range(2)]
+    shared = [logs.RotatedFile(path, maxBytes=50, backupCount=50) for _ in range(2)]
     for number in range(lines):
         shared[number % 2].emit(record(f"line {number}"))
     files = [path, *(tmp_path / f"heliopsf.log.{number}" for number in range(1, 51))]
@@ -119,7 +119,7 @@ def test_a_log_file_is_rotated_by_the_processes_that_share_it(tmp_path: Path) ->
     assert [line for file in reversed(there) for line in file] == [
         f"line {number}" for number in range(lines)
     ]
-    one = logs.RotatedFile(path, most_bytes=1, kept=1)
+    one = logs.RotatedFile(path, maxBytes=1, backupCount=1)
     for number in range(3):
         one.emit(record(f"last {number}"))
     assert (tmp_path / "heliopsf.log.1").read_text() == "last 1\n" and path.read_text() == "last 2\n"

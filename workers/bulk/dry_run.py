@@ -169,9 +169,7 @@ class _DryRun:
         image_id, summary = self._summary(image)
         resolved = resolved_image(self._run, image_id, summary, catalogue)
         needs = resolved.model_dump(mode="json") | {"image_shape": summary["shape"]}
-        estimate = estimates.checked(
-            "deconvolve", needs, catalogue, self._run.owner, self._settings, like=estimates.BULK
-        )
+        estimate = estimates.checked("deconvolve", needs, catalogue, self._run.owner, self._settings)
         exists = image.uploaded and (
             catalogue.get(ProductRow, product_identity(resolved), self._run.owner) is not None
         )
@@ -183,7 +181,8 @@ class _DryRun:
         self._existing += exists
         self._memory_mib = max(self._memory_mib, estimate["memory_mib"])
         if not exists:
-            self._seconds += estimate["seconds"]
+            start_s = estimate["start_s"]
+            self._seconds += start_s * estimates.factor(estimates.BULK, start_s, catalogue)
             self._bytes += product_bytes(summary["shape"], resolved.error_draws)
 
     def _target(self, image: Listed, summary: dict[str, Any], resolved: ResolvedDeconvolve) -> Path:

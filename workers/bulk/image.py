@@ -121,9 +121,7 @@ def read_one(context: Context, bulk: BulkRow, item: BulkItemRow) -> Ready | Outc
         if before is not None:
             return before
         needs = request.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
-        expected = estimates.checked(
-            "deconvolve", needs, context.catalogue, context.owner, settings, like=estimates.BULK
-        )
+        expected = estimates.checked("deconvolve", needs, context.catalogue, context.owner, settings)
         # The path is taken only now, because the store's local copy may have been removed during a wait.
         image_file = source.copy or context.store.verified(source.sha256)
         image = deconvolve_task.load(context, request, image_file)

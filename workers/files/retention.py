@@ -7,8 +7,7 @@ import time
 from collections import defaultdict
 
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.retention import TABLES
-from workers.catalogue.tables import ProductRow, ReportRow
+from workers.catalogue.retention import RESULTS, UPLOADS
 from workers.files.collection import files_of, remove_unnamed
 from workers.files.store import Store
 from workers.settings import Settings
@@ -40,9 +39,8 @@ def _delete(catalogue: Catalogue, store: Store, kind: str, owner: str, identity:
         return catalogue.uws.destroy(identity)
     if kind == "bulk":
         return catalogue.bulks.delete(identity)
-    row = catalogue.delete(TABLES[kind], identity, owner)
-    if row is None:
-        return False
-    named = [digest for digest, _ in files_of(row)] if isinstance(row, ProductRow | ReportRow) else [row.id]
-    remove_unnamed(catalogue, store, named)
-    return True
+    row = catalogue.delete((UPLOADS | RESULTS)[kind], identity, owner)
+    if row is not None:
+        named = [identity] if kind in UPLOADS else [digest for digest, _ in files_of(row)]
+        remove_unnamed(catalogue, store, named)
+    return row is not None

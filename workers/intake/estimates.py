@@ -152,19 +152,13 @@ class Estimate:
 
 
 def checked(
-    kind: str,
-    parameters: Mapping[str, Any],
-    catalogue: Catalogue,
-    owner: str,
-    settings: Settings,
-    *,
-    like: str | None = None,
+    kind: str, parameters: Mapping[str, Any], catalogue: Catalogue, owner: str, settings: Settings
 ) -> dict[str, Any]:
-    """The estimate of a job with these resolved parameters, as JSON. like: as for ``estimate``.
+    """The estimate of a job with these resolved parameters, as JSON.
 
     Raises DataError "too-much-memory" or "too-much-time" if it exceeds the operator's limits.
     """
-    expected = estimate(kind, parameters, catalogue, owner, settings.threads, like=like)
+    expected = estimate(kind, parameters, catalogue, owner, settings.threads)
     if expected.memory_mib > settings.max_job_memory_mib:
         raise DataError(
             "too-much-memory",
@@ -182,18 +176,9 @@ def checked(
 
 
 def estimate(
-    kind: str,
-    parameters: Mapping[str, Any],
-    catalogue: Catalogue,
-    owner: str,
-    threads: int,
-    *,
-    like: str | None = None,
+    kind: str, parameters: Mapping[str, Any], catalogue: Catalogue, owner: str, threads: int
 ) -> Estimate:
-    """The estimated time and memory of a job with these resolved parameters and this number of threads.
-
-    like: the kind of jobs from which the factor is learnt, or BULK; default: the kind of the job.
-    """
+    """The estimated time and memory of a job with these resolved parameters and this number of threads."""
     if kind == "rerun":
         kind, parameters = parameters["kind"], parameters["parameters"]
     if kind == "deconvolve":
@@ -205,7 +190,7 @@ def estimate(
     start_s = cpu_s / threads**COSTS.threads_exponent
     return Estimate(
         memory_mib=round(COSTS.worker_mib + mib),
-        seconds=round(start_s * factor(like or kind, start_s, catalogue), 1),
+        seconds=round(start_s * factor(kind, start_s, catalogue), 1),
         start_s=round(start_s, 3),
     )
 

@@ -57,7 +57,7 @@ def test_an_image_without_a_psf_is_told_so(api: TestClient, tmp_path: Path) -> N
     page = api.get(f"/images/{xrt}").text
     assert "none: choose a PSF" in page and "chosen for this image" not in page
     assert "2012-06-05T22:00:00.123" in page
-    assert f'action="/images/{xrt}/build"' not in page, "no instrument is of this telescope"
+    assert f'action="/psfs?image={xrt}"' in page, "a PSF is uploaded here"
 
 
 def test_the_psf_of_another_channel_is_refused_before_a_job(
@@ -108,33 +108,6 @@ def test_a_short_time_is_told_as_a_sentence(api: TestClient, psf_file: Path, tmp
     assert re.match(r"PSF uploaded 0\.0\.0\+\w{8} \(draft\)\.", found[0]) and found[1].startswith(
         "Draft means"
     )
-
-
-# One click to a PSF ---------------------------------------------------------------------------------
-
-
-def test_the_psf_of_the_instrument_is_built_for_the_image(api: TestClient, tmp_path: Path) -> None:
-    """The header names no channel, so the page offers the channels of the telescope."""
-    aia = image(api, tmp_path, **{**AIA, "WAVELNTH": None})
-    page = api.get(f"/images/{aia}").text
-    assert "same telescope and pixel scale" in page and "plate_scale" not in page
-    assert f'<form method="post" action="/images/{aia}/build">' in page
-    sent = api.post(f"/images/{aia}/build", data={"instrument": "aia_171"}, follow_redirects=False)
-    assert sent.status_code == 303 and sent.headers["location"].endswith(f"?image={aia}")
-    job_id = sent.headers["location"].removeprefix("/jobs/").partition("?")[0]
-    job = api.get(f"/v1/jobs/{job_id}").json()
-    assert (job["kind"], job["parameters"]["instrument"]) == ("psf-build", "aia_171")
-    waiting = api.get(sent.headers["location"]).text
-    assert f'data-image="{aia}"' in waiting and f'<a href="/images/{aia}">Back to the image</a>' in waiting
-    catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
-    psf_id = api.post(
-        "/v1/jobs/identity", json={"kind": "psf-build", "parameters": {"instrument": "aia_171"}}
-    )
-    result = psf_id.json()["result_id"]
-    lease = catalogue.jobs.claim(job_id, "host:1")
-    catalogue.jobs.complete(lease, result)
-    done = api.get(f"/jobs/{job_id}?image={aia}").text
-    assert f'href="/images/{aia}?psf_id={result}"' in done and "Deconvolve the image with this PSF" in done
 
 
 # What is kept ---------------------------------------------------------------------------------------
