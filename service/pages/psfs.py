@@ -16,7 +16,7 @@ from psfcore.instruments.files import instrument_names, telescope_of
 from psfcore.tables import lookup
 from service.api.lineage import get_psf_lineage, rerun_psf
 from service.api.pixels import picture_of
-from service.api.psf_curves import get_cutout, tables_of
+from service.api.psf_curves import tables_of
 from service.api.psf_status import (
     SeriesChange,
     SeriesView,
@@ -152,18 +152,6 @@ def products(
     found = list_affected_by_psf(psf_id, Listing(request, PER_PAGE, cursor), caller, state)
     view = get_psf(psf_id, caller, state)
     return page(request, "psf_products.html", psf=view, products=found.items, next=found.next)
-
-
-@router.get("/{psf_id}/cutout")
-async def cutout(
-    psf_id: Identity,
-    size: Annotated[int, Query(ge=1)],
-    request: Request,
-    caller: PageReading,
-    state: Shared,
-) -> Response:
-    """The central part of the PSF as FITS; an error is shown as a page."""
-    return await get_cutout(psf_id, size, request, caller, state)
 
 
 @router.get("/{psf_id}/core")

@@ -2,7 +2,7 @@
 
 | schema | what is read |
 |---|---|
-| psf-fit | parameters, curves with errors, free shells, the residual of each image |
+| psf-fit | parameters, free shells, the residual of each image |
 | cross-validation | bands of the parameters |
 | gap | the discs: position, time, residual without and with the named effects |
 | rerun | the arrays that were compared, and what made each of the two results |
@@ -39,19 +39,8 @@ def fit_parameters(fit: Report) -> list[Row]:
 
 
 def fit_plots(fit: Report) -> list[Plot]:
-    """The curves of a fit with their bands, the free shells if they were fitted, and the residual of each image."""
-    return [_fit_curves(fit), *_free_shells(fit), _fit_residuals(fit)]
-
-
-def _fit_curves(fit: Report) -> Plot:
-    whole, diffuse = fit["curve"], fit["diffuse_curve"]
-    series = [
-        with_errors(label, curve["light_beyond_pct"], curve["sigma"])
-        for label, curve in (("whole PSF", whole), ("diffuse scatter", diffuse))
-        if curve["radii_px"] == whole["radii_px"]
-    ]
-    title = "Light beyond a radius, with the errors of the fit"
-    return radial_plot(title, "1 - encircled energy (%)", whole["radii_px"], series)
+    """The free shells of a fit if they were fitted, and the residual of each image."""
+    return [*_free_shells(fit), _fit_residuals(fit)]
 
 
 def _free_shells(fit: Report) -> list[Plot]:

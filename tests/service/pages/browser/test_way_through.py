@@ -177,13 +177,16 @@ def test_a_file_that_is_no_image_is_refused_before_it_is_sent(page: Page) -> Non
     assert sent == []
 
 
-def test_the_check_of_a_folder_says_what_was_checked(page: Page, tmp_path: Path) -> None:
+def test_a_folder_is_checked_and_then_sent(page: Page, tmp_path: Path) -> None:
     folder = write_transit(tmp_path / "mercury", images=3)
-    with (folder / "001.fits").open("r+b") as file:
-        file.truncate(3000)  # its content is checked by the service
     page.goto("/transits")
+    (folder / "001.fits").rename(tmp_path / "001.fits")
     page.set_input_files("#folder", folder)
-    expect(page.locator("#upload-said")).to_contain_text("transit.json is correct, and its 4 files are there")
+    expect(page.get_by_label("What the check found")).to_contain_text("001.fits is missing in the folder")
+    (tmp_path / "001.fits").rename(folder / "001.fits")
+    page.set_input_files("#folder", folder)
+    expect(page).to_have_url(re.compile("/transits/[0-9a-f]{64}$"), timeout=20_000)
+    expect(page.get_by_role("heading", level=1)).to_have_text("mercury.tar")
 
 
 def test_the_header_of_an_image_is_searched(page: Page) -> None:
