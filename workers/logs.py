@@ -107,9 +107,9 @@ class RotatedFile(RotatingFileHandler):
         """Write the record, while no other process rotates the file."""
         with Path(f"{self.baseFilename}.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            there = Path(self.baseFilename).exists()
-            if not there or not os.path.samefile(self.baseFilename, self.stream.fileno()):
-                self.stream.close()  # another process has rotated the file
+            old, path = self.stream, Path(self.baseFilename)
+            if old is not None and not (path.exists() and os.path.samefile(path, old.fileno())):
+                old.close()  # another process has rotated the file
                 self.stream = self._open()
             super().emit(record)
 

@@ -24,6 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.fits.viewing.planes import Plane as Stored
+from psfcore.fits.viewing.windows import Window, window_of
+from psfcore.fits.viewing.windows import pixels as read_window
+
 # Control points: a position in the range (0 to 1), and its colour. Between them, colours are interpolated linearly in
 # sRGB.
 EUV_POINTS = (
@@ -66,12 +70,26 @@ def write_thumbnail(pixels: Plane, path: Path) -> None:
 
     The longer side of the picture has ``LONGER_SIDE_PX`` pixels; a smaller image keeps its size.
     """
-    path.write_bytes(png_of(reduced(pixels)))
+    path.write_bytes(_png(levels_of(reduced(pixels))[::-1]))
 
 
-def png_of(pixels: Plane) -> bytes:
-    """An image [y, x] as PNG: one pixel of the picture for each pixel, row 0 at the bottom."""
-    return _png(levels_of(pixels)[::-1])
+def picture(stored: Stored, most_px: int) -> bytes:
+    """A stored image as PNG, at most ``most_px`` wide and high; its pixels are means of blocks. Raises EOFError."""
+    window = window_of(stored.shape, step=-(-max(stored.shape) // most_px))
+    return _png(levels_of(_read(stored, window))[::-1])
+
+
+def core_picture(stored: Stored, most_px: int) -> bytes:
+    """The central part of a stored PSF as PNG, at most ``most_px`` wide and high. Raises EOFError."""
+    ny, nx = stored.shape
+    edge = min(most_px, ny, nx)
+    x, y = nx // 2 - edge // 2, ny // 2 - edge // 2
+    return png_of_weights(_read(stored, window_of(stored.shape, x=x, y=y, width=edge, height=edge)))
+
+
+def _read(stored: Stored, window: Window) -> Plane:
+    numbers = np.frombuffer(b"".join(read_window(stored, window, bits=False)), dtype="<f4")
+    return numbers.reshape(window.shape)
 
 
 def png_of_weights(weights: Plane) -> bytes:

@@ -161,7 +161,7 @@ async def picture_of(request: Request, state: State, digest: str, core_px: int |
         return same
 
     def draw(plane: Plane) -> bytes:
-        from psfcore.drawing.pictures import core_picture, picture
+        from psfcore.drawing.thumbnail import core_picture, picture
 
         return core_picture(plane, core_px) if core_px else picture(plane, PICTURE_PX)
 

@@ -42,15 +42,7 @@ from workers.catalogue.bulk_progress import MOST_EXPLAINED
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ProductRow, PsfContextRow, PsfRow
-from workers.contract.bulk import (
-    AT_WORK,
-    DELETABLE,
-    OPEN,
-    STOPPED,
-    BulkPhase,
-    BulkRequest,
-    ItemState,
-)
+from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, BulkRequest, ItemState
 from workers.contract.layout import FIELDS
 from workers.files import archive
 

@@ -28,7 +28,6 @@ from workers.catalogue.jobs import Jobs
 from workers.catalogue.owners import NamedFiles, Owners, hold_to_quota, lock_owner
 from workers.catalogue.parts import Parts
 from workers.catalogue.psfs import Psfs, existing_psf
-from workers.catalogue.retention import Retention
 from workers.catalogue.schema import Schema
 from workers.catalogue.series import Series
 from workers.catalogue.stage_times import KeptStageTimes
@@ -86,7 +85,6 @@ class Catalogue:
         self.sessions = Sessions(self._database, self.keys)
         self.owners = Owners(self._database)
         self.named_files = NamedFiles(self._database)
-        self.retention = Retention(self._database)
 
     def upgrade(self) -> None:
         """Upgrade the tables of the database to this version. Raises ``workers.catalogue.schema.SchemaError``."""

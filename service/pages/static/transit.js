@@ -10,12 +10,11 @@ const list = document.getElementById("found");
 const ARCHIVE = /\.(zip|tar|tar\.gz|tgz)$/i;
 const MOST_SHOWN = 20;
 
-/** Show what a check found: errors, then notes. */
-function show(errors, notes) {
-  const shown = [...errors.map((text) => [text, "bad"]), ...notes.map((text) => [text, "soft"])];
-  const more = shown.length > MOST_SHOWN ? [element("li", {}, `and ${shown.length - MOST_SHOWN} more`)] : [];
-  list.replaceChildren(...shown.slice(0, MOST_SHOWN).map(([text, kind]) => element("li", { class: kind }, text)), ...more);
-  list.hidden = shown.length === 0;
+/** Show the errors that a check found. */
+function show(errors) {
+  const more = errors.length > MOST_SHOWN ? [element("li", {}, `and ${errors.length - MOST_SHOWN} more`)] : [];
+  list.replaceChildren(...errors.slice(0, MOST_SHOWN).map((text) => element("li", { class: "bad" }, text)), ...more);
+  list.hidden = errors.length === 0;
 }
 
 /** Check a transit.json and the other files of its folder, and send them. */
@@ -26,8 +25,8 @@ async function sendFolder(manifest, files) {
   } catch (error) {
     return say(said, `${told(error)} Correct the file and choose the folder again.`, "error");
   }
-  const [sent, errors, notes] = compareFiles(manifest, files, names);
-  show(errors, notes);
+  const [sent, errors] = compareFiles(manifest, files, names);
+  show(errors);
   if (errors.length > 0) return say(said, "Correct the folder and choose it again.", "error");
   go(tar(sent), `${folder.files[0].webkitRelativePath.split("/")[0] || "transit"}.tar`);
 }
@@ -42,7 +41,7 @@ async function compact(manifest) {
   }
 }
 
-/** Compare the names in transit.json with the chosen files: the files to send, errors and notes. */
+/** Compare the names in transit.json with the chosen files: the files to send (no others), and errors. */
 function compareFiles(manifest, files, names) {
   const there = new Map(files.map((file) => [file.name, file]));
   const errors = names.filter((name) => !there.has(name)).map((name) => `${name} is missing in the folder`);
@@ -51,8 +50,7 @@ function compareFiles(manifest, files, names) {
   const whole = sent.reduce((sum, file) => sum + file.size, 0);
   const most = Math.min(Number(form.dataset.most), Number(form.dataset.mostUnpacked));
   if (whole > most) errors.push(`expected at most ${size(most)}; the files have ${size(whole)}`);
-  const extra = files.filter((file) => !sent.includes(file)).length;
-  return [sent, errors, extra > 0 ? [`${extra} file${extra === 1 ? "" : "s"} of the folder that ${manifest.name} does not name: not sent`] : []];
+  return [sent, errors];
 }
 
 async function go(file, name) {
@@ -64,7 +62,7 @@ async function go(file, name) {
 function goOn(input, other) {
   other.value = "";
   say(said, null);
-  show([], []);
+  show([]);
   const [file] = input.files;
   if (!file) return;
   if (input === folder) return goFolder();
