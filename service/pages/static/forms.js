@@ -62,7 +62,7 @@ function sendImages(form) {
   async function begun(id) {
     try {
       const { good, lines } = await json(`/images/${id}/check`);
-      if (!good) return lines[0];
+      if (!good) return lines[0].split(/(?<=\.) /)[0]; // its page says the rest
       const job = await json("/v1/jobs", { kind: "deconvolve", parameters: { image_id: id } });
       return element("a", { href: `/jobs/${job.id}` }, "started");
     } catch (error) {
