@@ -172,6 +172,8 @@ class _Catalogued(Collector):
         yield _gauge("jobs_silent", "Jobs whose worker did not report within its lease", silent)
         images = catalogue.bulks.progress.open_images()
         yield _gauge("bulk_images", "Images of bulk runs that have not ended", images, "state")
+        ended = catalogue.bulks.progress.ended_images()
+        yield _gauge("bulk_images_ended", "Images that all bulk runs have finished", ended, "outcome")
         workers = len(catalogue.census.workers(lease_s))
         yield _gauge("workers", "Worker processes that report", workers)
 

@@ -1,4 +1,4 @@
-"""Logs of the service and its workers on standard error: one line for each record, as JSON or as text.
+"""Logs of the service and its workers on standard error or in a file: one line for each record, as JSON or as text.
 
 ``bind`` stores the request, the job or its owner once; all later log lines of the same context then contain these
 values. Headers, keys and contents of files are never logged: in a line, the secret of a key is replaced by ``***``.
@@ -6,9 +6,11 @@ values. Headers, keys and contents of files are never logged: in a line, the sec
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import math
+import os
 import re
 import sys
 import threading
@@ -18,6 +20,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -96,6 +100,27 @@ def _one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+class RotatedFile(RotatingFileHandler):
+    """A log file of several processes: full, it is renamed to FILE.1, the file FILE.1 to FILE.2, and so on."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the record, while no other process rotates the file."""
+        with Path(f"{self.baseFilename}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            old, path = self.stream, Path(self.baseFilename)
+            if old is not None and not (path.exists() and os.path.samefile(path, old.fileno())):
+                old.close()  # another process has rotated the file
+                self.stream = self._open()
+            super().emit(record)
+
+
+def _tried_again(record: logging.LogRecord) -> bool:
+    """Lower errors of Celery to warnings: a lost broker or a lost process is no failure of a job, which is tried again."""
+    if record.levelno >= logging.ERROR:
+        record.levelno, record.levelname = logging.WARNING, logging.getLevelName(logging.WARNING)
+    return True
+
+
 class Seldom(logging.Filter):
     """Writes at most one record of each kind in ``every_s`` seconds. The next record says how many records were left out.
 
@@ -142,15 +167,21 @@ def _no_request(record: logging.LogRecord) -> bool:
 
 
 def configure(settings: Settings, *, verbose: bool = False) -> None:
-    """Write the logs of the process to standard error. Repeated calls change nothing.
+    """Write the logs of the process to standard error, or to the file of the settings. Repeated calls change nothing.
 
     A person who starts a service on a terminal sees a line for each request only if ``verbose`` is true or
     HELIOPSF_LOG_FORMAT is set: these lines would hide the address of the service.
     """
     stream = sys.__stderr__ or sys.stderr
-    form = settings.log_format or ("text" if stream.isatty() else "json")
-    handler = logging.StreamHandler(stream)
-    if settings.log_format is None and stream.isatty() and not verbose:
+    terminal = settings.log_file is None and stream.isatty()
+    form = settings.log_format or ("text" if terminal else "json")
+    handler: logging.Handler = logging.StreamHandler(stream)
+    if settings.log_file is not None:
+        size = settings.log_file_mib * 2**20
+        handler = RotatedFile(
+            settings.log_file, maxBytes=size, backupCount=settings.log_files, encoding="utf-8"
+        )
+    if settings.log_format is None and terminal and not verbose:
         handler.addFilter(_no_request)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
@@ -158,6 +189,10 @@ def configure(settings: Settings, *, verbose: bool = False) -> None:
     # id. An upgrade of the database is logged in one line, see ``Schema.upgrade``.
     for chatty in ("httpx", "httpcore", "uvicorn.access", "alembic.runtime"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    # The library of Celery's processes has a logger of its own, which passes nothing on.
+    logging.getLogger("multiprocessing").handlers = [handler]
+    for retried in ("multiprocessing", "celery.worker.consumer.consumer", "celery.worker.request"):
+        logging.getLogger(retried).addFilter(_tried_again)
     # Clients without a key can cause these: requests that are not HTTP, and more connections than the system allows.
     logging.getLogger("uvicorn.error").addFilter(_SELDOM_WARNINGS)
     logging.getLogger("asyncio").addFilter(_SELDOM_ACCEPTS)

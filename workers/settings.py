@@ -21,6 +21,8 @@ from workers.contract.queues import Queue, queues_named
 from workers.machine import cores, memory_bytes
 
 EMBEDDED_BROKER = "filesystem://"
+KEPT_KINDS = ("image", "transit", "product", "report", "job", "bulk")
+_KEPT = rf"([a-z0-9][a-z0-9._-]*/)?({'|'.join(KEPT_KINDS)})=[1-9][0-9]{{0,4}}"
 MEMORY_OF_JOBS = 0.8  # share of the memory for jobs; the rest is for the system, the server and the database
 
 
@@ -47,6 +49,15 @@ class Settings(BaseSettings):
         ge=0,
         description="largest size of an owner's stored files, MiB; each MiB also allows 256 database rows without a file, such as "
         "jobs and images of bulk runs; 0: unlimited; `heliopsf store quota` sets another limit for an owner",
+    )
+    keep_days: str = Field(
+        "",
+        pattern=rf"^$|^({_KEPT})(, *{_KEPT})*$",
+        description="for how many days things are kept, by kind and owner, for example `product=365,image=90,ann/product=30`; "
+        f"older ones are deleted once an hour; kinds: {', '.join(KEPT_KINDS)}; default: everything is kept",
+    )
+    keep_dry_run: bool = Field(
+        True, description="only log what keep_days would delete, by owner and kind; false: delete it"
     )
     min_free_mib: int = Field(
         256,
@@ -110,8 +121,16 @@ class Settings(BaseSettings):
         "`traces`); default: no traces",
     )
     log_format: Literal["text", "json"] | None = Field(
-        None, description="format of the logs on standard error; default: text on a terminal, otherwise json"
+        None, description="format of the logs; default: text on a terminal, otherwise json"
     )
+    log_file: Path | None = Field(
+        None,
+        description="file of the logs, which all servers and workers of a machine may share; default: standard error",
+    )
+    log_file_mib: int = Field(
+        100, ge=1, description="size at which the log file is renamed to FILE.1 and a new one begins, MiB"
+    )
+    log_files: int = Field(5, ge=1, description="number of renamed log files that are kept")
 
     uws_max_wait_s: float = Field(
         50.0, ge=0, le=3600, description="longest time that a UWS request with WAIT may wait, s"
@@ -221,6 +240,12 @@ class Settings(BaseSettings):
     def added_effects(self) -> tuple[str, ...]:
         """Modules or files with effects that a diagnosis tests in addition to the effects of the library."""
         return _named(self.gap_effects)
+
+    @property
+    def kept_days(self) -> dict[tuple[str, str], int]:
+        """For how many days things are kept, by owner and kind; the owner "" stands for all others."""
+        rules = (rule.partition("=") for rule in _named(self.keep_days))
+        return {(name.rpartition("/")[0], name.rpartition("/")[2]): int(days) for name, _, days in rules}
 
     @property
     def host_names(self) -> tuple[str, ...]:

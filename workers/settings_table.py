@@ -74,6 +74,8 @@ def _type(field: FieldInfo) -> str:
 def _name(annotation: Any) -> str:
     if get_origin(annotation) is Literal:
         return " or ".join(f"`{one}`" for one in get_args(annotation))
+    if annotation is bool:
+        return "`true` or `false`"
     return {"str": "text", "int": "integer", "float": "number", "Path": "path"}[annotation.__name__]
 
 
@@ -81,7 +83,8 @@ def _default(field: FieldInfo) -> str:
     if field.default_factory is not None:
         return "see the meaning"  # the value depends on the user or the machine
     value = field.default
-    return "not set" if value is None or value == "" else f"`{value}`"
+    told = str(value).lower() if isinstance(value, bool) else value
+    return "not set" if value is None or value == "" else f"`{told}`"
 
 
 def main(arguments: Sequence[str]) -> None:

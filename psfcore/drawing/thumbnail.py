@@ -1,4 +1,4 @@
-"""Small pictures of images for lists: a PNG with the colours of EUV images and an asinh stretch; and these colours.
+"""Pictures of images for lists and pages: a PNG with the colours of EUV images and an asinh stretch; and these colours.
 
 The stretch is asinh(I / (a T)) / asinh(1 / a), between 0 and 1, where
 
@@ -24,6 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.fits.viewing.planes import Plane as Stored
+from psfcore.fits.viewing.windows import Window, window_of
+from psfcore.fits.viewing.windows import pixels as read_window
+
 # Control points: a position in the range (0 to 1), and its colour. Between them, colours are interpolated linearly in
 # sRGB.
 EUV_POINTS = (
@@ -39,6 +43,7 @@ NO_DATA = "#3a4a5a"  # a blue grey, which the map does not contain
 LONGER_SIDE_PX = 192
 SOFTENING = 0.05
 TOP_PERCENTILE = 99.7
+DECADES = 6
 # The last level of the palette is the colour of pixels without data; all others are the colour map.
 _NO_DATA_LEVEL = 255
 
@@ -66,6 +71,32 @@ def write_thumbnail(pixels: Plane, path: Path) -> None:
     The longer side of the picture has ``LONGER_SIDE_PX`` pixels; a smaller image keeps its size.
     """
     path.write_bytes(_png(levels_of(reduced(pixels))[::-1]))
+
+
+def picture(stored: Stored, most_px: int) -> bytes:
+    """A stored image as PNG, at most ``most_px`` wide and high; its pixels are means of blocks. Raises EOFError."""
+    window = window_of(stored.shape, step=-(-max(stored.shape) // most_px))
+    return _png(levels_of(_read(stored, window))[::-1])
+
+
+def core_picture(stored: Stored, most_px: int) -> bytes:
+    """The central part of a stored PSF as PNG, at most ``most_px`` wide and high. Raises EOFError."""
+    ny, nx = stored.shape
+    edge = min(most_px, ny, nx)
+    x, y = nx // 2 - edge // 2, ny // 2 - edge // 2
+    return png_of_weights(_read(stored, window_of(stored.shape, x=x, y=y, width=edge, height=edge)))
+
+
+def _read(stored: Stored, window: Window) -> Plane:
+    numbers = np.frombuffer(b"".join(read_window(stored, window, bits=False)), dtype="<f4")
+    return numbers.reshape(window.shape)
+
+
+def png_of_weights(weights: Plane) -> bytes:
+    """The weights of a PSF [y, x] as PNG, row 0 at the bottom, with a logarithmic stretch over ``DECADES`` decades."""
+    top = float(weights.max(initial=0.0))
+    share = np.log10(np.maximum(weights / top, 10.0**-DECADES)) / DECADES + 1 if top > 0 else 0 * weights
+    return _png(np.round(share * (_NO_DATA_LEVEL - 1)).astype(np.uint8)[::-1])
 
 
 def reduced(pixels: Plane) -> NDArray[np.float64]:

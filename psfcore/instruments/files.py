@@ -1,10 +1,11 @@
-"""Finds the instrument files: by name, and by the header of an image.
+"""Finds the instrument files: by name, and by the header of an image; and says which telescopes they describe.
 
 This module imports no numerical library, so that the web process can import it.
 """
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from functools import cache
@@ -18,6 +19,9 @@ PLATE_SCALE_TOLERANCE = 0.01
 # The numbers in the table [match] may differ from those of an image by this ratio.
 _TOLERANCES = {"WAVELNTH": WAVELENGTH_TOLERANCE, "CDELT1": PLATE_SCALE_TOLERANCE}
 _FOLDER = Path(__file__).parent
+# Names of telescopes whose files match a card that does not name the spacecraft.
+_TELESCOPES = {"HRI_EUV": "Solar Orbiter EUI/HRI_EUV"}
+_STATUS = re.compile(r'^status = "draft" +# (.+)$', re.MULTILINE)
 
 
 def instrument_names() -> tuple[str, ...]:
@@ -36,6 +40,32 @@ def instrument_path(name: str) -> Path:
 def turned_text(name: str, turn_deg: float) -> str:
     """The text of the file of instrument `name` for images that are turned by this angle against the detector."""
     return f"turn_deg = {turn_deg:.2f}\n{instrument_path(name).read_text('utf-8')}"
+
+
+def telescope_of(name: str) -> str:
+    """The telescope of instrument `name` as people write it, such as "SDO/AIA"."""
+    cards = match_table(name)
+    card = str(cards.get("TELESCOP") or cards.get("DETECTOR") or name)
+    return _TELESCOPES.get(card, card)
+
+
+@cache
+def telescopes() -> dict[str, str]:
+    """The telescopes that the shipped files describe, with their channels in angstrom, such as "94 to 335"."""
+    found: dict[str, list[float]] = {}
+    for name in instrument_names():
+        angstrom = tomllib.loads(instrument_path(name).read_text("utf-8"))["wavelength_angstrom"]
+        found.setdefault(telescope_of(name), []).append(angstrom)
+    ends = {name: dict.fromkeys((min(channels), max(channels))) for name, channels in found.items()}
+    return {name: " to ".join(f"{channel:g}" for channel in channels) for name, channels in ends.items()}
+
+
+def assumed_in(name: str | None) -> str | None:
+    """What the file of instrument `name` assumes: the comment after its status. None: there is no such draft."""
+    if name not in instrument_names():
+        return None
+    told = _STATUS.search(instrument_path(name).read_text("utf-8"))
+    return None if told is None else told[1].replace(" below", "")
 
 
 def match_instrument(cards: Mapping[str, object]) -> str | None:

@@ -18,12 +18,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from psfcore.errors import DataError
 from psfcore.noise_figures import NoiseFigures
 
 MANIFEST_NAME = "transit.json"
 MAX_IMAGES = 2000
+MOST_FAULTS = 8  # wrong values that a message names
 MAX_MANIFEST_BYTES = 4 * 2**20
 # Every value of a JSON text except the first follows one of these characters. Python needs about 100 bytes for a value,
 # so the number of values is limited before the text is read. An image of today's format has 5 values.
@@ -58,9 +60,7 @@ def _printable(text: str) -> str:
     return text
 
 
-# In the JSON schema the format marks names of files, so that a program can compare them with the files of a folder.
-FILE_NAME = "file-name"
-FileName = Annotated[str, AfterValidator(_plain), Field(json_schema_extra={"format": FILE_NAME})]
+FileName = Annotated[str, AfterValidator(_plain)]
 # strict: the values "12.5" (a string) and true are not accepted as numbers.
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Coordinate = Annotated[Number, Field(ge=-FARTHEST_PX, le=FARTHEST_PX)]
@@ -135,7 +135,7 @@ def parse_manifest(content: bytes) -> TransitManifest:
     - if a file name is not plain or occurs twice;
     - if both noise figures are zero.
 
-    The message names the key (an image by its index and file), the expected value and the given value.
+    The message names each wrong key (an image by its index and file), the expected value and the given value.
     """
     if len(content) > MAX_MANIFEST_BYTES:
         raise _bad(f"expected at most {MAX_MANIFEST_BYTES} bytes; got more")
@@ -155,7 +155,9 @@ def parse_manifest(content: bytes) -> TransitManifest:
     try:
         manifest = TransitManifest.model_validate(data)
     except ValidationError as error:
-        raise _bad(_first_problem(error, data)) from None
+        faults = [_fault(one, data) for one in error.errors()]
+        more = f"; and {len(faults) - MOST_FAULTS} more" if len(faults) > MOST_FAULTS else ""
+        raise _bad("; ".join(faults[:MOST_FAULTS]) + more) from None
     _check_once(manifest)
     if manifest.noise is not None and not (manifest.noise.photon_gain_dn or manifest.noise.read_noise_dn):
         raise _bad("noise: expected photon_gain_dn or read_noise_dn above zero; got 0 and 0")
@@ -181,16 +183,13 @@ def _check_once(manifest: TransitManifest) -> None:
         raise _bad(f"known_psf: expected a FITS file; got {MANIFEST_NAME}")
 
 
-def _first_problem(error: ValidationError, data: dict[str, Any]) -> str:
-    first = error.errors()[0]
-    missing = first["type"] == "missing"
-    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    got = "no such key" if missing else f"{first['input']!r:.80}"
-    if first["type"] in ("too_long", "too_short"):
+def _fault(fault: ErrorDetails, data: dict[str, Any]) -> str:
+    got = "no such key" if fault["type"] == "missing" else f"{fault['input']!r:.80}"
+    if fault["type"] in ("too_long", "too_short"):
         got = f"{len(data['images'])}"
-    expected = first["msg"].removeprefix("Value error, ")
+    expected = fault["msg"].removeprefix("Value error, ")
     expected = expected if expected.startswith("expected") else f"expected: {expected}"
-    return f"{_where(first['loc'], data)}: {expected}; got {got}{more}"
+    return f"{_where(fault['loc'], data)}: {expected}; got {got}"
 
 
 def _where(location: tuple[int | str, ...], data: dict[str, Any]) -> str:

@@ -143,7 +143,7 @@ def get_product_changes(product_id: Identity, request: Request, caller: Reading,
 def delete_product(product_id: Identity, caller: Submitting, state: Shared) -> Response:
     """Remove the product from the catalogue and from your quota. The same request makes it again."""
     row = state.row(ProductRow, product_id, caller.owner)
-    state.catalogue.delete_product(product_id, caller.owner)
+    state.catalogue.delete(ProductRow, product_id, caller.owner)
     # The files are deleted at once. Otherwise an owner who deletes products and submits jobs in turn could exceed the
     # quota.
     remove_unnamed(state.catalogue, state.store, [digest for digest, _ in files_of(row)])

@@ -33,6 +33,7 @@ ANSWERS_VERSION = 1
 MEDIA_TYPE = "application/octet-stream"
 IMAGE, QUALITY = "image", "quality"
 LARGEST = 2**31 - 1
+PICTURE_PX = 640  # longest side of a picture
 router = APIRouter(tags=["pixels"], responses=RESPONSES)
 headers = APIRouter(tags=["headers"], responses=RESPONSES)
 
@@ -132,10 +133,8 @@ async def _pixels(request: Request, state: Shared, digest: str, name: str, part:
     sent = files.headers_of(f"{ANSWERS_VERSION} {digest} pixels {name} {part}")
     if (same := files.unchanged(request, sent)) is not None:
         return same
-    plane = state.planes.kept((digest, name))
     with as_problems():
-        if plane is None:
-            plane = await anyio.to_thread.run_sync(_decoded, state, digest, name, limiter=state.decoding)
+        plane = await _plane(state, digest, name)
         shape, length, pieces = await run_in_threadpool(_cut, plane, part, name == QUALITY)
     sent["X-Plane-Shape"] = "{},{}".format(*plane.shape)
     sent["X-Pixels-Shape"] = "{},{}".format(*shape)
@@ -150,9 +149,33 @@ async def prepare_image(state: State, digest: str) -> None:
 
     If the file cannot be decoded, this function raises no error; the later request gets the error.
     """
-    if state.planes.kept((digest, IMAGE)) is None:
-        with contextlib.suppress(DataError, Problem):
-            await anyio.to_thread.run_sync(_decoded, state, digest, IMAGE, limiter=state.decoding)
+    with contextlib.suppress(DataError, Problem):
+        await _plane(state, digest, IMAGE)
+
+
+async def picture_of(request: Request, state: State, digest: str, core_px: int | None = None) -> Response:
+    """A picture of the image in a stored file as PNG, or 304 if the client already has it. core_px: of the central part of a
+    PSF, with this width."""
+    sent = files.headers_of(f"{ANSWERS_VERSION} {digest} picture {core_px}")
+    if (same := files.unchanged(request, sent)) is not None:
+        return same
+
+    def draw(plane: Plane) -> bytes:
+        from psfcore.drawing.thumbnail import core_picture, picture
+
+        return core_picture(plane, core_px) if core_px else picture(plane, PICTURE_PX)
+
+    with as_problems():
+        png = await run_in_threadpool(draw, await _plane(state, digest, IMAGE))
+    return Response(png, media_type="image/png", headers=sent)
+
+
+async def _plane(state: State, digest: str, name: str) -> Plane:
+    """A plane of a stored file, decoded now unless it is still kept."""
+    plane = state.planes.kept((digest, name))
+    if plane is None:
+        plane = await anyio.to_thread.run_sync(_decoded, state, digest, name, limiter=state.decoding)
+    return plane
 
 
 def _decoded(state: State, digest: str, name: str) -> Plane:

@@ -41,7 +41,7 @@ from workers.catalogue.access import Scope
 from workers.catalogue.bulk_progress import MOST_EXPLAINED
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.psfs import PsfFilter
-from workers.catalogue.tables import ProductRow, PsfContextRow
+from workers.catalogue.tables import ProductRow, PsfContextRow, PsfRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, BulkRequest, ItemState
 from workers.contract.layout import FIELDS
 from workers.files import archive
@@ -222,6 +222,7 @@ def bulk(
         request,
         "bulk.html",
         bulk=view,
+        psf=None if view.psf_id is None else state.catalogue.get(PsfRow, view.psf_id, caller.owner),
         reasons=reasons,
         most_explained=MOST_EXPLAINED,
         results=_cards(rows[:PER_SHEET], caller, state),

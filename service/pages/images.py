@@ -15,9 +15,10 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, RedirectResponse
 
 from psfcore.fits.header import read_summary
-from psfcore.instruments.files import instrument_names
+from psfcore.instruments.files import telescope_of, telescopes
 from service.api.images import ImageView, upload_image
 from service.api.jobs import EstimateView, estimate_job, submit_job
+from service.api.pixels import picture_of
 from service.http.callers import Caller
 from service.http.problems import Problem
 from service.http.quotas import Allowed
@@ -27,7 +28,6 @@ from service.pages.forms import (
     SentForm,
     deconvolution,
     image_address,
-    job_request,
     shown_options,
     text,
     usual_steps,
@@ -35,14 +35,15 @@ from service.pages.forms import (
 from service.pages.jobs import job_lines
 from service.pages.login import PageReading, PageSubmitting
 from service.pages.rendering import duration, page, short
-from service.pages.sentences import of_problem
+from service.pages.sentences import draft, of_problem
 from service.views import JobView, ProductView
 from workers.catalogue.psfs import PsfFilter
 from workers.catalogue.tables import ImageRow, JobRow, ProductRow, PsfRow
-from workers.contract.phases import Phase
 from workers.contract.requests import Identity
+from workers.intake.compatibility import suits
 from workers.intake.psf_choice import ChosenPsf
 from workers.intake.uploads import image_row
+from workers.versions import PsfStatus
 
 SAMPLE = "sample.fits"
 LATEST = 6
@@ -63,7 +64,7 @@ def home(request: Request, caller: PageReading, state: Shared) -> Response:
     return page(
         request,
         "home.html",
-        known=" and ".join(instrument_names()),
+        telescopes=telescopes(),
         most_bytes=state.settings.max_upload_bytes,
         products=[product_card(state, row) for row in catalogue.page(ProductRow, owner=owner, limit=LATEST)],
         images=[image_line(row) for row in images],
@@ -95,7 +96,6 @@ def product_card(state: State, row: ProductRow) -> dict[str, object]:
     return {
         "id": view.id,
         "name": (image and image.filename) or short(view.id),
-        "psf_version": view.psf_version,
         "created_at": view.created_at,
         "thumbnail": f"/v1/products/{view.id}/thumbnail" if thumbnail else None,
     }
@@ -144,13 +144,20 @@ class Checked:
         return "" if self.problem is None else self.problem.code
 
 
+@router.get("/images/{image_id}/picture")
+async def picture(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """A picture of the image as it was uploaded."""
+    await run_in_threadpool(state.row, ImageRow, image_id, caller.owner)
+    return await picture_of(request, state, image_id)
+
+
 @router.get("/images/{image_id}")
 def image(image_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
     """The image, its PSF and the estimate for the options in the query."""
     row = state.row(ImageRow, image_id, caller.owner)
     asked = request.query_params
     checked = _checked(image_id, asked, caller, state)
-    psfs = _psfs(text(asked, "psf_id"), caller, state)
+    psfs, others = _psfs(text(asked, "psf_id"), row, caller, state)
     products = state.catalogue.page(ProductRow, owner=caller.owner, limit=MOST_PRODUCTS, image_id=image_id)
     return page(
         request,
@@ -158,8 +165,8 @@ def image(image_id: Identity, request: Request, caller: PageReading, state: Shar
         image=row,
         facts=_facts(row),
         checked=checked,
-        ways={} if checked.problem is None else checked.problem.more,
         psfs=psfs,
+        others=others,
         unknown=checked.code == "no-psf-for-instrument",
         products=[product_line(ProductView.of(product)) for product in products],
         methods=usual_steps(),
@@ -194,18 +201,6 @@ def start(
     return RedirectResponse(f"/jobs/{job.id}", 303)
 
 
-@router.post("/images/{image_id}/build")
-def build(
-    image_id: Identity, response: Response, caller: PageSubmitting, state: Shared, form: SentForm
-) -> Response:
-    """Build the PSF of an instrument; then the page of the image is shown with this PSF."""
-    build = job_request("psf-build", {"instrument": text(form, "instrument")})
-    job = submit_job(build, response, caller, state)
-    if job.phase == Phase.COMPLETED and job.result is not None:
-        return RedirectResponse(f"/images/{image_id}?psf_id={job.result.rpartition('/')[2]}", 303)
-    return RedirectResponse(f"/jobs/{job.id}?image={image_id}", 303)
-
-
 def product_line(product: ProductView) -> dict[str, Any]:
     """The entry of a product in the list of the products of an image."""
     done = product.details["steps_done"]
@@ -216,13 +211,14 @@ def product_line(product: ProductView) -> dict[str, Any]:
     }
 
 
-def _psfs(chosen: str, caller: Caller, state: State) -> list[PsfRow]:
-    """The PSFs that the form offers: the newest, and the chosen one."""
+def _psfs(chosen: str, image: ImageRow, caller: Caller, state: State) -> tuple[list[PsfRow], list[PsfRow]]:
+    """The PSFs that the form offers, the newest and the chosen one: those that suit the image, and the others."""
     found = list(state.catalogue.psfs.page(PsfFilter(), caller.owner, limit=MOST_PSFS))
     if chosen and chosen not in [psf.id for psf in found]:
         row = state.catalogue.get(PsfRow, chosen, caller.owner)
         found += [] if row is None else [row]
-    return found
+    fit = [psf for psf in found if suits(psf, image.summary)]
+    return fit, [psf for psf in found if psf not in fit]
 
 
 def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> Checked:
@@ -238,8 +234,12 @@ def _checked(image_id: str, asked: Sent, caller: Caller, state: State) -> Checke
 
 def _lines(found: EstimateView) -> list[str]:
     assert found.psf is not None
-    why = found.psf.why.replace("The request names this PSF.", "You chose this PSF.")
-    lines = [f"{_psf(found.psf)}. {why}"]
+    psf = found.psf
+    why = psf.why.replace("The request names this PSF.", "You chose this PSF.")
+    built = found.parameters.get("psf_recipe") is not None
+    lines = [f"{_psf(psf)}, built for {telescope_of(psf.name)}." if built else f"{_psf(psf)}. {why}"]
+    if built or psf.status == PsfStatus.DRAFT:
+        lines.append(draft(psf.name))
     if found.existing:
         return [*lines, "This product exists already."]
     waiting = ""

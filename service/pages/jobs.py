@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
 from pydantic import BaseModel
 
@@ -16,11 +16,11 @@ from service.http.paging import Cursor, Listing
 from service.http.state import Shared, State
 from service.pages.forms import address_of
 from service.pages.login import PageReading, PageSubmitting
-from service.pages.rendering import page, page_of
+from service.pages.rendering import page
 from service.pages.sentences import of_error
 from service.views import JobView
+from workers.catalogue.tables import ImageRow
 from workers.contract.phases import Phase
-from workers.contract.requests import Identity
 
 PER_PAGE = 50
 TITLES = {
@@ -55,19 +55,10 @@ def job_list(
 
 
 @router.get("/{job_id}")
-def job(
-    job_id: JobId,
-    request: Request,
-    caller: PageReading,
-    state: Shared,
-    image: Annotated[Identity | None, Query()] = None,
-) -> Response:
-    """The state of a job; a script keeps it up to date, and opens the result at its end.
-
-    image: id of the image for which the job builds a PSF. When the job ends, the page of this image opens, with the new
-    PSF chosen.
-    """
+def job(job_id: JobId, request: Request, caller: PageReading, state: Shared) -> Response:
+    """The state of a job; a script keeps it up to date, and opens the result at its end."""
     view = get_job(job_id, caller, state)
+    image = state.catalogue.get(ImageRow, view.parameters.get("image_id") or "", caller.owner)
     return page(
         request,
         "job.html",
@@ -77,8 +68,7 @@ def job(
         waiting_before=view.waiting_before,
         again=_again(view),
         error=None if view.error is None else of_error(view.error.code, view.error.message),
-        image=image,
-        result=None if view.result is None else result_page(view.result, image),
+        image=None if image is None else image.id,
         parameters=_pretty(view),
     )
 
@@ -95,11 +85,6 @@ def _again(view: JobView) -> str | None:
     # A job that was not started yet has the parameters that the client sent, and some may be missing.
     whole = {"image_id", "psf_id", "method"} <= view.parameters.keys()
     return address_of(view.parameters) if view.kind == "deconvolve" and whole else None
-
-
-def result_page(result: str, image: str | None) -> str:
-    """The page that follows a job. result: address of its result. image: see ``job``."""
-    return page_of(result) if image is None else f"/images/{image}?psf_id={result.rpartition('/')[2]}"
 
 
 def job_lines(jobs: Sequence[JobView], caller: Caller, state: State) -> list[dict[str, Any]]:

@@ -32,10 +32,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves over one quantity. x: ascending for lines, in any order for points. names: names of the rows of the table.
-
-    Raises ValueError if a row of numbers does not have the length of x.
-    """
+    """Curves over one quantity. x: ascending for lines, in any order for points. names: names of the rows of the table."""
 
     title: str
     x_label: str
@@ -45,13 +42,6 @@ class Plot:
     x_log: bool = False
     y_log: bool = False
     names: Sequence[str] | None = None
-    names_label: str = "Image"
-
-    def __post_init__(self) -> None:
-        rows = [row for one in self.series for row in (one.values, one.low, one.high) if row is not None]
-        for row in [*rows, *([] if self.names is None else [self.names])]:
-            if len(row) != len(self.x):
-                raise ValueError(f"{self.title}: expected {len(self.x)} numbers in each row; got {len(row)}")
 
     @property
     def columns(self) -> list[tuple[str, str, str, Numbers]]:

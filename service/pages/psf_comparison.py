@@ -138,21 +138,18 @@ def _plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Plot]:
 def _light_plots(labels: tuple[str, str], one: Tables, other: Tables) -> list[Plot]:
     """The light beyond each radius that both tables have, and the difference."""
     compared = lookup.compare(one, other)
-    radii = compared["radii_px"]
-    curves = {}
-    for label, tables in zip(labels, (one, other), strict=True):
-        curve = lookup.curve(tables)
-        at = {radius: place for place, radius in enumerate(curve["radii_px"])}
-        pct, sigma = curve["light_beyond_pct"][TOTAL], curve["sigma_points"].get(TOTAL)
-        chosen = [at[radius] for radius in radii]
-        errors = None if sigma is None else [sigma[place] for place in chosen]
-        curves[label] = ([pct[place] for place in chosen], errors)
-    places = shown_radii(radii)
+    places = shown_radii(compared["radii_px"])
+    radii = [compared["radii_px"][at] for at in places]
+    found = [lookup.curve(tables, radii) for tables in (one, other)]
+    curves = {
+        label: (curve["light_beyond_pct"][TOTAL], curve["sigma_points"].get(TOTAL))
+        for label, curve in zip(labels, found, strict=True)
+    }
     points, sigma = compared["difference_points"][TOTAL], compared["sigma_points"].get(TOTAL)
     difference = radial_plot(
         f"Difference of the light beyond a radius: {labels[1]} minus {labels[0]}",
         "percentage points",
-        [radii[at] for at in places],
+        radii,
         [with_errors("difference", points, sigma, places)],
         y_log=False,
     )

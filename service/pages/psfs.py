@@ -7,14 +7,16 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
 from pydantic import ValidationError, validate_call
 from starlette.datastructures import FormData
 
-from psfcore.instruments.files import instrument_names
+from psfcore.instruments.files import instrument_names, telescope_of
 from psfcore.tables import lookup
 from service.api.lineage import get_psf_lineage, rerun_psf
-from service.api.psf_curves import get_cutout, tables_of
+from service.api.pixels import picture_of
+from service.api.psf_curves import tables_of
 from service.api.psf_status import (
     SeriesChange,
     SeriesView,
@@ -39,13 +41,14 @@ from service.pages.rendering import number, page
 from service.views import PsfView
 from workers.catalogue.access import Scope
 from workers.catalogue.psfs import PsfFilter
-from workers.catalogue.tables import ReportRow
+from workers.catalogue.tables import PsfRow, ReportRow
 from workers.contract.requests import Component, Identity, PsfBuild
 from workers.versions import TOTAL, PsfStatus, without_variant
 
 PER_PAGE = MOST_OTHERS = 50
 MOST_REPORTS = 10
 CUTOUT_PX = 257
+CORE_PX = 129
 FILTERS = ("instrument", "channel", "kind", "name", "version", "status", "valid_at")
 router = APIRouter(prefix="/psfs", include_in_schema=False)
 _filter: Callable[..., PsfFilter] = validate_call(psf_filter)
@@ -64,7 +67,7 @@ def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Curso
         asked={name: asked.get(name, "") for name in (*FILTERS, "context")},
         filtered=bool(asked),
         statuses=list(PsfStatus),
-        instruments=instrument_names(),
+        instruments={name: telescope_of(name) for name in instrument_names()},
         components=get_args(Component),
         usual_size=PsfBuild.model_fields["size"].default,
         most_bytes=state.settings.max_upload_bytes,
@@ -74,11 +77,16 @@ def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Curso
 
 @router.post("")
 async def upload(
-    request: Request, response: Response, caller: PageSubmitting, state: Shared, kind: KindOfUpload = None
+    request: Request,
+    response: Response,
+    caller: PageSubmitting,
+    state: Shared,
+    kind: KindOfUpload = None,
+    image: Annotated[Identity | None, Query()] = None,
 ) -> Response:
-    """Take a PSF from the form, and go to its page. kind: as for the API."""
+    """Take a PSF from the form, and go to its page, or to the page of the image for which it was sent. kind: as for the API."""
     view = await upload_psf(request, response, caller, state, kind=kind)
-    return RedirectResponse(f"/psfs/{view.id}", 303)
+    return RedirectResponse(f"/psfs/{view.id}" if image is None else f"/images/{image}?psf_id={view.id}", 303)
 
 
 @router.post("/build")
@@ -129,6 +137,7 @@ def psf(psf_id: Identity, request: Request, caller: PageReading, state: Shared) 
         others=[one for one in others if one.id != psf_id][:MOST_OTHERS],
         rivals=_rivals(state, caller, view),
         reports=state.catalogue.page(ReportRow, owner=caller.owner, limit=MOST_REPORTS, about_id=psf_id),
+        core_px=CORE_PX,
         cutout_px=min(CUTOUT_PX, *view.details["shape"]),
         may_certify=Scope.CERTIFY in caller.scopes,
         may_submit=Scope.SUBMIT in caller.scopes,
@@ -145,16 +154,11 @@ def products(
     return page(request, "psf_products.html", psf=view, products=found.items, next=found.next)
 
 
-@router.get("/{psf_id}/cutout")
-async def cutout(
-    psf_id: Identity,
-    size: Annotated[int, Query(ge=1)],
-    request: Request,
-    caller: PageReading,
-    state: Shared,
-) -> Response:
-    """The central part of the PSF as FITS; an error is shown as a page."""
-    return await get_cutout(psf_id, size, request, caller, state)
+@router.get("/{psf_id}/core")
+async def core(psf_id: Identity, request: Request, caller: PageReading, state: Shared) -> Response:
+    """A picture of the core of the PSF."""
+    row = await run_in_threadpool(state.row, PsfRow, psf_id, caller.owner)
+    return await picture_of(request, state, row.file_sha256, core_px=CORE_PX)
 
 
 @router.post("/{psf_id}/status")

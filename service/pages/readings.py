@@ -2,8 +2,8 @@
 
 | schema | what is read |
 |---|---|
-| psf-fit | parameters, curves with errors, free shells, the residual of each image |
-| cross-validation | bands of the curve and of the parameters, free shells, held-out residuals, folds |
+| psf-fit | parameters, free shells, the residual of each image |
+| cross-validation | bands of the parameters |
 | gap | the discs: position, time, residual without and with the named effects |
 | rerun | the arrays that were compared, and what made each of the two results |
 """
@@ -39,19 +39,8 @@ def fit_parameters(fit: Report) -> list[Row]:
 
 
 def fit_plots(fit: Report) -> list[Plot]:
-    """The curves of a fit with their bands, the free shells if they were fitted, and the residual of each image."""
-    return [_fit_curves(fit), *_free_shells(fit), _fit_residuals(fit)]
-
-
-def _fit_curves(fit: Report) -> Plot:
-    whole, diffuse = fit["curve"], fit["diffuse_curve"]
-    series = [
-        with_errors(label, curve["light_beyond_pct"], curve["sigma"])
-        for label, curve in (("whole PSF", whole), ("diffuse scatter", diffuse))
-        if curve["radii_px"] == whole["radii_px"]
-    ]
-    title = "Light beyond a radius, with the errors of the fit"
-    return radial_plot(title, "1 - encircled energy (%)", whole["radii_px"], series)
+    """The free shells of a fit if they were fitted, and the residual of each image."""
+    return [*_free_shells(fit), _fit_residuals(fit)]
 
 
 def _free_shells(fit: Report) -> list[Plot]:
@@ -90,51 +79,6 @@ def band_parameters(report: Report) -> list[Row]:
         )
         for name, limits in report["parameters"].items()
     ]
-
-
-def cross_validation_plots(report: Report) -> list[Plot]:
-    """The curve with its band, the weights with and without a formula, the residual of each held-out image, the folds."""
-    curve = radial_plot(
-        "Light beyond a radius, over all folds",
-        "1 - encircled energy (%)",
-        report["radii_px"],
-        [_banded("median, with the band of one standard deviation", report["light_beyond_pct"])],
-    )
-    return [curve, *_shell_plots(report["shells"]), _held_out(report), _fold_totals(report)]
-
-
-def _shell_plots(shells: Report | None) -> list[Plot]:
-    if shells is None:
-        return []
-    weights, title = shells["weight"], "Weight of the scatter, with and without a formula"
-    series = [_banded("formula", weights["formula"]), _banded("free shells", weights["free"])]
-    return [radial_plot(title, "weight of a pixel", _middles(shells["edges_px"]), series)]
-
-
-def _held_out(report: Report) -> Plot:
-    found = {int(number): value for number, value in report["held_out_pct"].items()}
-    files = report["files"]
-    return Plot(
-        "Residual of each held-out image, mean of its folds",
-        "number of the image",
-        "simulated minus observed (%)",
-        list(found),
-        [Series("held out", list(found.values()), draw="points")],
-        names=[files[str(number)] for number in found],
-    )
-
-
-def _fold_totals(report: Report) -> Plot:
-    totals = [100 * fold["values"]["total"] for fold in report["folds"]]
-    return Plot(
-        "Diffuse light of each fold",
-        "number of the fit",
-        "diffuse light (%)",
-        list(range(len(totals))),
-        [Series("diffuse light", totals, draw="points")],
-        names=[f"run {fold['run']}, fold {fold['fold']}" for fold in report["folds"]],
-        names_label="Fold",
-    )
 
 
 def _banded(label: str, limits: Mapping[str, Numbers]) -> Series:

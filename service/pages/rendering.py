@@ -20,7 +20,7 @@ from service.http.callers import Caller
 from service.http.state import state_of
 from service.pages import assets
 from service.pages.forms import number_field
-from service.pages.sentences import of_error, plain
+from service.pages.sentences import draft, of_error, plain
 from workers.settings import software_version
 
 POLICY = (
@@ -95,7 +95,12 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.globals |= {"asset": assets.address, "number_field": number_field, "version": software_version()}
+    made.globals |= {
+        "asset": assets.address,
+        "draft": draft,
+        "number_field": number_field,
+        "version": software_version(),
+    }
     made.filters |= {
         "short": short,
         "date": date,

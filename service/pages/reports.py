@@ -1,4 +1,4 @@
-"""The page of a report: the sentence, the sections of the stored page, and curves from the stored numbers."""
+"""The page of a report: the sentence, the sections of the stored page or tables of its numbers, and the map of a gap."""
 
 from __future__ import annotations
 
@@ -66,7 +66,6 @@ def report(report_id: Identity, request: Request, caller: PageReading, state: Sh
         sections=[] if stored is None else stored.sections,
         footer="" if stored is None else stored.footer,
         gap=readings.gap_map(said) if row.kind == "gap" else None,
-        plots=_plots(row.kind, said),
         tables=_tables(row.kind, said),
         about=_about(said, row),
     )
@@ -121,14 +120,6 @@ def read_stored(path: Path, figures_at: str) -> StoredPage:
 def _said(state: State, row: ReportRow) -> Mapping[str, Any]:
     said: dict[str, Any] = json.loads(downloads.found(state.store, row.file_sha256, row.bytes).read_bytes())
     return said
-
-
-def _plots(kind: str, said: Mapping[str, Any]) -> list[readings.Plot]:
-    if kind == "cross-validation":
-        return readings.cross_validation_plots(said)
-    if kind == "report" and "fit" in said:
-        return readings.fit_plots(said["fit"])
-    return []
 
 
 def _tables(kind: str, said: Mapping[str, Any]) -> list[tuple[str, tuple[str, ...], list[readings.Row]]]:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from psfcore.instruments.files import assumed_in
 from service.http.problems import Problem
 from workers.rows import NAMES
 
@@ -42,6 +43,12 @@ def of_error(code: str, message: str, fields: Mapping[str, Any] = _NO_FIELDS) ->
         return plain(message)
 
 
+def draft(instrument: str | None) -> str:
+    """What it means that a PSF is a draft. instrument: the name of its instrument."""
+    assumed = assumed_in(instrument)
+    return "Draft means that nobody has certified this PSF" + (f" ({assumed})." if assumed else ".")
+
+
 def plain(message: str) -> str:
     """A message as a sentence: with a capital and a full stop, without the parts that only programs need."""
     text = _FOR_PROGRAMS.sub("", message).strip()
@@ -61,7 +68,7 @@ def _wrong_fields(message: str, _fields: Mapping[str, Any]) -> str:
 
 def _no_psf(_message: str, fields: Mapping[str, Any]) -> str:
     why = f" heliopsf has no instrument file for it: {fields['reason']}." if fields.get("reason") else ""
-    return f"No PSF for {fields['image']} is known here.{why} Upload a PSF below, or fit one to a transit."
+    return f"No PSF for {fields['image']} is known here.{why} Upload a PSF here, or fit one to a transit."
 
 
 def _channel(_message: str, fields: Mapping[str, Any]) -> str:

@@ -7,10 +7,10 @@ from typing import get_args
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse, RedirectResponse
 
-from psfcore.transit.manifest import MANIFEST_NAME, TransitManifest
+from psfcore.transit.manifest import MANIFEST_NAME, parse_manifest
 from service.api.transits import get_transit, list_transits, upload_transit
 from service.http.paging import Cursor, Listing
-from service.http.problems import Problem
+from service.http.problems import Problem, as_problems
 from service.http.state import Shared
 from service.pages.forms import SentForm, parameters, start_job
 from service.pages.jobs import TITLES
@@ -58,10 +58,11 @@ async def upload(request: Request, response: Response, caller: PageSubmitting, s
     return RedirectResponse(f"/transits/{view.id}", 303)
 
 
-@router.get("/manifest.schema.json")
-def manifest_schema(caller: PageReading) -> Response:
-    """The JSON schema of transit.json, made from the model with which the service checks an upload."""
-    return JSONResponse(TransitManifest.model_json_schema(by_alias=True))
+@router.post("/check")
+async def check(request: Request, caller: PageReading) -> Response:
+    """The names of the files in a transit.json, for the script of the page. Raises ``Problem`` 422 for its faults."""
+    with as_problems():
+        return JSONResponse(parse_manifest(await request.body()).files)
 
 
 @router.get("/{transit_id}")

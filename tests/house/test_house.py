@@ -86,6 +86,7 @@ def test_what_people_import_stands_on_the_core_the_client_the_folder_of_the_cach
 # Of psfcore the service reads what shows without a pixel: FITS headers, and a transit's archive and manifest, whose
 # table of contents is checked at upload as headers are. None of these loads numerics.
 LIGHT = (
+    "psfcore.drawing.thumbnail",  # loaded by the first request for a picture
     "psfcore.fits.blocks",
     "psfcore.fits.cards",
     "psfcore.fits.frame",
@@ -133,6 +134,7 @@ def test_the_web_process_carries_no_numerics_and_no_task() -> None:
         "workers.run.runner",
         "psfcore.convolution.convolver",
         "psfcore.fits.hdus",
+        "psfcore.drawing.thumbnail",
         "psfcore.fits.viewing.windows",  # loaded by the first request for pixels
         "psfcore.fits.images",
         "psfcore.fits.psfs",

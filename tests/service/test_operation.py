@@ -376,3 +376,11 @@ def test_images_of_a_bulk_are_counted_and_written_once_a_turn(
     stages = told(api, "bulk")
     assert stages["deconvolving"][1] == 9 and set(stages) >= {"reading", "saving", "between images"}
     assert "images" not in stages
+    found = scrape(api)
+    ended = {
+        of: found[sample("heliopsf_bulk_images_ended", outcome=of)]
+        for of in ("deconvolved", "reused", "failed")
+    }
+    assert ended == {"deconvolved": 3, "reused": 0, "failed": 0}
+    took_s = [took_s for _, took_s in catalogue.bulks.progress.image_times(9)]
+    assert len(took_s) == 3 and all(0 < one < 60 for one in took_s), "estimates learn from them"

@@ -1,4 +1,4 @@
-"""What a new user does with a real service: the curl lines of the README, Control-C, and a service that is restarted."""
+"""What a new user does with a real service: the curl lines of the documentation, Control-C, and a service that is restarted."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def started(stack: Stack, folder: Path) -> str:
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is missing")
-def test_the_curl_lines_of_the_readme_work(open_stack: Stack, tmp_path: Path) -> None:
-    [lines] = re.findall(r"```sh\n(.+?)```", (REPOSITORY / "README.md").read_text("utf-8"), flags=re.S)
+def test_the_curl_lines_of_the_documentation_work(open_stack: Stack, tmp_path: Path) -> None:
+    [lines] = re.findall(r"```sh\n(.+?)```", (REPOSITORY / "docs" / "http.md").read_text("utf-8"), flags=re.S)
     assert lines.count("curl ") == 6 and lines.startswith("S=http://127.0.0.1:8765 ")
     write_psf(tmp_path / "psf.fits", size=256)
     psf = open_stack.client.upload_psf(

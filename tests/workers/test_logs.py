@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import json
 import logging
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -92,6 +94,37 @@ def written(
         root.setLevel(level)
         logging.captureWarnings(False)
     return stream.getvalue()
+
+
+def test_what_celery_tries_again_is_a_warning_and_json(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = Terminal(terminal=False)
+    written(monkeypatch, stream, None, False)
+    library = logging.getLogger("multiprocessing")
+    monkeypatch.setattr(library, "propagate", False)  # as Celery's library leaves it
+    for name in ("multiprocessing", "service.http.problems"):
+        logging.getLogger(name).error("%s", name)
+    monkeypatch.setattr(library, "handlers", [])
+    levels = {line["message"]: line["level"] for line in map(json.loads, stream.getvalue().splitlines())}
+    assert levels["multiprocessing"] == "WARNING"
+
+
+def test_a_log_file_is_rotated_by_the_processes_that_share_it(tmp_path: Path) -> None:
+    path, lines = tmp_path / "heliopsf.log", 40
+    shared = [logs.RotatedFile(path, maxBytes=50, backupCount=50) for _ in range(2)]
+    for number in range(lines):
+        shared[number % 2].emit(record(f"line {number}"))
+    files = [path, *(tmp_path / f"heliopsf.log.{number}" for number in range(1, 51))]
+    there = [file.read_text().split("\n")[:-1] for file in files if file.exists()]
+    assert len(there) > 2
+    assert [line for file in reversed(there) for line in file] == [
+        f"line {number}" for number in range(lines)
+    ]
+    one = logs.RotatedFile(path, maxBytes=1, backupCount=1)
+    for number in range(3):
+        one.emit(record(f"last {number}"))
+    assert (tmp_path / "heliopsf.log.1").read_text() == "last 1\n" and path.read_text() == "last 2\n"
+    for handler in (*shared, one):
+        handler.close()
 
 
 @pytest.mark.parametrize("form", [logs.JsonFormatter(), logs.TextFormatter()], ids=["json", "text"])

@@ -15,7 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from workers.broker import app as queue
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
-from workers.files.collection import settle_old
+from workers.files.collection import retain, settle_old
 from workers.files.store import Store
 from workers.settings import Settings
 
@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 # jobs.
 AT_ONCE = 50
 SETTLE_EVERY_S = 60.0
+RETAIN_EVERY_S = 3600.0
 
 
 def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
@@ -54,12 +55,14 @@ def reconcile(catalogue: Catalogue, app: Celery, settings: Settings) -> int:
 class Reconciler:
     """A thread that reconciles every ``settings.reconcile_s`` seconds, and immediately after ``wake``.
 
-    Once a minute it also deletes the files of ``store`` that were removed, and temporary files of ended processes.
+    Once a minute it also deletes the files of ``store`` that were removed, and temporary files of ended processes. Once an
+    hour it deletes what is older than the operator keeps it.
     """
 
     def __init__(self, catalogue: Catalogue, store: Store, app: Celery, settings: Settings) -> None:
         self._catalogue, self._store, self._app, self._settings = catalogue, store, app, settings
         self._settled_at = time.monotonic()
+        self._retained_at = -RETAIN_EVERY_S
         self._wake = threading.Event()
         self._stopping = False
         self._thread = threading.Thread(target=self._loop, name="reconciler", daemon=True)
@@ -93,6 +96,9 @@ class Reconciler:
                     self._settled_at = time.monotonic()
                     self._store.sweep()
                     settle_old(self._catalogue, self._store)
+                if time.monotonic() - self._retained_at > RETAIN_EVERY_S:
+                    self._retained_at = time.monotonic()
+                    retain(self._catalogue, self._store, self._settings)
             except SQLAlchemyError as error:
                 # The database may be restarting; the thread tries again after the interval.
                 log.warning("reconciler: the database does not answer: %s", error)

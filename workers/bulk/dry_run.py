@@ -181,7 +181,8 @@ class _DryRun:
         self._existing += exists
         self._memory_mib = max(self._memory_mib, estimate["memory_mib"])
         if not exists:
-            self._seconds += estimate["seconds"]
+            start_s = estimate["start_s"]
+            self._seconds += start_s * estimates.factor(estimates.BULK, start_s, catalogue)
             self._bytes += product_bytes(summary["shape"], resolved.error_draws)
 
     def _target(self, image: Listed, summary: dict[str, Any], resolved: ResolvedDeconvolve) -> Path:

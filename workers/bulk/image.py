@@ -68,11 +68,12 @@ class Destination:
 
 @dataclass(frozen=True)
 class Ready:
-    """An image that was read and can be deconvolved."""
+    """An image that was read and can be deconvolved. start_s: its estimated time (``Estimate.start_s``)."""
 
     request: ResolvedDeconvolve
     image: Image
     destination: Destination
+    start_s: float
 
 
 @dataclass(frozen=True)
@@ -120,10 +121,11 @@ def read_one(context: Context, bulk: BulkRow, item: BulkItemRow) -> Ready | Outc
         if before is not None:
             return before
         needs = request.model_dump(mode="json") | {"image_shape": source.summary["shape"]}
-        estimates.checked("deconvolve", needs, context.catalogue, context.owner, settings)
+        expected = estimates.checked("deconvolve", needs, context.catalogue, context.owner, settings)
         # The path is taken only now, because the store's local copy may have been removed during a wait.
         image_file = source.copy or context.store.verified(source.sha256)
-        return Ready(request, deconvolve_task.load(context, request, image_file), destination)
+        image = deconvolve_task.load(context, request, image_file)
+        return Ready(request, image, destination, expected["start_s"])
 
 
 def compute_one(context: Context, ready: Ready) -> Made:
@@ -203,7 +205,9 @@ def done_before(context: Context, destination: Destination) -> Outcome | None:
         return None
     columns = {name: getattr(earlier, name) for name in Outcome.__annotations__}
     statistics = {
-        name: value for name, value in (earlier.statistics or {}).items() if not name.endswith("seconds")
+        name: value
+        for name, value in (earlier.statistics or {}).items()
+        if not name.endswith(("seconds", "_s"))
     }
     return Outcome(**columns | {"reused": True, "kept": False, "statistics": statistics})
 

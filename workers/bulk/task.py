@@ -239,7 +239,7 @@ class _Turn:
 
     def _written(self, ready: Ready, made: Made, kernel_s: float) -> Outcome:
         outcome = write_one(self._beside, ready, made)
-        kernel = {"kernel_seconds": round(kernel_s, 3)}
+        kernel = {"kernel_seconds": round(kernel_s, 3), "start_s": ready.start_s}
         return dataclasses.replace(outcome, statistics=outcome.statistics | kernel)
 
     def _record(self, item: BulkItemRow, write: Callable[[], Outcome], before_s: float) -> None:

@@ -160,3 +160,23 @@ class BulkProgress:
         with self._database.reading() as session:
             found = session.execute(query).one()
         return dict(zip(("left", "done", "failed"), map(int, found), strict=True))
+
+    def ended_images(self) -> dict[str, int]:
+        """Numbers of images in all bulk runs: deconvolved, reused (their products existed before), and failed."""
+        sums = (BulkRow.done - BulkRow.reused, BulkRow.reused, BulkRow.failed)
+        query = select(*(func.coalesce(func.sum(one), 0) for one in sums))
+        with self._database.reading() as session:
+            found = session.execute(query).one()
+        return dict(zip(("deconvolved", "reused", "failed"), map(int, found), strict=True))
+
+    def image_times(self, limit: int) -> list[tuple[float, float]]:
+        """Estimated and measured time of the newest images that bulk runs deconvolved, s. Only the newest such run is read."""
+        newest = select(BulkRow.id).where(BulkRow.done > BulkRow.reused).order_by(BulkRow.created_at.desc())
+        query = select(BulkItemRow.statistics).where(
+            BulkItemRow.bulk_id == newest.limit(1).scalar_subquery(),
+            BulkItemRow.state == ItemState.DONE,
+            BulkItemRow.reused.is_(False),
+        )
+        with self._database.reading() as session:
+            found = session.scalars(query.order_by(BulkItemRow.ended_at.desc()).limit(limit)).all()
+        return [(one["start_s"], one["seconds"]) for one in found if one and "start_s" in one]

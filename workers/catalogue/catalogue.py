@@ -192,19 +192,18 @@ class Catalogue:
         query = select(table.id).where(table.owner == owner, table.id.in_(identities))
         return set(self._database.all(query))
 
-    def delete_product(self, identity: str, owner: str) -> bool:
-        """Remove a product from the catalogue; returns whether it was there.
+    def delete(self, table: type[Row], identity: str, owner: str) -> Row | None:
+        """Remove a row with a file from the catalogue; returns the row, or None if it was not there.
 
         Its bytes no longer count for the owner, and a later identical request makes it again. Its files stay until
         ``workers.files.collection`` removes them, because other rows may refer to the same files.
         """
         with self._database.writing.begin() as session:
-            row = session.get(ProductRow, (owner, identity), with_for_update=True)
-            if row is None:
-                return False
-            session.delete(row)
-            _unshare_jobs(session, owner, identity)
-            return True
+            row = session.get(table, (owner, identity), with_for_update=True)
+            if row is not None:
+                session.delete(row)
+                _unshare_jobs(session, owner, identity)
+            return row
 
     def page(
         self,

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, TypeVar
@@ -33,6 +33,7 @@ from sqlalchemy import (
     cast,
     delete,
     func,
+    literal,
     or_,
     select,
     tuple_,
@@ -57,6 +58,8 @@ from workers.catalogue.tables import (
     SolutionRow,
     TransitRow,
 )
+from workers.contract.bulk import BULK_ENDED
+from workers.contract.phases import ENDED
 
 MIB = 2**20
 ROWS_PER_MIB = 256
@@ -69,6 +72,14 @@ WITHOUT_FILES: dict[type[Any], ColumnElement[int]] = {
     PsfChangeRow: func.count(),
     SeriesChangeRow: func.count(),
     DefaultContextRow: func.count(),
+}
+# The kinds of things that the operator can keep for some time only (setting HELIOPSF_KEEP_DAYS).
+UPLOADED: dict[str, type[Any]] = {"image": ImageRow, "transit": TransitRow}
+KEPT: dict[str, type[Any]] = UPLOADED | {
+    "product": ProductRow,
+    "report": ReportRow,
+    "job": JobRow,
+    "bulk": BulkRow,
 }
 # Reasons for Usage.no_room and Usage.too_many_rows:
 NOT_KEPT = "the result of this job could not be kept"
@@ -176,6 +187,29 @@ class Owners(Queries):
         """Remove these kept solutions. Their files stay until ``workers.files.collection`` removes them."""
         for row in rows:
             self._database.change(_removal(row))
+
+    def old(
+        self, kind: str, before: float, owner: str, others: Collection[str]
+    ) -> list[tuple[str, str, int]]:
+        """Owner, id and bytes of the rows of a kind that were made before this time; of jobs and bulk runs, that ended
+        before this time. Uploads that an unfinished job or bulk run uses are left out.
+
+        owner: only the rows of this owner; empty: the rows of all owners except ``others``.
+        """
+        table = KEPT[kind]
+        without_file = table in WITHOUT_FILES
+        at, size = (table.ended_at, literal(0)) if without_file else (table.created_at, table.bytes)
+        query = select(table.owner, table.id, size).where(at < before)
+        query = query.where(table.owner == owner) if owner else query.where(table.owner.not_in(others))
+        jobs = select(cast(JobRow.parameters, String)).where(JobRow.phase.not_in(ENDED))
+        runs = select(BulkRow.id).where(BulkRow.phase.not_in(BULK_ENDED))
+        items = select(BulkItemRow.source).where(BulkItemRow.bulk_id.in_(runs))
+        with self._database.reading() as session:
+            texts = chain.from_iterable(session.scalars(one) for one in (jobs, items) if kind in UPLOADED)
+            used = {identity for text in texts for identity in _DIGEST.findall(text)}
+            return [
+                (of, identity, size) for of, identity, size in session.execute(query) if identity not in used
+            ]
 
 
 class NamedFiles(Queries):

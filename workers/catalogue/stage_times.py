@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.dialects import postgresql, sqlite
@@ -44,8 +43,8 @@ class KeptStageTimes:
         with self._database.reading() as session:
             return {(row.kind, row.stage): Spent(row.seconds, row.steps) for row in session.scalars(query)}
 
-    def run_times(self, kind: str, limit: int) -> list[tuple[dict[str, Any], float]]:
-        """Estimate and duration in seconds of the newest completed jobs of a kind."""
+    def run_times(self, kind: str, limit: int) -> list[tuple[float, float]]:
+        """Estimated time (before the measured factor) and duration of the newest completed jobs of a kind, s."""
         query = (
             select(JobRow.estimate, JobRow.ended_at - JobRow.started_at)
             .where(JobRow.kind == kind, JobRow.phase == Phase.COMPLETED)
@@ -54,4 +53,6 @@ class KeptStageTimes:
             .limit(limit)
         )
         with self._database.reading() as session:
-            return [(estimate or {}, float(seconds)) for estimate, seconds in session.execute(query)]
+            return [
+                ((one or {}).get("start_s", 0.0), float(took_s)) for one, took_s in session.execute(query)
+            ]

@@ -6,20 +6,27 @@ removes it, and add the row a little later. Therefore the rows are read a second
 ``settle`` is the only place that deletes files of the store.
 
 Kept solutions of transits can be made again, so old ones are removed too, with their rows. The same age limit applies.
+``retain`` deletes what is older than the operator keeps it, with its files. PSFs and contexts are always kept.
 """
 
 from __future__ import annotations
 
+import logging
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import FileRow
+from workers.catalogue.owners import KEPT, UPLOADED, FileRow
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
 from workers.files.store import Blob, FileState, Store
+from workers.settings import Settings
+
+log = logging.getLogger(__name__)
+DAY_S = 86_400.0
 
 # A collection moves only old files aside. The second look finds a file that was sent again at the same moment.
 SECOND_LOOK_AFTER_S = 10.0
@@ -214,3 +221,33 @@ def _removed(
         time.sleep(second_look_after_s)
     back = settle(catalogue, store, {blob.digest for blob in gone})
     return [blob for blob in gone if blob.digest not in back]
+
+
+def retain(catalogue: Catalogue, store: Store, settings: Settings) -> dict[tuple[str, str], list[int]]:
+    """Delete what is older than ``settings.kept_days`` allows, and log it. In a dry run, only log what would be deleted.
+
+    Returns the bytes of each deleted thing, by owner and kind.
+    """
+    deleted: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for (owner, kind), days in settings.kept_days.items():
+        others = [other for other, of in settings.kept_days if other and of == kind]
+        for of, identity, size in catalogue.owners.old(kind, time.time() - days * DAY_S, owner, others):
+            if settings.keep_dry_run or _delete(catalogue, store, kind, of, identity):
+                deleted[of, kind].append(size)
+    done = "would delete" if settings.keep_dry_run else "deleted"
+    for (owner, kind), sizes in deleted.items():
+        fields = {"owner": owner, "kind": kind, "count": len(sizes), "bytes": sum(sizes)}
+        log.info("retention: %s %d of kind %s", done, len(sizes), kind, extra={"fields": fields})
+    return dict(deleted)
+
+
+def _delete(catalogue: Catalogue, store: Store, kind: str, owner: str, identity: str) -> bool:
+    if kind == "job":
+        return catalogue.uws.destroy(identity)
+    if kind == "bulk":
+        return catalogue.bulks.delete(identity)
+    row = catalogue.delete(KEPT[kind], identity, owner)
+    if row is not None:
+        named = [identity] if kind in UPLOADED else [digest for digest, _ in files_of(row)]
+        remove_unnamed(catalogue, store, named)
+    return row is not None

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from psfcore.errors import DataError
 from psfcore.fits.cards import Cards
 from psfcore.fits.channel import binning_factor, check_channel
 from psfcore.fits.frame import plate_scale_arcsec
@@ -49,6 +50,18 @@ def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: Mapping[str, 
         raise no_noise_figures()
 
 
+def suits(psf: PsfRow | str, header: Mapping[str, Any]) -> bool:
+    """Whether the channel and the pixels of an image fit a PSF. psf: its row, or the name of its instrument. header: as in
+    ``check``."""
+    origin = _origin_of(psf) if isinstance(psf, str) else _origin_of_row(psf)
+    try:
+        check_channel(origin, header["cards"])
+        binning_factor(origin, header["cards"])
+    except DataError:
+        return False
+    return True
+
+
 def noise_of(request: ResolvedDeconvolve, header: Cards) -> NoiseFigures | None:
     """The noise figures of the request; if there are none, the noise figures of the instrument that took the image."""
     if request.noise is not None:
@@ -73,6 +86,10 @@ def _origin(request: ResolvedDeconvolve, psf: PsfRow | None) -> PsfOrigin | None
     if psf is None:
         recipe = request.psf_recipe
         return None if recipe is None or recipe.instrument is None else _origin_of(recipe.instrument)
+    return _origin_of_row(psf)
+
+
+def _origin_of_row(psf: PsfRow) -> PsfOrigin:
     if psf.origin != "uploaded":
         return PsfOrigin(
             psf.name,

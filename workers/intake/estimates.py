@@ -1,8 +1,9 @@
 """Estimates the time and memory of a job from the sizes of its inputs, before the job is accepted.
 
-The initial values are in ``estimates.json``; ``python -m benchmarks.estimates --write`` measured these values. The time is then multiplied by a factor that was measured on
-completed jobs of the same kind in this catalogue. A wrong estimate does little harm, because a job that takes too
-long is stopped, and no memory is reserved.
+The initial values are in ``estimates.json``; ``python -m benchmarks.estimates --write`` measured these values. The time is
+then multiplied by a factor that was measured in this catalogue: on the completed jobs of the same kind that were of the
+most similar size, and for the images of a bulk run on the images of the newest run. A wrong estimate does little harm,
+because a job that takes too long is stopped, and no memory is reserved.
 
 In ``estimates.json``, times in seconds are processor time on one core of a machine of 2026. Times per pixel are in ns,
 memory per pixel in bytes.
@@ -20,7 +21,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.resources import files
-from statistics import median
+from statistics import median_low
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -40,14 +41,17 @@ from workers.settings import Settings
 
 BYTES_A_PIXEL = 4.0  # assumed for the files of a transit, because only their length is known here
 
-# Number of completed jobs of a kind from which the factor is computed, as a median.
-FEWEST_JOBS, MOST_JOBS = 3, 30
-BOUNDS = 0.2, 5.0
+# The factor is the median of the NEAREST jobs or images, by the estimated time, of the newest MOST_JOBS. Of short jobs
+# FEWEST_JOBS are needed, because the first one may have compiled kernels; one job of LONG_S is enough.
+FEWEST_JOBS, NEAREST, MOST_JOBS = 3, 5, 100
+LONG_S = 60.0
+BOUNDS = 0.1, 20.0
+BULK = "bulk-image"  # takes the place of a kind for the images of bulk runs
 # If the measured time of a job is below this fraction of its estimate, the job found its result in the catalogue and
 # computed nothing. Such jobs are left out.
 FOUND = 0.05
 KEEP_FACTOR_S = 60.0
-_factors: WeakKeyDictionary[Catalogue, dict[str, tuple[float, float]]] = WeakKeyDictionary()
+_times: WeakKeyDictionary[Catalogue, dict[str, tuple[list[tuple[float, float]], float]]] = WeakKeyDictionary()
 
 
 class _Frozen(BaseModel):
@@ -186,24 +190,30 @@ def estimate(
     start_s = cpu_s / threads**COSTS.threads_exponent
     return Estimate(
         memory_mib=round(COSTS.worker_mib + mib),
-        seconds=round(start_s * factor(kind, catalogue), 1),
+        seconds=round(start_s * factor(kind, start_s, catalogue), 1),
         start_s=round(start_s, 3),
     )
 
 
-def factor(kind: str, catalogue: Catalogue) -> float:
-    """The median ratio of measured to estimated time of the completed jobs of this kind; 1 if there are too few
-    jobs."""
-    known = _factors.setdefault(catalogue, {})
-    value, until = known.get(kind, (1.0, -math.inf))
-    if time.monotonic() < until:
-        return value
-    times = catalogue.stage_times.run_times(kind, MOST_JOBS)
-    ratios = [took_s / estimated["start_s"] for estimated, took_s in times if estimated["start_s"] > 0]
-    ratios = [ratio for ratio in ratios if ratio > FOUND]
-    value = min(max(median(ratios), BOUNDS[0]), BOUNDS[1]) if len(ratios) >= FEWEST_JOBS else 1.0
-    known[kind] = value, time.monotonic() + KEEP_FACTOR_S
-    return value
+def factor(kind: str, start_s: float, catalogue: Catalogue) -> float:
+    """The median ratio of measured to estimated time of completed jobs of this kind, of those whose estimate was nearest to
+    ``start_s``; 1 if there are too few."""
+    known = _times.setdefault(catalogue, {})
+    times, until = known.get(kind, ([], -math.inf))
+    if time.monotonic() >= until:
+        progress = catalogue.bulks.progress
+        found = (
+            progress.image_times(MOST_JOBS)
+            if kind == BULK
+            else catalogue.stage_times.run_times(kind, MOST_JOBS)
+        )
+        times = [(estimated_s, took_s) for estimated_s, took_s in found if took_s > FOUND * estimated_s > 0]
+        known[kind] = times, time.monotonic() + KEEP_FACTOR_S
+    nearest = sorted(times, key=lambda one: abs(math.log(one[0] / max(start_s, 1e-3))))[:NEAREST]
+    if len(nearest) < FEWEST_JOBS and not any(took_s >= LONG_S for _, took_s in nearest):
+        return 1.0
+    ratio = median_low(took_s / estimated_s for estimated_s, took_s in nearest)
+    return min(max(ratio, BOUNDS[0]), BOUNDS[1])
 
 
 def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> tuple[float, float]:

@@ -13,23 +13,68 @@ async function refused(file, most) {
   return null;
 }
 
-/** Send a dropped or chosen image and show how much has arrived. Without this script the form itself sends the file. */
+/**
+ * Send dropped or chosen images, one after the other. One image alone leads to its page; several are deconvolved, if they need no
+ * option. Without this script the form sends one file.
+ */
 function sendImages(form) {
   const input = document.getElementById("file");
-  const said = document.getElementById("upload-said");
+  const list = document.getElementById("files");
+  const waiting = []; // {file, line}
+  let busy = false;
+  input.multiple = true;
 
-  async function sendImage(file) {
-    say(said, null);
-    const reason = await refused(file, Number(form.dataset.most));
-    if (reason !== null) return say(said, reason, "error");
-    send(file, file.name, "/v1/images", "application/fits", said, (image) => location.assign(`/images/${image.id}`));
+  /** Send these files after those that are being sent. What was refused or stopped gives way to them. */
+  function take(files) {
+    for (const line of list.querySelectorAll(".error, .note")) line.remove();
+    if (!busy) for (const { line } of waiting.splice(0)) line.remove();
+    for (const file of files) {
+      const line = element("li", {}, `${file.name}: waiting`);
+      list.append(line);
+      waiting.push({ file, line });
+    }
+    sendAll();
+  }
+
+  async function sendAll() {
+    if (busy) return;
+    busy = true;
+    while (waiting.length > 0) {
+      const { file, line } = waiting[0];
+      const reason = await refused(file, Number(form.dataset.most));
+      if (reason !== null) say(line, reason, "error");
+      const image = reason === null ? await send(file, file.name, "/v1/images", "application/fits", line) : null;
+      if (image === undefined) break;
+      waiting.shift();
+      if (image === null) continue;
+      if (list.children.length === 1) {
+        busy = false; // for whoever comes back
+        list.replaceChildren();
+        return location.assign(`/images/${image.id}`);
+      }
+      line.replaceChildren(element("a", { href: `/images/${image.id}` }, file.name), ": ", await begun(image.id));
+    }
+    busy = false;
+    if (waiting.length === 0) input.value = ""; // the same name can be chosen again
+  }
+
+  /** Start the deconvolution of an image. Returns a link to its job, or the reason why it needs an option. */
+  async function begun(id) {
+    try {
+      const { good, lines } = await json(`/images/${id}/check`);
+      if (!good) return lines[0].split(/(?<=\.) /)[0]; // its page says the rest
+      const job = await json("/v1/jobs", { kind: "deconvolve", parameters: { image_id: id } });
+      return element("a", { href: `/jobs/${job.id}` }, "started");
+    } catch (error) {
+      return told(error);
+    }
   }
 
   form.addEventListener("submit", (event) => {
     event.preventDefault();
-    if (input.files.length > 0) sendImage(input.files[0]);
+    sendAll();
   });
-  input.addEventListener("change", () => say(said, null));
+  input.addEventListener("change", () => take(input.files));
   // A file that is dropped beside the form must not replace the page.
   for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
   document.addEventListener("dragover", () => form.classList.add("over"));
@@ -37,12 +82,8 @@ function sendImages(form) {
   document.addEventListener("drop", (event) => {
     form.classList.remove("over");
     if (event.dataTransfer.files.length === 0) return;
-    if (event.dataTransfer.files.length > 1) {
-      say(said, `Expected one file; got ${event.dataTransfer.files.length}. Send many images with \`heliopsf deconvolve *.fits -o FOLDER/\`.`, "error");
-      return;
-    }
     input.files = event.dataTransfer.files;
-    sendImage(event.dataTransfer.files[0]);
+    take(input.files);
   });
 }
 
@@ -51,11 +92,13 @@ function checkOptions(form) {
   const place = document.getElementById("checked");
   const ways = document.getElementById("ways");
   const button = document.getElementById("go");
+  const others = document.getElementById("others");
   let last = 0;
 
   function show(good, lines) {
     place.className = good ? "good" : "error";
     place.replaceChildren(...lines.map((line) => element("p", {}, line)));
+    button.disabled = !good;
   }
 
   /** Let the service check the options. If several checks are open, only the answer to the last one is shown. */
@@ -64,6 +107,8 @@ function checkOptions(form) {
     const options = new URLSearchParams(new FormData(form));
     options.delete("form_token");
     button.textContent = "Check and start";
+    button.disabled = false;
+    if (others !== null) others.disabled = !form.elements.other_channel.checked;
     try {
       const found = await json(`${form.dataset.check}?${options}`);
       if (mine !== last) return;
@@ -75,6 +120,7 @@ function checkOptions(form) {
     }
   }
 
+  button.disabled = place.className === "error";
   form.addEventListener("change", check);
   // A browser that comes back to this page shows the options as they were left.
   window.addEventListener("pageshow", (event) => event.persisted && check());
@@ -97,6 +143,7 @@ function sendInSession(form) {
     // Other errors, such as a lost service, are shown by the next page or by the browser.
     request("/v1/jobs?limit=1").then(goOn, (error) => error.shown || goOn());
   });
+  if (form.hasAttribute("data-now")) form.addEventListener("change", () => form.requestSubmit());
 }
 
 const upload = document.getElementById("upload");

@@ -132,12 +132,6 @@ function pageOf(result) {
   return result.replace(/^\/v1/, "");
 }
 
-/** The page that follows a job: that of its result, or that of the image for which a PSF was built. */
-function nextPage(place, job) {
-  const image = place.dataset.image;
-  return image ? `/images/${image}?psf_id=${job.result.split("/").pop()}` : pageOf(job.result);
-}
-
 function showJob(place, job) {
   const part = (name) => place.querySelector(`[data-part="${name}"]`);
   const phase = part("phase");
@@ -169,9 +163,9 @@ function showOneJob(place, part, job) {
   if (cancel) cancel.hidden = true;
   part("done").hidden = job.result === null;
   if (job.result === null) return;
-  part("result").href = nextPage(place, job);
+  part("result").href = pageOf(job.result);
   // Back must lead to the page before the job, not to a page that leads on at once.
-  if (place.dataset.follow === "yes") location.replace(nextPage(place, job));
+  if (place.dataset.follow === "yes") location.replace(pageOf(job.result));
 }
 
 const theJob = document.getElementById("job");

@@ -98,7 +98,7 @@ export function whileThere(form, place) {
   });
 }
 
-/** Show a message in an element with the role status or alert; null hides it. */
+/** Show a message in an element that is announced; null hides it. */
 export function say(place, text, kind = "note") {
   place.hidden = text === null;
   place.className = kind;

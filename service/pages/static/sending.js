@@ -1,17 +1,22 @@
-// Sends a file and shows how much has arrived, in the elements sending, sending-name, sending-done, sending-bar and stop.
+// Sends a file and shows how much has arrived, in the elements sending, sending-name, sending-done, sending-bar, stop and send.
 import { forgetEndOfSession, request, say, serviceError, size, told } from "./page.js";
 
 const BLOCK = 512;
 const MOST_NAME = 100; // bytes
+const REFUSALS = [400, 413, 415, 422]; // statuses that the same file gets again
 
 const part = (name) => document.getElementById(name);
 
-/** Send a file. said: the element for messages. arrived: called with the description of what was uploaded. */
-export function send(file, name, address, type, said, arrived) {
+// The button sends a form without scripts; with them it sends again what did not arrive.
+const again = part("send");
+if (again !== null) again.hidden = true;
+
+/** Send a file. said: the element for messages. Resolves with the description of what was uploaded; null: the service refused
+ * the file; undefined: the file did not arrive, and can be sent again. */
+export function send(file, name, address, type, said) {
   const sending = part("sending");
   const done = part("sending-done");
   const post = new XMLHttpRequest();
-  const refused = (error) => error.shown || say(said, told(error), "error");
   const lost = () => say(said, `The connection to the service ended before all of ${name} had arrived. No part of it was stored. The file is still chosen: send it again.`, "error");
   forgetEndOfSession();
   post.open("POST", `${address}?filename=${encodeURIComponent(name)}`);
@@ -24,24 +29,31 @@ export function send(file, name, address, type, said, arrived) {
   post.upload.onload = () => {
     done.textContent = "received; the service reads it";
   };
-  post.onload = () => {
-    sending.hidden = true;
-    if (post.status < 300) arrived(JSON.parse(post.responseText));
-    else refused(serviceError(post.status, post.responseText));
-  };
-  post.onerror = () => {
-    sending.hidden = true;
-    // If the service refuses a large file before its end, the connection ends, and the answer may be lost.
-    request("/v1/jobs?limit=1").then(lost, (error) => error.shown || lost());
-  };
-  post.onabort = () => {
-    sending.hidden = true;
-    say(said, `The upload of ${name} was stopped. No part of it was stored.`, "note");
-  };
   part("sending-name").textContent = name;
   part("stop").onclick = () => post.abort();
   sending.hidden = false;
-  post.send(file);
+  again.hidden = true;
+  return new Promise((resolve) => {
+    const end = (stored) => {
+      sending.hidden = true;
+      again.hidden = stored !== undefined;
+      resolve(stored);
+    };
+    const refuse = (error) => {
+      if (!error.shown) say(said, told(error), "error");
+      end(REFUSALS.includes(error.status) ? null : undefined);
+    };
+    post.onload = () => (post.status < 300 ? end(JSON.parse(post.responseText)) : refuse(serviceError(post.status, post.responseText)));
+    post.onerror = () => {
+      // If the service refuses a large file before its end, the connection ends, and the answer may be lost.
+      request("/v1/jobs?limit=1").then(lost, (error) => error.shown || lost()).then(() => end(undefined));
+    };
+    post.onabort = () => {
+      say(said, `The upload of ${name} was stopped. No part of it was stored.`, "note");
+      end(undefined);
+    };
+    post.send(file);
+  });
 }
 
 // --- a tar archive (POSIX ustar) of files, which the browser reads while it sends ---

@@ -311,7 +311,6 @@ class Viewer {
     part("quality").checked = view.quality;
     part("error").checked = view.error !== null;
     if (view.error !== null && part("error-percent") !== document.activeElement) part("error-percent").value = view.error;
-    part("blink").hidden = view.mode !== "blink";
     part("change-row")?.toggleAttribute("hidden", view.mode !== "change");
   }
 

@@ -17,11 +17,13 @@ from matplotlib.image import imread
 from psfcore.drawing import plots
 from psfcore.drawing.plots import GOLD, preview_png, psf_png, write_png
 from psfcore.drawing.thumbnail import (
+    DECADES,
     EUV_POINTS,
     NO_DATA,
     SOFTENING,
     euv_levels,
     levels_of,
+    png_of_weights,
     reduced,
     rgb,
     write_thumbnail,
@@ -146,6 +148,15 @@ def test_an_image_without_finite_pixels_has_a_picture(tmp_path: Path) -> None:
     write_thumbnail(np.full((300, 300), np.nan), tmp_path / "none.png")
     picture = np.round(imread(tmp_path / "none.png")[..., :3] * 255)
     assert picture.shape == (192, 192, 3) and (picture == rgb(NO_DATA)).all()
+
+
+def test_the_weights_of_a_psf_have_a_logarithmic_stretch(tmp_path: Path) -> None:
+    weights = np.array([[0.1, 0.1 * 10 ** (-DECADES / 2)], [0.0, -1.0]])
+    (tmp_path / "psf.png").write_bytes(png_of_weights(weights))
+    picture = np.round(imread(tmp_path / "psf.png")[::-1, :, :3] * 255)
+    levels = euv_levels(255)
+    assert (picture[0] == [levels[-1], levels[127]]).all() and (picture[1] == levels[0]).all()
+    assert png_of_weights(np.zeros((2, 2))), "no weight is no error"
 
 
 # --- plots -----------------------------------------------------------------------------------------------

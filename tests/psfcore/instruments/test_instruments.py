@@ -13,7 +13,14 @@ from psfcore.diffraction.mesh_series import order_spacing_px
 from psfcore.errors import DataError
 from psfcore.fits.header import known_instrument
 from psfcore.instruments import files
-from psfcore.instruments.files import instrument_names, instrument_path, match_instrument
+from psfcore.instruments.files import (
+    assumed_in,
+    instrument_names,
+    instrument_path,
+    match_instrument,
+    telescope_of,
+    telescopes,
+)
 from psfcore.instruments.model import Mesh, SpectralLine, load_instrument, parse_instrument
 from tests.conftest import SMALL_INSTRUMENT
 
@@ -22,6 +29,18 @@ def test_every_shipped_instrument_loads_under_its_own_name() -> None:
     assert "hri_euv" in instrument_names()
     for name in instrument_names():
         assert load_instrument(name).name == name
+
+
+def test_telescopes_are_named_as_people_name_them() -> None:
+    assert telescopes() == {"SDO/AIA": "94 to 335", "Solar Orbiter EUI/HRI_EUV": "174"}
+    assert telescope_of("aia_171") == "SDO/AIA"
+
+
+def test_every_draft_says_what_it_assumes() -> None:
+    for name in instrument_names():
+        assumed = assumed_in(name)
+        assert (assumed is not None) == (load_instrument(name).status == "draft")
+    assert assumed_in("none") is None and assumed_in(None) is None
 
 
 def test_headers_are_matched() -> None:

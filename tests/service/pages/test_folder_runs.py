@@ -124,6 +124,7 @@ def test_a_check_says_what_the_run_then_does(
     }  # fmt: skip
     expected = api.post("/v1/bulk/estimate", json=estimate).json()
     assert fact(page, "Images") == "3" == str(expected["images"])
+    assert expected["complete"] and 'class="good"' in page
     assert fact(page, "Examined") == "3 of 3 images; 1 would be refused"
     assert fact(page, "Memory").startswith(f"at most {expected['memory_mib']} MiB")
     assert fact(page, "Time").endswith("with 1 worker process")
@@ -137,6 +138,15 @@ def test_a_check_says_what_the_run_then_does(
     assert started.status_code == 303
     run = api.get(f"/v1{started.headers['location']}").json()
     assert run["request"]["output"] == estimate["output"] and run["name"] == "Rome"
+    page = api.get(started.headers["location"]).text
+    said = {
+        "Files": form["pattern"],
+        "Method": "richardson-lucy, 2 steps",
+        "Output": f"{form['folder']} only",
+        "Names": LAYOUT,
+    }
+    assert {name: fact(page, name).strip() for name in said} == said
+    assert fact(page, "PSF").startswith("uploaded 0.0.0")
     work_through_bulks(settings)
     done = api.get(f"/v1{started.headers['location']}").json()["images"]
     assert (done["total"], done["done"], done["failed"]) == (3, 2, 1)

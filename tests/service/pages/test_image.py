@@ -52,12 +52,12 @@ def test_an_image_without_a_psf_is_told_so(api: TestClient, tmp_path: Path) -> N
     xrt = image(api, tmp_path, **XRT)
     assert checked(api, xrt) == [
         "No PSF for Hinode/XRT is known here. heliopsf has no instrument file for it: an instrument file describes pupils "
-        "and meshes, but not mirrors that reflect X-rays at grazing incidence. Upload a PSF below, or fit one to a transit."
+        "and meshes, but not mirrors that reflect X-rays at grazing incidence. Upload a PSF here, or fit one to a transit."
     ]
     page = api.get(f"/images/{xrt}").text
     assert "none: choose a PSF" in page and "chosen for this image" not in page
     assert "2012-06-05T22:00:00.123" in page
-    assert f'action="/images/{xrt}/build"' not in page, "no instrument is of this telescope"
+    assert f'action="/psfs?image={xrt}"' in page, "a PSF is uploaded here"
 
 
 def test_the_psf_of_another_channel_is_refused_before_a_job(
@@ -90,7 +90,7 @@ def test_an_error_plane_needs_figures_and_the_form_takes_them(api: TestClient, t
     (told,) = checked(api, hri, error_draws="8")
     assert told.startswith("The photon gain and the read noise of this camera are not known here.")
     figures = {"photon_gain_dn": "4", "read_noise_dn": "1.5"}
-    assert checked(api, hri, error_draws="8", **figures)[0].startswith("PSF hri_euv 0.2.0. No PSF of hri_euv")
+    assert checked(api, hri, error_draws="8", **figures)[0].startswith("PSF hri_euv 0.2.0, built for")
     sent = api.post(f"/images/{hri}/start", data={"error_draws": "8", **figures}, follow_redirects=False)
     job = api.get(f"/v1{sent.headers['location']}").json()
     assert job["parameters"]["noise"] == {"photon_gain_dn": 4.0, "read_noise_dn": 1.5}
@@ -104,35 +104,10 @@ def test_an_error_plane_needs_figures_and_the_form_takes_them(api: TestClient, t
 
 def test_a_short_time_is_told_as_a_sentence(api: TestClient, psf_file: Path, tmp_path: Path) -> None:
     found = checked(api, image(api, tmp_path), psf_id=upload(api, psf_file, "/v1/psfs"), steps="1")
-    assert re.fullmatch(r"(Less than 1 s|About \d+ s) and \d+ MiB\.", found[1])
-    assert re.match(r"PSF uploaded 0\.0\.0\+\w{8} \(draft\)\.", found[0])
-
-
-# One click to a PSF ---------------------------------------------------------------------------------
-
-
-def test_the_psf_of_the_instrument_is_built_for_the_image(api: TestClient, tmp_path: Path) -> None:
-    aia = image(api, tmp_path, **AIA)
-    page = api.get(f"/images/{aia}").text
-    assert "same telescope and pixel scale, but another channel (171, not 1600 Å)." in page
-    assert "plate_scale" not in page
-    assert f'<form method="post" action="/images/{aia}/build">' in page
-    sent = api.post(f"/images/{aia}/build", data={"instrument": "aia_171"}, follow_redirects=False)
-    assert sent.status_code == 303 and sent.headers["location"].endswith(f"?image={aia}")
-    job_id = sent.headers["location"].removeprefix("/jobs/").partition("?")[0]
-    job = api.get(f"/v1/jobs/{job_id}").json()
-    assert (job["kind"], job["parameters"]["instrument"]) == ("psf-build", "aia_171")
-    waiting = api.get(sent.headers["location"]).text
-    assert f'data-image="{aia}"' in waiting and f'<a href="/images/{aia}">Back to the image</a>' in waiting
-    catalogue = api.app.state.heliopsf.catalogue  # type: ignore[attr-defined]
-    psf_id = api.post(
-        "/v1/jobs/identity", json={"kind": "psf-build", "parameters": {"instrument": "aia_171"}}
+    assert re.fullmatch(r"(Less than 1 s|About \d+ s) and \d+ MiB\.", found[2])
+    assert re.match(r"PSF uploaded 0\.0\.0\+\w{8} \(draft\)\.", found[0]) and found[1].startswith(
+        "Draft means"
     )
-    result = psf_id.json()["result_id"]
-    lease = catalogue.jobs.claim(job_id, "host:1")
-    catalogue.jobs.complete(lease, result)
-    done = api.get(f"/jobs/{job_id}?image={aia}").text
-    assert f'href="/images/{aia}?psf_id={result}"' in done and "Deconvolve the image with this PSF" in done
 
 
 # What is kept ---------------------------------------------------------------------------------------

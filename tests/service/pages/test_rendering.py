@@ -182,9 +182,14 @@ def test_the_page_of_the_api_names_its_icon(api: TestClient) -> None:
     assert found.content.startswith(b"<svg")
 
 
-def test_the_first_page_says_what_the_service_can_build(api: TestClient) -> None:
-    told = "The service knows the optics of aia_171 and hri_euv, and builds the PSF for your image."
-    assert told.replace("aia_171 and hri_euv", " and ".join(instrument_names())) in api.get("/").text
+def test_the_first_page_names_the_telescopes_of_the_instrument_files(api: TestClient) -> None:
+    page = api.get("/").text
+    assert "SDO/AIA 94 to 335 Å, Solar Orbiter EUI/HRI_EUV 174 Å" in page
+    assert not [name for name in instrument_names() if name in page]
+
+
+def test_the_page_of_the_api_leads_back(api: TestClient) -> None:
+    assert '<a href="./">' in api.get("/docs").text
 
 
 # Words ----------------------------------------------------------------------------------------------

@@ -75,7 +75,8 @@ def test_a_fit_and_its_cross_validation_are_shown(
     psf, folds = f"/psfs/{made['psf']['id']}", f"/reports/{made['folds']['id']}"
     with TestClient(create_app(settings_in(tmp_path / "data"))) as api:
         shown(api, psf, "Fit to the transit", "Weight of the scatter without a formula", "000.fits, pointing")
-        shown(api, folds, "3 fits with held-out blocks", "Parameters over all folds", "run 0, fold 2")
+        page = shown(api, folds, "3 fits with held-out blocks", "Parameters over all folds", "/preview")
+        assert "data-plot" not in page, "the picture shows the curves; they are not drawn twice"
         shown(api, f"/transits/{made['folds']['transit_id']}", psf, folds)
 
 

@@ -1,14 +1,14 @@
-"""The pages of transits: upload, the schema of transit.json, and the jobs that a form starts."""
+"""The pages of transits: upload, the check of transit.json, and the jobs that a form starts."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
 
 from psfcore.transit.archive import pack
-from psfcore.transit.manifest import FILE_NAME, ImageEntry, TransitManifest
 from tests.service.conftest import upload
 from tests.service.keyed import keyed
 from tests.service.pages.test_login import PERSON, browser
@@ -41,16 +41,19 @@ def test_an_upload_by_the_form_leads_to_the_page_of_the_transit(api: TestClient,
     assert refused.status_code == 415 and refused.headers["content-type"].startswith("text/html")
 
 
-def test_the_schema_is_that_of_the_model_and_marks_the_names_of_files(api: TestClient) -> None:
-    schema = api.get("/transits/manifest.schema.json").json()
-    assert set(schema["required"]) == {"schema", "images"}
-    assert set(schema["properties"]) == {
-        field.alias or name for name, field in TransitManifest.model_fields.items()
-    }
-    entry = schema["$defs"][ImageEntry.__name__]
-    assert set(entry["required"]) == {"file", "fov", "x", "y", "r"}
-    assert entry["properties"]["file"]["format"] == FILE_NAME
-    assert {"format": FILE_NAME, "type": "string"} in schema["properties"]["known_psf"]["anyOf"]
+def test_a_manifest_is_checked_before_its_files_are_sent(api: TestClient, tmp_path: Path) -> None:
+    manifest = write_transit(tmp_path / "mercury", images=4) / "transit.json"
+    content = json.loads(manifest.read_text())
+    names = [one["file"] for one in content["images"]]
+    assert set(names) <= set(api.post("/transits/check", content=manifest.read_bytes()).json())
+    for image in content["images"]:
+        image["r"] = -1
+    del content["images"][1]["x"]
+    answer = api.post("/transits/check", content=json.dumps(content).encode())
+    assert answer.status_code == 422 and answer.json()["type"].endswith("bad-manifest")
+    told = answer.json()["detail"]
+    assert all(name in told for name in names) and "no such key" in told, "all faults are named"
+    assert api.post("/transits/check", content=b"{").status_code == 422
 
 
 def test_a_form_starts_a_job_with_its_options(

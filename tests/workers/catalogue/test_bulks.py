@@ -30,6 +30,7 @@ from workers.catalogue.tables import ImageRow
 from workers.contract.bulk import DELETABLE, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError
 from workers.files.store import Store
+from workers.intake.estimates import BULK, factor
 from workers.settings import Settings
 from workers.tasks.context import Context
 
@@ -494,6 +495,17 @@ def test_images_of_open_bulks_are_counted_together(catalogue: Catalogue) -> None
     assert catalogue.bulks.progress.open_images() == {"left": 3, "done": 1, "failed": 1}
     catalogue.bulks.cancel(first)
     assert catalogue.bulks.progress.open_images() == {"left": 2, "done": 0, "failed": 0}
+    assert catalogue.bulks.progress.ended_images() == {"deconvolved": 1, "reused": 0, "failed": 1}
+
+
+def test_estimates_learn_from_the_images_of_the_newest_run(catalogue: Catalogue) -> None:
+    bulk_id, lease = made(catalogue, 4), turn(catalogue)
+    for taken, start_s in zip(all_taken(catalogue, bulk_id, lease), (1.0, 2.0, None, 4.0), strict=True):
+        statistics = {"seconds": 3.0} | ({} if start_s is None else {"start_s": start_s})
+        assert done(catalogue, taken, statistics=statistics)
+    assert sorted(catalogue.bulks.progress.image_times(10)) == [(1.0, 3.0), (2.0, 3.0), (4.0, 3.0)]
+    assert factor(BULK, 2.0, catalogue) == pytest.approx(1.5)
+    assert factor("deconvolve", 2.0, catalogue) == 1.0, "the images are no jobs"
 
 
 @BOTH

@@ -197,7 +197,9 @@ def test_a_deleted_result_is_made_again_by_a_new_job(catalogue: Catalogue) -> No
     for result, job in zip(results, jobs, strict=True):
         assert catalogue.jobs.submit("psf-build", {}, result, OWNER)[0].id == job
     catalogue.delete_draft(results[0], OWNER)
-    assert catalogue.delete_product(results[1], OWNER) and not catalogue.delete_product(results[1], OWNER)
+    assert catalogue.delete(ProductRow, results[1], OWNER) and not catalogue.delete(
+        ProductRow, results[1], OWNER
+    )
     assert catalogue.get(ProductRow, results[1], OWNER) is None
     for result, job in zip(results, jobs, strict=True):
         row, new = catalogue.jobs.submit("psf-build", {}, result, OWNER)

@@ -16,7 +16,7 @@ from psfcore.noise_figures import NoiseFigures
 from tests.conftest import write_image, write_psf
 from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.requests import PsfBuild, ResolvedDeconvolve, RichardsonLucy
-from workers.intake.compatibility import check, noise_of
+from workers.intake.compatibility import check, noise_of, suits
 from workers.intake.uploads import image_row, uploaded_psf_row
 
 AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171, "CDELT1": 0.6, "CDELT2": 0.6}
@@ -63,6 +63,18 @@ def test_another_channel_is_refused_unless_the_request_allows_it(tmp_path: Path)
     check(request(other_channel=True), psf, header)
     named = psf_of(tmp_path, instrument="aia_171", channel="171")
     assert refusal(request(), named, header).code == "channel-mismatch", "that an upload was given"
+
+
+def test_a_psf_suits_an_image_if_its_deconvolution_is_not_refused(tmp_path: Path) -> None:
+    header = summary_of(tmp_path, **AIA)
+    for psf, fits_it in (
+        (psf_of(tmp_path, **AIA), True),
+        (psf_of(tmp_path, **{**AIA, "WAVELNTH": 193}), False),
+        (psf_of(tmp_path, **{**AIA, "CDELT1": 0.25, "CDELT2": 0.25}), False),
+        ("aia_171", True),
+        ("aia_193", False),
+    ):
+        assert suits(psf, header) is fits_it
 
 
 def test_another_filter_is_refused_and_the_units_of_the_cards_count(tmp_path: Path) -> None:

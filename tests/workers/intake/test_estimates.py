@@ -178,13 +178,13 @@ def test_studies_go_with_the_transit_s_length(catalogue: Catalogue) -> None:
     assert exact[0] > 5 * shared[0]
 
 
-def completed(catalogue: Catalogue, count: int, took_s: float) -> None:
-    """Add completed deconvolutions that were expected to take a second and took so long."""
+def completed(catalogue: Catalogue, count: int, took_s: float, start_s: float = 1.0) -> None:
+    """Add completed deconvolutions that were expected to take ``start_s`` and took so long."""
     rows = [
         JobRow(
             id=uuid.uuid4().hex, owner=OWNER, kind="deconvolve", parameters={}, request_key=uuid.uuid4().hex, work_key="k",
             phase=Phase.COMPLETED, created_at=0.0, started_at=100.0, ended_at=100.0 + took_s,
-            estimate={"memory_mib": 1, "seconds": 1.0, "start_s": 1.0},
+            estimate={"memory_mib": 1, "seconds": start_s, "start_s": start_s},
         )
         for _ in range(count)
     ]  # fmt: skip
@@ -201,7 +201,7 @@ def test_the_estimate_follows_the_times_of_completed_jobs(
     for took_s, expected in (
         (3.0, 3.0),
         (0.5, 0.5),
-        (100.0, BOUNDS[1]),  # much slower
+        (50.0, BOUNDS[1]),  # much slower
         (0.06, BOUNDS[0]),  # much faster
         (0.001, 1.0),  # the result was there already
     ):
@@ -216,6 +216,23 @@ def test_the_estimate_follows_the_times_of_completed_jobs(
         assert seconds == pytest.approx(start_s * expected, abs=0.2) and same == memory, took_s
         start = estimate("deconvolve", job, catalogue, OWNER, 1).start_s
         assert start == pytest.approx(start_s, abs=0.1)
+
+
+def ratio(catalogue: Catalogue, px: int, **changes: Any) -> float:
+    found = estimate("deconvolve", deconvolution(catalogue, px, **changes), catalogue, OWNER, 1)
+    return found.seconds / found.start_s
+
+
+def test_jobs_of_similar_size_count(catalogue: Catalogue) -> None:
+    completed(catalogue, 5, 2.0)
+    completed(catalogue, 5, 900.0, start_s=100.0)
+    assert ratio(catalogue, 4096, error_draws=8) == pytest.approx(9.0, rel=0.01)
+    assert ratio(catalogue, 1024) == pytest.approx(2.0, rel=0.05)
+
+
+def test_one_long_job_is_enough(catalogue: Catalogue) -> None:
+    completed(catalogue, 1, 300.0, start_s=100.0)
+    assert ratio(catalogue, 4096, error_draws=8) == pytest.approx(3.0, rel=0.01)
 
 
 def test_a_kind_without_figures_of_its_own_has_an_estimate(catalogue: Catalogue) -> None:

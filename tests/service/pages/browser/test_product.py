@@ -60,6 +60,23 @@ def test_the_page_of_a_product_from_its_numbers_to_a_rerun(
     expect(main).to_contain_text("The new product is the same file, bit for bit.")
 
 
+def test_title_download_and_blink_need_no_scrolling(page: Page, product: Looked) -> None:
+    for width, height in ((1366, 768), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        page.goto(product.page)
+        expect(page.locator("#zoom")).to_contain_text("%")
+        for place in (
+            page.get_by_role("heading", level=1),
+            page.get_by_role("link", name="Download FITS"),
+            page.get_by_role("button", name="Blink"),
+            page.locator("#canvas"),
+        ):
+            box = place.bounding_box()
+            assert box is not None and box["y"] >= 0 and box["y"] + box["height"] <= height, (width, place)
+        page.get_by_role("button", name="Blink").click()
+        expect(page.locator("#tag-left")).to_have_text(re.compile("before|after"))
+
+
 def test_a_deleted_product_leaves_its_image(page: Page, site: Site, product: Looked, watch: Watch) -> None:
     page.goto(product.page)
     page.get_by_text("Delete this product").click()

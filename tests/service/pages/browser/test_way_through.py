@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from pathlib import Path
 
@@ -34,13 +35,10 @@ def test_an_image_without_a_psf_says_what_to_do_and_goes_on_with_one(
 ) -> None:
     page.goto("/")
     page.set_input_files("#file", image_file)
-    page.get_by_role("button", name="Upload").click()
     expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
     expect(page.locator("#checked")).to_contain_text("No PSF for TEST is known here.")
     start = page.locator("#go")
-    expect(start).to_have_text("Check and start")
-    start.click()
-    expect(page.locator("#checked")).to_have_class("error")  # the page says again what is missing
+    expect(start).to_be_disabled()
     good(page)
 
     page.locator("select[name=psf_id]").select_option(psf_id)
@@ -109,6 +107,60 @@ def test_a_dropped_file_is_sent(page: Page, image_file: Path) -> None:
     expect(page.get_by_role("heading", level=1)).to_have_text(re.compile("sun.fits|dropped.fits"))
 
 
+def test_several_files_are_sent_one_after_the_other_and_deconvolved(
+    page: Page, site: Site, tmp_path: Path
+) -> None:
+    """A letter among them is refused, an image of an unknown telescope is told so, and the others are started."""
+    known = {"DETECTOR": "HRI_EUV", "WAVELNTH": 174, "CDELT1": 0.492, "CDELT2": 0.492}
+    write_image(tmp_path / "known.fits", seed=41, **known)
+    write_image(tmp_path / "unknown.fits", seed=42)
+    (tmp_path / "letter.fits").write_text("Dear editor")
+    page.goto("/")
+    page.set_input_files("#file", [tmp_path / f"{name}.fits" for name in ("letter", "known", "unknown")])
+    lines = page.locator("#files li")
+    expect(lines).to_contain_text(
+        ["is not a FITS file", "known.fits: started", "unknown.fits: No PSF for TEST is known here."]
+    )
+    good(page)
+    started = {one["parameters"]["image_id"]: one["id"] for one in site.client.jobs() if not one["ended_at"]}
+    image_id = hashlib.sha256((tmp_path / "known.fits").read_bytes()).hexdigest()
+    assert list(started) == [image_id]
+    site.client.cancel(started[image_id])
+
+
+def test_a_psf_is_uploaded_where_the_page_says_that_none_is_known(
+    page: Page, image_file: Path, tmp_path: Path
+) -> None:
+    write_psf(tmp_path / "mine.fits", size=64, scale=0.9)
+    page.goto("/")
+    page.set_input_files("#file", image_file)
+    expect(page.locator("#checked")).to_have_class("error")
+    page.get_by_label("Upload a PSF").set_input_files(tmp_path / "mine.fits")
+    expect(page).to_have_url(re.compile("[?]psf_id=[0-9a-f]{64}$"))
+    expect(page.locator("#checked")).to_have_class("good")
+    expect(page.locator("#go")).to_have_text("Start")
+    picture = page.get_by_role("img", name="The image as it was uploaded")
+    assert picture.evaluate("(one) => [one.naturalWidth, one.naturalHeight]") == [96, 128]
+
+
+def test_a_psf_of_another_channel_is_offered_only_when_it_is_allowed(
+    page: Page, site: Site, tmp_path: Path
+) -> None:
+    aia = {"TELESCOP": "SDO/AIA", "CDELT1": 0.6, "CDELT2": 0.6}
+    write_image(tmp_path / "a.fits", seed=51, WAVELNTH=193, **aia)
+    write_psf(tmp_path / "p.fits", size=64, scale=0.8)
+    image = site.client.upload_image(tmp_path / "a.fits")["id"]
+    psf = site.client.upload_psf(tmp_path / "p.fits", instrument="aia_171", channel="171")["id"]
+    page.goto(f"/images/{image}")
+    page.get_by_text("Options").click()
+    offer = page.locator(f"option[value='{psf}']")
+    expect(offer).to_be_disabled()
+    page.get_by_label("Allow a PSF of another telescope").check()
+    expect(offer).to_be_enabled()
+    page.locator("select[name=psf_id]").select_option(psf)
+    expect(page.locator("#checked")).to_have_class("good")
+
+
 def test_a_file_that_is_no_image_is_refused_before_it_is_sent(page: Page) -> None:
     page.goto("/")
     sent: list[str] = []
@@ -119,18 +171,22 @@ def test_a_file_that_is_no_image_is_refused_before_it_is_sent(page: Page) -> Non
         ("binary.fits", bytes(range(0x80, 0xA0)), "is not a FITS file"),
     ):
         page.set_input_files("#file", {"name": name, "mimeType": "application/fits", "buffer": content})
-        page.get_by_role("button", name="Upload").click()
-        expect(page.get_by_role("alert")).to_contain_text(f"{name} {reason}")
+        expect(page.locator("#files li")).to_contain_text(
+            [f"{name} {reason}"]
+        )  # and none of the earlier files
     assert sent == []
 
 
-def test_the_check_of_a_folder_says_what_was_checked(page: Page, tmp_path: Path) -> None:
+def test_a_folder_is_checked_and_then_sent(page: Page, tmp_path: Path) -> None:
     folder = write_transit(tmp_path / "mercury", images=3)
-    with (folder / "001.fits").open("r+b") as file:
-        file.truncate(3000)  # its content is checked by the service
     page.goto("/transits")
+    (folder / "001.fits").rename(tmp_path / "001.fits")
     page.set_input_files("#folder", folder)
-    expect(page.locator("#upload-said")).to_contain_text("transit.json is correct, and its 4 files are there")
+    expect(page.get_by_label("What the check found")).to_contain_text("001.fits is missing in the folder")
+    (tmp_path / "001.fits").rename(folder / "001.fits")
+    page.set_input_files("#folder", folder)
+    expect(page).to_have_url(re.compile("/transits/[0-9a-f]{64}$"), timeout=20_000)
+    expect(page.get_by_role("heading", level=1)).to_have_text("mercury.tar")
 
 
 def test_the_header_of_an_image_is_searched(page: Page) -> None:
@@ -162,8 +218,6 @@ def test_the_keyboard_alone_leads_from_a_file_to_a_blinked_product(
     page.keyboard.press("Space")
     assert page.evaluate("window.asked"), "the key opens the dialog"
     page.set_input_files("#file", image_file)
-    tab_to(page, page.get_by_role("button", name="Upload"))
-    page.keyboard.press("Enter")
     expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"))
     psfs = page.locator("select[name=psf_id]")
     tab_to(page, psfs)
@@ -198,12 +252,11 @@ def test_the_keyboard_alone_leads_from_a_file_to_a_blinked_product(
 
 @pytest.mark.slow  # the PSF of the instrument is built in half a minute; the tests above go the same way with a small PSF
 def test_a_real_image_becomes_a_product_that_is_blinked(page: Page, shared: Path) -> None:
-    """Three clicks (choose, Upload, Start) and one key, without any option."""
+    """Two clicks (choose, Start) and one key, without any option."""
     page.goto("/")
     page.set_input_files(
         "#file", shared / "data/real/eui/derived_hrieuv174_20220401T103005920_pseudolinear.fits"
     )
-    page.get_by_role("button", name="Upload").click()
     expect(page).to_have_url(re.compile("/images/[0-9a-f]{64}$"), timeout=LONG_MS)
     page.get_by_role("button", name="Start").click()
     expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=5 * LONG_MS)

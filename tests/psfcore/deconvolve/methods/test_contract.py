@@ -1,0 +1,88 @@
+"""What a method needs, beside its equation: each fault is told as a sentence that says what to add (CONTRIBUTING.md)."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import SimpleNamespace
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+
+from psfcore.deconvolve import memory
+from psfcore.deconvolve.additive import Additive
+from psfcore.deconvolve.conditions import Conditions, Deconvolved
+from psfcore.deconvolve.methods.registry import method_names
+from psfcore.deconvolve.problem import pose
+from psfcore.image import Image
+from psfcore.psf import Psf
+from psfcore.simulate.observe import observe
+from psfcore.simulate.scene import solar_scene
+from tests.psfcore.conftest import gaussian, make_image, make_psf
+from workers.contract.requests import Method
+from workers.intake.estimates import COSTS
+
+# What the file of a method must define, and what each constant means.
+CONSTANTS = {
+    "METHOD": "its name, the name of the file with hyphens",
+    "EDGES": "the default assumption about the scene beyond the edges",
+    "MARGIN_SHARE": "the largest share of the light of an edge pixel that may come from beyond the margin",
+}
+STEPS = 3
+LEAST_GAIN = 0.95  # a few steps must bring the estimate nearer to the scene by 5 %
+
+
+def faults(name: str, module: Any) -> list[str]:
+    """A sentence for each thing that a method lacks."""
+    told = [
+        f"{name}: add the constant {constant} to its file: {meaning}"
+        for constant, meaning in CONSTANTS.items()
+        if not hasattr(module, constant)
+    ]
+    for figures in ("MARGIN_SHARE", "WORKING_BYTES"):
+        if name not in getattr(memory, figures):
+            told.append(f"{name}: add its entry to {figures} of psfcore/deconvolve/memory.py")
+    if name not in COSTS.kinds.deconvolve.step_ns:
+        told.append(f"{name}: measure its time: python -m benchmarks.estimates --write")
+    if not any(
+        name in get_args(one.model_fields["name"].annotation) for one in get_args(get_args(Method)[0])
+    ):
+        told.append(f"{name}: add a class with its parameters to Method in workers/contract/requests.py")
+    if not told and not _approaches(module):
+        told.append(
+            f"{name}: {STEPS} steps do not bring the estimate nearer to the scene: divide a filter in the layout of "
+            "engine.transfer by engine.transfer_scale (psfcore/deconvolve/additive.py)"
+        )
+    return told
+
+
+def _approaches(module: Any) -> bool:
+    scene, psf = solar_scene((96, 96), 4), make_psf(gaussian(33, 1.2))
+    image = make_image(observe(scene, psf, exposure_s=1.0, photon_gain_dn=0.0, read_noise_dn=0.0, seed=1))
+    estimate = module.deconvolve(image, psf, Conditions(edges="zero"), steps=STEPS).pixels
+    inside = np.s_[16:-16, 16:-16]
+    before, after = (np.std((one - scene)[inside]) for one in (image.pixels, estimate))
+    return bool(after < LEAST_GAIN * before)
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_a_method_has_all_that_it_needs(name: str) -> None:
+    module = import_module(f"psfcore.deconvolve.methods.{name.replace('-', '_')}")
+    assert faults(name, module) == []
+
+
+def unscaled(
+    image: Image, psf: Psf, conditions: Conditions, *, steps: int = 5, stop: str = "fixed"
+) -> Deconvolved:
+    """The step x + (y - H x), with a filter that its author forgot to divide by the scale of the transform."""
+    problem = pose(image, psf, conditions, edges="zero", margin_share=0.015, steps=steps, stop="fixed")
+    step_filter = np.ones_like(problem.engine.transfer[:, :, :1])
+    return problem.solve(Additive(problem, step_filter), method="linear", steps=steps, stop="fixed")
+
+
+def test_each_thing_that_is_missing_is_told_by_its_name() -> None:
+    empty = faults("my-method", SimpleNamespace())
+    for thing in (*CONSTANTS, "WORKING_BYTES", "benchmarks.estimates", "requests.py"):
+        assert any(thing in sentence for sentence in empty), thing
+    whole = SimpleNamespace(**dict.fromkeys(CONSTANTS, "x"), deconvolve=unscaled)
+    assert ["transfer_scale" in sentence for sentence in faults("linear", whole)] == [True]
