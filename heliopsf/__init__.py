@@ -44,24 +44,23 @@ __all__ = [
     "read_psf",
 ]
 
-# The module of each name, and the extra with the packages that the module needs.
 _MODULES = {
-    "Client": ("service.client.http", "service"),
-    "DataError": ("psfcore.errors", ""),
-    "DataWarning": ("psfcore.errors", ""),
-    "Deconvolution": ("heliopsf.outputs", ""),
-    "GapDiagnosis": ("heliopsf.transits", "fit"),
-    "MissingExtra": ("psfcore.errors", ""),
-    "Psf": ("heliopsf.psfs", ""),
-    "ScatterFit": ("heliopsf.transits", "fit"),
-    "ServiceError": ("service.client.errors", "service"),
-    "build_psf": ("heliopsf.psfs", ""),
-    "deconvolve": ("heliopsf.images", ""),
-    "diagnose_gap": ("heliopsf.transits", "fit"),
-    "fit_scatter": ("heliopsf.transits", "fit"),
-    "interpolate_psf": ("heliopsf.psfs", ""),
-    "psf_for": ("heliopsf.images", ""),
-    "read_psf": ("heliopsf.psfs", ""),
+    "Client": "service.client.http",
+    "DataError": "psfcore.errors",
+    "DataWarning": "psfcore.errors",
+    "Deconvolution": "heliopsf.outputs",
+    "GapDiagnosis": "heliopsf.transits",
+    "MissingExtra": "psfcore.errors",
+    "Psf": "heliopsf.psfs",
+    "ScatterFit": "heliopsf.transits",
+    "ServiceError": "service.client.errors",
+    "build_psf": "heliopsf.psfs",
+    "deconvolve": "heliopsf.images",
+    "diagnose_gap": "heliopsf.transits",
+    "fit_scatter": "heliopsf.transits",
+    "interpolate_psf": "heliopsf.psfs",
+    "psf_for": "heliopsf.images",
+    "read_psf": "heliopsf.psfs",
 }
 
 
@@ -70,8 +69,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'heliopsf' has no attribute {name!r}")
     from psfcore.errors import module_of_extra
 
-    module, extra = _MODULES[name]
-    found = getattr(module_of_extra(extra, module), name)
+    found = getattr(module_of_extra(_MODULES[name]), name)
     globals()[name] = found
     return found
 

@@ -63,17 +63,17 @@ class Deconvolution(Product):
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the deconvolved image. Needs the extra "plot". axes None: new axes."""
-        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_image(self, axes)
+        drawn: Axes = module_of_extra("heliopsf.plots").draw_image(self, axes)
         return drawn
 
     def plot_change(self, axes: Axes | None = None) -> Axes:
         """Draw the change in percent of the input. Needs the extra "plot"."""
-        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_change(self, axes)
+        drawn: Axes = module_of_extra("heliopsf.plots").draw_change(self, axes)
         return drawn
 
     def quicklook(self) -> Figure:
         """A figure with the image before and after, and the change. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("plot", "heliopsf.plots").before_and_after(self)
+        figure: Figure = module_of_extra("heliopsf.plots").before_and_after(self)
         return figure
 
 

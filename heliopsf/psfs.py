@@ -57,17 +57,17 @@ class Psf(CorePsf):
 
     def plot(self, axes: Axes | None = None, *, size: int = 129) -> Axes:
         """Draw the central ``size`` px on a logarithmic scale. Needs the extra "plot". axes None: new axes."""
-        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_psf(self, axes, size=size)
+        drawn: Axes = module_of_extra("heliopsf.plots").draw_psf(self, axes, size=size)
         return drawn
 
     def plot_curve(self, axes: Axes | None = None) -> Axes:
         """Draw 1 - encircled energy by radius, also of the components. Needs the extra "plot"."""
-        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_curves(self, axes)
+        drawn: Axes = module_of_extra("heliopsf.plots").draw_curves(self, axes)
         return drawn
 
     def quicklook(self) -> Figure:
         """A figure with the centre, the mean weight by radius and the light beyond a radius. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("plot", "psfcore.drawing.plots").psf_figure(self)
+        figure: Figure = module_of_extra("psfcore.drawing.plots").psf_figure(self)
         return figure
 
     @classmethod

@@ -45,12 +45,12 @@ class ScatterFit(TransitFit):
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the light beyond each radius with its error. Needs the extra "plot". axes None: new axes."""
-        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_fit(self, axes)
+        drawn: Axes = module_of_extra("heliopsf.plots").draw_fit(self, axes)
         return drawn
 
     def quicklook(self) -> Figure:
         """A figure with curves, residuals and convergence. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("plot", "psfcore.scatter.fit_plot").fit_figure(self)
+        figure: Figure = module_of_extra("psfcore.scatter.fit_plot").fit_figure(self)
         return figure
 
 
@@ -63,13 +63,13 @@ class GapDiagnosis(diagnose.Diagnosis):
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the probabilities of the effects. Needs the extra "plot". axes None: new axes."""
-        axes = module_of_extra("plot", "matplotlib.pyplot").subplots()[1] if axes is None else axes
-        module_of_extra("plot", "psfcore.gap.report.plot").draw_effects(axes, self.report())
+        axes = module_of_extra("matplotlib.pyplot").subplots()[1] if axes is None else axes
+        module_of_extra("psfcore.gap.report.plot").draw_effects(axes, self.report())
         return axes
 
     def quicklook(self) -> Figure:
         """A figure with residuals, maps and effects. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("plot", "psfcore.gap.report.plot").gap_figure(self, self.report())
+        figure: Figure = module_of_extra("psfcore.gap.report.plot").gap_figure(self, self.report())
         return figure
 
 

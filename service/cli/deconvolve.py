@@ -11,7 +11,7 @@ import click
 from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf, short
 from service.cli.fields import options_of
 from service.cli.options import (
-    OUTPUT,
+    DRAWN,
     OutputPlace,
     Place,
     counted,
@@ -50,8 +50,8 @@ OPTIONS = (
 )
 @PSF
 @options_of(Deconvolve, *OPTIONS)
-@click.option("--plot", type=OUTPUT, help="Write the image before and after (PNG)")
-@click.option("--changes", type=OUTPUT, help="Write difference, ratio and histograms (PNG)")
+@click.option("--plot", type=DRAWN, help="Write the image before and after (PNG)")
+@click.option("--changes", type=DRAWN, help="Write difference, ratio and histograms (PNG)")
 @click.option("--timings", is_flag=True, help="Print how long each stage of the command took; needs --local")
 @SERVER
 @LOCAL

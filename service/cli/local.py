@@ -15,8 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from astropy.io.fits import Header
 from pydantic import TypeAdapter, ValidationError
@@ -27,13 +26,16 @@ from psfcore.deconvolve import run
 from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.run import BUILDING, Identities, UsedPsf
-from psfcore.errors import DataError
+from psfcore.errors import DataError, module_of_extra
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import FitsLimits, HeaderSummary, check_not_deconvolved, optional_text, read_summary
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf, stated_id
 from psfcore.fits.stored_psf import check_is_psf
+from psfcore.gap.effect_sources import sha256_of_source
+from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.unknown import channel_of, unknown_instrument
+from psfcore.instruments.workload import check_workload
 from psfcore.psf import Kernel, Psf, light_beyond_pct
 from psfcore.psf_cache import built_file, kept_psf
 from psfcore.transit.archive import ArchiveContents, list_archive, transit_in, unpack
@@ -44,6 +46,9 @@ from service.client.outputs import written
 from workers.cache_folder import psf_cache
 from workers.contract.identities import (
     build_for,
+    check_noise,
+    diffraction_build,
+    instrument_text,
     product_identity,
     psf_identity,
     recipe_of,
@@ -51,7 +56,9 @@ from workers.contract.identities import (
 from workers.contract.kinds import KINDS, JobRequest
 from workers.contract.requests import (
     Deconvolve,
+    GapDiagnose,
     PsfBuild,
+    Report,
     ResolvedCrossValidate,
     ResolvedDeconvolve,
     ResolvedGapDiagnose,
@@ -271,29 +278,30 @@ class Local(Operations):
             faults = (f"{'/'.join(map(str, e['loc'][1:])) or 'kind'}: {said}" for e, said in told)
             raise ServiceError("; ".join(faults)) from error
         if isinstance(request.parameters, Deconvolve):
-            resolved = self._resolved_deconvolution(request.parameters)
-            return resolved, product_identity(resolved)
-        # Only commands that compute for minutes load the catalogue, whose requests are resolved in the same way.
-        from workers.catalogue.catalogue import Catalogue
-        from workers.intake.requests import resolve
+            deconvolution = self._resolved_deconvolution(request.parameters)
+            return deconvolution, product_identity(deconvolution)
+        if isinstance(request.parameters, PsfBuild):
+            label = request.parameters.instrument or "instrument_file"
+            check_workload(parse_instrument(instrument_text(request.parameters), label), label)
+            return request.parameters, psf_identity(request.parameters)
+        of_kind = KINDS[kind]
+        assert of_kind.resolved is not None and of_kind.identity is not None
+        fields = request.parameters.model_dump() | self._resolved_on_transit(request.parameters)
+        resolved = of_kind.resolved.model_validate(fields)
+        return resolved, of_kind.identity(resolved)
 
-        effects = Settings.apart(self.folder, gap_effects=self.gap_effects).added_effects
-        rows = cast(Catalogue, SimpleNamespace(get=self._row))
-        fields, identity = resolve(request, rows, "", added_effects=effects)
-        model = KINDS[kind].resolved
-        assert model is not None
-        return model.model_validate(fields), identity
-
-    def _row(self, table: type[Any], identity: str, owner: str) -> Any:
-        """The row that a catalogue with the files of the command would have; None if no file has this id."""
-        from workers.catalogue.tables import TransitRow
-        from workers.intake.uploads import image_row, transit_row
-
-        if table is TransitRow:
-            transit = self._transits[identity]
-            return transit_row(owner, identity, transit.bytes, transit.path.name, transit.contents)
-        file = self._images.get(identity) or self._psfs.get(identity)
-        return file and image_row(owner, identity, 0, file.path.name, file.summary)
+    def _resolved_on_transit(self, request: Any) -> dict[str, Any]:
+        """The further fields of a resolved request on a transit, as ``workers.intake.requests`` finds them in a catalogue."""
+        manifest = vars(self._transits[request.transit_id].contents.manifest)
+        if isinstance(request, Report) and request.psf_id is not None:
+            check_noise(manifest, request.noise)
+            return {"dark_offsets": False}  # no fit is made
+        fields: dict[str, Any] = {"diffraction_recipe": diffraction_build(manifest, request.noise)}
+        if isinstance(request, GapDiagnose):
+            effects = Settings.apart(self.folder, gap_effects=self.gap_effects).added_effects
+            hashes = tuple(map(sha256_of_source, effects))
+            fields |= {"added_effects": effects, "added_effects_sha256": hashes}
+        return fields
 
     def _resolved_deconvolution(self, request: Deconvolve) -> ResolvedDeconvolve:
         summary = self._images[request.image_id].summary
@@ -387,7 +395,6 @@ class Local(Operations):
         )
 
     def _psf_build(self, request: PsfBuild, _job_id: str, report: _Report) -> str:
-        from psfcore.drawing.plots import psf_png
         from psfcore.fits.images import read_plane
 
         mask = None if request.mask_id is None else read_plane(self._images[request.mask_id].path, LIMITS)
@@ -404,12 +411,11 @@ class Local(Operations):
             recipe.identity,
             {"cumulative_curve_pct": light_beyond_pct(psf.kernel)},
             file=partial(shutil.copyfile, copy),
-            preview=partial(psf_png, psf),
+            preview=lambda path: module_of_extra("psfcore.drawing.plots").psf_png(psf, path),
         )
 
     def _psf_fit(self, request: ResolvedPsfFit, job_id: str, report: _Report) -> str:
         from psfcore.fits.psfs import write_psf
-        from psfcore.scatter.fit_plot import fit_png
         from workers.tasks import psf_fit
         from workers.tasks.data.reports import write_json
 
@@ -421,7 +427,7 @@ class Local(Operations):
             fitted.psf.provenance["psf_id"],
             {"fit": fitted.details},
             file=lambda path: write_psf(path, fitted.psf),
-            preview=partial(fit_png, fitted.fit),
+            preview=fitted.draw,
             report=lambda path: write_json(path, fitted.report),
         )
 
@@ -515,7 +521,7 @@ class Local(Operations):
             {"details": report.details},
             file=lambda path: write_json(path, report.content),
             preview=report.draw,
-            html=lambda path: path.write_text(report.page, "utf-8"),
+            html=lambda path: path.write_text(report.page(), "utf-8"),
         )
 
     def _add(self, address: str, described: dict[str, Any], **files: Callable[[Path], object]) -> str:
