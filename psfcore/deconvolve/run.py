@@ -38,12 +38,10 @@ from psfcore.errors import DataError
 from psfcore.fits.channel import check_channel
 from psfcore.fits.doubts import doubts
 from psfcore.fits.frame import frame_of
-from psfcore.fits.gain import no_noise_figures, noise_for
 from psfcore.fits.header import known_instrument, optional_text, seen_by
 from psfcore.fits.images import described, write_image
 from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.image import Image, MaskBit
-from psfcore.instruments.model import load_instrument
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.noise import Noise
 from psfcore.psf import REACH_GRID_PX, Psf
@@ -51,6 +49,7 @@ from psfcore.psf_sampling import frame_warnings, with_scale
 
 if TYPE_CHECKING:
     from psfcore.deconvolve.assess.error_planes import ErrorPlanes
+    from psfcore.deconvolve.camera_noise import CameraNoise
 
 BUILDING = "building the PSF"
 DECONVOLVING = "deconvolving"  # the stage whose steps are the steps of the method
@@ -117,12 +116,14 @@ class Product(Deconvolved):
     """A deconvolved image or box, with its inputs, its errors and its warnings.
 
     image: the input, with its mask. psf: the PSF on the pixels of the image. errors: planes with the standard deviation of each
-    pixel, if they were asked for. warnings: sentences by their codes, the most harmful first.
+    pixel, if they were asked for. noise: that of the camera, if errors or the stopping rule needed it. warnings: sentences by
+    their codes, the most harmful first.
     """
 
     image: Image
     psf: Psf
     errors: ErrorPlanes | None
+    noise: CameraNoise | None = None
     warnings: Mapping[str, str]
     work: Work | BoxWork = field(repr=False)
 
@@ -170,6 +171,7 @@ class Product(Deconvolved):
             "edge_band_px": self.edge_band_px,
             "noise_amplification": self.noise_amplification if self.errors is None else self.amplification,
             "chi2_per_pixel": self.chi2_per_pixel,
+            "noise": self.noise and self.noise.as_json(),
             # The bound of the error is in the unit of the image, as is the saturation level.
             "region": box and {"box": str(box.box), "rim_px": box.rim_px, "error": box.error},
             "flux_change_pct": self.flux_change_pct,
@@ -205,15 +207,18 @@ def deconvolve(
 
     Raises DataError "no-noise-figures", and the errors of `box_work` and of the method.
     """
+    noise = None
+    if options.error_draws or options.parameters.get("stop") == "discrepancy":
+        from psfcore.deconvolve.camera_noise import camera_noise  # most deconvolutions do not load SciPy
+
+        noise = camera_noise(image, options.noise, binning=int(psf.provenance.get("binning", 1)))
     conditions = Conditions(
         edges=options.edges,
         margin_px=options.margin_px,
-        noise=options.noise,
+        noise=noise or options.noise,
         threads=options.threads,
         engine_for=engine_for,
     )
-    if options.error_draws and options.noise is None:
-        raise no_noise_figures()
     whole = Work(image, psf, options.method, conditions, options.parameters)
     work: Work | BoxWork = whole
     progress = begin(DECONVOLVING, int(options.parameters.get("steps") or 1))
@@ -225,7 +230,9 @@ def deconvolve(
     errors = None
     if options.error_draws:
         errors = whole.errors(result, options.error_draws, possible_psfs=possible_psfs, begin=begin)
-    return Product(**vars(result), image=image, psf=psf, errors=errors, warnings=warnings, work=work)
+    return Product(
+        **vars(result), image=image, psf=psf, errors=errors, noise=noise, warnings=warnings, work=work
+    )
 
 
 def read_and_deconvolve(
@@ -286,11 +293,6 @@ def read_and_deconvolve(
     instrument, turn_deg = known_instrument(header), frame_of(header).turn_to_build_deg
     if psf is None and instrument is None:
         raise unknown_instrument(seen_by(header))
-    # The pixels of a turned image are interpolated, so they do not have the noise of the camera.
-    if options.noise is None and psf is None and instrument is not None and not turn_deg:
-        options = replace(options, noise=noise_for(load_instrument(instrument), header))
-    if options.error_draws and options.noise is None:
-        raise no_noise_figures()
     key = (id(psf) if psf is not None else (instrument, turn_deg), plate_scale_arcsec)
     whole = prepared.as_built(key, as_built)
     check_channel(seen_as(whole), header, other_channel=other_channel)
@@ -378,6 +380,10 @@ def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
         cards["DCNVSATF"] = (saturation.found, "where the saturation level was found")
     if product.amplification is not None:
         cards["DCNVAMPL"] = (product.amplification, "noise of result / noise of input")
+    if product.noise is not None and product.noise.source != "given":
+        cards["DCNVGAIN"] = (product.noise.photon_gain_dn, "[DN] photon gain")
+        cards["DCNVREAD"] = (product.noise.read_noise_dn, "[DN] read noise, rms")
+        cards["DCNVNOIS"] = (product.noise.source, "where DCNVGAIN and DCNVREAD are from")
     for number, code in enumerate(product.warnings, start=1):
         cards[f"DCNVWRN{number}"] = (code, "warning, see HISTORY")
     return cards
@@ -397,6 +403,7 @@ def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
                 f"image by at most {box.error:.3g} (estimated bound, in the unit of the image)"
             ]
         ),
+        *([] if product.noise is None or product.noise.source == "given" else [f"noise: {product.noise}"]),
         *(f"WARNING ({code}): {message}" for code, message in product.warnings.items()),
     ]
 

@@ -363,7 +363,7 @@ class Local(Operations):
             ),
             summary.shape,
             None if named is None else self._psf(request.psf_id, parts=request.error_draws > 0),
-            options_of(request, None if request.noise is None else request.noise.noise(), cores()),
+            options_of(request, cores()),
             build=build,
             possible_psfs=possible_psfs,
             prepared=self._prepared,

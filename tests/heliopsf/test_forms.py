@@ -134,8 +134,11 @@ def test_an_uncertainty_is_added_where_asked(psf: heliopsf.Psf) -> None:
     # Deconvolution amplifies the photon noise of the background of 50 DN.
     assert 10.0 < np.median(sigma) < 40.0 and (sigma > 0).all()
     assert result.meta["dcnvampl"] == pytest.approx(np.median(sigma) / np.sqrt(2 * 50 + 1), rel=0.15)
-    with pytest.raises(DataError, match="no-noise-figures"):
-        heliopsf.deconvolve(a_map(), psf, error_draws=4)
+    measured = heliopsf.deconvolve(a_map(), psf, error_draws=4)
+    # The background has the noise of 30 photons.
+    variance = 50 * measured.meta["dcnvgain"] + measured.meta["dcnvread"] ** 2
+    assert measured.meta["dcnvnois"] == "measured" and variance == pytest.approx(30, rel=0.15)
+    assert (measured.uncertainty.array > 0).all() and "dcnvnois" not in result.meta
     with pytest.raises(DataError, match="2 to 64; got 1"):
         heliopsf.deconvolve(a_map(), psf, noise=noise, error_draws=1)
 

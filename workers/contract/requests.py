@@ -22,7 +22,6 @@ from workers.versions import TIME, iso, seconds
 
 if TYPE_CHECKING:
     from psfcore.deconvolve.run import Options
-    from psfcore.noise import Noise
 
 # Texts of one line from outside: without control characters, of which PostgreSQL cannot store NUL.
 PRINTABLE, PRINTABLE_OR_EMPTY = r"^[^\x00-\x1f\x7f]+$", r"^[^\x00-\x1f\x7f]*$"
@@ -208,14 +207,14 @@ class Treatment(Parameters):
     method: Method = Field(default_factory=lambda: RichardsonLucy())
     noise: NoiseFigures | None = Field(
         None,
-        description="photon gain (DN per photon), read noise (DN rms); null: those of the instrument",
+        description="photon gain (DN per photon), read noise (DN rms); null: published, else measured in the image",
     )
     saturation_dn: Saturation = None
     error_draws: Annotated[int, Option("--errors", "N")] = Field(
         0,
         ge=0,
         le=64,
-        description="noise realisations for an ERROR plane, 0 or at least 2 (slow)",
+        description="noise realisations for an ERROR plane, 0 or at least 2 (slow); 8 is a good number",
     )
     other_channel: OtherChannel = False
     again: bool = Field(False, description="deconvolve even a product or a PSF")
@@ -483,8 +482,8 @@ class ResolvedRerun(Rerun):
 ResolvedOnTransit = ResolvedPsfFit | ResolvedCrossValidate | ResolvedReport | ResolvedGapDiagnose
 
 
-def options_of(request: Deconvolve, noise: Noise | None, threads: int) -> Options:
-    """The options of psfcore for a request. noise: of the request, or else of the instrument that took the image."""
+def options_of(request: Deconvolve, threads: int) -> Options:
+    """The options of psfcore for a request."""
     # A request is checked without numerical libraries.
     from psfcore.deconvolve.run import Options
 
@@ -494,7 +493,7 @@ def options_of(request: Deconvolve, noise: Noise | None, threads: int) -> Option
         parameters=method.model_dump(exclude={"name", "edges", "margin_px"}),
         edges=method.edges,
         margin_px=method.margin_px,
-        noise=noise,
+        noise=None if request.noise is None else request.noise.noise(),
         error_draws=request.error_draws,
         region=None if request.region is None else Box.parse(request.region),
         region_error=request.region_error,
