@@ -6,8 +6,8 @@ figures of the camera follow from
 
     V = g D + r^2                                                                          Eq. (1)
 
-g is the median of the slopes between all pairs of classes, and r^2 the median of V - g D (Theil 1950, Indag. Math. 12, 85),
-so a few classes with much structure change neither. Their uncertainties are those of the mean of the four quarters of
+g is the median of the slopes between all pairs of classes (Theil 1950, Indag. Math. 12, 85), and r^2 the median of V - g D of
+the fainter half of the classes, so a few classes with much structure change neither. Their uncertainties are those of the mean of the four quarters of
 the image.
 
 Structure on the scale of a pixel raises V. Noise that neighbouring pixels share lowers it: in images of the EUV channels of
@@ -162,7 +162,7 @@ def _transfer(pixels: Any, counted: Any, sigma: Any) -> tuple[float, float] | No
     rising = steps > 0
     slopes = (variance[second] - variance[first])[rising] / steps[rising]
     gain = max(0.0, float(np.median(slopes))) if rising.any() else 0.0
-    read = float(np.median(variance - gain * brightness))
+    read = float(np.median((variance - gain * brightness)[: len(brightness) // 2]))
     if read < 0:  # all of it is photon noise
         lit = brightness > 0
         return float(np.median(variance[lit] / brightness[lit])), 0.0
