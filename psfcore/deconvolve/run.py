@@ -32,6 +32,7 @@ from psfcore.deconvolve.kernels import compiling_beside
 from psfcore.deconvolve.memory import Asked, check_memory, product_bytes
 from psfcore.deconvolve.methods.registry import may_be_negative, method_names
 from psfcore.deconvolve.region import BoxWork, box_work
+from psfcore.deconvolve.stopping import no_noise_model
 from psfcore.deconvolve.whole import Assessed, Work
 from psfcore.drawing.units import unit_label
 from psfcore.errors import DataError
@@ -116,8 +117,8 @@ class Product(Deconvolved):
     """A deconvolved image or box, with its inputs, its errors and its warnings.
 
     image: the input, with its mask. psf: the PSF on the pixels of the image. errors: planes with the standard deviation of each
-    pixel, if they were asked for. noise: that of the camera, if errors or the stopping rule needed it. warnings: sentences by
-    their codes, the most harmful first.
+    pixel, if they were asked for. noise: that of the camera, if errors were asked for. warnings: sentences by their
+    codes, the most harmful first.
     """
 
     image: Image
@@ -205,10 +206,12 @@ def deconvolve(
     `Conditions`. possible_psfs, begin: see `Work.errors`. check_plane: called with the shape (ny, nx) of box and rim, which is
     known only after the image is read; it may raise.
 
-    Raises DataError "no-noise-figures", and the errors of `box_work` and of the method.
+    Raises DataError "no-noise-figures", "no-noise-model", and the errors of `box_work` and of the method.
     """
+    if options.noise is None and options.parameters.get("stop") == "discrepancy":
+        raise no_noise_model()  # figures that nobody chose are too uncertain to end an iteration
     noise = None
-    if options.error_draws or options.parameters.get("stop") == "discrepancy":
+    if options.error_draws:
         from psfcore.deconvolve.camera_noise import camera_noise  # most deconvolutions do not load SciPy
 
         noise = camera_noise(image, options.noise, binning=int(psf.provenance.get("binning", 1)))
@@ -365,7 +368,10 @@ def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
         "PSFSTAT": (psf.status, "PSF status"),
         "DCNVMETH": (product.method, "deconvolution method"),
         "DCNVITER": (product.steps_done, "deconvolution steps done"),
-        "DCNVSTOP": (product.stopped_because, "why the iteration stopped"),
+        "DCNVSTOP": (
+            product.stopped_because,
+            "" if "chi2" in product.stopped_because else "why the iteration stopped",
+        ),
         "DCNVEDGE": (product.edges, "assumed scene beyond the edges"),
         "DCNVBAND": (product.edge_band_px, "[px] width of band affected by DCNVEDGE"),
         "SWHELIO": (software_version(), "heliopsf version"),
