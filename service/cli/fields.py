@@ -50,7 +50,6 @@ def _option(model: type[BaseModel], name: str) -> Callable[[Command], Command]:
             "--method",
             type=click.Choice(METHODS),
             default=METHODS[0],
-            show_default=True,
             help="Deconvolution method",
         )
     field = _field(model, name)
@@ -58,7 +57,9 @@ def _option(model: type[BaseModel], name: str) -> Callable[[Command], Command]:
     names = (_name(model, name), name)
     if kind is bool:
         switch = f"{names[0]}/--no-{names[0][2:]}" if field.default else names[0]
-        return click.option(switch, name, is_flag=True, default=bool(field.default), help=text)
+        return click.option(
+            switch, name, is_flag=True, default=bool(field.default), show_default=False, help=text
+        )
     if kind is NoiseFigures:
         return click.option("--noise", nargs=2, type=float, metavar="GAIN READ", help=text)
     # The default of a parameter of a method depends on the method.
@@ -68,7 +69,6 @@ def _option(model: type[BaseModel], name: str) -> Callable[[Command], Command]:
         type=_type(kind, field),
         metavar=about.metavar,
         default=default,
-        show_default=bool(default),
         callback=None if about.check is None else _checked_by(about.check),
         help=text,
     )

@@ -121,9 +121,7 @@ CENTRE = click.option(
     help="Position of the flare, px [default: searched in IMAGE]",
 )
 BACKGROUND = "Image of the same frame before the flare (FITS)"
-SEED = click.option(
-    "--seed", type=click.IntRange(0, 2**31 - 1), default=1, show_default=True, help="Seed of random numbers"
-)
+SEED = click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=1, help="Seed of random numbers")
 JSON = click.option("--json", "json_file", type=OUTPUT, help="Write all numbers to this file (JSON)")
 PLOT = click.option("--plot", type=DRAWN, help="Write a plot to this file (PNG)")
 DATA = click.option(
