@@ -78,7 +78,7 @@ class CameraNoise(Noise):
     def as_json(self) -> dict[str, Any]:
         """The figures and their source."""
         figures = {"photon_gain_dn": self.photon_gain_dn, "read_noise_dn": self.read_noise_dn}
-        return {**figures, "source": self.source, "basis": self.basis, "sigma": self.sigma}
+        return {**figures, "source": self.source, "sigma": self.sigma, "text": str(self)}
 
 
 def camera_noise(image: Image, given: Noise | None, *, binning: int) -> CameraNoise:

@@ -33,6 +33,7 @@ from psfcore.deconvolve.memory import Asked, check_memory, product_bytes
 from psfcore.deconvolve.methods.registry import may_be_negative, method_names
 from psfcore.deconvolve.region import BoxWork, box_work
 from psfcore.deconvolve.stopping import no_noise_model
+from psfcore.deconvolve.summary import assumptions
 from psfcore.deconvolve.whole import Assessed, Work
 from psfcore.drawing.units import unit_label
 from psfcore.errors import DataError
@@ -148,23 +149,38 @@ class Product(Deconvolved):
                 planes["PSF_ERROR"] = self.errors.psf_error
         return planes
 
-    def title(self, psf: UsedPsf) -> str:
-        """The telescope, the time and the PSF, for the title of a picture."""
+    @property
+    def name(self) -> str:
+        """The telescope and the time of the image."""
         header = self.image.header
         seen_by = optional_text(header, "DETECTOR", "INSTRUME") or "image"
         date = optional_text(header, "DATE-BEG", "DATE-OBS", "DATE_OBS")
-        return f"{seen_by}{f' {date}' if date else ''}   PSF {psf.name} {psf.version}"
+        return f"{seen_by}{f' {date}' if date else ''}"
 
-    def details(self) -> dict[str, Any]:
+    def title(self, psf: UsedPsf) -> str:
+        """The telescope, the time and the PSF, for the title of a picture."""
+        return f"{self.name}   PSF {psf.name} {psf.version}"
+
+    def details(
+        self, used: UsedPsf | None = None, provenance: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
         """How the image was deconvolved, the measured changes, and the warnings, as JSON values.
 
-        A bright pixel is at or above the 99th percentile of the input; a dark pixel is at or below the first percentile.
+        used, provenance: of the PSF, if its file does not say them. A bright pixel is at or above the 99th percentile of the input; a dark pixel is at or below the first percentile.
         """
         image, box, saturation = self.image, self.of_box, self.image.saturation
         before, after = image.pixels[image.valid], self.pixels[image.valid]
         low, high = np.percentile(before, [1, 99])
         dark, bright = before <= low, before >= high
+        psf = used or self.psf
         return {
+            "image": self.name,
+            "psf": {
+                "name": psf.name,
+                "version": psf.version,
+                "status": psf.status,
+                "assumed": assumptions(provenance or self.psf.provenance),
+            },
             "steps_done": self.steps_done,
             "stopped_because": self.stopped_because,
             "last_step_change": self.last_change,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from psfcore.deconvolve.summary import percent
 from service.cli.connection import (
     CONTEXT,
     ID,
@@ -26,7 +27,7 @@ from service.cli.connection import (
 )
 from service.cli.fields import options_of
 from service.cli.jobs import MOST, moment
-from service.cli.options import OUTPUT, fits_files, percent, progress_bar, writes_files
+from service.cli.options import OUTPUT, fits_files, progress_bar, writes_files
 from service.cli.progress import duration, echo
 from service.client.errors import ServiceError
 from service.client.operations import treatment

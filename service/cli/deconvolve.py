@@ -8,15 +8,15 @@ from typing import Any
 
 import click
 
+from psfcore.deconvolve.summary import summary_lines
 from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf, short
-from service.cli.fields import options_of
+from service.cli.fields import methods_help, options_of
 from service.cli.options import (
     DRAWN,
     OutputPlace,
     Place,
     counted,
     fits_files,
-    percent,
     progress_bar,
     say_warnings,
     user_errors,
@@ -38,7 +38,7 @@ OPTIONS = (
 )
 
 
-@click.command()
+@click.command(epilog=methods_help())
 @click.argument("images", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option(
     "-o",
@@ -137,24 +137,13 @@ def _one(
     """Deconvolve one image into a file; returns the lines to print."""
     product = service.deconvolve(image, output, preview=plot, changes=changes, progress=report, **parameters)
     say_warnings(product)
-    details = product["details"]
+    first, *others = summary_lines(product["details"])
+    pictures = [str(path) for path in (plot, changes) if path is not None]
     return [
-        f"{output}: PSF {product['psf_version']}, product {short(product['id'])}",
-        f"{details['steps_done']} steps ({details['stopped_because']}), edges {details['edges']}",
-        *_told_region(details),
-        f"flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
-        f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",
-    ]
-
-
-def _told_region(details: dict[str, Any]) -> list[str]:
-    """The line about the region that was deconvolved."""
-    found = details["region"]
-    if found is None:
-        return []
-    return [
-        f"region {found['box']}, rim {found['rim_px']} px: differs from the same pixels of the whole image by at most "
-        f"{found['error']:.3g} (estimated bound, in the unit of the image)"
+        f"{output}: {first}",
+        *others,
+        f"picture: {', '.join(pictures) or 'none; --plot FILE.png draws the image before and after'}",
+        *([] if service.server is None else [f"product {short(product['id'])} of {service.server}"]),
     ]
 
 

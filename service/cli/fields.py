@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 
 from psfcore.errors import DataError
 from psfcore.noise_figures import NoiseFigures
-from workers.contract.requests import METHODS, Option, RichardsonLucy
+from workers.contract.requests import METHOD_MODELS, METHODS, Option, RichardsonLucy
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 _NULL = re.compile(r"; null: (.*?)(?=\. |$)")
@@ -38,6 +38,15 @@ def options_of(model: type[BaseModel], *names: str) -> Callable[[Command], Comma
         return command
 
     return with_options
+
+
+def methods_help() -> str:
+    """When to use which method, for the end of a help text."""
+    rows = (
+        f"  {name:<33}{(model.__doc__ or '').split('. ')[0].rstrip('.')}"
+        for name, model in zip(METHODS, METHOD_MODELS, strict=True)
+    )
+    return "\b\nMethods:\n" + "\n".join(rows)
 
 
 def _field(model: type[BaseModel], name: str) -> FieldInfo:

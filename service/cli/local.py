@@ -41,7 +41,7 @@ from psfcore.psf_cache import built_file, kept_psf
 from psfcore.transit.archive import ArchiveContents, list_archive, transit_in, unpack
 from psfcore.whole_files import sha256_of
 from service.client.errors import ServiceError
-from service.client.operations import Operations, Progress
+from service.client.operations import Operations, Progress, named_instrument
 from service.client.outputs import written
 from workers.cache_folder import psf_cache
 from workers.contract.identities import (
@@ -164,6 +164,7 @@ class Local(Operations):
     times: StageTimer = field(default_factory=StageTimer)
     _images: dict[str, _Image] = field(default_factory=dict)
     _psfs: dict[str, _NamedPsf] = field(default_factory=dict)
+    _builds: dict[str, PsfBuild] = field(default_factory=dict)  # PSFs that are built when they are needed
     _transits: dict[str, _NamedTransit] = field(default_factory=dict)
     _read_psfs: dict[tuple[str, bool], Psf] = field(default_factory=dict)
     _prepared: PreparedPsfs = field(default_factory=PreparedPsfs)
@@ -215,6 +216,13 @@ class Local(Operations):
         self._psfs[identity] = _NamedPsf(path, files, sha256, summary, used)
         return {"id": identity}
 
+    def psf_of_instrument(self, instrument: str) -> str:
+        """Add the PSF of an instrument, which a deconvolution builds without its components."""
+        build = PsfBuild.model_validate(named_instrument(instrument))
+        self._resolved_build(build)
+        self._builds[psf_identity(build)] = build
+        return psf_identity(build)
+
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
         """Check a request; ``wait`` computes its result."""
         job_id = uuid.uuid4().hex
@@ -260,14 +268,6 @@ class Local(Operations):
         for name in ("file", "preview", "changes"):
             del self._writers[product[name]]
 
-    def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        """No command with ``--local`` asks the tables of a PSF."""
-        raise NotImplementedError
-
-    def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
-        """No command with ``--local`` cuts a PSF."""
-        raise NotImplementedError
-
     def _resolved(self, kind: str, parameters: dict[str, Any]) -> tuple[Any, str]:
         """The resolved parameters of a request, and the id of its result."""
         body = {"kind": kind, "parameters": parameters}
@@ -281,14 +281,18 @@ class Local(Operations):
             deconvolution = self._resolved_deconvolution(request.parameters)
             return deconvolution, product_identity(deconvolution)
         if isinstance(request.parameters, PsfBuild):
-            label = request.parameters.instrument or "instrument_file"
-            check_workload(parse_instrument(instrument_text(request.parameters), label), label)
-            return request.parameters, psf_identity(request.parameters)
+            return self._resolved_build(request.parameters), psf_identity(request.parameters)
         of_kind = KINDS[kind]
         assert of_kind.resolved is not None and of_kind.identity is not None
         fields = request.parameters.model_dump() | self._resolved_on_transit(request.parameters)
         resolved = of_kind.resolved.model_validate(fields)
         return resolved, of_kind.identity(resolved)
+
+    @staticmethod
+    def _resolved_build(build: PsfBuild) -> PsfBuild:
+        label = build.instrument or "instrument_file"
+        check_workload(parse_instrument(instrument_text(build), label), label)
+        return build
 
     def _resolved_on_transit(self, request: Any) -> dict[str, Any]:
         """The further fields of a resolved request on a transit, as ``workers.intake.requests`` finds them in a catalogue."""
@@ -320,6 +324,8 @@ class Local(Operations):
                 raise unknown_instrument(asdict(summary))
             recipe = build_for(summary.instrument, frame_of(summary.cards).turn_to_build_deg)
             psf = {"psf_id": psf_identity(recipe), "psf_recipe": recipe}
+        elif request.psf_id in self._builds:
+            psf["psf_recipe"] = self._builds[request.psf_id]
         elif request.psf_id not in self._psfs:
             raise _no_such_psf(request.psf_id)
         return ResolvedDeconvolve(**psf, **request.model_dump(exclude={"psf_id", "context"}))
@@ -384,7 +390,7 @@ class Local(Operations):
         ids = Identities(
             identity, request.image_id, request.method.algorithm_version, safe_name(name, identity)
         )
-        details = product.details() | {"software_version": software_version()}
+        details = product.details(used) | {"software_version": software_version()}
         result = {"psf_id": used.id, "psf_version": used.version, "details": details}
         return self._add(
             f"/v1/products/{identity}",

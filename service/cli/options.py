@@ -139,13 +139,17 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 @contextmanager
 def user_errors() -> Iterator[None]:
     """Turn an error of the user's data, files or service into text and an exit status, without a traceback."""
+    context = click.get_current_context(silent=True)
+    local = context is not None and bool(context.params.get("local"))
     try:
         yield
     except DataError as error:
-        raise click.ClickException("\n".join(error_lines(error.message, error.fields))) from error
+        raise click.ClickException(
+            "\n".join(error_lines(error.message, error.fields, local=local))
+        ) from error
     except ServiceError as error:
         message = NO_KEY if error.code == "no-key" else str(error)
-        raise click.ClickException("\n".join(error_lines(message, error.fields))) from error
+        raise click.ClickException("\n".join(error_lines(message, error.fields, local=local))) from error
     except OSError as error:
         raise click.ClickException(str(error)) from error
 
@@ -251,11 +255,6 @@ def listed(words: Sequence[str]) -> str:
     """Words as a list in a sentence: "a", "a and b", "a, b and c"."""
     *others, last = words
     return f"{', '.join(others)} and {last}" if others else last
-
-
-def percent(value: float | None, digits: int = 1) -> str:
-    """A relative change as text. value: in percent; None if the reference contains no light."""
-    return "n/a (no light)" if value is None else f"{value:+.{digits}f} %"
 
 
 def read_settings(data: Path | None = None) -> Settings:

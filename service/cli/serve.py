@@ -14,12 +14,12 @@ from urllib.parse import urlsplit
 
 import click
 
+from psfcore.deconvolve.summary import percent
 from service.cli.options import (
     DATA,
     FILE,
     OUTPUT_FOLDER,
     check_fresh_folder,
-    percent,
     progress_bar,
     read_settings,
     user_errors,

@@ -110,9 +110,10 @@ def _limited(state: State, owner: str, but: str | None = None) -> Usage | None:
 
 
 def _file_too_large(usage: Usage, count: int) -> Problem:
-    return _exceeded(413, usage, usage.no_room(f"this file needs at least {count} more"))
+    message = usage.no_room(f"this file needs at least {count / MIB:.1f} MiB more")
+    return _exceeded(413, usage, message, needed_bytes=count)
 
 
-def _exceeded(status: int, usage: Usage, message: str) -> Problem:
+def _exceeded(status: int, usage: Usage, message: str, **more: int) -> Problem:
     used, limit = usage.used_bytes, usage.limit_bytes
-    return Problem(status, "quota-exceeded", message, used_bytes=used, limit_bytes=limit)
+    return Problem(status, "quota-exceeded", message, used_bytes=used, limit_bytes=limit, **more)

@@ -108,7 +108,7 @@ class _Method(Parameters):
 
 
 class RichardsonLucy(_Method):
-    """Richardson-Lucy. The paper recommends 20 steps and edges `zero`."""
+    """For most images. The paper recommends 20 steps and edges `zero`."""
 
     algorithm_version: ClassVar[int] = 2
     name: Literal["richardson-lucy"] = "richardson-lucy"
@@ -116,7 +116,7 @@ class RichardsonLucy(_Method):
 
 
 class RichardsonLucyAccelerated(_Method):
-    """Richardson-Lucy with the extrapolation of Biggs and Andrews, which reaches the same result in fewer steps."""
+    """For many images: the same result in half the steps. The extrapolation is that of Biggs and Andrews."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["richardson-lucy-accelerated"]
@@ -125,7 +125,7 @@ class RichardsonLucyAccelerated(_Method):
 
 
 class RichardsonLucyExtended(_Method):
-    """Richardson-Lucy that also estimates the scene beyond the edges (Bertero and Boccacci)."""
+    """For cut-outs with bright light beyond their edges. Bertero and Boccacci describe it."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["richardson-lucy-extended"]
@@ -133,7 +133,7 @@ class RichardsonLucyExtended(_Method):
 
 
 class RichardsonLucyTotalVariation(_Method):
-    """Richardson-Lucy with total-variation regularisation: less noise; meant for pictures rather than photometry."""
+    """For pictures of noisy images, not for photometry. The total variation is regularised."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["richardson-lucy-total-variation"]
@@ -144,7 +144,7 @@ class RichardsonLucyTotalVariation(_Method):
 
 
 class BasicIterative(_Method):
-    """Basic iterative deconvolution, which the paper recommends for a bright source near an edge."""
+    """For a bright source near an edge, as the paper recommends. Results may be negative."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["basic-iterative"]
@@ -152,7 +152,7 @@ class BasicIterative(_Method):
 
 
 class Linear(_Method):
-    """Linear reconstruction: no positivity constraint, no bias of faint pixels, converged after about five steps."""
+    """For photometry of faint pixels: no bias, results may be negative. It has converged after about five steps."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["linear"]
@@ -168,9 +168,8 @@ Method = Annotated[
     | Linear,
     Field(discriminator="name"),
 ]
-METHODS: list[str] = [
-    get_args(one.model_fields["name"].annotation)[0] for one in get_args(get_args(Method)[0])
-]
+METHOD_MODELS: tuple[type[_Method], ...] = get_args(get_args(Method)[0])
+METHODS: list[str] = [get_args(one.model_fields["name"].annotation)[0] for one in METHOD_MODELS]
 
 
 class PsfBuild(Parameters):

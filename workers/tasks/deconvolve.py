@@ -98,7 +98,7 @@ def make(
     with ThreadPoolExecutor(1) as beside:
         # A worker with one thread draws the picture in this thread: a second thread would slow down the other workers.
         picture = beside.submit(draw).result if preview and threads > 1 else draw
-        details = details_of(context, request, product)
+        details = details_of(context, request, product, psf_row)
         preview_sha256 = picture() if preview else None
     return Made(context, request, psf_row, product, details, preview_sha256)
 
