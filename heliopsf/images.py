@@ -48,7 +48,7 @@ def deconvolve(smap: str | Path | Image, psf: AnyPsf | None = ..., **options: An
 def deconvolve(smap: Like, psf: AnyPsf | None = ..., **options: Any) -> Like: ...
 @overload
 def deconvolve(smap: Sequence[Any], psf: AnyPsf | None = ..., **options: Any) -> list[Any]: ...
-def deconvolve(
+def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the options
     smap: Any,
     psf: AnyPsf | None = None,
     iterations: int | None = None,
@@ -162,8 +162,9 @@ def deconvolve(
         raise DataError(
             "bad-steps", "expected iterations or steps; got both, which mean the same: give only one of them"
         )
-    if steps is None:
-        steps = iterations
+    steps = iterations if steps is None else steps
+    if steps is not None:
+        steps = whole("steps", steps, "bad-steps")
     of_method = {"steps": steps, "stop": stop, "order": order, "smoothing": smoothing}
     options = Options(
         method=method,

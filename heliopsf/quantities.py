@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -47,7 +46,7 @@ def number(name: str, value: Any, *allowed: Any) -> float:
 def whole(name: str, value: Any, code: str, *allowed: Any) -> int:
     """A whole number. Raises DataError with this code."""
     found = value.to_value(allowed[0]) if isinstance(value, units.Quantity) and allowed else value
-    if not isinstance(found, Integral | Real) or isinstance(found, bool) or int(found) != found:
+    if not isinstance(found, int | float | np.integer) or isinstance(found, bool) or int(found) != found:
         raise DataError(code, f"{name}: expected a whole number; got {value!r:.80}")
     return int(found)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ from psfcore.deconvolve.conditions import (
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.kernels import compiling_beside
 from psfcore.deconvolve.memory import Asked, check_memory, product_bytes
-from psfcore.deconvolve.methods.registry import may_be_negative, method_names
+from psfcore.deconvolve.methods.registry import may_be_negative, method_named, method_names
 from psfcore.deconvolve.region import BoxWork, box_work
 from psfcore.deconvolve.stopping import no_noise_model
 from psfcore.deconvolve.summary import assumptions
@@ -63,7 +64,7 @@ Cards = dict[str, tuple[str | int | float, str]]
 
 @dataclass(frozen=True)
 class Options:
-    """How an image is deconvolved. Raises DataError "bad-draws" and "region-errors".
+    """How an image is deconvolved. Raises DataError "bad-draws", "region-errors", "unknown-method" and "unknown-parameter".
 
     method: name of the method; parameters: its own parameters, such as steps and stop. edges, margin_px, noise, threads: see
     `Conditions`. error_draws: number of noise realisations (2 to 64) for the planes of errors; 0: no such planes. region:
@@ -87,6 +88,17 @@ class Options:
             raise DataError(
                 "bad-draws", f"error_draws: expected 0, or 2 to {MOST_DRAWS}; got {self.error_draws}"
             )
+        known = [
+            name
+            for name, one in signature(method_named(self.method)).parameters.items()
+            if one.kind is one.KEYWORD_ONLY
+        ]
+        for name in self.parameters:
+            if name not in known:
+                raise DataError(
+                    "unknown-parameter",
+                    f"expected parameters of {self.method}, {', '.join(known)}; got {name!r}",
+                )
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ def how_to_start(server: str) -> str:
         return "check the address, or ask the operator whether the service runs"
     port = parts.port or 80
     named = "" if port == urlsplit(DEFAULT_SERVER).port else f" --port {port}"
-    return f"`heliopsf serve{named}` starts a service there"
+    return f"`heliopsf serve{named}` starts a service there; commands with --local need none"
 
 
 def is_loopback(host: str) -> bool:
