@@ -115,8 +115,7 @@ SERVER = server_option("Address of the service, which this command needs")
 LOCAL = click.option("--local", is_flag=True, help="Run in this process, without a service")
 SERVER_FOR_IDS = server_option("Address of the service, which is needed only if a PSF is given by its id")
 PSF = psf_option(
-    "PSF: an id, a file (FITS), or an instrument (its name such as aia_171, or a TOML file) whose PSF is built [default: the "
-    "certified PSF for the image, else the PSF built for its instrument]",
+    "PSF: an id or a file; or an instrument (aia_171, FILE.toml) [default: the certified PSF for the image, else the one built]",
     or_instrument=True,
 )
 CONTEXT = options_of(Deconvolve, "context")

@@ -46,13 +46,13 @@ OPTIONS = (
     required=True,
     type=OutputPlace(decides=True),
     metavar="FILE|FOLDER/",
-    help="Write the deconvolved image (FITS) to this file; several images: to this folder",
+    help="Write the product (FITS) to this file, several into this folder",
 )
 @PSF
 @options_of(Deconvolve, *OPTIONS)
 @click.option("--plot", type=DRAWN, help="Write the image before and after (PNG)")
 @click.option("--changes", type=DRAWN, help="Write difference, ratio and histograms (PNG)")
-@click.option("--timings", is_flag=True, help="Print how long each stage of the command took; needs --local")
+@click.option("--timings", is_flag=True, help="Print how long each stage took; needs --local")
 @SERVER
 @LOCAL
 @writes_files
@@ -68,10 +68,9 @@ def deconvolve(
     overwrite: bool,
     **parameters: Any,
 ) -> None:
-    """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with the PSF that you name.
+    """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with yours.
 
-    The output is a folder if there are several images, or if its name ends in /. Images whose product is in the folder
-    are skipped. Failures are listed at the end; the exit status is then 1.
+    The output is a folder for several images, or if its name ends in /. Images whose product is in the folder are skipped.
     """
     files = fits_files(images)
     if not files:

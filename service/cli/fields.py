@@ -58,8 +58,9 @@ def _option(model: type[BaseModel], name: str) -> Callable[[Command], Command]:
         return click.option(
             "--method",
             type=click.Choice(METHODS),
+            metavar="NAME",
             default=METHODS[0],
-            help="Deconvolution method",
+            help="Method; `heliopsf deconvolve -h` says which for what",
         )
     field = _field(model, name)
     kind, about, text = _kind(field), _about(field), _help(model, field)
@@ -78,6 +79,7 @@ def _option(model: type[BaseModel], name: str) -> Callable[[Command], Command]:
         type=_type(kind, field),
         metavar=about.metavar,
         default=default,
+        show_default=bool(default),
         callback=None if about.check is None else _checked_by(about.check),
         help=text,
     )

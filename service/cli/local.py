@@ -324,19 +324,23 @@ class Local(Operations):
                 raise unknown_instrument(asdict(summary))
             recipe = build_for(summary.instrument, frame_of(summary.cards).turn_to_build_deg)
             psf = {"psf_id": psf_identity(recipe), "psf_recipe": recipe}
-        elif request.psf_id in self._builds:
-            psf["psf_recipe"] = self._builds[request.psf_id]
-        elif request.psf_id not in self._psfs:
+        elif request.psf_id not in self._psfs | self._builds:
             raise _no_such_psf(request.psf_id)
         return ResolvedDeconvolve(**psf, **request.model_dump(exclude={"psf_id", "context"}))
 
     def _psf(self, identity: str, *, parts: bool) -> Psf:
-        """The PSF of a file; it is read once, because the prepared PSFs belong to this object."""
-        if (identity, parts) not in self._read_psfs:
+        """The PSF of a file or an instrument; it is read once, because the prepared PSFs belong to this object."""
+        key = identity, parts
+        if key in self._read_psfs:
+            return self._read_psfs[key]
+        if identity in self._builds:
+            recipe = recipe_of(self._builds[identity])
+            psf = kept_psf(psf_cache(), recipe, LIMITS, parts=False, threads=cores())
+        else:
             named = self._psfs[identity]
             named.files.check()
-            self._read_psfs[identity, parts] = read_psf(named.path, LIMITS, parts=parts)
-        return self._read_psfs[identity, parts]
+            psf = read_psf(named.path, LIMITS, parts=parts)
+        return self._read_psfs.setdefault(key, psf)
 
     def _deconvolve(self, request: ResolvedDeconvolve, _job_id: str, report: _Report) -> str:
         image, named = self._images[request.image_id], self._psfs.get(request.psf_id)
@@ -368,7 +372,7 @@ class Local(Operations):
                 image.path, LIMITS, saturation_dn=request.saturation_dn, hdu=request.hdu
             ),
             summary.shape,
-            None if named is None else self._psf(request.psf_id, parts=request.error_draws > 0),
+            None if request.psf_recipe else self._psf(request.psf_id, parts=request.error_draws > 0),
             options_of(request, cores()),
             build=build,
             possible_psfs=possible_psfs,

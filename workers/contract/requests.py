@@ -58,15 +58,13 @@ Saturation = Annotated[
     Field(
         gt=0,
         allow_inf_nan=False,
-        description="pixels at or above this level (DN) are not used; null: the level of the header or instrument file",
+        description="level (DN) from which pixels are not used; null: as its file says",
     ),
 ]
 Component = Literal["airy", "entrance_mesh", "mount", "entrance", "filter_wheel", "diffraction", "scatter"]
 OtherChannel = Annotated[
     bool,
-    Field(
-        description="use a PSF of another telescope, channel or filter than the image; false: such an image is refused"
-    ),
+    Field(description="allow a PSF of another telescope, channel, filter; false: such an image is refused"),
 ]
 ShapeName = Literal[
     "softened-power-law",
@@ -96,8 +94,8 @@ class _Method(Parameters):
         "fixed",
         description="`fixed`: do all `steps`; `discrepancy`: stop once the residual is like the noise",
     )
-    edges: Literal["zero", "symmetric", "extended"] | None = Field(
-        None, description="assumed scene beyond the field of view; null: depends on the method"
+    edges: Annotated[Literal["zero", "symmetric", "extended"] | None, Option(metavar="SCENE")] = Field(
+        None, description="scene beyond the field: zero, symmetric or extended; null: depends on the method"
     )
     margin_px: int | None = Field(
         None,
@@ -112,7 +110,7 @@ class RichardsonLucy(_Method):
 
     algorithm_version: ClassVar[int] = 2
     name: Literal["richardson-lucy"] = "richardson-lucy"
-    steps: int = Field(20, ge=1, le=200, description="number of iterations; the paper uses 20")
+    steps: int = Field(20, ge=1, le=200, description="iterations; the paper uses 20")
 
 
 class RichardsonLucyAccelerated(_Method):
@@ -213,7 +211,7 @@ class Treatment(Parameters):
         0,
         ge=0,
         le=64,
-        description="noise realisations for an ERROR plane, 0 or at least 2 (slow); 8 is a good number",
+        description="noise realisations for an ERROR plane: 0, or 2 and more, such as 8 (slow)",
     )
     other_channel: OtherChannel = False
     again: bool = Field(False, description="deconvolve even a product or a PSF")
@@ -238,7 +236,7 @@ class Deconvolve(Treatment):
     )
     context: ContextName | None = Field(
         None,
-        description="take the PSF from this context: id, name or `now`; null: the default context",
+        description="context of the PSF: id, name or `now`; null: the default context",
     )
     changes_picture: bool = Field(
         False, description="also draw the difference, the ratio and the histogram of the changes"
@@ -251,18 +249,18 @@ class Deconvolve(Treatment):
         None,
         gt=0,
         allow_inf_nan=False,
-        description="plate scale of a PSF whose file gives none, arcsec/px; null: not compared",
+        description="plate scale of a PSF whose file gives none; null: not compared",
     )
     region: Annotated[str | None, Option(metavar="X0:X1,Y0:Y1", check=Box.parse)] = Field(
         None,
         pattern=BOX,
-        description="deconvolve only this box, px from 0 (x0 <= x < x1); null: the whole image",
+        description="only this box, px from 0 (x0 <= x < x1); null: the whole image",
     )
     region_error: Annotated[float, Option(metavar="SHARE")] = Field(
         LARGEST_ERROR,
         gt=0,
         le=1,
-        description="largest error of the region by its rim, as a share of its mean light",
+        description="largest error by the rim of the region, share of its mean light",
     )
 
     @model_validator(mode="after")
