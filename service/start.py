@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
+from importlib import import_module
 
 STARTED = time.perf_counter()  # when the command began, before the libraries are loaded
 # Libraries make many objects when they are loaded, and hardly any garbage. With Python's own value (700), the collector would
@@ -14,6 +15,4 @@ NEW_OBJECTS = 50_000
 def main() -> None:
     """Run the command."""
     gc.set_threshold(NEW_OBJECTS)
-    from service.cli.main import main as command
-
-    command()
+    import_module("service.cli.main").main()
