@@ -32,7 +32,7 @@ from scipy.ndimage import binary_erosion, uniform_filter
 
 from psfcore.deconvolve.assess.artefacts import classes_of, filled, second_difference
 from psfcore.errors import DataError
-from psfcore.fits.gain import gain_mode
+from psfcore.fits.cards import optional_text
 from psfcore.fits.header import known_instrument
 from psfcore.fits.units import dn_per_unit, parse_unit
 from psfcore.image import Image
@@ -97,7 +97,7 @@ def camera_noise(image: Image, given: Noise | None, *, binning: int) -> CameraNo
     if name is None or parse_unit(image.unit).kind == "other":
         return measured_noise(image)
     figures, basis = PUBLISHED.get(name), _AIA
-    mode = gain_mode(load_instrument(name), image.header)
+    mode = load_instrument(name).gain_mode(optional_text(image.header, "GAINCOMB"))
     if mode is not None and mode.photon_gain_dn is not None and mode.read_noise_dn is not None:
         figures, basis = (mode.photon_gain_dn, mode.read_noise_dn), f"instrument file {name} ({mode.basis})"
     if figures is None:

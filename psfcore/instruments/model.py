@@ -291,6 +291,11 @@ class Instrument:
             mount = replace(mount, rays=rays, polygons=polygons)
         return replace(self, meshes=meshes, mount=mount)
 
+    def gain_mode(self, name: str | None) -> GainMode | None:
+        """The readout mode that the card GAINCOMB names, in upper or lower case; None if the file does not have it."""
+        modes = {known.lower(): mode for known, mode in self.detector.gain_modes.items()}
+        return modes.get((name or "").lower())
+
     @property
     def spectral_lines(self) -> tuple[SpectralLine, ...]:
         """The bandpass, or the one wavelength; the weights sum to 1."""

@@ -88,7 +88,8 @@ class LazyGroup(click.Group):
             missing = missing_extra(error) if isinstance(error, ModuleNotFoundError) else error
             if not isinstance(missing, MissingExtra):
                 raise
-            raise click.ClickException(_without_service(missing)) from error
+            local = "; or add --local, if the command has it" if missing.name == "httpx" else ""
+            raise click.ClickException(f"{missing}{local}") from error
         except KeyboardInterrupt as stop:
             echo(_interrupted(stop), err=True)
             ctx.exit(INTERRUPTED)
@@ -99,13 +100,6 @@ class LazyGroup(click.Group):
         for heading, rows in self.sections.items():
             with formatter.section(heading):
                 formatter.write_dl([(f"{name:<{width}}", row.summary) for name, row in rows.items()])
-
-
-def _without_service(missing: MissingExtra) -> str:
-    """What to tell a user who lacks a package."""
-    if missing.name == "httpx":
-        return f"{missing}; or add --local, which needs no service (the help of a command says whether it has this option)"
-    return str(missing)
 
 
 def _interrupted(stop: KeyboardInterrupt) -> str:
