@@ -17,64 +17,52 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from heliopsf.images import deconvolve, psf_for
-    from heliopsf.outputs import Deconvolution
-    from heliopsf.psfs import Psf, build_psf, interpolate_psf, read_psf
-    from heliopsf.transits import GapDiagnosis, ScatterFit, diagnose_gap, fit_scatter
-    from psfcore.errors import DataError, DataWarning, MissingExtra
-    from service.client.errors import ServiceError
-    from service.client.http import Client
+    from heliopsf.images import deconvolve as deconvolve
+    from heliopsf.images import psf_for as psf_for
+    from heliopsf.outputs import Deconvolution as Deconvolution
+    from heliopsf.psfs import Psf as Psf
+    from heliopsf.psfs import build_psf as build_psf
+    from heliopsf.psfs import interpolate_psf as interpolate_psf
+    from heliopsf.psfs import read_psf as read_psf
+    from heliopsf.transits import GapDiagnosis as GapDiagnosis
+    from heliopsf.transits import ScatterFit as ScatterFit
+    from heliopsf.transits import diagnose_gap as diagnose_gap
+    from heliopsf.transits import fit_scatter as fit_scatter
+    from psfcore.errors import DataError as DataError
+    from psfcore.errors import DataWarning as DataWarning
+    from psfcore.errors import MissingExtra as MissingExtra
+    from service.client.errors import ServiceError as ServiceError
+    from service.client.http import Client as Client
 
-__all__ = [
-    "Client",
-    "DataError",
-    "DataWarning",
-    "Deconvolution",
-    "GapDiagnosis",
-    "MissingExtra",
-    "Psf",
-    "ScatterFit",
-    "ServiceError",
-    "build_psf",
-    "deconvolve",
-    "diagnose_gap",
-    "fit_scatter",
-    "interpolate_psf",
-    "psf_for",
-    "read_psf",
-]
+    __version__: str
 
-# The module of each name, and the extra with the packages that the module needs.
+# The names of each module.
 _MODULES = {
-    "Client": ("service.client.http", "service"),
-    "DataError": ("psfcore.errors", ""),
-    "DataWarning": ("psfcore.errors", ""),
-    "Deconvolution": ("heliopsf.outputs", ""),
-    "GapDiagnosis": ("heliopsf.transits", "fit"),
-    "MissingExtra": ("psfcore.errors", ""),
-    "Psf": ("heliopsf.psfs", ""),
-    "ScatterFit": ("heliopsf.transits", "fit"),
-    "ServiceError": ("service.client.errors", "service"),
-    "build_psf": ("heliopsf.psfs", ""),
-    "deconvolve": ("heliopsf.images", ""),
-    "diagnose_gap": ("heliopsf.transits", "fit"),
-    "fit_scatter": ("heliopsf.transits", "fit"),
-    "interpolate_psf": ("heliopsf.psfs", ""),
-    "psf_for": ("heliopsf.images", ""),
-    "read_psf": ("heliopsf.psfs", ""),
+    "heliopsf.images": "deconvolve psf_for",
+    "heliopsf.outputs": "Deconvolution",
+    "heliopsf.psfs": "Psf build_psf interpolate_psf read_psf",
+    "heliopsf.transits": "GapDiagnosis ScatterFit diagnose_gap fit_scatter",
+    "psfcore.errors": "DataError DataWarning MissingExtra",
+    "service.client.errors": "ServiceError",
+    "service.client.http": "Client",
 }
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
+__all__ = sorted(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
+    if name == "__version__":
+        from psfcore import software_version
+
+        return software_version()
+    if name not in _MODULE_OF:
         raise AttributeError(f"module 'heliopsf' has no attribute {name!r}")
     from psfcore.errors import module_of_extra
 
-    module, extra = _MODULES[name]
-    found = getattr(module_of_extra(extra, module), name)
+    found = getattr(module_of_extra(_MODULE_OF[name]), name)
     globals()[name] = found
     return found
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*__all__, "__version__"]

@@ -1,32 +1,47 @@
-"""Images as users have them: files, sunpy Maps, NDData and CCDData, arrays; and their regions. Each becomes an ``Image`` of the core.
+"""Images as users have them: files, HDUs, sunpy Maps, NDData and CCDData, arrays; and their regions. Each becomes an ``Image``.
 
-This module does not import ``sunpy`` and ``astropy.nddata``. An object of one of their classes can exist only if
+This module does not import ``sunpy``, ``dask`` and ``astropy.nddata``. An object of one of their classes can exist only if
 these modules are already loaded.
 """
 
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy import units
+from astropy.io import fits
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
-from heliopsf.psfs import LIMITS
+from heliopsf.psfs import LIMITS, existing_file
+from heliopsf.quantities import saturation_dn
 from psfcore.deconvolve.box import Box
-from psfcore.errors import DataError
+from psfcore.errors import DataError, DataWarning
 from psfcore.fits.cards import card_trouble
 from psfcore.fits.header import first_image_header, read_summary
 from psfcore.fits.observation import observation_of, read_observation
 from psfcore.fits.viewing.regions import moved_header
 from psfcore.image import Image
 
-_EXPECTED = "a sunpy Map, an NDData or CCDData, an array, a path of a FITS file, or a list of these"
+_EXPECTED = "a sunpy Map, an NDData or CCDData, an array, an HDU or HDUList, a path of a FITS file, or a list of these"
 _RATE, _COUNT = "DN/s", "DN"
+_HDUS = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """An image in memory. data: the pixels, which may not be computed or read yet. uncertainty: of an NDData."""
+
+    data: Any
+    header: Header
+    mask: Any = None
+    uncertainty: Any = None
 
 
 def is_map(image: Any) -> bool:
@@ -39,9 +54,19 @@ def is_nddata(image: Any) -> bool:
     return _is_of(image, "astropy.nddata", "NDData")
 
 
+def is_hdu(image: Any) -> bool:
+    """Whether an object is an HDU of images."""
+    return isinstance(image, _HDUS)
+
+
+def is_sequence(image: Any) -> bool:
+    """Whether an object is a MapSequence of sunpy."""
+    return _is_of(image, "sunpy.map", "MapSequence")
+
+
 def is_many(image: Any) -> bool:
     """Whether an object is a list of images: a list, a tuple or a MapSequence."""
-    return isinstance(image, list | tuple) or _is_of(image, "sunpy.map", "MapSequence")
+    return (isinstance(image, list | tuple) and not isinstance(image, fits.HDUList)) or is_sequence(image)
 
 
 def _is_of(image: Any, module: str, name: str) -> bool:
@@ -50,74 +75,123 @@ def _is_of(image: Any, module: str, name: str) -> bool:
     return loaded is not None and isinstance(image, getattr(loaded, name, ()))
 
 
-def image_of(image: Any, *, saturation_dn: float | None, hdu: int | None = None) -> Image:
-    """The ``Image`` of psfcore for an image of the user.
+def image_of(image: Any, *, saturation: Any, hdu: int | None = None) -> Image:
+    """The ``Image`` of psfcore for an image of the user. saturation: a number of DN, or a quantity.
 
-    Pixels that the mask of a Map or NDData excludes are pixels without a value. Raises ``DataError`` "bad-input" for another
+    Pixels that the mask excludes are pixels without a value. Raises ``DataError`` "bad-input" for another
     kind of object, "bad-unit" for a logarithmic unit, and the errors of reading an image.
     """
     if isinstance(image, Image):
         return image
+    level = saturation_dn(saturation, {} if saturation is None else header_of(image, hdu))
     if isinstance(image, str | Path):
-        return read_observation(image, LIMITS, saturation_dn=saturation_dn, hdu=hdu)
-    if is_nddata(image) or isinstance(image, np.ndarray):
-        data = np.asarray(image.value if isinstance(image, units.Quantity) else _data(image))
-        pixels = _pixels(data)
-        mask = getattr(image, "mask", None)
-        if mask is not None and np.any(mask):
-            pixels = np.where(np.asarray(mask, dtype=bool), np.nan, pixels)
-        return observation_of(
-            pixels,
-            header_of(image),
-            saturation_dn=saturation_dn,
-            stored_as_integer=data.dtype.kind in "iu",
+        return read_observation(image, LIMITS, saturation_dn=level, hdu=hdu)
+    parts = _parts_of(image, hdu)
+    data = _computed(parts.data)
+    pixels = _pixels(data)
+    if parts.mask is not None and np.any(parts.mask):
+        pixels = np.where(np.asarray(parts.mask, dtype=bool), np.nan, pixels)
+    return observation_of(
+        pixels, parts.header, saturation_dn=level, stored_as_integer=data.dtype.kind in "iu"
+    )
+
+
+def uncertainty_of(image: Any) -> NDArray[np.float64] | None:
+    """The standard deviation [y, x] of an NDData in the unit of its pixels; None if it has none.
+
+    Gives a ``DataWarning`` "uncertainty-dropped" for an uncertainty of an unknown kind.
+    """
+    uncertainty = getattr(image, "uncertainty", None) if is_nddata(image) else None
+    if uncertainty is None:
+        return None
+    from astropy.nddata import StdDevUncertainty
+
+    try:
+        found = uncertainty.represent_as(StdDevUncertainty)
+        unit = image.unit or units.dimensionless_unscaled
+        return np.asarray(units.Quantity(found.array, found.unit or unit).to_value(unit), dtype=np.float64)
+    except (TypeError, units.UnitsError) as error:
+        message = (
+            f"the uncertainty of the image is not used: expected a standard deviation or variance; {error}"
         )
-    raise _not_an_image(image)
+        warnings.warn(DataWarning("uncertainty-dropped", message), stacklevel=4)
+        return None
 
 
 def shape_of(image: Any, hdu: int | None = None) -> tuple[int, int]:
     """The shape (ny, nx) of an image of the user. No pixel of a file is read.
 
-    Raises ``DataError`` "bad-input" or "not-2d", and the errors of reading a header.
+    Raises ``DataError`` "bad-input", "no-such-file" or "not-2d", and the errors of reading a header.
     """
     if isinstance(image, str | Path):
-        return read_summary(image, LIMITS, hdu=hdu).shape
-    if not (isinstance(image, Image | np.ndarray) or is_nddata(image)):
-        raise _not_an_image(image)
-    shape = np.shape(image.pixels if isinstance(image, Image) else _data(image))
+        return read_summary(existing_file(image), LIMITS, hdu=hdu).shape
+    shape = image.pixels.shape if isinstance(image, Image) else np.shape(_parts_of(image, hdu).data)
     if len(shape) != 2:
         raise DataError("not-2d", f"expected an image with two axes; got {len(shape)}")
     return shape[0], shape[1]
 
 
-def header_of(image: Any) -> Header:
+def header_of(image: Any, hdu: int | None = None) -> Header:
     """The header of an image of the user, or of its header alone (a ``Header`` or a table of cards).
 
-    Raises ``DataError`` "bad-input", "bad-unit", and the errors of reading a header.
+    Raises ``DataError`` "bad-input", "bad-unit", "no-such-file", and the errors of reading a header.
     """
     if isinstance(image, Image):
         return image.header
     if isinstance(image, str | Path):
-        return first_image_header(image, LIMITS)
+        return first_image_header(existing_file(image), LIMITS)
     if isinstance(image, Header):
         return image
+    return _header(image) if isinstance(image, Mapping) else _parts_of(image, hdu).header
+
+
+def hdu_of(hdus: fits.HDUList, number: int | None = None) -> Any:
+    """The HDU with this number, or the first one with an image of two axes. Raises ``DataError`` "no-image"."""
+    with_image = [n for n, one in enumerate(hdus) if is_hdu(one) and len(one.shape) == 2]
+    wanted = with_image[:1] if number is None else [n for n in with_image if n == number]
+    if not wanted:
+        raise DataError(
+            "no-image",
+            f"expected an HDU with an image of two axes; got {len(hdus)} HDUs, images in {with_image}",
+        )
+    return hdus[wanted[0]]
+
+
+def _parts_of(image: Any, hdu: int | None = None) -> _Parts:
+    """An image in memory with its header. Raises ``DataError`` "bad-input" and "bad-unit"."""
+    if isinstance(image, fits.HDUList):
+        image = hdu_of(image, hdu)
+    if is_hdu(image):
+        return _Parts(image.data if image.shape else np.empty(()), image.header.copy())
+    unit, header = getattr(image, "unit", None), Header()
     if is_nddata(image):
         header = _header(image.meta)
         if not is_map(image):
             _add_coordinates(header, image.wcs)
+        found = _Parts(image.data, header, image.mask, image.uncertainty)
     elif isinstance(image, np.ndarray):
-        header = Header()
-    elif isinstance(image, Mapping):
-        return _header(image)
+        plain = getattr(image, "unmasked", image)
+        plain = plain.value if isinstance(plain, units.Quantity) else plain
+        found = _Parts(np.asarray(plain), header, getattr(image, "mask", None))
+    elif _is_of(image, "dask.array", "Array"):
+        found = _Parts(image, header)
     else:
-        raise _not_an_image(image)
-    if "BUNIT" not in header:
-        text = unit_text(getattr(image, "unit", None))
-        if text is not None:
-            header["BUNIT"] = text
-    elif not is_map(image):
-        unit_text(getattr(image, "unit", None))  # refuses logarithmic units
-    return header
+        raise DataError("bad-input", f"expected {_EXPECTED}; got {type(image).__name__}")
+    if "BUNIT" in header:
+        if not is_map(image):
+            unit_text(unit)  # refuses logarithmic units
+    elif (text := unit_text(unit)) is not None:
+        header["BUNIT"] = text
+    return found
+
+
+def _computed(data: Any) -> NDArray[Any]:
+    """The pixels. A dask array is computed, with a ``DataWarning`` "dask-computed"."""
+    if not hasattr(data, "compute"):
+        return np.asarray(data)
+    message = f"the dask array of {' x '.join(map(str, data.shape[::-1]))} px is computed; the result is an array in memory"
+    warnings.warn(DataWarning("dask-computed", message), stacklevel=5)
+    return np.asarray(data.compute())
 
 
 def unit_text(unit: Any) -> str | None:
@@ -138,10 +212,6 @@ def unit_text(unit: Any) -> str | None:
         if pixel_free == count / units.s:
             return _RATE
     return str(unit) or None
-
-
-def _data(image: Any) -> Any:
-    return image.data if is_nddata(image) else image
 
 
 def _pixels(data: NDArray[Any]) -> NDArray[np.float64]:
@@ -176,10 +246,6 @@ def _add_coordinates(header: Header, wcs: Any) -> None:
                 header.append(card, end=True)
 
 
-def _not_an_image(image: Any) -> DataError:
-    return DataError("bad-input", f"expected {_EXPECTED}; got {type(image).__name__}")
-
-
 def box_of(region: Any, image: Any) -> Box:
     """The pixels of a region of an image.
 
@@ -212,7 +278,7 @@ def box_of(region: Any, image: Any) -> Box:
 
 
 def cut(image: Any, box: Box) -> Any:
-    """The box of a Map, an NDData or an array, with its coordinates; other images unchanged."""
+    """The box of a Map, an NDData or an HDU, with its coordinates; other images unchanged."""
     if is_map(image):
         corners = ((box.x0, box.y0), (box.x1 - 1, box.y1 - 1))
         bottom_left, top_right = (list(corner) * units.pix for corner in corners)
@@ -225,9 +291,15 @@ def cut(image: Any, box: Box) -> Any:
             meta=moved_header(meta, columns, rows)
             if isinstance(meta, Header)
             else _moved(meta, columns, rows),
+            mask=None if image.mask is None else image.mask[box.slices],
             wcs=None if image.wcs is None else image.wcs[box.slices],
             unit=image.unit,
         )
+    if isinstance(image, fits.HDUList):
+        return fits.HDUList([cut(hdu_of(image), box)])
+    if is_hdu(image):
+        rows, columns = box.slices
+        return type(image)(image.data[box.slices], moved_header(image.header, columns, rows))
     return image
 
 

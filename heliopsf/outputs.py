@@ -6,18 +6,24 @@ import copy
 import hashlib
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy import units
+from astropy.io import fits
 from astropy.io.fits import Header
+from astropy.utils.masked import Masked
 from numpy.typing import NDArray
 
-from heliopsf.inputs import is_map, is_nddata
+from heliopsf.inputs import hdu_of, is_hdu, is_map, is_nddata
 from heliopsf.psfs import Psf
+from heliopsf.shown import Shown
 from psfcore.deconvolve.run import Product, UsedPsf, deconvolution_cards, deconvolution_history
+from psfcore.deconvolve.summary import summary_lines
 from psfcore.errors import module_of_extra
 from psfcore.fits.images import CARD_OF_PASS, passes_of
+from psfcore.image import Image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,8 +33,8 @@ if TYPE_CHECKING:
 _STATISTICS = re.compile(r"data(min|max|mean|medn|rms|std|skew|kurt|cent|p\d\d)", re.IGNORECASE)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Deconvolution(Product):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Deconvolution(Shown, Product):
     """A deconvolved image: ``pixels`` [y, x] in the unit of the image, and the inputs, errors and warnings that
     belong to it.
 
@@ -61,31 +67,53 @@ class Deconvolution(Product):
         """What the deconvolution changed: flux, bright and dark structures, signs of artefacts."""
         return self.assessed.found.as_json()
 
+    def lines(self) -> list[str]:
+        """The result in two lines: image, PSF and its doubts; and what changed."""
+        ny, nx = self.pixels.shape
+        told = summary_lines(self.details())
+        warned = f"; warnings: {', '.join(self.warnings)}" if self.warnings else ""
+        return [f"Deconvolution of {told[0]}", f"{nx} x {ny} px, {'; '.join(told[1:])}{warned}"]
+
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the deconvolved image. Needs the extra "plot". axes None: new axes."""
-        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_image(self, axes)
+        drawn: Axes = module_of_extra("heliopsf.plots").draw_image(self, axes)
         return drawn
 
     def plot_change(self, axes: Axes | None = None) -> Axes:
         """Draw the change in percent of the input. Needs the extra "plot"."""
-        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_change(self, axes)
+        drawn: Axes = module_of_extra("heliopsf.plots").draw_change(self, axes)
         return drawn
 
     def quicklook(self) -> Figure:
         """A figure with the image before and after, and the change. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("plot", "heliopsf.plots").before_and_after(self)
+        figure: Figure = module_of_extra("heliopsf.plots").before_and_after(self)
         return figure
 
 
 def in_form_of(image: Any, result: Deconvolution) -> Any:
-    """The result in the form of the user's image: a Map for a Map, an NDData for an NDData, an array for an array."""
+    """The result in the form of the user's image: a Map for a Map, an HDU for an HDU, an array for an array."""
     if is_map(image):
         return _as_map(image, result)
     if is_nddata(image):
         return _as_nddata(image, result)
+    if isinstance(image, fits.HDUList):
+        planes = [fits.ImageHDU(_stored(plane), name=name) for name, plane in result.planes.items()]
+        return fits.HDUList(
+            [fits.PrimaryHDU(result.pixels, _described(hdu_of(image).header, result)), *planes]
+        )
+    if is_hdu(image):
+        kind = fits.PrimaryHDU if isinstance(image, fits.PrimaryHDU) else fits.ImageHDU
+        return kind(result.pixels, _described(image.header, result))
+    if isinstance(image, str | Path | Image):
+        return result
+    pixels: Any = result.pixels
+    if isinstance(image, np.ma.MaskedArray):
+        return np.ma.MaskedArray(pixels, result.mask)
     if isinstance(image, units.Quantity):
-        return result.pixels * image.unit
-    return result.pixels if isinstance(image, np.ndarray) else result
+        pixels = pixels * image.unit
+    if isinstance(image, Masked):
+        return Masked(pixels, result.mask)
+    return pixels
 
 
 def used_psf(psf: Psf) -> UsedPsf:
@@ -98,29 +126,26 @@ def used_psf(psf: Psf) -> UsedPsf:
 
 
 def _as_map(image: Any, result: Deconvolution) -> Any:
-    meta = copy.deepcopy(image.meta)
-    _describe(meta, result)
-    made = type(image)(result.pixels, meta, mask=_mask(result), uncertainty=_uncertainty(result))
+    meta = _described(image.meta, result)
+    made = type(image)(result.pixels, meta, mask=_mask(image, result), uncertainty=_uncertainty(result))
     # The settings are set last, because the class of a Map may choose other settings for a new Map.
     made.plot_settings.update(copy.deepcopy(image.plot_settings))
     return made
 
 
 def _as_nddata(image: Any, result: Deconvolution) -> Any:
-    meta = copy.deepcopy(image.meta)
-    _describe(meta, result)
     return type(image)(
         result.pixels,
-        mask=_mask(result),
+        mask=_mask(image, result),
         uncertainty=_uncertainty(result),
-        meta=meta,
+        meta=_described(image.meta, result),
         wcs=image.wcs,
         unit=image.unit,
     )
 
 
-def _mask(result: Deconvolution) -> NDArray[np.bool_] | None:
-    return result.mask if result.mask.any() else None
+def _mask(image: Any, result: Deconvolution) -> NDArray[np.bool_] | None:
+    return result.mask if image.mask is not None or result.mask.any() else None
 
 
 def _uncertainty(result: Deconvolution) -> Any:
@@ -131,8 +156,13 @@ def _uncertainty(result: Deconvolution) -> Any:
     return StdDevUncertainty(result.error)
 
 
-def _describe(meta: Any, result: Deconvolution) -> None:
-    """Add the cards and the history of a product to the metadata of the image."""
+def _stored(plane: NDArray[Any]) -> NDArray[Any]:
+    return plane.astype(np.float32) if plane.dtype.kind == "f" else plane
+
+
+def _described(of_image: Any, result: Deconvolution) -> Any:
+    """The metadata of the image with the cards and the history of a product."""
+    meta = copy.deepcopy(of_image)
     used = used_psf(result.psf)
     is_header = isinstance(meta, Header)
     for key in [key for key in meta if _STATISTICS.fullmatch(str(key))]:
@@ -149,3 +179,4 @@ def _describe(meta: Any, result: Deconvolution) -> None:
         # sunpy keeps HISTORY as one text with a line for each card.
         before = [str(meta[key]) for key in ("history",) if key in meta]
         meta["history"] = "\n".join([*before, *lines])
+    return meta

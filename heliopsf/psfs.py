@@ -5,16 +5,21 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from astropy import units
 
 from heliopsf.progress import Steps, Told, told
+from heliopsf.quantities import radii_px, whole
+from heliopsf.shown import Shown
 from psfcore.deconvolve.run import BUILDING
-from psfcore.errors import module_of_extra
+from psfcore.errors import DataError, did_you_mean, module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.header import utc_time
 from psfcore.fits.images import read_mask_image
-from psfcore.instruments.files import instrument_path, turned_text
+from psfcore.instruments.files import instrument_names, instrument_path, turned_text
 from psfcore.instruments.model import load_instrument, read_instrument_text
 from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
@@ -27,14 +32,16 @@ from workers.cache_folder import psf_cache
 from workers.machine import cores
 
 if TYPE_CHECKING:
+    from astropy.time import Time
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
 
+AnyPsf: TypeAlias = "str | Path | CorePsf | NDArray[np.floating]"
 LIMITS = FitsLimits(max_pixels=2**26)
 
 
-class Psf(CorePsf):
+class Psf(Shown, CorePsf):
     """The weights ``kernel`` [y, x] of a PSF, and how they were obtained.
 
     A weight is the share of a point source's light that a pixel receives; the centre is [ny // 2, nx // 2]. Further
@@ -42,13 +49,13 @@ class Psf(CorePsf):
     ``provenance``.
     """
 
-    def light_beyond(self, radii_px: ArrayLike) -> NDArray[Any]:
-        """1 - encircled energy: the light beyond each radius (px), in percent."""
-        return cumulative_curve(self.kernel, radii_px)
+    def light_beyond(self, radii: ArrayLike | units.Quantity) -> NDArray[Any]:
+        """1 - encircled energy: the light beyond each radius, in percent. radii: px, or quantities in px or angles."""
+        return cumulative_curve(self.kernel, radii_px(radii, self.plate_scale_arcsec))
 
     def rebinned(self, factor: int) -> Psf:
         """The PSF for pixels that are means of factor x factor pixels. Raises ``DataError`` "bad-binning"."""
-        return Psf.of(rebinned(self, factor))
+        return Psf.of(rebinned(self, whole("factor", factor, "bad-binning")))
 
     def write(self, path: str | Path) -> None:
         """Write the PSF and its components to a FITS file, which every function and command reads."""
@@ -57,18 +64,35 @@ class Psf(CorePsf):
 
     def plot(self, axes: Axes | None = None, *, size: int = 129) -> Axes:
         """Draw the central ``size`` px on a logarithmic scale. Needs the extra "plot". axes None: new axes."""
-        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_psf(self, axes, size=size)
+        drawn: Axes = module_of_extra("heliopsf.plots").draw_psf(self, axes, size=size)
         return drawn
 
     def plot_curve(self, axes: Axes | None = None) -> Axes:
         """Draw 1 - encircled energy by radius, also of the components. Needs the extra "plot"."""
-        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_curves(self, axes)
+        drawn: Axes = module_of_extra("heliopsf.plots").draw_curves(self, axes)
         return drawn
 
     def quicklook(self) -> Figure:
         """A figure with the centre, the mean weight by radius and the light beyond a radius. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("plot", "psfcore.drawing.plots").psf_figure(self)
+        figure: Figure = module_of_extra("psfcore.drawing.plots").psf_figure(self)
         return figure
+
+    def lines(self) -> list[str]:
+        """The PSF in two lines: which it is, and where its light is."""
+        told = [self.instrument or "instrument unknown"]
+        told += [f"{self.wavelength_angstrom:g} angstrom"] if self.wavelength_angstrom else []
+        told += [f"{self.plate_scale_arcsec:.4g} arcsec/px"] if self.plate_scale_arcsec else []
+        radii = [radius for radius in (1, 10, 100) if radius < self.reach_px]
+        beyond = ", ".join(
+            f"{pct:.3g} % beyond {radius} px"
+            for radius, pct in zip(radii, self.light_beyond(radii), strict=True)
+        )
+        ny, nx = self.kernel.shape
+        return [
+            f"PSF {self.name} {self.version} ({self.status}): {', '.join(told)}",
+            f"{nx} x {ny} px, central pixel {self.kernel.max():.3g}, {beyond}; components: "
+            f"{', '.join(self.components).lower() or 'none'}",
+        ]
 
     @classmethod
     def of(cls, psf: CorePsf) -> Psf:
@@ -84,23 +108,73 @@ def build_psf(
     threads: int | None = None,
     progress: Told = None,
 ) -> Psf:
-    """Compute the PSF of an instrument: a ``kernel`` [y, x] of (size, size) px, and its ``components``.
+    """Compute the PSF of an instrument.
 
     The PSF is kept in the user's cache folder (``heliopsf cache``); the next call reads it there.
 
-    instrument: the name of a known instrument, such as "hri_euv", or the path of an instrument file (TOML). If the file
-    names a mask image of the mount, that image is read too.
-    size: an even number from 64 to 4096 (px).
-    component: compute only this component, such as "DIFFRACTION".
-    threads: default: all cores.
-    progress: True, or a function that is called with (step, steps).
+    Parameters
+    ----------
+    instrument : str or path
+        The name of a known instrument, such as "hri_euv", or an instrument file (TOML). If the file names a mask image of the
+        mount, that image is read too.
+    size : int
+        An even number from 64 to 4096 (px).
+    component : str, optional
+        Compute only this component, such as "DIFFRACTION".
+    threads : int, optional
+        Default: all cores.
+    progress : bool or function, optional
+        True, or a function that is called with (step, steps).
 
-    Raises ``DataError`` "bad-size", "unknown-component" or "bad-mount", and the errors of
-    ``psfcore.instruments.model.load_instrument``.
+    Returns
+    -------
+    Psf
+        With its ``kernel`` [y, x] of (size, size) px and its ``components``.
+
+    Raises
+    ------
+    DataError
+        "unknown-instrument", "bad-size", "unknown-component" or "bad-mount", and the errors of
+        ``psfcore.instruments.model.load_instrument``.
     """
     return built_psf(
-        instrument, size=size, component=component, threads=threads, progress=told(progress, BUILDING)
+        instrument,
+        size=whole("size", size, "bad-size", units.pix),
+        component=component,
+        threads=threads,
+        progress=told(progress, BUILDING),
     )
+
+
+def given_psf(psf: Any, *, threads: int, progress: Steps | None) -> Psf:
+    """The PSF that a user gives: a PSF, a file, the name or the file of an instrument, or weights.
+
+    Raises ``DataError`` "bad-input", "no-such-file", and the errors of reading and building.
+    """
+    if isinstance(psf, CorePsf):
+        return psf if isinstance(psf, Psf) else Psf.of(psf)
+    if isinstance(psf, str | Path):
+        if str(psf).endswith(".toml") or (str(psf) in instrument_names() and not Path(psf).exists()):
+            return built_psf(psf, parts=False, threads=threads, progress=progress)
+        return read_psf(psf)
+    weights = getattr(psf, "data", None) if hasattr(psf, "uncertainty") else psf
+    try:
+        kernel = np.asarray(weights, np.float64)
+        if not isinstance(weights, np.ndarray):
+            raise TypeError
+    except (TypeError, ValueError):
+        expected = "a Psf, a FITS file, an instrument (its name or file), or an array"
+        raise DataError("bad-input", f"psf: expected {expected}; got {type(psf).__name__}") from None
+    return Psf(kernel=kernel, name="array", version="unversioned", instrument=None, status="user")
+
+
+def existing_file(path: str | Path) -> Path:
+    """The path of a file. Raises ``DataError`` "no-such-file", which names the instrument that may be meant."""
+    if Path(path).is_file():
+        return Path(path)
+    what = "it is a folder" if Path(path).is_dir() else "there is none"
+    meant = did_you_mean(str(path), instrument_names())
+    raise DataError("no-such-file", f"expected a FITS file; got {str(path)!r:.200}, and {what}{meant}")
 
 
 def built_psf(
@@ -115,6 +189,12 @@ def built_psf(
 ) -> Psf:
     """As ``build_psf``. turn_deg: for images of a known instrument that are turned by this angle against its detector. parts:
     False: without the components, which a deconvolution does not need."""
+    if not isinstance(instrument, str | Path):
+        known_names = ", ".join(instrument_names())
+        raise DataError(
+            "unknown-instrument",
+            f"expected the name of an instrument ({known_names}) or its file; got {instrument!r:.80}",
+        )
     known = load_instrument(instrument)
     own = isinstance(instrument, Path) or instrument.endswith(".toml")
     text = (
@@ -150,11 +230,12 @@ def read_psf(path: str | Path) -> Psf:
     """Read a PSF from a FITS file: its ``kernel`` [y, x] and its ``components``, if it has any.
 
     The weights of the kernel sum to 1 over the reach, and to less on a smaller array.
-    Raises ``DataError``, for example "not-fits".
+    Raises ``DataError``, for example "no-such-file" or "not-fits".
     """
+    path = existing_file(path)
     psf = Psf.of(psfs.read_psf(path, LIMITS))
     # The id that a service would give to this file after an upload: a built PSF keeps the id that its file states.
-    identity = psfs.stated_id(path, LIMITS) or sha256_of(Path(path))
+    identity = psfs.stated_id(path, LIMITS) or sha256_of(path)
     return replace(psf, provenance={**psf.provenance, "psf_id": identity})
 
 
@@ -162,9 +243,9 @@ def interpolate_psf(
     before: CorePsf | str | Path,
     after: CorePsf | str | Path,
     *,
-    before_time: datetime | str,
-    after_time: datetime | str,
-    time: datetime | str,
+    before_time: datetime | Time | str,
+    after_time: datetime | Time | str,
+    time: datetime | Time | str,
     threads: int | None = None,
 ) -> Psf:
     """Interpolate between two fitted PSFs in time: the PSF at ``time``, with its errors.
@@ -172,28 +253,38 @@ def interpolate_psf(
     The coordinates of the fitted shape are interpolated linearly; ``fitted`` of the result holds them with their
     covariance (``psfcore.scatter.interpolation`` gives the equations). Nothing is extrapolated.
 
-    before, after: PSFs (``ScatterFit.psf()``) or files, fitted with the same shape and the same diffraction PSF.
-    before_time, after_time: when they hold. Times are datetimes or texts such as "2024-03-01T12:00:00"; a time without a
-    zone is UTC.
-    threads: default: all cores.
+    Parameters
+    ----------
+    before, after : Psf or path
+        PSFs (``ScatterFit.psf()``) or files, fitted with the same shape and the same diffraction PSF.
+    before_time, after_time, time : datetime, Time or str
+        When the PSFs hold, and the time of the new one, such as "2024-03-01T12:00:00". A time without a zone is UTC.
+    threads : int, optional
+        Default: all cores.
 
-    Raises ``DataError``: "bad-time", "psf-not-fitted", "shapes-differ", "psfs-differ", "diffraction-differs",
-    "psf-not-of-its-shape", "epochs-not-in-order", "time-outside-epochs", and the errors of ``read_psf``.
+    Raises
+    ------
+    DataError
+        "bad-time", "psf-not-fitted", "shapes-differ", "psfs-differ", "diffraction-differs", "psf-not-of-its-shape",
+        "epochs-not-in-order", "time-outside-epochs", and the errors of ``read_psf``.
     """
-    # Other functions do not load what an interpolation needs.
-
     first, second = (
-        Epoch(one if isinstance(one, CorePsf) else read_psf(one), utc_time(at, name))
+        Epoch(one if isinstance(one, CorePsf) else read_psf(one), utc_time(_moment(at), name))
         for one, at, name in ((before, before_time, "before_time"), (after, after_time, "after_time"))
     )
     return Psf.of(
         interpolated_psf(
             first,
             second,
-            utc_time(time, "time"),
+            utc_time(_moment(time), "time"),
             name=f"{first.psf.instrument or 'psf'}-interpolated",
             version="0.1.0",
             provenance={},
             threads=threads or cores(),
         )
     )
+
+
+def _moment(time: Any) -> Any:
+    """A time of astropy as a text in UTC; others unchanged."""
+    return str(time.utc.isot) if hasattr(time, "isot") else time

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from heliopsf.progress import Stages, told_stages
 from heliopsf.psfs import LIMITS, Psf, build_psf
+from heliopsf.quantities import NoiseFigures, Number, noise_of
+from heliopsf.quantities import saturation_dn as saturation_dn_of
 from psfcore.build import check_known
 from psfcore.errors import module_of_extra
 from psfcore.gap import diagnose
 from psfcore.gap.report.report import gap_report
 from psfcore.gap.verdict.calibration import COVERAGE
-from psfcore.noise import Noise
 from psfcore.psf import Kernel
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
 from psfcore.transit.folder import read_transit
@@ -45,12 +46,12 @@ class ScatterFit(TransitFit):
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the light beyond each radius with its error. Needs the extra "plot". axes None: new axes."""
-        drawn: Axes = module_of_extra("plot", "heliopsf.plots").draw_fit(self, axes)
+        drawn: Axes = module_of_extra("heliopsf.plots").draw_fit(self, axes)
         return drawn
 
     def quicklook(self) -> Figure:
         """A figure with curves, residuals and convergence. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("plot", "psfcore.scatter.fit_plot").fit_figure(self)
+        figure: Figure = module_of_extra("psfcore.scatter.fit_plot").fit_figure(self)
         return figure
 
 
@@ -63,13 +64,13 @@ class GapDiagnosis(diagnose.Diagnosis):
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the probabilities of the effects. Needs the extra "plot". axes None: new axes."""
-        axes = module_of_extra("plot", "matplotlib.pyplot").subplots()[1] if axes is None else axes
-        module_of_extra("plot", "psfcore.gap.report.plot").draw_effects(axes, self.report())
+        axes = module_of_extra("matplotlib.pyplot").subplots()[1] if axes is None else axes
+        module_of_extra("psfcore.gap.report.plot").draw_effects(axes, self.report())
         return axes
 
     def quicklook(self) -> Figure:
         """A figure with residuals, maps and effects. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("plot", "psfcore.gap.report.plot").gap_figure(self, self.report())
+        figure: Figure = module_of_extra("psfcore.gap.report.plot").gap_figure(self, self.report())
         return figure
 
 
@@ -77,26 +78,41 @@ def fit_scatter(
     transit: str | Path,
     *,
     shape: str = "softened-power-law",
-    noise: tuple[float, float] | None = None,
-    saturation_dn: float | None = None,
+    noise: NoiseFigures | None = None,
+    saturation_dn: Number | None = None,
     seed: int = 1,
     threads: int | None = None,
     progress: Stages | bool | None = None,
 ) -> ScatterFit:
     """Fit the scatter kernel to the stray light that a transit's images show inside the occulter's disc.
 
-    transit: a folder with a transit.json.
-    shape: the formula of the scatter kernel.
-    noise: photon gain (DN per photon) and read noise (DN rms); default: the values in transit.json.
-    saturation_dn: pixels at or above this level (DN) are ignored; default: the level that the instrument description
-    gives for the image's gain mode.
-    seed: seed of the random numbers.
-    threads: default: all cores.
-    progress: True, or a function that is called with (stage, step, steps) after each step.
+    Parameters
+    ----------
+    transit : path
+        A folder with a transit.json.
+    shape : str
+        The formula of the scatter kernel.
+    noise : (gain, read noise), optional
+        DN per photon and DN rms. Default: the values in transit.json.
+    saturation_dn : float or Quantity, optional
+        Pixels at or above this level (DN) are ignored. Default: the level that the header or the instrument file gives.
+    seed : int
+        Seed of the random numbers.
+    threads : int, optional
+        Default: all cores.
+    progress : bool or function, optional
+        True, or a function that is called with (stage, step, steps) after each step.
 
-    The result holds the total PSF (``kernel`` [y, x], 2048 px) and its scatter kernel. The result also holds the
-    curve of 1 - encircled energy (radius in px, light in percent), the parameters with their errors, and the limits
-    of the fit. Raises ``DataError``, for example "no-manifest" or "too-few-frames".
+    Returns
+    -------
+    ScatterFit
+        The total PSF (``kernel`` [y, x], 2048 px) and its scatter kernel; the curve of 1 - encircled energy, the parameters with
+        their errors, and the limits of the fit.
+
+    Raises
+    ------
+    DataError
+        For example "no-manifest" or "too-few-frames".
     """
     threads = threads or cores()
     fitted = _read(transit, noise, saturation_dn, threads)
@@ -107,8 +123,8 @@ def fit_scatter(
 def diagnose_gap(
     transit: str | Path,
     *,
-    noise: tuple[float, float] | None = None,
-    saturation_dn: float | None = None,
+    noise: NoiseFigures | None = None,
+    saturation_dn: Number | None = None,
     coverage: float = COVERAGE,
     seed: int = 1,
     threads: int | None = None,
@@ -116,10 +132,17 @@ def diagnose_gap(
 ) -> GapDiagnosis:
     """Fit a transit and find out which effect explains the residuals of the fit.
 
-    coverage: the probability with which the answer set contains the true cause.
+    Parameters
+    ----------
+    transit, noise, saturation_dn, seed, threads, progress
+        As in ``fit_scatter``, which raises the same errors.
+    coverage : float
+        The probability with which the answer set contains the true cause.
 
-    The other parameters are the same as in ``fit_scatter``. ``report()`` of the result is the report (JSON). Raises the same
-    errors as ``fit_scatter``.
+    Returns
+    -------
+    GapDiagnosis
+        Its ``report()`` is the report (JSON).
     """
     threads = threads or cores()
     found = diagnose.diagnose(
@@ -132,9 +155,7 @@ def diagnose_gap(
     return GapDiagnosis(**{one.name: getattr(found, one.name) for one in fields(diagnose.Diagnosis)})
 
 
-def _read(
-    transit: str | Path, noise: tuple[float, float] | None, saturation_dn: float | None, threads: int
-) -> Transit:
+def _read(transit: str | Path, noise: NoiseFigures | None, level: Number | None, threads: int) -> Transit:
     def diffraction(instrument: str | None, _shape: tuple[int, int]) -> Kernel:
         return build_psf(check_known(instrument), component="DIFFRACTION", threads=threads).kernel
 
@@ -142,6 +163,6 @@ def _read(
         transit,
         LIMITS,
         diffraction=diffraction,
-        noise=None if noise is None else Noise(*noise),
-        saturation_dn=saturation_dn,
+        noise=noise_of(noise),
+        saturation_dn=saturation_dn_of(level, {}),
     )

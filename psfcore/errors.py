@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
 
 # If a module of heliopsf itself is missing, the installation is faulty.
 _OWN = ("heliopsf", "psfcore", "workers", "service")
+# The extra that installs a package; every other package that can be missing belongs to the service.
+_EXTRAS = {"matplotlib": "plot", "jinja2": "plot", "markupsafe": "plot", "sunpy": "map", "s3fs": "s3"}
+_EXTRAS |= {"opentelemetry": "traces"}
 MOST_TOLD = 20  # if a request has many errors, only the texts of the first ones are given
 
 
@@ -37,6 +41,12 @@ class DataWarning(UserWarning):
         self.message = message
 
 
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``; did you mean 'x'?``, or an empty text if no known name is close."""
+    close = get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
 class HeaderError(DataError):
     """The headers of a file show that the file cannot be used. No pixel was read."""
 
@@ -45,23 +55,28 @@ class MissingExtra(ImportError):
     """A function needs packages that an extra of heliopsf installs, and they are not installed."""
 
 
-def module_of_extra(extra: str, module: str) -> Any:
-    """Import a module that needs the packages of an extra, such as "plot". extra "": it needs only the standard
-    packages.
+def module_of_extra(module: str) -> Any:
+    """Import a module that may need the packages of an extra, such as "plot".
 
     Raises MissingExtra, whose message names the missing package and the extra.
     """
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package in _OWN or not extra:
-            raise
-        raise MissingExtra(
-            f"expected the package {package}, which is not installed: install heliopsf with the extra {extra!r}, "
-            f"pip install 'heliopsf[{extra}]'",
-            name=error.name,
-        ) from error
+        raise missing_extra(error) from error
+
+
+def missing_extra(error: ModuleNotFoundError) -> ImportError:
+    """The error that names the extra of a missing package; the same error if a module of heliopsf itself is missing."""
+    package = (error.name or "").partition(".")[0]
+    if package in _OWN:
+        return error
+    extra = _EXTRAS.get(package, "service")
+    return MissingExtra(
+        f"expected the package {package}, which is not installed: install heliopsf with the extra {extra!r}, "
+        f"pip install 'heliopsf[{extra}]'",
+        name=error.name,
+    )
 
 
 def together(errors: Sequence[DataError]) -> DataError:

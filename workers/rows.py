@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from psfcore.errors import DataError
-from workers.catalogue.catalogue import Catalogue, Row
-from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, TransitRow
 from workers.contract.requests import FEWEST_DIGITS
+
+if TYPE_CHECKING:
+    from workers.catalogue.catalogue import Catalogue, Row
 
 # The word of an error code, the name of the thing in messages, and what its user can do.
 NAMES = {
@@ -26,14 +29,13 @@ _ADVICE = {
     "job": "list your jobs with `heliopsf job list`",
     "bulk": "list your bulk runs with `heliopsf bulk list`",
 }
-_WORDS = {ImageRow: "image", TransitRow: "transit", PsfRow: "psf", ProductRow: "product", ReportRow: "report"}
 
 
 def row_of(catalogue: Catalogue, table: type[Row], identity: str, owner: str) -> Row:
     """The owner's row with this id. Raises ``DataError`` "no-such-image", "no-such-psf", ... if there is none."""
     row = catalogue.get(table, identity, owner)
     if row is None:
-        raise no_such(_WORDS[table], identity)
+        raise no_such(table.__name__.removesuffix("Row").lower(), identity)
     return row
 
 

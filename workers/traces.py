@@ -28,7 +28,7 @@ def configure(settings: Settings, part: str) -> None:
     """
     global _exporter
     if settings.traces_url is not None and _exporter is None:
-        _exporter = module_of_extra("traces", "workers.trace_exporter").Sender(settings.traces_url, part)
+        _exporter = module_of_extra("workers.trace_exporter").Sender(settings.traces_url, part)
 
 
 def shutdown() -> None:

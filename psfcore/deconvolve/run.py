@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,20 +31,20 @@ from psfcore.deconvolve.conditions import (
 from psfcore.deconvolve.edges import Edges
 from psfcore.deconvolve.kernels import compiling_beside
 from psfcore.deconvolve.memory import Asked, check_memory, product_bytes
-from psfcore.deconvolve.methods.registry import may_be_negative, method_names
+from psfcore.deconvolve.methods.registry import may_be_negative, method_named, method_names
 from psfcore.deconvolve.region import BoxWork, box_work
+from psfcore.deconvolve.stopping import no_noise_model
+from psfcore.deconvolve.summary import assumptions
 from psfcore.deconvolve.whole import Assessed, Work
 from psfcore.drawing.units import unit_label
 from psfcore.errors import DataError
 from psfcore.fits.channel import check_channel
 from psfcore.fits.doubts import doubts
 from psfcore.fits.frame import frame_of
-from psfcore.fits.gain import no_noise_figures, noise_for
 from psfcore.fits.header import known_instrument, optional_text, seen_by
 from psfcore.fits.images import described, write_image
 from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.image import Image, MaskBit
-from psfcore.instruments.model import load_instrument
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.noise import Noise
 from psfcore.psf import REACH_GRID_PX, Psf
@@ -51,6 +52,7 @@ from psfcore.psf_sampling import frame_warnings, with_scale
 
 if TYPE_CHECKING:
     from psfcore.deconvolve.assess.error_planes import ErrorPlanes
+    from psfcore.deconvolve.camera_noise import CameraNoise
 
 BUILDING = "building the PSF"
 DECONVOLVING = "deconvolving"  # the stage whose steps are the steps of the method
@@ -62,7 +64,7 @@ Cards = dict[str, tuple[str | int | float, str]]
 
 @dataclass(frozen=True)
 class Options:
-    """How an image is deconvolved. Raises DataError "bad-draws" and "region-errors".
+    """How an image is deconvolved. Raises DataError "bad-draws", "region-errors", "unknown-method" and "unknown-parameter".
 
     method: name of the method; parameters: its own parameters, such as steps and stop. edges, margin_px, noise, threads: see
     `Conditions`. error_draws: number of noise realisations (2 to 64) for the planes of errors; 0: no such planes. region:
@@ -86,6 +88,17 @@ class Options:
             raise DataError(
                 "bad-draws", f"error_draws: expected 0, or 2 to {MOST_DRAWS}; got {self.error_draws}"
             )
+        known = [
+            name
+            for name, one in signature(method_named(self.method)).parameters.items()
+            if one.kind is one.KEYWORD_ONLY
+        ]
+        for name in self.parameters:
+            if name not in known:
+                raise DataError(
+                    "unknown-parameter",
+                    f"expected parameters of {self.method}, {', '.join(known)}; got {name!r}",
+                )
 
 
 @dataclass(frozen=True)
@@ -117,12 +130,14 @@ class Product(Deconvolved):
     """A deconvolved image or box, with its inputs, its errors and its warnings.
 
     image: the input, with its mask. psf: the PSF on the pixels of the image. errors: planes with the standard deviation of each
-    pixel, if they were asked for. warnings: sentences by their codes, the most harmful first.
+    pixel, if they were asked for. noise: that of the camera, if errors were asked for. warnings: sentences by their
+    codes, the most harmful first.
     """
 
     image: Image
     psf: Psf
     errors: ErrorPlanes | None
+    noise: CameraNoise | None = None
     warnings: Mapping[str, str]
     work: Work | BoxWork = field(repr=False)
 
@@ -146,23 +161,38 @@ class Product(Deconvolved):
                 planes["PSF_ERROR"] = self.errors.psf_error
         return planes
 
-    def title(self, psf: UsedPsf) -> str:
-        """The telescope, the time and the PSF, for the title of a picture."""
+    @property
+    def name(self) -> str:
+        """The telescope and the time of the image."""
         header = self.image.header
         seen_by = optional_text(header, "DETECTOR", "INSTRUME") or "image"
         date = optional_text(header, "DATE-BEG", "DATE-OBS", "DATE_OBS")
-        return f"{seen_by}{f' {date}' if date else ''}   PSF {psf.name} {psf.version}"
+        return f"{seen_by}{f' {date}' if date else ''}"
 
-    def details(self) -> dict[str, Any]:
+    def title(self, psf: UsedPsf) -> str:
+        """The telescope, the time and the PSF, for the title of a picture."""
+        return f"{self.name}   PSF {psf.name} {psf.version}"
+
+    def details(
+        self, used: UsedPsf | None = None, provenance: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
         """How the image was deconvolved, the measured changes, and the warnings, as JSON values.
 
-        A bright pixel is at or above the 99th percentile of the input; a dark pixel is at or below the first percentile.
+        used, provenance: of the PSF, if its file does not say them. A bright pixel is at or above the 99th percentile of the input; a dark pixel is at or below the first percentile.
         """
         image, box, saturation = self.image, self.of_box, self.image.saturation
         before, after = image.pixels[image.valid], self.pixels[image.valid]
         low, high = np.percentile(before, [1, 99])
         dark, bright = before <= low, before >= high
+        psf = used or self.psf
         return {
+            "image": self.name,
+            "psf": {
+                "name": psf.name,
+                "version": psf.version,
+                "status": psf.status,
+                "assumed": assumptions(provenance or self.psf.provenance),
+            },
             "steps_done": self.steps_done,
             "stopped_because": self.stopped_because,
             "last_step_change": self.last_change,
@@ -170,6 +200,7 @@ class Product(Deconvolved):
             "edge_band_px": self.edge_band_px,
             "noise_amplification": self.noise_amplification if self.errors is None else self.amplification,
             "chi2_per_pixel": self.chi2_per_pixel,
+            "noise": self.noise and self.noise.as_json(),
             # The bound of the error is in the unit of the image, as is the saturation level.
             "region": box and {"box": str(box.box), "rim_px": box.rim_px, "error": box.error},
             "flux_change_pct": self.flux_change_pct,
@@ -203,17 +234,22 @@ def deconvolve(
     `Conditions`. possible_psfs, begin: see `Work.errors`. check_plane: called with the shape (ny, nx) of box and rim, which is
     known only after the image is read; it may raise.
 
-    Raises DataError "no-noise-figures", and the errors of `box_work` and of the method.
+    Raises DataError "no-noise-figures", "no-noise-model", and the errors of `box_work` and of the method.
     """
+    if options.noise is None and options.parameters.get("stop") == "discrepancy":
+        raise no_noise_model()  # figures that nobody chose are too uncertain to end an iteration
+    noise = None
+    if options.error_draws:
+        from psfcore.deconvolve.camera_noise import camera_noise  # most deconvolutions do not load SciPy
+
+        noise = camera_noise(image, options.noise, binning=int(psf.provenance.get("binning", 1)))
     conditions = Conditions(
         edges=options.edges,
         margin_px=options.margin_px,
-        noise=options.noise,
+        noise=noise or options.noise,
         threads=options.threads,
         engine_for=engine_for,
     )
-    if options.error_draws and options.noise is None:
-        raise no_noise_figures()
     whole = Work(image, psf, options.method, conditions, options.parameters)
     work: Work | BoxWork = whole
     progress = begin(DECONVOLVING, int(options.parameters.get("steps") or 1))
@@ -225,7 +261,9 @@ def deconvolve(
     errors = None
     if options.error_draws:
         errors = whole.errors(result, options.error_draws, possible_psfs=possible_psfs, begin=begin)
-    return Product(**vars(result), image=image, psf=psf, errors=errors, warnings=warnings, work=work)
+    return Product(
+        **vars(result), image=image, psf=psf, errors=errors, noise=noise, warnings=warnings, work=work
+    )
 
 
 def read_and_deconvolve(
@@ -286,11 +324,6 @@ def read_and_deconvolve(
     instrument, turn_deg = known_instrument(header), frame_of(header).turn_to_build_deg
     if psf is None and instrument is None:
         raise unknown_instrument(seen_by(header))
-    # The pixels of a turned image are interpolated, so they do not have the noise of the camera.
-    if options.noise is None and psf is None and instrument is not None and not turn_deg:
-        options = replace(options, noise=noise_for(load_instrument(instrument), header))
-    if options.error_draws and options.noise is None:
-        raise no_noise_figures()
     key = (id(psf) if psf is not None else (instrument, turn_deg), plate_scale_arcsec)
     whole = prepared.as_built(key, as_built)
     check_channel(seen_as(whole), header, other_channel=other_channel)
@@ -363,7 +396,10 @@ def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
         "PSFSTAT": (psf.status, "PSF status"),
         "DCNVMETH": (product.method, "deconvolution method"),
         "DCNVITER": (product.steps_done, "deconvolution steps done"),
-        "DCNVSTOP": (product.stopped_because, "why the iteration stopped"),
+        "DCNVSTOP": (
+            product.stopped_because,
+            "" if "chi2" in product.stopped_because else "why the iteration stopped",
+        ),
         "DCNVEDGE": (product.edges, "assumed scene beyond the edges"),
         "DCNVBAND": (product.edge_band_px, "[px] width of band affected by DCNVEDGE"),
         "SWHELIO": (software_version(), "heliopsf version"),
@@ -378,6 +414,10 @@ def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
         cards["DCNVSATF"] = (saturation.found, "where the saturation level was found")
     if product.amplification is not None:
         cards["DCNVAMPL"] = (product.amplification, "noise of result / noise of input")
+    if product.noise is not None and product.noise.source != "given":
+        cards["DCNVGAIN"] = (product.noise.photon_gain_dn, "[DN] photon gain")
+        cards["DCNVREAD"] = (product.noise.read_noise_dn, "[DN] read noise, rms")
+        cards["DCNVNOIS"] = (product.noise.source, "where DCNVGAIN and DCNVREAD are from")
     for number, code in enumerate(product.warnings, start=1):
         cards[f"DCNVWRN{number}"] = (code, "warning, see HISTORY")
     return cards
@@ -397,6 +437,7 @@ def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
                 f"image by at most {box.error:.3g} (estimated bound, in the unit of the image)"
             ]
         ),
+        *([] if product.noise is None or product.noise.source == "given" else [f"noise: {product.noise}"]),
         *(f"WARNING ({code}): {message}" for code, message in product.warnings.items()),
     ]
 

@@ -147,11 +147,7 @@ def run(
     Raises DataError "no-noise-model" if the rule is discrepancy and the noise is not known.
     """
     if stop == "discrepancy" and not (noise_known and found.count):
-        raise DataError(
-            "no-noise-model",
-            "expected photon gain, read noise and valid pixels away from the edges, because the stopping rule discrepancy "
-            "needs them; at least one is missing: give the noise figures, or use the stopping rule fixed",
-        )
+        raise no_noise_model()
     for step in range(1, steps + 1):
         iteration.measure()
         if stop == "discrepancy" and found.chi2 <= 1:  # Eq. (1)
@@ -164,6 +160,15 @@ def run(
     if stop == "discrepancy":
         return Ended(steps, f"chi2 of {chi2:.3f} a pixel still above 1 at the most steps, {steps}", chi2)
     return Ended(steps, f"all {steps} steps asked for were done", chi2)
+
+
+def no_noise_model() -> DataError:
+    """The error if the rule is discrepancy and the noise is not known."""
+    return DataError(
+        "no-noise-model",
+        "expected photon gain, read noise and valid pixels away from the edges, because the stopping rule discrepancy "
+        "needs them; at least one is missing: give the noise figures, or use the stopping rule fixed",
+    )
 
 
 def check_steps(steps: int, stop: str) -> None:

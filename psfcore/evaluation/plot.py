@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from psfcore.drawing.plots import CHANGE, INK, points, tidy, write_png
 from psfcore.evaluation.evaluation import Evaluation
 from psfcore.evaluation.frame import FrameEvaluation, Slice, Superposed
-from psfcore.evaluation.report import summaries
+from psfcore.evaluation.report import sentence
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 
 Vector = NDArray[np.float64]
@@ -73,18 +73,6 @@ def evaluation_png(
         charts += offsets
     tidy(charts)
     write_png(figure, path)
-
-
-def sentence(evaluation: Evaluation) -> str:
-    """A summary of the evaluation in two sentences."""
-    whole, maps = summaries(evaluation)[-1], evaluation.superposed
-    return (
-        f"Residuals of {whole.images} images (simulated minus observed light in the occulter): mean "
-        f"{whole.mean_pct:+.2f} %, rms {whole.rms_pct:.2f} % (noise alone {whole.noise_pct:.2f} %), largest "
-        f"{whole.largest_pct:.2f} %. Errors per pixel of the disc: MPE {maps.mpe_rms_pct:.2f} % rms (noise alone "
-        f"{maps.mpe_noise_rms_pct:.2f} %), MAPE {maps.mape_mean_pct:.2f} % (noise alone "
-        f"{maps.mape_noise_mean_pct:.2f} %)."
-    )
 
 
 def shown_slices(evaluation: Evaluation, most: int) -> list[FrameEvaluation]:

@@ -81,6 +81,18 @@ class Trend:
     absolute_dn_s: Slope
 
 
+def sentence(evaluation: Evaluation) -> str:
+    """A summary of the evaluation in two sentences."""
+    whole, maps = summaries(evaluation)[-1], evaluation.superposed
+    return (
+        f"Residuals of {whole.images} images (simulated minus observed light in the occulter): mean "
+        f"{whole.mean_pct:+.2f} %, rms {whole.rms_pct:.2f} % (noise alone {whole.noise_pct:.2f} %), largest "
+        f"{whole.largest_pct:.2f} %. Errors per pixel of the disc: MPE {maps.mpe_rms_pct:.2f} % rms (noise alone "
+        f"{maps.mpe_noise_rms_pct:.2f} %), MAPE {maps.mape_mean_pct:.2f} % (noise alone "
+        f"{maps.mape_noise_mean_pct:.2f} %)."
+    )
+
+
 def summaries(evaluation: Evaluation) -> tuple[Summary, ...]:
     """One summary for each pointing, in the order of the pointings; the last summary is for all images."""
     fovs = sorted({frame.pointing for frame in evaluation.frames})

@@ -107,7 +107,7 @@ def read_mask_image(path: Path) -> NDArray[np.float64]:
 
 
 def _png(path: Path) -> NDArray[np.float64]:
-    imread = module_of_extra("plot", "matplotlib.image").imread
+    imread = module_of_extra("matplotlib.image").imread
     try:
         picture = np.asarray(imread(path, format="png"), dtype=np.float64)
     except (OSError, ValueError, SyntaxError) as error:  # Pillow raises SyntaxError for a broken PNG

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import Cards, optional_number, optional_text
-from psfcore.fits.gain import saturation_for
 from psfcore.fits.hdus import StoredImage, read_pixels
 from psfcore.fits.header import (
     check_not_deconvolved,
@@ -156,7 +155,8 @@ def observation_of(
         )
     image = Image(pixels, mask, header, unit_of(header).text, optional_exposure_s(header), warnings=warnings)
     name = known_instrument(header)
-    of_instrument = None if name is None else saturation_for(load_instrument(name), header)
+    mode = None if name is None else load_instrument(name).gain_mode(optional_text(header, "GAINCOMB"))
+    of_instrument = None if mode is None else mode.saturation_dn
     image = with_saturation(image, requested_dn=saturation_dn, instrument_dn=of_instrument)
     _check_signal(image, stored_as_integer=stored_as_integer)
     return image

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-from psfcore.errors import DataError
+from psfcore.errors import DataError, did_you_mean
 
 # Two wavelengths count as the same channel, and two plate scales as the same, if their ratio differs from 1 by at most this.
 WAVELENGTH_TOLERANCE = 0.01
@@ -33,7 +33,8 @@ def instrument_path(name: str) -> Path:
     """Path of the file of instrument `name`; raises DataError "unknown-instrument"."""
     if name not in instrument_names():
         known = ", ".join(instrument_names())
-        raise DataError("unknown-instrument", f"expected one of: {known}; got {name!r}")
+        meant = did_you_mean(name, instrument_names())
+        raise DataError("unknown-instrument", f"expected one of: {known}; got {name!r}{meant}")
     return _FOLDER / f"{name}.toml"
 
 

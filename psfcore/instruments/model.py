@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import field, is_dataclass, replace
 from decimal import Decimal
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args, get_type_hints
 
@@ -19,7 +20,7 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails
 from typing_extensions import TypedDict
 
-from psfcore.errors import DataError
+from psfcore.errors import MOST_TOLD, DataError
 from psfcore.instruments.files import instrument_path
 
 _MOST_DOTS = 64  # a part of the file without brackets, commas or line ends may contain this number of dots
@@ -290,6 +291,11 @@ class Instrument:
             mount = replace(mount, rays=rays, polygons=polygons)
         return replace(self, meshes=meshes, mount=mount)
 
+    def gain_mode(self, name: str | None) -> GainMode | None:
+        """The readout mode that the card GAINCOMB names, in upper or lower case; None if the file does not have it."""
+        modes = {known.lower(): mode for known, mode in self.detector.gain_modes.items()}
+        return modes.get((name or "").lower())
+
     @property
     def spectral_lines(self) -> tuple[SpectralLine, ...]:
         """The bandpass, or the one wavelength; the weights sum to 1."""
@@ -320,7 +326,7 @@ def _turned(corners: tuple[tuple[float, float], ...], angle_deg: float) -> tuple
 def load_instrument(name_or_path: str | Path) -> Instrument:
     """Read an instrument by its name, or from a TOML file given as a Path or as a string that ends in .toml.
 
-    Raises DataError "unknown-instrument" or "bad-instrument-file" (one line that names the key).
+    Raises DataError "unknown-instrument" or "bad-instrument-file" (a line for each wrong key).
     """
     is_file = isinstance(name_or_path, Path) or name_or_path.endswith(".toml")
     path = Path(name_or_path) if is_file else instrument_path(str(name_or_path))
@@ -343,7 +349,7 @@ def read_instrument_text(path: Path) -> str:
 def parse_instrument(text: str, label: str) -> Instrument:
     """Read an instrument from the text of its TOML file; ``label`` names the file in errors.
 
-    Raises DataError "bad-instrument-file": one line with the key, the expected and the given value.
+    Raises DataError "bad-instrument-file": a line with the key, the expected and the given value of each fault.
     """
     if len(text) > MOST_BYTES:
         raise DataError("bad-instrument-file", f"{label}: expected at most {MOST_BYTES} characters; got more")
@@ -386,17 +392,31 @@ _EXPECTED = {
 
 
 def _said(error: ValidationError) -> str:
-    """The first fault in one line, and how many further faults there are.
+    """All faults, each in a line. A key that is missing because it is misspelt is one fault, not two."""
+    faults = sorted(error.errors(include_url=False), key=lambda one: one["type"] not in _UNKNOWN)
+    meant = [(*one["loc"][:-1], _meant(one["loc"])) for one in faults if one["type"] in _UNKNOWN]
+    told = [_fault(one) for one in faults if one["type"] != "missing" or tuple(one["loc"]) not in meant]
+    if len(told) > MOST_TOLD:
+        told = [*told[:MOST_TOLD], f"and {len(told) - MOST_TOLD} more"]
+    return (
+        told[0] if len(told) == 1 else "\n".join(["several keys are wrong:", *(f"  {one}" for one in told)])
+    )
 
-    A misspelt key is named before other faults: it is often the reason why another key is missing.
-    """
-    first, *more = sorted(error.errors(include_url=False), key=lambda one: one["type"] not in _UNKNOWN)
+
+def _fault(fault: ErrorDetails) -> str:
     # pydantic marks the name of a gain mode itself, unlike its table, by one more step.
-    key = ".".join(str(step) for step in first["loc"] if step != "[key]")
-    expected = _expected(first)
+    key = ".".join(str(step) for step in fault["loc"] if step != "[key]")
+    if fault["type"] in _UNKNOWN and (meant := _meant(fault["loc"])):
+        return f"{key}: unknown key; did you mean {meant!r}?"
+    expected = _expected(fault)
     if "; got " not in expected:  # a fault of several values says itself what was given
-        expected += "; got none" if first["type"] == "missing" else f"; got {first['input']!r:.80}"
-    return (f"{key}: {expected}" if key else expected) + (f" (and {len(more)} more)" if more else "")
+        expected += "; got none" if fault["type"] == "missing" else f"; got {fault['input']!r:.80}"
+    return f"{key}: {expected}" if key else expected
+
+
+def _meant(location: Sequence[str | int]) -> str:
+    """The known key that is like an unknown one; an empty text if there is none."""
+    return next(iter(get_close_matches(str(location[-1]), _keys(location[:-1]), n=1)), "")
 
 
 def _expected(fault: ErrorDetails) -> str:

@@ -106,7 +106,7 @@ TELESCOPES = (
         # NOAA's level 2 files have both cards. Level 1b files have no DETECTOR, and the satellite as TELESCOP.
         cards=({"instrume": "GOES-R Series Solar Ultraviolet Imager"}, {"detector": "SUVI"}),
         reason=_NO_SOURCE,
-        ways={"fit": "We found no published PSF of SUVI, so we recommend this step"},
+        ways={"fit": "We found no published PSF of SUVI"},
     ),
     Telescope(
         name="Hinode/XRT",
@@ -184,15 +184,12 @@ def unknown_instrument(header: Mapping[str, Any], psfs: Sequence[Mapping[str, An
     could = [f"PSF {psf['id']} ({psf['name']})" for psf in psfs] + [
         f"instrument {one['name']}" for one in instruments if {"telescope", "channel"} <= set(one["same"])
     ]
-    candidates = (
-        f"These could suit the image: {', '.join(could)}" if could else "No known PSF suits the image"
-    )
+    candidates = f"These could suit the image: {', '.join(could)}. " if could else ""
     return DataError(
         "no-psf-for-instrument",
-        "expected an image of an instrument whose PSF is known, or a PSF in the request; got an image of "
-        f"{_seen(named, telescope, header)} and no PSF. {_why(telescope)}"
-        f"{candidates}. Name a PSF (psf in Python, psf_id in a request, --psf in a command), upload a PSF or an instrument "
-        "file, or fit a PSF to a transit",
+        f"expected a telescope whose PSF is known, or a PSF; got an image of {_seen(named, telescope, header)}. "
+        f"{_why(telescope)}{candidates}Give a PSF (psf in Python, psf_id in a request, --psf in a command), or fit one to a "
+        "transit",
         {
             "image": telescope.name if telescope else named or "this telescope",
             "reason": telescope.reason if telescope else None,
@@ -226,7 +223,9 @@ def _ways(telescope: Telescope | None) -> list[dict[str, str]]:
     """The steps that the user can take next, each with what is known about this telescope."""
     known = {} if telescope is None else {str(way): sentence for way, sentence in telescope.ways.items()}
     return [
-        one | {"text": f"{one['text']}. {known[one['way']]}"} if one["way"] in known else dict(one)
+        one | {"text": f"{one['text']}. {known[one['way']]}", "known": known[one["way"]]}
+        if one["way"] in known
+        else dict(one)
         for one in WAYS
     ]
 

@@ -23,8 +23,8 @@ from typing import Any
 
 from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import Evaluation, evaluate
-from psfcore.evaluation.plot import sentence as evaluation_sentence
 from psfcore.evaluation.report import report as evaluation_json
+from psfcore.evaluation.report import sentence
 from psfcore.evaluation.shapes import held_out_kernels
 from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
@@ -101,7 +101,7 @@ class PsfReport:
     @property
     def sentence(self) -> str:
         """The summary at the top of the report."""
-        judged = evaluation_sentence(self.evaluation)
+        judged = sentence(self.evaluation)
         if self.fit is not None:
             return fit_json(self.fit)["sentence"] + f" {self.how_judged}. {judged}"
         return f"PSF {self.psf.name} {self.psf.version}. {self.how_judged}. {judged}"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from psfcore.deconvolve.summary import percent
 from service.cli.connection import (
     CONTEXT,
     ID,
@@ -26,7 +27,7 @@ from service.cli.connection import (
 )
 from service.cli.fields import options_of
 from service.cli.jobs import MOST, moment
-from service.cli.options import OUTPUT, fits_files, percent, progress_bar, writes_files
+from service.cli.options import OUTPUT, fits_files, progress_bar, writes_files
 from service.cli.progress import duration, echo
 from service.client.errors import ServiceError
 from service.client.operations import treatment
@@ -83,7 +84,7 @@ def bulk() -> None:
     help="Path of each product in the --output folder, for example {telescop}/{date:%Y/%m/%d}/{stem}_deconvolved.fits",
 )
 @options_of(Treatment, "method", "steps", "noise", "saturation_dn", "other_channel", "again")
-@click.option("--name", default="", help="Label of the bulk run")
+@click.option("--name", default="", show_default=False, help="Label of the bulk run")
 @click.option(
     "--dry-run", is_flag=True, help="Estimate the run and list inputs that it would refuse; start nothing"
 )
@@ -210,9 +211,7 @@ def delete(service: Client, bulk_ids: tuple[str, ...]) -> None:
 @BULK_ID
 @click.option("-o", "--output", type=OUTPUT, help="Write the manifest of all products (.ndjson or .csv)")
 @click.option("--failures", type=OUTPUT, help="Write the failures with their reasons (.ndjson)")
-@click.option(
-    "--most", default=20, show_default=True, type=click.IntRange(0, 10_000), help="Number of images to show"
-)
+@click.option("--most", default=20, type=click.IntRange(0, 10_000), help="Number of images to show")
 @on_service
 @writes_files
 def report(

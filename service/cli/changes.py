@@ -44,9 +44,7 @@ FOR_ALL = (401, 403)
 @click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help=f"Folder for {TABLE} and {SHEET}")
 @PSF
 @options_of(Deconvolve, "other_channel", "context", "method", "steps", "noise", "saturation_dn", "again")
-@click.option(
-    "--most", default=60, show_default=True, type=click.IntRange(1, 200), help="Images on the contact sheet"
-)
+@click.option("--most", default=60, type=click.IntRange(1, 200), help="Images on the contact sheet")
 @SERVER
 @LOCAL
 @OVERWRITE

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.shell_completion import CompletionItem
 
+from psfcore.errors import did_you_mean
+from psfcore.instruments.files import instrument_names
 from service.cli.fields import options_of
 from service.cli.options import user_errors
 from service.cli.progress import echo, say
@@ -32,12 +34,13 @@ Row = dict[str, Any]
 
 
 class _Id(click.ParamType):
-    """An id, or its first digits. or_file: or the name of a file with a PSF."""
+    """An id, or its first digits. or_file: or the name of a file with a PSF. or_instrument: or an instrument, whose PSF is
+    built: its name, or its file (TOML)."""
 
     name = "id"
 
-    def __init__(self, *, or_file: bool = False) -> None:
-        self.or_file = or_file
+    def __init__(self, *, or_file: bool = False, or_instrument: bool = False) -> None:
+        self.or_file, self.or_instrument = or_file, or_instrument
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """The digits in lower case, or the name of the file. Other texts never become part of an address of the service."""
@@ -46,8 +49,14 @@ class _Id(click.ParamType):
             return text
         if _ID.fullmatch(text.lower()):
             return text.lower()
-        expected = f"a PSF id ({_DIGITS}) or a file" if self.or_file else f"an id, or its first {_DIGITS}"
-        self.fail(f"expected {expected}; got {value!r}", param, ctx)
+        if not self.or_instrument:
+            expected = f"a PSF id ({_DIGITS}) or a file" if self.or_file else f"an id, or its first {_DIGITS}"
+            self.fail(f"expected {expected}; got {value!r}", param, ctx)
+        if text in instrument_names():
+            return text
+        meant = did_you_mean(text, instrument_names())
+        expected = f"a file, the name of an instrument or a PSF id ({_DIGITS})"
+        self.fail(f"expected {expected}; got {value!r}{meant}", param, ctx)
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
@@ -92,9 +101,13 @@ def server_option(what: str) -> Callable[[Command], Command]:
     return lambda command: server(key(command))
 
 
-def psf_option(what: str, *, required: bool = False) -> Callable[[Command], Command]:
+def psf_option(
+    what: str, *, required: bool = False, or_instrument: bool = False
+) -> Callable[[Command], Command]:
     """The option ``--psf``. what: what the command does with the PSF, and its default."""
-    return click.option("--psf", type=ID_OR_FILE, metavar="ID|FILE", required=required, help=what)
+    kind = _Id(or_file=True, or_instrument=or_instrument)
+    metavar = "ID|FILE|NAME" if or_instrument else "ID|FILE"
+    return click.option("--psf", type=kind, metavar=metavar, required=required, help=what)
 
 
 ID, ID_OR_FILE = _Id(), _Id(or_file=True)
@@ -102,7 +115,8 @@ SERVER = server_option("Address of the service, which this command needs")
 LOCAL = click.option("--local", is_flag=True, help="Run in this process, without a service")
 SERVER_FOR_IDS = server_option("Address of the service, which is needed only if a PSF is given by its id")
 PSF = psf_option(
-    "PSF: an id or a file [default: the certified PSF for the image, else the PSF built for its instrument]"
+    "PSF: an id or a file; or an instrument (aia_171, FILE.toml) [default: the certified PSF for the image, else the one built]",
+    or_instrument=True,
 )
 CONTEXT = options_of(Deconvolve, "context")
 
@@ -187,9 +201,11 @@ def psf_file(server: str | None, psf: str) -> Iterator[Path]:
 
 
 def named_psf(service: Operations, psf: str | None) -> str | None:
-    """The id of the PSF that the user named with ``--psf``; a file is uploaded first."""
+    """The id of the PSF that the user named with ``--psf``; a file is uploaded first, and the PSF of an instrument is built."""
     if psf is None:
         return None
+    if psf.endswith(".toml") or (psf in instrument_names() and is_psf_id(psf)):
+        return service.psf_of_instrument(psf)
     if is_psf_id(psf):
         return whole_id(service, "psfs", psf)
     return str(service.upload_psf(psf)["id"])

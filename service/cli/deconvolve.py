@@ -8,15 +8,15 @@ from typing import Any
 
 import click
 
+from psfcore.deconvolve.summary import summary_lines
 from service.cli.connection import LOCAL, PSF, SERVER, connection, named_psf, short
-from service.cli.fields import options_of
+from service.cli.fields import methods_help, options_of
 from service.cli.options import (
-    OUTPUT,
+    DRAWN,
     OutputPlace,
     Place,
     counted,
     fits_files,
-    percent,
     progress_bar,
     say_warnings,
     user_errors,
@@ -38,7 +38,7 @@ OPTIONS = (
 )
 
 
-@click.command()
+@click.command(epilog=methods_help())
 @click.argument("images", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option(
     "-o",
@@ -46,13 +46,13 @@ OPTIONS = (
     required=True,
     type=OutputPlace(decides=True),
     metavar="FILE|FOLDER/",
-    help="Write the deconvolved image (FITS) to this file; several images: to this folder",
+    help="Write the product (FITS) to this file, several into this folder",
 )
 @PSF
 @options_of(Deconvolve, *OPTIONS)
-@click.option("--plot", type=OUTPUT, help="Write the image before and after (PNG)")
-@click.option("--changes", type=OUTPUT, help="Write difference, ratio and histograms (PNG)")
-@click.option("--timings", is_flag=True, help="Print how long each stage of the command took; needs --local")
+@click.option("--plot", type=DRAWN, help="Write the image before and after (PNG)")
+@click.option("--changes", type=DRAWN, help="Write difference, ratio and histograms (PNG)")
+@click.option("--timings", is_flag=True, help="Print how long each stage took; needs --local")
 @SERVER
 @LOCAL
 @writes_files
@@ -68,10 +68,9 @@ def deconvolve(
     overwrite: bool,
     **parameters: Any,
 ) -> None:
-    """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with the PSF that you name.
+    """Deconvolve IMAGES (FITS files, or folders of them) with the PSF of their instrument, or with yours.
 
-    The output is a folder if there are several images, or if its name ends in /. Images whose product is in the folder
-    are skipped. Failures are listed at the end; the exit status is then 1.
+    The output is a folder for several images, or if its name ends in /. Images whose product is in the folder are skipped.
     """
     files = fits_files(images)
     if not files:
@@ -137,24 +136,13 @@ def _one(
     """Deconvolve one image into a file; returns the lines to print."""
     product = service.deconvolve(image, output, preview=plot, changes=changes, progress=report, **parameters)
     say_warnings(product)
-    details = product["details"]
+    first, *others = summary_lines(product["details"])
+    pictures = [str(path) for path in (plot, changes) if path is not None]
     return [
-        f"{output}: PSF {product['psf_version']}, product {short(product['id'])}",
-        f"{details['steps_done']} steps ({details['stopped_because']}), edges {details['edges']}",
-        *_told_region(details),
-        f"flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
-        f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",
-    ]
-
-
-def _told_region(details: dict[str, Any]) -> list[str]:
-    """The line about the region that was deconvolved."""
-    found = details["region"]
-    if found is None:
-        return []
-    return [
-        f"region {found['box']}, rim {found['rim_px']} px: differs from the same pixels of the whole image by at most "
-        f"{found['error']:.3g} (estimated bound, in the unit of the image)"
+        f"{output}: {first}",
+        *others,
+        f"picture: {', '.join(pictures) or 'none; --plot FILE.png draws the image before and after'}",
+        *([] if service.server is None else [f"product {short(product['id'])} of {service.server}"]),
     ]
 
 

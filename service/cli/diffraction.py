@@ -26,7 +26,7 @@ from service.cli.options import (
 from service.cli.progress import echo
 from service.client.outputs import written
 
-INSTRUMENT = click.option("--instrument", default="hri_euv", show_default=True, metavar="NAME|FILE",
+INSTRUMENT = click.option("--instrument", default="hri_euv", metavar="NAME|FILE",
                           help="A known instrument, or an instrument file (TOML)")  # fmt: skip
 ARM_NUMBERS = (
     "angles_deg", "angles_sigma_deg", "spacing_px", "spacing_sigma_px", "centre_xy", "reduced_chi2",
@@ -41,7 +41,7 @@ ARM_NUMBERS = (
     "--distances",
     help="Distances from filter wheel to detector, mm, such as 50,273,550 [default: the seven distances of the paper]",
 )
-@click.option("--phases", default=16, show_default=True, type=click.IntRange(1, 256),
+@click.option("--phases", default=16, type=click.IntRange(1, 256),
               help="Number of mesh positions to average")  # fmt: skip
 @click.option("--windows", type=click.IntRange(1),
               help="Number of terms of the analytic series [default: from the instrument file]")  # fmt: skip
@@ -88,7 +88,7 @@ def fresnel(
 @click.argument("image", type=FILE)
 @click.option("--background", type=FILE, help=f"{BACKGROUND}, to subtract")
 @CENTRE
-@click.option("--arms", "n_arms", default=2, show_default=True, type=click.IntRange(1, 8),
+@click.option("--arms", "n_arms", default=2, type=click.IntRange(1, 8),
               help="Number of arms (lines of peaks) to fit")  # fmt: skip
 @SATURATION
 @JSON
@@ -137,10 +137,8 @@ def arms(
 
 @click.command()
 @INSTRUMENT
-@click.option(
-    "--pitches", default="400,635,800,1000,1270,1600,2000", show_default=True, help="Mesh pitches to try, um"
-)
-@click.option("--wires", default="20,30,40,60", show_default=True, help="Wire widths to try, um")
+@click.option("--pitches", default="400,635,800,1000,1270,1600,2000", help="Mesh pitches to try, um")
+@click.option("--wires", default="20,30,40,60", help="Wire widths to try, um")
 @JSON
 @PLOT
 @writes_files

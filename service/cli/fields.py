@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 
 from psfcore.errors import DataError
 from psfcore.noise_figures import NoiseFigures
-from workers.contract.requests import METHODS, Option, RichardsonLucy
+from workers.contract.requests import METHOD_MODELS, METHODS, Option, RichardsonLucy
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 _NULL = re.compile(r"; null: (.*?)(?=\. |$)")
@@ -40,6 +40,15 @@ def options_of(model: type[BaseModel], *names: str) -> Callable[[Command], Comma
     return with_options
 
 
+def methods_help() -> str:
+    """When to use which method, for the end of a help text."""
+    rows = (
+        f"  {name:<33}{(model.__doc__ or '').split('. ')[0].rstrip('.')}"
+        for name, model in zip(METHODS, METHOD_MODELS, strict=True)
+    )
+    return "\b\nMethods:\n" + "\n".join(rows)
+
+
 def _field(model: type[BaseModel], name: str) -> FieldInfo:
     return model.model_fields.get(name) or RichardsonLucy.model_fields[name]
 
@@ -49,16 +58,18 @@ def _option(model: type[BaseModel], name: str) -> Callable[[Command], Command]:
         return click.option(
             "--method",
             type=click.Choice(METHODS),
+            metavar="NAME",
             default=METHODS[0],
-            show_default=True,
-            help="Deconvolution method",
+            help="Method; `heliopsf deconvolve -h` says which for what",
         )
     field = _field(model, name)
     kind, about, text = _kind(field), _about(field), _help(model, field)
     names = (_name(model, name), name)
     if kind is bool:
         switch = f"{names[0]}/--no-{names[0][2:]}" if field.default else names[0]
-        return click.option(switch, name, is_flag=True, default=bool(field.default), help=text)
+        return click.option(
+            switch, name, is_flag=True, default=bool(field.default), show_default=False, help=text
+        )
     if kind is NoiseFigures:
         return click.option("--noise", nargs=2, type=float, metavar="GAIN READ", help=text)
     # The default of a parameter of a method depends on the method.

@@ -42,7 +42,6 @@ from service.client.outputs import written
     nargs=2,
     type=float,
     default=(10, 80),
-    show_default=True,
     metavar="FROM TO",
     help="Distances from the flare to compare, px",
 )

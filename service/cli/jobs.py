@@ -34,7 +34,7 @@ RESULTS = {
     "reports": ("report", "repeat the command that started the job; it ends at once and writes its files"),
     "bulk": ("bulk run", "heliopsf bulk status {id}{at}"),
 }
-MOST = click.option("--most", default=20, show_default=True, type=click.IntRange(1),
+MOST = click.option("--most", default=20, type=click.IntRange(1),
                     help="Number of lines to show, newest first")  # fmt: skip
 IDS = id_argument("identities", several=True)
 

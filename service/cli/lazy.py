@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from difflib import get_close_matches
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import click
 from click.shell_completion import CompletionItem
 
+from psfcore.errors import MissingExtra, missing_extra, module_of_extra
 from service.cli.progress import echo, printable
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.errors import WaitInterrupted
@@ -49,7 +49,7 @@ class LazyGroup(click.Group):
         row = self.rows.get(cmd_name)
         if row is None:
             return None
-        command: click.Command = getattr(import_module(row.module), row.name)
+        command: click.Command = getattr(module_of_extra(row.module), row.name)
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
@@ -76,13 +76,20 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command. Control-C ends it with status 130; if its job continues, a message says how to return to the job.
 
-        The message of an error may contain texts of a service or a file; it is made printable.
+        The message of an error may contain texts of a service or a file; it is made printable. If a package is missing, the
+        message names the extra that installs it.
         """
         try:
             return super().invoke(ctx)
         except click.ClickException as error:
             error.message = printable(error.message)  # type: ignore[misc]  # click declares it final
             raise
+        except ImportError as error:
+            missing = missing_extra(error) if isinstance(error, ModuleNotFoundError) else error
+            if not isinstance(missing, MissingExtra):
+                raise
+            local = "; or add --local, if the command has it" if missing.name == "httpx" else ""
+            raise click.ClickException(f"{missing}{local}") from error
         except KeyboardInterrupt as stop:
             echo(_interrupted(stop), err=True)
             ctx.exit(INTERRUPTED)

@@ -15,8 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from astropy.io.fits import Header
 from pydantic import TypeAdapter, ValidationError
@@ -27,23 +26,29 @@ from psfcore.deconvolve import run
 from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.run import BUILDING, Identities, UsedPsf
-from psfcore.errors import DataError
+from psfcore.errors import DataError, module_of_extra
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import FitsLimits, HeaderSummary, check_not_deconvolved, optional_text, read_summary
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf, stated_id
 from psfcore.fits.stored_psf import check_is_psf
+from psfcore.gap.effect_sources import sha256_of_source
+from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.unknown import channel_of, unknown_instrument
+from psfcore.instruments.workload import check_workload
 from psfcore.psf import Kernel, Psf, light_beyond_pct
 from psfcore.psf_cache import built_file, kept_psf
 from psfcore.transit.archive import ArchiveContents, list_archive, transit_in, unpack
 from psfcore.whole_files import sha256_of
 from service.client.errors import ServiceError
-from service.client.operations import Operations, Progress
+from service.client.operations import Operations, Progress, named_instrument
 from service.client.outputs import written
 from workers.cache_folder import psf_cache
 from workers.contract.identities import (
     build_for,
+    check_noise,
+    diffraction_build,
+    instrument_text,
     product_identity,
     psf_identity,
     recipe_of,
@@ -51,7 +56,9 @@ from workers.contract.identities import (
 from workers.contract.kinds import KINDS, JobRequest
 from workers.contract.requests import (
     Deconvolve,
+    GapDiagnose,
     PsfBuild,
+    Report,
     ResolvedCrossValidate,
     ResolvedDeconvolve,
     ResolvedGapDiagnose,
@@ -157,6 +164,7 @@ class Local(Operations):
     times: StageTimer = field(default_factory=StageTimer)
     _images: dict[str, _Image] = field(default_factory=dict)
     _psfs: dict[str, _NamedPsf] = field(default_factory=dict)
+    _builds: dict[str, PsfBuild] = field(default_factory=dict)  # PSFs that are built when they are needed
     _transits: dict[str, _NamedTransit] = field(default_factory=dict)
     _read_psfs: dict[tuple[str, bool], Psf] = field(default_factory=dict)
     _prepared: PreparedPsfs = field(default_factory=PreparedPsfs)
@@ -208,6 +216,13 @@ class Local(Operations):
         self._psfs[identity] = _NamedPsf(path, files, sha256, summary, used)
         return {"id": identity}
 
+    def psf_of_instrument(self, instrument: str) -> str:
+        """Add the PSF of an instrument, which a deconvolution builds without its components."""
+        build = PsfBuild.model_validate(named_instrument(instrument))
+        self._resolved_build(build)
+        self._builds[psf_identity(build)] = build
+        return psf_identity(build)
+
     def submit(self, kind: str, **parameters: Any) -> dict[str, Any]:
         """Check a request; ``wait`` computes its result."""
         job_id = uuid.uuid4().hex
@@ -253,14 +268,6 @@ class Local(Operations):
         for name in ("file", "preview", "changes"):
             del self._writers[product[name]]
 
-    def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        """No command with ``--local`` asks the tables of a PSF."""
-        raise NotImplementedError
-
-    def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
-        """No command with ``--local`` cuts a PSF."""
-        raise NotImplementedError
-
     def _resolved(self, kind: str, parameters: dict[str, Any]) -> tuple[Any, str]:
         """The resolved parameters of a request, and the id of its result."""
         body = {"kind": kind, "parameters": parameters}
@@ -271,29 +278,34 @@ class Local(Operations):
             faults = (f"{'/'.join(map(str, e['loc'][1:])) or 'kind'}: {said}" for e, said in told)
             raise ServiceError("; ".join(faults)) from error
         if isinstance(request.parameters, Deconvolve):
-            resolved = self._resolved_deconvolution(request.parameters)
-            return resolved, product_identity(resolved)
-        # Only commands that compute for minutes load the catalogue, whose requests are resolved in the same way.
-        from workers.catalogue.catalogue import Catalogue
-        from workers.intake.requests import resolve
+            deconvolution = self._resolved_deconvolution(request.parameters)
+            return deconvolution, product_identity(deconvolution)
+        if isinstance(request.parameters, PsfBuild):
+            return self._resolved_build(request.parameters), psf_identity(request.parameters)
+        of_kind = KINDS[kind]
+        assert of_kind.resolved is not None and of_kind.identity is not None
+        fields = request.parameters.model_dump() | self._resolved_on_transit(request.parameters)
+        resolved = of_kind.resolved.model_validate(fields)
+        return resolved, of_kind.identity(resolved)
 
-        effects = Settings.apart(self.folder, gap_effects=self.gap_effects).added_effects
-        rows = cast(Catalogue, SimpleNamespace(get=self._row))
-        fields, identity = resolve(request, rows, "", added_effects=effects)
-        model = KINDS[kind].resolved
-        assert model is not None
-        return model.model_validate(fields), identity
+    @staticmethod
+    def _resolved_build(build: PsfBuild) -> PsfBuild:
+        label = build.instrument or "instrument_file"
+        check_workload(parse_instrument(instrument_text(build), label), label)
+        return build
 
-    def _row(self, table: type[Any], identity: str, owner: str) -> Any:
-        """The row that a catalogue with the files of the command would have; None if no file has this id."""
-        from workers.catalogue.tables import TransitRow
-        from workers.intake.uploads import image_row, transit_row
-
-        if table is TransitRow:
-            transit = self._transits[identity]
-            return transit_row(owner, identity, transit.bytes, transit.path.name, transit.contents)
-        file = self._images.get(identity) or self._psfs.get(identity)
-        return file and image_row(owner, identity, 0, file.path.name, file.summary)
+    def _resolved_on_transit(self, request: Any) -> dict[str, Any]:
+        """The further fields of a resolved request on a transit, as ``workers.intake.requests`` finds them in a catalogue."""
+        manifest = vars(self._transits[request.transit_id].contents.manifest)
+        if isinstance(request, Report) and request.psf_id is not None:
+            check_noise(manifest, request.noise)
+            return {"dark_offsets": False}  # no fit is made
+        fields: dict[str, Any] = {"diffraction_recipe": diffraction_build(manifest, request.noise)}
+        if isinstance(request, GapDiagnose):
+            effects = Settings.apart(self.folder, gap_effects=self.gap_effects).added_effects
+            hashes = tuple(map(sha256_of_source, effects))
+            fields |= {"added_effects": effects, "added_effects_sha256": hashes}
+        return fields
 
     def _resolved_deconvolution(self, request: Deconvolve) -> ResolvedDeconvolve:
         summary = self._images[request.image_id].summary
@@ -312,17 +324,23 @@ class Local(Operations):
                 raise unknown_instrument(asdict(summary))
             recipe = build_for(summary.instrument, frame_of(summary.cards).turn_to_build_deg)
             psf = {"psf_id": psf_identity(recipe), "psf_recipe": recipe}
-        elif request.psf_id not in self._psfs:
+        elif request.psf_id not in self._psfs | self._builds:
             raise _no_such_psf(request.psf_id)
         return ResolvedDeconvolve(**psf, **request.model_dump(exclude={"psf_id", "context"}))
 
     def _psf(self, identity: str, *, parts: bool) -> Psf:
-        """The PSF of a file; it is read once, because the prepared PSFs belong to this object."""
-        if (identity, parts) not in self._read_psfs:
+        """The PSF of a file or an instrument; it is read once, because the prepared PSFs belong to this object."""
+        key = identity, parts
+        if key in self._read_psfs:
+            return self._read_psfs[key]
+        if identity in self._builds:
+            recipe = recipe_of(self._builds[identity])
+            psf = kept_psf(psf_cache(), recipe, LIMITS, parts=False, threads=cores())
+        else:
             named = self._psfs[identity]
             named.files.check()
-            self._read_psfs[identity, parts] = read_psf(named.path, LIMITS, parts=parts)
-        return self._read_psfs[identity, parts]
+            psf = read_psf(named.path, LIMITS, parts=parts)
+        return self._read_psfs.setdefault(key, psf)
 
     def _deconvolve(self, request: ResolvedDeconvolve, _job_id: str, report: _Report) -> str:
         image, named = self._images[request.image_id], self._psfs.get(request.psf_id)
@@ -354,8 +372,8 @@ class Local(Operations):
                 image.path, LIMITS, saturation_dn=request.saturation_dn, hdu=request.hdu
             ),
             summary.shape,
-            None if named is None else self._psf(request.psf_id, parts=request.error_draws > 0),
-            options_of(request, None if request.noise is None else request.noise.noise(), cores()),
+            None if request.psf_recipe else self._psf(request.psf_id, parts=request.error_draws > 0),
+            options_of(request, cores()),
             build=build,
             possible_psfs=possible_psfs,
             prepared=self._prepared,
@@ -376,7 +394,7 @@ class Local(Operations):
         ids = Identities(
             identity, request.image_id, request.method.algorithm_version, safe_name(name, identity)
         )
-        details = product.details() | {"software_version": software_version()}
+        details = product.details(used) | {"software_version": software_version()}
         result = {"psf_id": used.id, "psf_version": used.version, "details": details}
         return self._add(
             f"/v1/products/{identity}",
@@ -387,7 +405,6 @@ class Local(Operations):
         )
 
     def _psf_build(self, request: PsfBuild, _job_id: str, report: _Report) -> str:
-        from psfcore.drawing.plots import psf_png
         from psfcore.fits.images import read_plane
 
         mask = None if request.mask_id is None else read_plane(self._images[request.mask_id].path, LIMITS)
@@ -404,12 +421,11 @@ class Local(Operations):
             recipe.identity,
             {"cumulative_curve_pct": light_beyond_pct(psf.kernel)},
             file=partial(shutil.copyfile, copy),
-            preview=partial(psf_png, psf),
+            preview=lambda path: module_of_extra("psfcore.drawing.plots").psf_png(psf, path),
         )
 
     def _psf_fit(self, request: ResolvedPsfFit, job_id: str, report: _Report) -> str:
         from psfcore.fits.psfs import write_psf
-        from psfcore.scatter.fit_plot import fit_png
         from workers.tasks import psf_fit
         from workers.tasks.data.reports import write_json
 
@@ -421,7 +437,7 @@ class Local(Operations):
             fitted.psf.provenance["psf_id"],
             {"fit": fitted.details},
             file=lambda path: write_psf(path, fitted.psf),
-            preview=partial(fit_png, fitted.fit),
+            preview=fitted.draw,
             report=lambda path: write_json(path, fitted.report),
         )
 
@@ -515,7 +531,7 @@ class Local(Operations):
             {"details": report.details},
             file=lambda path: write_json(path, report.content),
             preview=report.draw,
-            html=lambda path: path.write_text(report.page, "utf-8"),
+            html=lambda path: path.write_text(report.page(), "utf-8"),
         )
 
     def _add(self, address: str, described: dict[str, Any], **files: Callable[[Path], object]) -> str:

@@ -73,7 +73,11 @@ PSF_SECTIONS = {
 }  # fmt: skip
 
 
-@click.group(cls=LazyGroup, sections=SECTIONS, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=LazyGroup,
+    sections=SECTIONS,
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
+)
 @click.version_option(None, "-V", "--version", package_name="heliopsf", prog_name="heliopsf")
 def main() -> None:
     """Determine the point-spread functions (PSFs) of solar EUV telescopes, and deconvolve images.

@@ -127,7 +127,7 @@ def store() -> None:
 
 @store.command("collect", short_help="Remove files that nothing refers to.")
 @click.option("--dry-run", is_flag=True, help="List the files that would be removed, but remove nothing")
-@click.option("--older-than", "older_than_s", type=Duration(), default="30d", show_default=True,
+@click.option("--older-than", "older_than_s", type=Duration(), default="30d",
               help="Remove only files older than this")  # fmt: skip
 @click.option("--even-most", is_flag=True, help="Allow that more than half of all files are removed")
 @DATA
@@ -237,7 +237,12 @@ def key() -> None:
 @click.option("--scope", "scopes", multiple=True, type=click.Choice([scope.value for scope in Scope]),
               help=f"Scope of the key; can be repeated [default: {', '.join(DEFAULT_SCOPES)}]")  # fmt: skip
 @click.option("--expires", type=Duration(), metavar="30d", help="Lifetime [default: until it is revoked]")
-@click.option("--label", default="", help="Note that `key list` shows, for example the purpose of the key")
+@click.option(
+    "--label",
+    default="",
+    show_default=False,
+    help="Note that `key list` shows, for example the purpose of the key",
+)
 @DATA
 def create(owner: str, scopes: tuple[str, ...], expires: float | None, label: str, data: Path | None) -> None:
     """Create a key and print it once. Only its hash is stored, so it cannot be shown again."""

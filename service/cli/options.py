@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from pydantic import ValidationError
 
-from psfcore.errors import DataError
+from psfcore.errors import DataError, missing_extra
 from service.cli.fields import options_of
 from service.cli.progress import echo
 from service.cli.progress import progress_bar as progress_bar
@@ -44,6 +45,17 @@ class _Output(click.Path):
 
 class OutputFile(_Output):
     """The type of an option that names a file to write. ``writes_files`` checks the files of these options."""
+
+
+class DrawnFile(OutputFile):
+    """The type of an option that names a picture or page to write. A missing package is told before the work begins."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path. Raises MissingExtra."""
+        for package in ("matplotlib", "jinja2"):
+            if find_spec(package) is None:
+                raise missing_extra(ModuleNotFoundError(name=package))
+        return super().convert(value, param, ctx)
 
 
 class OutputFolder(_Output):
@@ -90,6 +102,7 @@ class Place:
 
 
 OUTPUT = OutputFile(dir_okay=False, path_type=Path)
+DRAWN = DrawnFile(dir_okay=False, path_type=Path)
 OUTPUT_PLACE = OutputPlace()
 OUTPUT_FOLDER = OutputFolder(file_okay=False, path_type=Path)
 NOISE = click.option(
@@ -108,11 +121,9 @@ CENTRE = click.option(
     help="Position of the flare, px [default: searched in IMAGE]",
 )
 BACKGROUND = "Image of the same frame before the flare (FITS)"
-SEED = click.option(
-    "--seed", type=click.IntRange(0, 2**31 - 1), default=1, show_default=True, help="Seed of random numbers"
-)
+SEED = click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=1, help="Seed of random numbers")
 JSON = click.option("--json", "json_file", type=OUTPUT, help="Write all numbers to this file (JSON)")
-PLOT = click.option("--plot", type=OUTPUT, help="Write a plot to this file (PNG)")
+PLOT = click.option("--plot", type=DRAWN, help="Write a plot to this file (PNG)")
 DATA = click.option(
     "--data",
     type=OUTPUT_FOLDER,
@@ -128,13 +139,17 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 @contextmanager
 def user_errors() -> Iterator[None]:
     """Turn an error of the user's data, files or service into text and an exit status, without a traceback."""
+    context = click.get_current_context(silent=True)
+    local = context is not None and bool(context.params.get("local"))
     try:
         yield
     except DataError as error:
-        raise click.ClickException("\n".join(error_lines(error.message, error.fields))) from error
+        raise click.ClickException(
+            "\n".join(error_lines(error.message, error.fields, local=local))
+        ) from error
     except ServiceError as error:
         message = NO_KEY if error.code == "no-key" else str(error)
-        raise click.ClickException("\n".join(error_lines(message, error.fields))) from error
+        raise click.ClickException("\n".join(error_lines(message, error.fields, local=local))) from error
     except OSError as error:
         raise click.ClickException(str(error)) from error
 
@@ -240,11 +255,6 @@ def listed(words: Sequence[str]) -> str:
     """Words as a list in a sentence: "a", "a and b", "a, b and c"."""
     *others, last = words
     return f"{', '.join(others)} and {last}" if others else last
-
-
-def percent(value: float | None, digits: int = 1) -> str:
-    """A relative change as text. value: in percent; None if the reference contains no light."""
-    return "n/a (no light)" if value is None else f"{value:+.{digits}f} %"
 
 
 def read_settings(data: Path | None = None) -> Settings:

@@ -12,8 +12,8 @@ import click
 from service.cli.connection import LOCAL, SERVER, connection, named_psf, psf_option
 from service.cli.fields import options_of
 from service.cli.options import (
+    DRAWN,
     JSON,
-    OUTPUT,
     PLOT,
     progress_bar,
     user_errors,
@@ -25,7 +25,7 @@ from workers.contract.requests import Report
 
 @click.command()
 @click.argument("transit", type=click.Path(exists=True, path_type=Path))
-@click.option("-o", "--output", type=OUTPUT, help="Write the result as an HTML page")
+@click.option("-o", "--output", type=DRAWN, help="Write the result as an HTML page")
 @JSON
 @PLOT
 @psf_option("PSF to test: an id or a file [default: fit a PSF to TRANSIT]")

@@ -14,12 +14,12 @@ from urllib.parse import urlsplit
 
 import click
 
+from psfcore.deconvolve.summary import percent
 from service.cli.options import (
     DATA,
     FILE,
     OUTPUT_FOLDER,
     check_fresh_folder,
-    percent,
     progress_bar,
     read_settings,
     user_errors,
@@ -38,8 +38,8 @@ DEMO_LOG = "server.log"  # a later demo recognises the folder of an earlier demo
 
 
 @click.command()
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on")
-@click.option("--port", default=8765, show_default=True, help="Port to listen on; 0: any free port")
+@click.option("--host", default="127.0.0.1", help="Address to listen on")
+@click.option("--port", default=8765, help="Port to listen on; 0: any free port")
 @DATA
 @click.option("-v", "--verbose", is_flag=True,
               help="Also log every request on a terminal; a log that is not on a terminal always contains every request")  # fmt: skip
@@ -124,7 +124,7 @@ def worker(
 
 @click.command()
 @click.option("--image", type=FILE, help="Your own image (FITS) [default: a simulated image]")
-@click.option("-o", "--output", default="heliopsf-demo", show_default=True, type=OUTPUT_FOLDER,
+@click.option("-o", "--output", default="heliopsf-demo", type=OUTPUT_FOLDER,
               help="Folder for the results")  # fmt: skip
 def demo(image: Path | None, output: Path) -> None:
     """Start a service, upload an image, deconvolve it, download the product, and stop the service.

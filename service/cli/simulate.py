@@ -38,38 +38,22 @@ def simulate() -> None:
 
 @simulate.command(short_help="Write a simulated transit.")
 @click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help="Folder to write to")
-@click.option(
-    "--size",
-    default=512,
-    show_default=True,
-    type=click.IntRange(64, 4096),
-    help="Width and height of an image, px",
-)
-@click.option(
-    "--images", default=30, show_default=True, type=click.IntRange(1, 1000), help="Number of images"
-)
-@click.option("--seed", default=1, show_default=True, type=click.IntRange(0), help="Seed of scenes and noise")
-@click.option("--total", default=0.411, show_default=True, help="Fraction of light that is scattered, 0 to 1")
-@click.option(
-    "--b", "b_px", default=6.15, show_default=True, help="Softening radius of the scatter kernel, px"
-)
-@click.option("--c", default=2.53, show_default=True, help="Exponent of the scatter kernel")
-@click.option(
-    "--stretch", default=0.0, show_default=True, help="Stretch of the scatter kernel along --stretch-angle"
-)
+@click.option("--size", default=512, type=click.IntRange(64, 4096), help="Width and height of an image, px")
+@click.option("--images", default=30, type=click.IntRange(1, 1000), help="Number of images")
+@click.option("--seed", default=1, type=click.IntRange(0), help="Seed of scenes and noise")
+@click.option("--total", default=0.411, help="Fraction of light that is scattered, 0 to 1")
+@click.option("--b", "b_px", default=6.15, help="Softening radius of the scatter kernel, px")
+@click.option("--c", default=2.53, help="Exponent of the scatter kernel")
+@click.option("--stretch", default=0.0, help="Stretch of the scatter kernel along --stretch-angle")
 @click.option(
     "--stretch-angle",
     default=0.0,
-    show_default=True,
     help="Direction of stretch and dipole, degrees from +x towards +y",
 )
-@click.option(
-    "--dipole", default=0.0, show_default=True, help="Dipole (asymmetry) of the scatter kernel, -1 to 1"
-)
+@click.option("--dipole", default=0.0, help="Dipole (asymmetry) of the scatter kernel, -1 to 1")
 @click.option(
     "--beyond",
     default="dark",
-    show_default=True,
     type=click.Choice(["dark", "on"]),
     help="Sky outside the field of view. dark: no light; on: the scene continues",
 )
@@ -79,11 +63,10 @@ def simulate() -> None:
     metavar="DN",
     help="Clip high-gain images at this level [default: no clipping]",
 )
-@click.option("--dark-offset", default=0.0, show_default=True, help="Offset to add to every pixel, DN")
+@click.option("--dark-offset", default=0.0, help="Offset to add to every pixel, DN")
 @click.option(
     "--instrument",
     default="hri_euv",
-    show_default=True,
     metavar="NAME|FILE",
     help="Use the diffraction PSF and the header keywords of this instrument",
 )

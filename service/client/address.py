@@ -5,11 +5,11 @@ from __future__ import annotations
 import ipaddress
 from urllib.parse import SplitResult, urlsplit
 
+from service.client.errors import SHOWN_DIGITS as SHOWN_DIGITS
 from service.client.errors import ServiceError
 
 DEFAULT_SERVER = "http://127.0.0.1:8765"
 EXAMPLE = f"{DEFAULT_SERVER} or localhost:8765"
-SHOWN_DIGITS = 12  # digits of an id in lists; commands and addresses accept such shortened ids
 
 
 def service_address(text: str) -> str:
@@ -43,7 +43,7 @@ def how_to_start(server: str) -> str:
         return "check the address, or ask the operator whether the service runs"
     port = parts.port or 80
     named = "" if port == urlsplit(DEFAULT_SERVER).port else f" --port {port}"
-    return f"`heliopsf serve{named}` starts a service there"
+    return f"`heliopsf serve{named}` starts a service there; commands with --local need none"
 
 
 def is_loopback(host: str) -> bool:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, TypeVar
 
+SHOWN_DIGITS = 12  # digits of an id in lists; commands and addresses accept such shortened ids
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0
 PATIENCE_S = 600.0  # a client gives up after this time without an answer
 PASSING: tuple[int | None, ...] = (
@@ -40,35 +41,23 @@ class ServiceError(Exception):
         self.fields = dict(fields or {})
 
 
-def error_lines(message: str, fields: Mapping[str, Any]) -> list[str]:
-    """An error as lines to print: the message; then the PSFs that could fit the image and the next steps, if the
-    error contains them."""
-    lines = [message]
-    if fields.get("instruments"):
-        lines.append("Instruments whose PSF can be built:")
-        lines += [
-            f"  {one['name']:<12} {one['wavelength_angstrom']:g} angstrom, {one['plate_scale_arcsec']:g} arcsec/px{_same(one)}"
-            for one in fields["instruments"]
-        ]
-    if "psfs" in fields:
-        lines.append(
-            "PSFs of the catalogue that could fit:"
-            if fields["psfs"]
-            else "No PSF of the catalogue could fit."
-        )
-        lines += [
-            f"  {one['id']}  {one['name']} {one['version']} ({one['status']}){_same(one)}"
-            for one in fields["psfs"]
-        ]
-    if fields.get("ways"):
-        lines.append("What to do next:")
-        lines += [f"  {number}. {one['text']}" for number, one in enumerate(fields["ways"], 1)]
-    return lines
+def error_lines(message: str, fields: Mapping[str, Any], *, local: bool) -> list[str]:
+    """An error as lines to print. If the telescope of an image is unknown: why, and the two ways that exist here.
 
-
-def _same(one: Mapping[str, Any]) -> str:
-    same = ", ".join(str(what).replace("_", " ") for what in one["same"])
-    return f"; same {same} as the image" if same else ""
+    local: whether the command runs without a service.
+    """
+    if not fields.get("ways"):
+        return [message]
+    known = {one["way"]: f". {one['known']}" if "known" in one else "" for one in fields["ways"]}
+    reason = f": {fields['reason']}" if fields["reason"] else ""
+    could = [f"{one['id'][:SHOWN_DIGITS]} ({one['name']} {one['version']})" for one in fields["psfs"]]
+    ids = f", or a PSF of the service: --psf ID, such as {', '.join(could[:3])}" if could else ""
+    return [
+        f"no PSF is known for {fields['image']}{reason}",
+        "Two ways:",
+        f"  1. your own PSF: --psf FILE.fits, or an instrument file (docs/instruments.md): --psf FILE.toml{ids}{known['upload']}",
+        f"  2. a fit to images of a transit: heliopsf psf fit TRANSIT -o PSF.fits{' --local' if local else ''}{known['fit']}",
+    ]
 
 
 class WaitInterrupted(KeyboardInterrupt):

@@ -86,16 +86,18 @@ class Operations(ABC):
     def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the file at an address of the service to ``path``; an existing file only if ``overwrite`` is true."""
 
-    @abstractmethod
+    # No command with --local asks for these two.
+
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
         """The answer of a PSF's tables to "curve", "profile", "encircled", "annulus" or "compare/ID".
 
         Raises ``ServiceError`` "no-tables" if the tables have not been made.
         """
+        raise NotImplementedError
 
-    @abstractmethod
     def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
         """Write the central (size, size) px of a PSF as FITS."""
+        raise NotImplementedError
 
     def deconvolve(
         self,
@@ -143,16 +145,16 @@ class Operations(ABC):
         """
         is_file = isinstance(instrument, Path) or instrument.endswith(".toml")
         check_outputs((output, preview), inputs=(instrument if is_file else None, mask), overwrite=overwrite)
-        request: dict[str, Any] = {"size": size, "component": component}
-        if is_file:
-            request["instrument_file"] = Path(instrument).read_text("utf-8")
-        else:
-            request["instrument"] = instrument
+        request: dict[str, Any] = {"size": size, "component": component, **named_instrument(instrument)}
         if mask is not None:
             request["mask_id"] = self.upload_image(mask)["id"]
         psf = self.run("psf-build", request, progress)
         self._fetch(psf, {"file": output, "preview": preview}, overwrite)
         return psf
+
+    def psf_of_instrument(self, instrument: str) -> str:
+        """The id of the PSF of an instrument, which is built if it does not exist. instrument: as for ``build_psf``."""
+        return str(self.build_psf(instrument)["id"])
 
     def fit_psf(
         self,
@@ -307,6 +309,13 @@ def treatment(
     fields = {name: value for name, value in parameters.items() if name in Deconvolve.model_fields}
     of_method = {name: value for name, value in parameters.items() if name not in fields}
     return {"method": {"name": method, **of_method}, **fields, **_noise(noise)}
+
+
+def named_instrument(instrument: str | Path) -> dict[str, str]:
+    """The field of a request to build a PSF that names the instrument, or contains its file."""
+    if isinstance(instrument, Path) or instrument.endswith(".toml"):
+        return {"instrument_file": Path(instrument).read_text("utf-8")}
+    return {"instrument": instrument}
 
 
 def given(parameters: dict[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from service.http.callers import Caller
 from service.http.problems import Problem
@@ -110,9 +111,10 @@ def _limited(state: State, owner: str, but: str | None = None) -> Usage | None:
 
 
 def _file_too_large(usage: Usage, count: int) -> Problem:
-    return _exceeded(413, usage, usage.no_room(f"this file needs at least {count} more"))
+    message = usage.no_room(f"this file needs at least {count / MIB:.1f} MiB more")
+    return _exceeded(413, usage, message, needed_bytes=count)
 
 
-def _exceeded(status: int, usage: Usage, message: str) -> Problem:
+def _exceeded(status: int, usage: Usage, message: str, **more: Any) -> Problem:
     used, limit = usage.used_bytes, usage.limit_bytes
-    return Problem(status, "quota-exceeded", message, used_bytes=used, limit_bytes=limit)
+    return Problem(status, "quota-exceeded", message, used_bytes=used, limit_bytes=limit, **more)

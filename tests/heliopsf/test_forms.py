@@ -7,15 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import astropy.units as u
+import dask.array
 import numpy as np
 import pytest
 import sunpy.map
 from astropy.io import fits
-from astropy.nddata import CCDData, NDData
+from astropy.nddata import CCDData, NDData, StdDevUncertainty, UnknownUncertainty, VarianceUncertainty
+from astropy.utils.masked import Masked
 from astropy.wcs import WCS
 
 import heliopsf
-from heliopsf.images import DataError
+from heliopsf import DataError, DataWarning
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.psf_sampling import rebinned_kernel
 
@@ -134,8 +136,11 @@ def test_an_uncertainty_is_added_where_asked(psf: heliopsf.Psf) -> None:
     # Deconvolution amplifies the photon noise of the background of 50 DN.
     assert 10.0 < np.median(sigma) < 40.0 and (sigma > 0).all()
     assert result.meta["dcnvampl"] == pytest.approx(np.median(sigma) / np.sqrt(2 * 50 + 1), rel=0.15)
-    with pytest.raises(DataError, match="no-noise-figures"):
-        heliopsf.deconvolve(a_map(), psf, error_draws=4)
+    measured = heliopsf.deconvolve(a_map(), psf, error_draws=4)
+    # The background has the noise of 30 photons.
+    variance = 50 * measured.meta["dcnvgain"] + measured.meta["dcnvread"] ** 2
+    assert measured.meta["dcnvnois"] == "measured" and variance == pytest.approx(30, rel=0.15)
+    assert (measured.uncertainty.array > 0).all() and "dcnvnois" not in result.meta
     with pytest.raises(DataError, match="2 to 64; got 1"):
         heliopsf.deconvolve(a_map(), psf, noise=noise, error_draws=1)
 
@@ -175,6 +180,84 @@ def test_another_unit_keeps_the_unit_and_ignores_levels_in_dn(psf: heliopsf.Psf)
     assert bright.mask.any() and np.isfinite(bright.data).all()
     with pytest.raises(DataError, match="bad-unit"):
         heliopsf.deconvolve(NDData(pixels(), unit=u.mag), psf)
+
+
+def test_an_hdu_gives_an_hdu_and_a_list_of_hdus_the_planes_of_a_product(psf: heliopsf.Psf) -> None:
+    wanted = heliopsf.deconvolve(pixels(), psf)
+    for hdu in (fits.PrimaryHDU(pixels(), header()), fits.ImageHDU(pixels(), header())):
+        result = heliopsf.deconvolve(hdu, psf)
+        assert type(result) is type(hdu) and "PSFID" not in hdu.header
+        np.testing.assert_array_equal(result.data, wanted)
+        assert result.header["PSFID"] == psf.provenance["psf_id"] and result.header["CRPIX1"] == 64.5
+    several = fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(pixels().astype("i4"), header())])
+    product = heliopsf.deconvolve(several, psf, noise=(2.0, 1.0), error_draws=2)
+    assert [one.name for one in product] == ["PRIMARY", "QUALITY", "ERROR"]
+    np.testing.assert_array_equal(product[0].data, wanted)
+    part = heliopsf.deconvolve(several, psf, region=REGION, region_error=0.9)
+    assert part[0].data.shape == (32, 32) and part[0].header["CRPIX1"] == 64.5 - 32
+    named = fits.HDUList([fits.PrimaryHDU(pixels(2), header()), fits.ImageHDU(pixels(), header())])
+    np.testing.assert_array_equal(heliopsf.deconvolve(named, psf, hdu=1)[0].data, wanted)
+    with pytest.raises(DataError, match="no-image"):
+        heliopsf.deconvolve(fits.HDUList([fits.PrimaryHDU()]), psf)
+
+
+def test_masked_arrays_stay_masked(psf: heliopsf.Psf) -> None:
+    hidden = np.zeros(SHAPE, bool)
+    hidden[30, 40] = True
+    wanted = heliopsf.deconvolve(sunpy.map.Map(pixels(), cards(), mask=hidden), psf)
+    for image in (
+        np.ma.MaskedArray(pixels(), hidden),
+        Masked(pixels() * u.DN, hidden),
+        Masked(pixels(), hidden),
+    ):
+        result = heliopsf.deconvolve(image, psf)
+        assert type(result) is type(image)
+        np.testing.assert_array_equal(result.mask, hidden)
+        found = np.asarray(getattr(result, "unmasked", result))
+        np.testing.assert_array_equal(found[~hidden], wanted.data[~hidden])
+    unhidden = sunpy.map.Map(pixels(), cards(), mask=np.zeros(SHAPE, bool))
+    assert not heliopsf.deconvolve(unhidden, psf).mask.any()
+
+
+def test_a_dask_array_is_computed_with_a_warning(psf: heliopsf.Psf) -> None:
+    wanted = heliopsf.deconvolve(pixels(), psf)
+    lazy = dask.array.from_array(pixels())
+    with pytest.warns(DataWarning, match="dask") as warned:
+        result = heliopsf.deconvolve(lazy, psf)
+    assert "dask-computed" in [one.message.code for one in warned]  # type: ignore[union-attr]
+    np.testing.assert_array_equal(result, wanted)
+    with pytest.warns(DataWarning, match="dask"):
+        np.testing.assert_array_equal(heliopsf.deconvolve(a_map(lazy), psf).data, wanted)
+
+
+def test_an_uncertainty_is_the_noise_and_comes_back(psf: heliopsf.Psf) -> None:
+    sigma = np.sqrt(2.0 * pixels() + 1.0)
+    given = heliopsf.deconvolve(
+        NDData(pixels(), unit="DN", meta=cards()), psf, noise=(2.0, 1.0), error_draws=4
+    )
+    for uncertainty in (
+        StdDevUncertainty(sigma),
+        VarianceUncertainty(sigma**2),
+        StdDevUncertainty(1000 * sigma, unit=u.Unit("0.001 DN")),
+    ):
+        image = NDData(pixels(), unit="DN", meta=cards(), uncertainty=uncertainty)
+        result = heliopsf.deconvolve(image, psf, error_draws=4)
+        assert result.meta["DCNVNOIS"] == "uncertainty"
+        assert np.median(result.uncertainty.array / given.uncertainty.array) == pytest.approx(1, abs=0.03)
+        with pytest.warns(DataWarning) as warned:
+            assert heliopsf.deconvolve(image, psf).uncertainty is None
+        assert [one.message.code for one in warned] == ["uncertainty-dropped"]  # type: ignore[union-attr]
+    unknown = NDData(pixels(), unit="DN", meta=cards(), uncertainty=UnknownUncertainty(sigma))
+    with pytest.warns(DataWarning, match="not used"):
+        assert heliopsf.deconvolve(unknown, psf).uncertainty is None
+
+
+def test_a_map_sequence_gives_a_map_sequence(psf: heliopsf.Psf) -> None:
+    maps = [a_map(), a_map(pixels(2))]
+    result = heliopsf.deconvolve(sunpy.map.Map(maps, sequence=True), psf)
+    assert isinstance(result, sunpy.map.MapSequence)
+    for one, image in zip(result, maps, strict=True):
+        np.testing.assert_array_equal(one.data, heliopsf.deconvolve(image, psf).data)
 
 
 def test_a_list_gives_a_list_and_an_error_names_the_image(psf: heliopsf.Psf) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import fields
 from datetime import UTC, datetime
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -81,7 +82,8 @@ def test_the_core_needs_no_extra() -> None:
 def test_every_name_is_there_with_a_docstring_and_no_other() -> None:
     for name in heliopsf.__all__:
         assert getattr(heliopsf, name).__doc__, name
-    assert sorted(dir(heliopsf)) == sorted(heliopsf.__all__)
+    assert sorted(dir(heliopsf)) == sorted([*heliopsf.__all__, "__version__"])
+    assert heliopsf.__version__ == version("heliopsf")
     with pytest.raises(AttributeError, match="no attribute 'evaluate'"):
         heliopsf.evaluate  # noqa: B018
     assert (Path(heliopsf.__file__).parent / "py.typed").is_file()

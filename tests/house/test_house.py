@@ -296,7 +296,7 @@ def test_the_image_is_installed_from_pins_with_hashes() -> None:
     build = project["build-system"]["requires"]
     assert (HERE / "pins" / "build.in").read_text().split() == build
     extras = project["project"]["optional-dependencies"]
-    of_service = [one for extra in ("service", "fit", "plot", "s3") for one in extras[extra]]
+    of_service = [one for extra in ("service", "plot", "s3") for one in extras[extra]]
     needed = [*project["project"]["dependencies"], *of_service, *build]
     missing = {canonicalize_name(Requirement(one).name) for one in needed} - set(pins) - {"heliopsf"}
     assert missing == set(), "`make pins` writes the file anew"

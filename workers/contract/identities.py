@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
+from psfcore.errors import DataError
 from psfcore.gap.effect_sources import library_sha256
-from psfcore.instruments.files import instrument_path, turned_text
+from psfcore.instruments.files import instrument_names, instrument_path, turned_text
+from psfcore.noise_figures import NoiseFigures
 from psfcore.recipe import Recipe
 from psfcore.recipe import canonical_hash as canonical_hash
 from workers.contract.requests import (
@@ -38,6 +40,33 @@ def build_for(instrument: str, turn_deg: float) -> PsfBuild:
     if turn_deg:
         return PsfBuild(instrument_file=turned_text(instrument, turn_deg))
     return PsfBuild(instrument=instrument)
+
+
+def diffraction_build(transit: Mapping[str, Any], noise: NoiseFigures | None) -> PsfBuild | None:
+    """The build of the diffraction PSF of a transit; None if the transit contains this PSF.
+
+    transit: the entries "noise", "known_psf" and "instrument" of its manifest. noise: of the request. Raises DataError
+    "no-noise-figures" and "no-known-psf".
+    """
+    check_noise(transit, noise)
+    if transit["known_psf"] is not None:
+        return None
+    if transit["instrument"] not in instrument_names():
+        raise DataError(
+            "no-known-psf",
+            f"expected known_psf in transit.json, or one of the instruments {', '.join(instrument_names())}; "
+            f"got neither ({transit['instrument']!r})",
+        )
+    return PsfBuild(instrument=transit["instrument"], component="diffraction")
+
+
+def check_noise(transit: Mapping[str, Any], noise: NoiseFigures | None) -> None:
+    """Raise DataError "no-noise-figures" if neither the transit nor the request has noise figures."""
+    if noise is None and transit["noise"] is None:
+        raise DataError(
+            "no-noise-figures",
+            "expected noise figures (photon_gain_dn, read_noise_dn) in transit.json or in the request; got neither",
+        )
 
 
 def psf_identity(build: PsfBuild) -> str:

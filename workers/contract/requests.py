@@ -22,7 +22,6 @@ from workers.versions import TIME, iso, seconds
 
 if TYPE_CHECKING:
     from psfcore.deconvolve.run import Options
-    from psfcore.noise import Noise
 
 # Texts of one line from outside: without control characters, of which PostgreSQL cannot store NUL.
 PRINTABLE, PRINTABLE_OR_EMPTY = r"^[^\x00-\x1f\x7f]+$", r"^[^\x00-\x1f\x7f]*$"
@@ -59,15 +58,13 @@ Saturation = Annotated[
     Field(
         gt=0,
         allow_inf_nan=False,
-        description="pixels at or above this level (DN) are not used; null: the level of the header or instrument file",
+        description="level (DN) from which pixels are not used; null: as its file says",
     ),
 ]
 Component = Literal["airy", "entrance_mesh", "mount", "entrance", "filter_wheel", "diffraction", "scatter"]
 OtherChannel = Annotated[
     bool,
-    Field(
-        description="use a PSF of another telescope, channel or filter than the image; false: such an image is refused"
-    ),
+    Field(description="allow a PSF of another telescope, channel, filter; false: such an image is refused"),
 ]
 ShapeName = Literal[
     "softened-power-law",
@@ -97,8 +94,8 @@ class _Method(Parameters):
         "fixed",
         description="`fixed`: do all `steps`; `discrepancy`: stop once the residual is like the noise",
     )
-    edges: Literal["zero", "symmetric", "extended"] | None = Field(
-        None, description="assumed scene beyond the field of view; null: depends on the method"
+    edges: Annotated[Literal["zero", "symmetric", "extended"] | None, Option(metavar="SCENE")] = Field(
+        None, description="scene beyond the field: zero, symmetric or extended; null: depends on the method"
     )
     margin_px: int | None = Field(
         None,
@@ -109,15 +106,15 @@ class _Method(Parameters):
 
 
 class RichardsonLucy(_Method):
-    """Richardson-Lucy. The paper recommends 20 steps and edges `zero`."""
+    """For most images. The paper recommends 20 steps and edges `zero`."""
 
     algorithm_version: ClassVar[int] = 2
     name: Literal["richardson-lucy"] = "richardson-lucy"
-    steps: int = Field(20, ge=1, le=200, description="number of iterations; the paper uses 20")
+    steps: int = Field(20, ge=1, le=200, description="iterations; the paper uses 20")
 
 
 class RichardsonLucyAccelerated(_Method):
-    """Richardson-Lucy with the extrapolation of Biggs and Andrews, which reaches the same result in fewer steps."""
+    """For many images: the same result in half the steps. The extrapolation is that of Biggs and Andrews."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["richardson-lucy-accelerated"]
@@ -126,7 +123,7 @@ class RichardsonLucyAccelerated(_Method):
 
 
 class RichardsonLucyExtended(_Method):
-    """Richardson-Lucy that also estimates the scene beyond the edges (Bertero and Boccacci)."""
+    """For cut-outs with bright light beyond their edges. Bertero and Boccacci describe it."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["richardson-lucy-extended"]
@@ -134,7 +131,7 @@ class RichardsonLucyExtended(_Method):
 
 
 class RichardsonLucyTotalVariation(_Method):
-    """Richardson-Lucy with total-variation regularisation: less noise; meant for pictures rather than photometry."""
+    """For pictures of noisy images, not for photometry. The total variation is regularised."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["richardson-lucy-total-variation"]
@@ -145,7 +142,7 @@ class RichardsonLucyTotalVariation(_Method):
 
 
 class BasicIterative(_Method):
-    """Basic iterative deconvolution, which the paper recommends for a bright source near an edge."""
+    """For a bright source near an edge, as the paper recommends. Results may be negative."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["basic-iterative"]
@@ -153,7 +150,7 @@ class BasicIterative(_Method):
 
 
 class Linear(_Method):
-    """Linear reconstruction: no positivity constraint, no bias of faint pixels, converged after about five steps."""
+    """For photometry of faint pixels: no bias, results may be negative. It has converged after about five steps."""
 
     algorithm_version: ClassVar[int] = 1
     name: Literal["linear"]
@@ -169,9 +166,8 @@ Method = Annotated[
     | Linear,
     Field(discriminator="name"),
 ]
-METHODS: list[str] = [
-    get_args(one.model_fields["name"].annotation)[0] for one in get_args(get_args(Method)[0])
-]
+METHOD_MODELS: tuple[type[_Method], ...] = get_args(get_args(Method)[0])
+METHODS: list[str] = [get_args(one.model_fields["name"].annotation)[0] for one in METHOD_MODELS]
 
 
 class PsfBuild(Parameters):
@@ -208,14 +204,14 @@ class Treatment(Parameters):
     method: Method = Field(default_factory=lambda: RichardsonLucy())
     noise: NoiseFigures | None = Field(
         None,
-        description="photon gain (DN per photon), read noise (DN rms); null: those of the instrument",
+        description="photon gain (DN per photon), read noise (DN rms); null: published, else measured in the image",
     )
     saturation_dn: Saturation = None
     error_draws: Annotated[int, Option("--errors", "N")] = Field(
         0,
         ge=0,
         le=64,
-        description="noise realisations for an ERROR plane, 0 or at least 2 (slow)",
+        description="noise realisations for an ERROR plane: 0, or 2 and more, such as 8 (slow)",
     )
     other_channel: OtherChannel = False
     again: bool = Field(False, description="deconvolve even a product or a PSF")
@@ -240,7 +236,7 @@ class Deconvolve(Treatment):
     )
     context: ContextName | None = Field(
         None,
-        description="take the PSF from this context: id, name or `now`; null: the default context",
+        description="context of the PSF: id, name or `now`; null: the default context",
     )
     changes_picture: bool = Field(
         False, description="also draw the difference, the ratio and the histogram of the changes"
@@ -253,18 +249,18 @@ class Deconvolve(Treatment):
         None,
         gt=0,
         allow_inf_nan=False,
-        description="plate scale of a PSF whose file gives none, arcsec/px; null: not compared",
+        description="plate scale of a PSF whose file gives none; null: not compared",
     )
     region: Annotated[str | None, Option(metavar="X0:X1,Y0:Y1", check=Box.parse)] = Field(
         None,
         pattern=BOX,
-        description="deconvolve only this box, px from 0 (x0 <= x < x1); null: the whole image",
+        description="only this box, px from 0 (x0 <= x < x1); null: the whole image",
     )
     region_error: Annotated[float, Option(metavar="SHARE")] = Field(
         LARGEST_ERROR,
         gt=0,
         le=1,
-        description="largest error of the region by its rim, as a share of its mean light",
+        description="largest error by the rim of the region, share of its mean light",
     )
 
     @model_validator(mode="after")
@@ -483,8 +479,8 @@ class ResolvedRerun(Rerun):
 ResolvedOnTransit = ResolvedPsfFit | ResolvedCrossValidate | ResolvedReport | ResolvedGapDiagnose
 
 
-def options_of(request: Deconvolve, noise: Noise | None, threads: int) -> Options:
-    """The options of psfcore for a request. noise: of the request, or else of the instrument that took the image."""
+def options_of(request: Deconvolve, threads: int) -> Options:
+    """The options of psfcore for a request."""
     # A request is checked without numerical libraries.
     from psfcore.deconvolve.run import Options
 
@@ -494,7 +490,7 @@ def options_of(request: Deconvolve, noise: Noise | None, threads: int) -> Option
         parameters=method.model_dump(exclude={"name", "edges", "margin_px"}),
         edges=method.edges,
         margin_px=method.margin_px,
-        noise=noise,
+        noise=None if request.noise is None else request.noise.noise(),
         error_draws=request.error_draws,
         region=None if request.region is None else Box.parse(request.region),
         region_error=request.region_error,

@@ -299,7 +299,7 @@ def open_store(settings: Settings) -> Store:
     """The store that the settings name: a local folder, or S3. Raises ``MissingExtra`` if the packages for S3 are missing."""
     if settings.store_url is None:
         return Store(settings.data_dir)
-    remote = module_of_extra("s3", "workers.files.s3_store").RemoteStore
+    remote = module_of_extra("workers.files.s3_store").RemoteStore
     store: Store = remote(settings.store_url, settings.data_dir, settings.store_cache_mib * 2**20)
     return store
 

@@ -12,13 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from psfcore.errors import DataError
-from psfcore.fits.cards import Cards
 from psfcore.fits.channel import binning_factor, check_channel
 from psfcore.fits.frame import plate_scale_arcsec
-from psfcore.fits.gain import no_noise_figures, noise_figures_for
 from psfcore.fits.header import origin_of, wavelength_angstrom
 from psfcore.instruments.model import load_instrument
-from psfcore.noise_figures import NoiseFigures
 from workers.catalogue.tables import PsfRow
 from workers.contract.requests import ResolvedDeconvolve
 from workers.versions import without_variant
@@ -39,15 +36,13 @@ def check(request: ResolvedDeconvolve, psf: PsfRow | None, header: Mapping[str, 
     """Raise the errors that the job would raise for the headers of its image and its PSF.
 
     psf: the row of the PSF; None: the PSF is not built yet. header: the header summary that is stored with the image. Codes:
-    "channel-mismatch", "plate-scale-mismatch", "no-noise-figures".
+    "channel-mismatch", "plate-scale-mismatch".
     """
     cards = header["cards"]
     origin = _origin(request, psf)
     if origin is not None:
         check_channel(origin, cards, other_channel=request.other_channel)
         binning_factor(origin, cards)
-    if request.error_draws and noise_of(request, {"GAINCOMB": header["gain_mode"]}) is None:
-        raise no_noise_figures()
 
 
 def suits(psf: PsfRow | str, header: Mapping[str, Any]) -> bool:
@@ -60,16 +55,6 @@ def suits(psf: PsfRow | str, header: Mapping[str, Any]) -> bool:
     except DataError:
         return False
     return True
-
-
-def noise_of(request: ResolvedDeconvolve, header: Cards) -> NoiseFigures | None:
-    """The noise figures of the request; if there are none, the noise figures of the instrument that took the image."""
-    if request.noise is not None:
-        return request.noise
-    recipe = request.psf_recipe
-    instrument = request.picked_for if recipe is None else recipe.instrument
-    known = None if instrument is None else noise_figures_for(load_instrument(instrument), header)
-    return None if known is None else NoiseFigures(photon_gain_dn=known[0], read_noise_dn=known[1])
 
 
 def of_upload(row: PsfRow, instrument: str | None, angstrom: float | None) -> tuple[str | None, float | None]:

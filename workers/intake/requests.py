@@ -7,19 +7,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from psfcore.deconvolve.box import Box
-from psfcore.errors import DataError
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import check_not_deconvolved
 from psfcore.gap.effect_sources import sha256_of_source
-from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import check_workload
-from psfcore.noise_figures import NoiseFigures
 from workers.catalogue.catalogue import Catalogue, Row
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, TransitRow
 from workers.contract.identities import (
     build_for,
     canonical_hash,
+    check_noise,
+    diffraction_build,
     instrument_text,
     interpolated_psf_identity,
     psf_identity,
@@ -108,7 +107,7 @@ def resolve_report(asked: Asked) -> Parameters:
         return resolve_by_ids(asked)
     summary = asked.row(TransitRow, asked.parameters.transit_id).summary
     asked.row(PsfRow, asked.parameters.psf_id)
-    _check_noise(summary, asked.parameters.noise)
+    check_noise(summary, asked.parameters.noise)
     # The ignored parameter is set to a fixed value, so that requests that differ only in it share one report.
     return asked.resolved(dark_offsets=False)
 
@@ -154,26 +153,11 @@ def resolved_deconvolution(
 _TABLES: dict[str, Any] = {"image": ImageRow, "psf": PsfRow, "transit": TransitRow}
 
 
-def _check_noise(summary: dict[str, Any], noise: NoiseFigures | None) -> None:
-    if noise is None and summary["noise"] is None:
-        raise DataError(
-            "no-noise-figures",
-            "expected noise figures (photon_gain_dn, read_noise_dn) in transit.json or in the request; got neither",
-        )
-
-
 def _diffraction_of(asked: Asked, summary: dict[str, Any]) -> PsfBuild | None:
     """The recipe of the diffraction PSF of a transit; None if the transit contains this PSF."""
-    _check_noise(summary, asked.parameters.noise)
-    if summary["known_psf"] is not None:
+    recipe = diffraction_build(summary, asked.parameters.noise)
+    if recipe is None:
         return None
-    if summary["instrument"] not in instrument_names():
-        raise DataError(
-            "no-known-psf",
-            f"expected known_psf in transit.json, or one of the instruments {', '.join(instrument_names())}; "
-            f"got neither ({summary['instrument']!r})",
-        )
-    recipe = PsfBuild(instrument=summary["instrument"], component="diffraction")
     check_not_deprecated(
         asked.catalogue,
         psf_identity(recipe),

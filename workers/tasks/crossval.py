@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from psfcore.errors import module_of_extra
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import shape_named
 from psfcore.scatter.total_psf import CURVE_RADII_PX
@@ -27,17 +28,18 @@ from psfcore.scatter.validation.cross_validation import (
     exact_fit,
     shared_fits,
 )
-from psfcore.scatter.validation.cross_validation_plot import cross_validation_png
 from psfcore.transit.transit import Transit
-from workers.catalogue.parts import Part
-from workers.catalogue.tables import ReportRow
 from workers.contract.identities import psf_fit_identity
 from workers.contract.requests import ResolvedCrossValidate
-from workers.tasks.context import Context
-from workers.tasks.data.reports import Finished, keep_report, provenance_of
+from workers.tasks.data.reports import Finished, keep_report, provenance_of, report_made
 from workers.tasks.data.solutions import solved
 from workers.tasks.transits import load_transit
 
+if TYPE_CHECKING:
+    from workers.catalogue.parts import Part
+    from workers.tasks.context import Context
+
+_PLOT = "psfcore.scatter.validation.cross_validation_plot"
 WAIT_S = 0.5
 MOST_HELPERS = 16
 
@@ -46,7 +48,7 @@ def cross_validate(context: Context, parameters: Mapping[str, Any]) -> str:
     """Cross-validate the fit of a transit; returns the report's id."""
     request = ResolvedCrossValidate.model_validate(parameters)
     identity = psf_fit_identity(request)
-    if context.made(ReportRow, identity) is not None:
+    if report_made(context, identity):
         return identity
     transit = load_transit(context, request)[0]
     wanted = bootstrap_samples(len(transit.frames), runs=request.runs, seed=request.seed)
@@ -151,7 +153,7 @@ def report_of(
     return Finished(
         said,
         {"sentence": said["sentence"], "held_out": found.held_out, "folds": len(fits)},
-        draw=lambda path: cross_validation_png(found, fits, pointings, path),
+        draw=lambda path: module_of_extra(_PLOT).cross_validation_png(found, fits, pointings, path),
     )
 
 

@@ -19,7 +19,7 @@ from psfcore.psf_sampling import with_scale
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow
 from workers.contract.identities import product_identity
 from workers.contract.requests import ResolvedDeconvolve, options_of
-from workers.intake.compatibility import noise_of, of_upload
+from workers.intake.compatibility import of_upload
 from workers.intake.deprecated import CODE, deprecated_warning
 from workers.rows import row_of
 from workers.tasks.context import Context
@@ -76,7 +76,6 @@ def make(
         return with_scale(read_psf(context.store.verified(digest), context.limits, parts=parts), scale)
 
     psf = prepared.on_pixels_of(image.header, (digest, context.limits, scale), read)
-    figures = noise_of(request, image.header)
 
     def begin(stage: str, steps: int) -> Callable[[int, int], None]:
         if stage == run.DECONVOLVING:
@@ -88,7 +87,7 @@ def make(
     product = run.deconvolve(
         image,
         psf,
-        options_of(request, None if figures is None else figures.noise(), threads),
+        options_of(request, threads),
         warnings=_warnings(context, request, psf_row, psf, image),
         engine_for=prepared.engine_for,
         possible_psfs=lambda: _possible_psfs(read(parts=True), image, threads),
@@ -99,7 +98,7 @@ def make(
     with ThreadPoolExecutor(1) as beside:
         # A worker with one thread draws the picture in this thread: a second thread would slow down the other workers.
         picture = beside.submit(draw).result if preview and threads > 1 else draw
-        details = details_of(context, request, product)
+        details = details_of(context, request, product, psf_row)
         preview_sha256 = picture() if preview else None
     return Made(context, request, psf_row, product, details, preview_sha256)
 

@@ -10,29 +10,27 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from psfcore.drawing.plots import psf_png
-from psfcore.errors import DataError
+from psfcore.errors import DataError, module_of_extra
 from psfcore.gap.corrected_psf import corrected_psf
 from psfcore.gap.diagnose import Diagnosis, diagnose, start_of
 from psfcore.gap.effect_sources import library_sha256
 from psfcore.gap.library.registry import Added, added_effects, library_with
-from psfcore.gap.report.page import gap_page
-from psfcore.gap.report.plot import gap_png
 from psfcore.gap.report.report import gap_report
 from psfcore.psf import Psf
 from psfcore.scatter.inversion import Inverter, Progress
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.transit.transit import Transit
-from workers.catalogue.tables import ReportRow
 from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
 from workers.contract.requests import ResolvedGapDiagnose
-from workers.tasks.context import Context
 from workers.tasks.data.psfs import given_psf, keep_psf
-from workers.tasks.data.reports import Finished, keep_report, provenance_of
+from workers.tasks.data.reports import Finished, keep_report, provenance_of, report_made
 from workers.tasks.data.solutions import solver
 from workers.tasks.transits import load_transit
+
+if TYPE_CHECKING:
+    from workers.tasks.context import Context
 
 KIND = "gap"
 
@@ -41,7 +39,7 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
     """Diagnose the gap of a transit; returns the report's id."""
     request = ResolvedGapDiagnose.model_validate(parameters)
     identity = gap_identity(request)
-    if context.made(ReportRow, identity) is not None:
+    if report_made(context, identity):
         return identity
     added = _added(context, request)
     parent = given_psf(context, request.psf_id)
@@ -63,7 +61,7 @@ def gap_diagnose(context: Context, parameters: Mapping[str, Any]) -> str:
             corrected,
             corrected.provenance["psf_id"],
             origin="fitted",
-            draw=partial(psf_png, corrected),
+            draw=partial(module_of_extra("psfcore.drawing.plots").psf_png, corrected),
             details={
                 "transit_id": parents["transit"],
                 "parents": parents,
@@ -120,8 +118,8 @@ def diagnosis_of(
             "psf_id": request.psf_id,
             "corrected_psf_id": corrected_id,
         },
-        draw=lambda path: path.write_bytes(gap_png(found, said)),
-        page=gap_page(found, said),
+        draw=lambda path: path.write_bytes(module_of_extra("psfcore.gap.report.plot").gap_png(found, said)),
+        page=lambda: module_of_extra("psfcore.gap.report.page").gap_page(found, said),
     )
     return report, corrected
 

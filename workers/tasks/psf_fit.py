@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from psfcore.errors import module_of_extra
 from psfcore.psf import Psf
 from psfcore.scatter.fit import TransitFit, fit_transit, fitted_psf
-from psfcore.scatter.fit_plot import fit_png
 from psfcore.scatter.inversion import Inverter, Progress
 from psfcore.scatter.report import fit_json
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Transit
-from workers.catalogue.tables import PsfRow
 from workers.contract.identities import diffraction_identity, psf_fit_identity
 from workers.contract.requests import ResolvedPsfFit
-from workers.tasks.context import Context
 from workers.tasks.data.psfs import keep_psf
 from workers.tasks.data.reports import provenance_of, write_json
 from workers.tasks.data.solutions import solver
 from workers.tasks.transits import load_transit
+
+if TYPE_CHECKING:
+    from workers.tasks.context import Context
 
 _SHOWN = ("sentence", "shape", "parameters", "curve", "chi2_per_pixel", "converged", "limits")
 
@@ -39,9 +40,15 @@ class Fitted:
         """The main figures of the fit, as JSON."""
         return {key: self.report[key] for key in _SHOWN}
 
+    def draw(self, path: Path) -> None:
+        """Draw the fit into a PNG file."""
+        module_of_extra("psfcore.scatter.fit_plot").fit_png(self.fit, path)
+
 
 def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:
     """Fit the scatter to a transit and add the PSF to the catalogue; returns the PSF's id."""
+    from workers.catalogue.tables import PsfRow  # a command with --local needs no catalogue
+
     request = ResolvedPsfFit.model_validate(parameters)
     identity = psf_fit_identity(request)
     if context.made(PsfRow, identity) is not None:
@@ -102,6 +109,4 @@ def _save(context: Context, request: ResolvedPsfFit, identity: str, fitted: Fitt
             "report_sha256": context.store.keep(text),
             "fit": fitted.details,
         }
-    keep_psf(
-        context, fitted.psf, identity, origin="fitted", draw=partial(fit_png, fitted.fit), details=details
-    )
+    keep_psf(context, fitted.psf, identity, origin="fitted", draw=fitted.draw, details=details)

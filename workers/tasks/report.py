@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfcore.evaluation.plot import evaluation_png
+from psfcore.errors import module_of_extra
 from psfcore.evaluation.shapes import compare_shapes_by_errors
 from psfcore.psf import Psf
-from psfcore.report.page import report_page
 from psfcore.report.report import make_report, report_json
 from psfcore.scatter.inversion import Inverter, Progress
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
-from workers.catalogue.tables import ReportRow
 from workers.contract.identities import report_identity
 from workers.contract.requests import ResolvedReport
-from workers.tasks.context import Context
 from workers.tasks.data.psfs import given_psf
-from workers.tasks.data.reports import Finished, keep_report, provenance_of
+from workers.tasks.data.reports import Finished, keep_report, provenance_of, report_made
 from workers.tasks.data.solutions import solver
 from workers.tasks.transits import load_transit
+
+if TYPE_CHECKING:
+    from workers.tasks.context import Context
 
 KIND = "report"
 POINT_PX = 17
@@ -32,7 +32,7 @@ def report(context: Context, parameters: Mapping[str, Any]) -> str:
     """Make a report on a transit; returns its id."""
     request = ResolvedReport.model_validate(parameters)
     identity = report_identity(request)
-    if context.made(ReportRow, identity) is not None:
+    if report_made(context, identity):
         return identity
     psf = given_psf(context, request.psf_id)
     transit, prepared = load_transit(context, request, diffraction=None if psf is None else point())
@@ -100,8 +100,8 @@ def make(
             "not_shown": said["not_shown"],
             "limits": said["fit"]["limits"] if report.fit is not None else [],
         },
-        draw=lambda path: evaluation_png(
+        draw=lambda path: module_of_extra("psfcore.evaluation.plot").evaluation_png(
             report.evaluation, path, title=report.how_judged, study=report.study
         ),
-        page=report_page(report, provenance),
+        page=lambda: module_of_extra("psfcore.report.page").report_page(report, provenance),
     )

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from psfcore.errors import DataError
 from psfcore.fits.psfs import read_psf
 from psfcore.transit.folder import read_prepared
 from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
-from workers.catalogue.tables import TransitRow
 from workers.contract.requests import ResolvedOnTransit
 from workers.rows import row_of
-from workers.tasks.context import Context
-from workers.tasks.psf_build import built_psf
+
+if TYPE_CHECKING:
+    from workers.tasks.context import Context
 
 
 def load_transit(
@@ -26,6 +28,8 @@ def load_transit(
 
     Raises DataError "no-such-transit", "no-known-psf", and the errors of unpacking and preparing.
     """
+    from workers.catalogue.tables import TransitRow  # a command with --local needs no catalogue
+
     upload = row_of(context.catalogue, TransitRow, request.transit_id, context.owner)
     images = int(upload.summary["images"])
     context.report("reading", 0, images)
@@ -56,5 +60,7 @@ def _built_diffraction(
             "expected known_psf in transit.json, or an instrument whose diffraction PSF can be built; got neither: add "
             "the file of the known PSF to the transit",
         )
+    from workers.tasks.psf_build import built_psf  # a command with --local needs no catalogue
+
     row = built_psf(context, request.diffraction_recipe)
     return read_psf(context.store.verified(row.file_sha256), context.limits, parts=False).kernel

@@ -84,7 +84,7 @@ def find_artefacts(
     estimated from the pixels.
     """
     # Single precision is accurate enough for these filters, and twice as fast.
-    filled_before, filled_after = (_filled(plane).astype(np.float32) for plane in (before, after))
+    filled_before, filled_after = (filled(plane).astype(np.float32) for plane in (before, after))
     classes = classes_of(filled_before[counted])
     noise_after = _estimated_noise(filled_after, filled_before, counted, classes)
     noise_before = sigma or _estimated_noise(filled_before, filled_before, counted, classes)
@@ -154,7 +154,7 @@ class NoiseLevels:
 
 def noise_levels(pixels: Plane, counted: Flags, classes: BrightnessClasses) -> NoiseLevels:
     """Upper limit of the noise of `pixels` [y, x], which must be finite."""
-    second = np.abs(_second_difference(pixels))[counted] / 6
+    second = np.abs(second_difference(pixels))[counted] / 6
     smallest = 1e-6 * float(np.abs(pixels).max()) + np.finfo(float).tiny
     levels = np.array([1.4826 * np.median(second[part]) for part in classes.members])
     return NoiseLevels(classes.centres, levels, smallest)
@@ -166,7 +166,7 @@ def _estimated_noise(pixels: Plane, brightness: Plane, counted: Flags, classes: 
     return lambda at: levels.at(brightness[at])
 
 
-def _second_difference(plane: Plane) -> Plane:
+def second_difference(plane: Plane) -> Plane:
     """The second difference along both axes [y, x]; the plane is mirrored at its edges. Sums are in double precision."""
     found = np.empty_like(plane)
     padded = np.pad(plane, 1, mode="symmetric")
@@ -317,7 +317,7 @@ def _rise(profile: Plane) -> float:
     return float(profile[dip + 1 :].max() - profile[dip])
 
 
-def _filled(plane: Plane) -> Plane:
+def filled(plane: Plane) -> Plane:
     """Replace the pixels of a plane that are not finite by the median of the finite pixels."""
     good = np.isfinite(plane)
     if good.all():

@@ -32,19 +32,14 @@ IDEAL = (sys.executable, "-P", "-m", "psfcore.gap.ideal_observer", "{expected}",
 
 
 @click.command(short_help="Test the diagnosis on simulated cases.")
-@click.option("--cases", default=24, show_default=True, type=click.IntRange(1, 9999), help="Number of cases")
-@click.option("--seed", default=1, show_default=True, type=click.IntRange(0), help="Seed of random numbers")
+@click.option("--cases", default=24, type=click.IntRange(1, 9999), help="Number of cases")
+@click.option("--seed", default=1, type=click.IntRange(0), help="Seed of random numbers")
 @click.option("-o", "--output", required=True, type=OUTPUT_FOLDER, help="Folder of the set")
-@click.option(
-    "--size", default=256, show_default=True, type=click.IntRange(128, 1024), help="Width and height, px"
-)
-@click.option(
-    "--images", default=18, show_default=True, type=click.IntRange(6, 200), help="Images per transit"
-)
+@click.option("--size", default=256, type=click.IntRange(128, 1024), help="Width and height, px")
+@click.option("--images", default=18, type=click.IntRange(6, 200), help="Images per transit")
 @click.option(
     "--processes",
     default=2,
-    show_default=True,
     type=click.IntRange(1, 64),
     help="Number of diagnoses that run at the same time",
 )
@@ -63,6 +58,7 @@ IDEAL = (sys.executable, "-P", "-m", "psfcore.gap.ideal_observer", "{expected}",
 @click.option(
     "--simulator",
     default="",
+    show_default=False,
     metavar="FILE.py|MODULE",
     help="Let the function make_case of this file or module make the cases; its code is executed (docs/gap.md)",
 )

@@ -14,6 +14,7 @@ from service.cli.fields import options_of
 from service.cli.gap.blind import blind
 from service.cli.gap.plan import plan
 from service.cli.options import (
+    DRAWN,
     JSON,
     OUTPUT,
     PLOT,
@@ -48,7 +49,7 @@ def gap() -> None:
 
 @gap.command(short_help="Find the effects that explain a gap.")
 @click.argument("transit", type=click.Path(exists=True, path_type=Path))
-@click.option("-o", "--output", type=OUTPUT, help="Write the result as an HTML page")
+@click.option("-o", "--output", type=DRAWN, help="Write the result as an HTML page")
 @JSON
 @PLOT
 @psf_option(

@@ -10,9 +10,9 @@ from pathlib import Path
 import click
 
 from service.cli.options import (
+    DRAWN,
     FILE,
     JSON,
-    OUTPUT,
     SEED,
     limits,
     progress_bar,
@@ -28,7 +28,7 @@ THREADS = 2
 
 @click.command(short_help="Find what a planned transit would show.")
 @click.argument("plan_file", metavar="PLAN", type=click.Path(exists=True, path_type=Path))
-@click.option("-o", "--output", type=OUTPUT, help="Write the result as an HTML page")
+@click.option("-o", "--output", type=DRAWN, help="Write the result as an HTML page")
 @JSON
 @click.option(
     "--instrument",

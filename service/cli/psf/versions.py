@@ -41,9 +41,14 @@ if TYPE_CHECKING:
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 PSF_ID = id_argument("psf_id")
-REASON = click.option("--reason", default="", help="Reason, kept in the history")
+REASON = click.option("--reason", default="", show_default=False, help="Reason, kept in the history")
 PRODUCT = click.option(
-    "--product", "of", flag_value="product", default="psf", help="The ID is of a product, not of a PSF"
+    "--product",
+    "of",
+    flag_value="product",
+    default="psf",
+    show_default=False,
+    help="The ID is of a product, not of a PSF",
 )
 
 

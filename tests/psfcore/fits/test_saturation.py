@@ -13,12 +13,10 @@ from scipy.stats import poisson
 
 from psfcore.fits import observation
 from psfcore.fits.blocks import FitsLimits
-from psfcore.fits.gain import noise_for
 from psfcore.fits.observation import read_observation
 from psfcore.fits.saturation import largest_value, with_saturation
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import Instrument, parse_instrument
-from psfcore.noise import Noise
 from tests.conftest import SMALL_INSTRUMENT, write_image
 
 Find = Callable[[str], Path]
@@ -164,13 +162,11 @@ def test_the_level_and_its_source() -> None:
         np.testing.assert_array_equal(saturated(image), pixels >= (np.inf if level is None else level))
 
 
-# --- the level and the noise of the gain mode ---
+# --- the level of the gain mode ---
 
 MODES = """
 [detector.gain_modes.combined]
 saturation_dn = 400.0
-photon_gain_dn = 6.0
-read_noise_dn = 2.0
 basis = "assumed"
 [detector.gain_modes.high-only]
 saturation_dn = 300.0
@@ -206,9 +202,3 @@ def test_the_level_is_that_of_the_gain_mode_in_the_header(
         assert image.saturation is not None
         assert (image.saturation.level, image.saturation.found) == (level, source), cards
         assert image.valid.all() == (level is None)
-
-
-def test_noise_needs_photon_gain_and_read_noise() -> None:
-    assert noise_for(instrument(), fits.Header({"GAINCOMB": "combined"})) == Noise(6.0, 2.0)
-    assert noise_for(instrument(), fits.Header({"GAINCOMB": "high-only"})) is None
-    assert noise_for(instrument(), fits.Header()) is None

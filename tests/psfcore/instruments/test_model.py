@@ -117,11 +117,16 @@ def test_the_fault_names_the_key_what_was_expected_and_what_was_given() -> None:
         assert "\n" not in caught.value.message and "more)" not in caught.value.message, change
 
 
-def test_a_misspelt_key_is_named_first_and_further_faults_are_counted() -> None:
-    with pytest.raises(
-        DataError, match=r"aperture\.diametre_mm: expected one of the keys .* \(and 2 more\)$"
-    ):
-        read(("diameter_mm", "diametre_mm"), ("pixels = 512", "pixels = 0"))
+def test_all_faults_are_told_and_a_misspelt_key_with_the_one_that_is_meant() -> None:
+    misspelt = ("", MESH.replace("pitch_um", "pitch_mm"))
+    with pytest.raises(DataError) as caught:
+        read(("diameter_mm", "diametre_mm"), ("pixels = 512", "pixels = 0"), misspelt)
+    told = [line.strip().split(": ")[0] for line in caught.value.message.splitlines()[1:]]
+    assert told == ["aperture.diametre_mm", "meshes.0.pitch_mm", "detector.pixels"], "and none as missing"
+    assert "'diameter_mm'" in caught.value.message and "'pitch_um'" in caught.value.message
+    many = "".join(f"[[meshes]]\nzzz = {number}\n" for number in range(12))
+    with pytest.raises(DataError, match=r"and \d+ more$"):
+        read(("", many))
 
 
 def test_instruments_do_not_change_and_a_changed_copy_is_checked() -> None:

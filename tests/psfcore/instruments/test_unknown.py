@@ -58,6 +58,7 @@ def test_the_error_names_the_telescope_the_reason_and_the_step() -> None:
         assert list(texts) == ["name", "upload", "fit"]
         for way, sentence in telescope.ways.items():
             assert texts[way].endswith(sentence)
+            assert sentence in [one.get("known") for one in error.fields["ways"]]
         for recommended in list(telescope.ways.values())[:1]:
             assert recommended in error.message
 

@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 
 from service.cli import connection
 from service.cli.main import main
-from tests.conftest import write_image, write_psf
+from tests.conftest import SMALL_INSTRUMENT, write_image, write_psf
 
 
 def run(*arguments: object) -> Result:
@@ -51,7 +51,10 @@ def test_images_go_into_a_folder(folder: Path) -> None:
 
 def test_one_image_goes_into_a_file(folder: Path) -> None:
     done = run("deconvolve", folder / "in" / "0.fits", "-o", folder / "new.fits", *options(folder))
-    assert done.exit_code == 0 and "new.fits: PSF" in done.output, done.output
+    assert done.exit_code == 0, done.output
+    told = done.stdout.splitlines()
+    assert len(told) == 3 and "PSF psf 0.0.0+" in told[0] and told[1].startswith("1 steps: flux"), told
+    assert "--plot" in told[2]
     header = fits.getheader(folder / "new.fits")
     assert header["DCNVITER"] == 1 and "DCNVSATL" not in header
     level = ("--saturation", 100.0)
@@ -85,14 +88,37 @@ def test_a_failure_is_named_and_ends_with_status_1(folder: Path) -> None:
 
 def test_an_error_is_told_once_with_local(folder: Path) -> None:
     """In a process of its own, because pytest replaces the handlers of the logs."""
-    wrong = ("--errors", 2, "--steps", 1, "--psf", folder / "psf.dat", "--local")
+    wrong = ("--stop", "discrepancy", "--steps", 1, "--psf", folder / "psf.dat", "--local")
     line = ("deconvolve", folder / "in" / "0.fits", "-o", folder / "o.fits", *wrong)
     done = subprocess.run(
         [sys.executable, "-m", "service.cli", *map(str, line)], capture_output=True, text=True
     )
     assert done.returncode == 1
-    assert done.stderr.count("expected noise (photon_gain_dn and read_noise_dn)") == 1, done.stderr
+    assert done.stderr.count("expected photon gain, read noise") == 1, done.stderr
     assert "job " not in done.stderr
+
+
+def test_the_psf_of_an_instrument_may_be_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    image, file = folder / "in" / "0.fits", folder / "small.toml"
+    file.write_text(SMALL_INSTRUMENT)
+    done = run("deconvolve", image, "-o", folder / "o.fits", "--steps", 1, "--psf", file, "--local")
+    assert done.exit_code == 0 and "PSF small 1.0.0" in done.output, done.output
+    assert "draft: without diffuse scatter" in done.output
+    assert fits.getheader(folder / "o.fits")["PSFNAME"] == "small"
+    done = run("deconvolve", image, "-o", folder / "n.fits", "--psf", "aia171", "--local")
+    assert done.exit_code == 2 and "'aia_171'" in done.output
+    file.write_text(SMALL_INSTRUMENT.replace("diameter_mm", "diameter_cm"))
+    done = run("deconvolve", image, "-o", folder / "n.fits", "--psf", file, "--local")
+    assert done.exit_code == 1 and "aperture.diameter_cm" in done.output and "'diameter_mm'" in done.output
+
+
+def test_errors_need_no_figures(folder: Path) -> None:
+    image = folder / "in" / "0.fits"
+    done = run("deconvolve", image, "-o", folder / "e.fits", "--errors", 2, *options(folder))
+    assert done.exit_code == 0 and "measured (photon transfer" in done.output, done.output
+    with fits.open(folder / "e.fits") as hdus:
+        assert hdus[0].header["DCNVNOIS"] == "measured" and (hdus["ERROR"].data > 0).all()
+        assert any("noise: photon gain" in str(line) for line in hdus[0].header["HISTORY"])
 
 
 def test_what_does_not_fit_together_is_refused(folder: Path) -> None:

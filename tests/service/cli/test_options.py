@@ -12,6 +12,8 @@ from astropy.io import fits
 from click.testing import CliRunner
 
 from psfcore.errors import DataError
+from psfcore.fits.header import seen_by
+from psfcore.instruments.unknown import unknown_instrument
 from service.cli import options as cli_options
 from service.cli.main import main
 from service.client.http import ServiceError
@@ -90,20 +92,15 @@ def test_an_image_without_a_known_psf_prints_the_ways_on(tmp_path: Path, image_f
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 1 and not (tmp_path / "o.fits").exists()
     lines = result.output.splitlines()
-    for start in (
-        "Instruments whose PSF can be built:",
-        "  aia_171",
-        "No PSF of the catalogue",
-        "What to do next:",
-    ):
-        assert any(line.startswith(start) for line in lines), result.output
-    assert [line[:5] for line in lines[-3:]] == ["  1. ", "  2. ", "  3. "]
-    fields = {
-        "psfs": [{"id": "a" * 64, "name": "p", "version": "1", "status": "draft", "same": ["plate_scale"]}]
-    }
+    assert len(lines) == 4 and "TEST" in lines[0], result.output
+    assert "--psf FILE.toml" in lines[2] and "psf fit TRANSIT" in lines[3] and "--local" in lines[3]
+    psf = {"id": "a" * 64, "name": "p", "version": "1", "status": "draft", "same": ["plate_scale"]}
+    error = unknown_instrument(seen_by(fits.Header({"INSTRUME": "TRACE"})), [psf])
     with pytest.raises(click.ClickException) as caught, cli_options.user_errors():
-        raise ServiceError("no PSF", code="no-psf-for-instrument", fields=fields)
-    assert caught.value.message.splitlines()[-1].endswith("p 1 (draft); same plate scale as the image")
+        raise ServiceError(str(error), code=error.code, fields=error.fields)
+    lines = caught.value.message.splitlines()
+    assert len(lines) == 4 and lines[0].endswith(error.fields["reason"])
+    assert f"--psf ID, such as {12 * 'a'} (p 1)" in lines[2] and "--local" not in caught.value.message
 
 
 def test_warnings_of_a_product_are_printed(tmp_path: Path) -> None:

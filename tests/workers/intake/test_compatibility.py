@@ -12,11 +12,10 @@ from astropy.io import fits
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.header import read_summary
-from psfcore.noise_figures import NoiseFigures
 from tests.conftest import write_image, write_psf
 from workers.catalogue.tables import ImageRow, PsfRow
 from workers.contract.requests import PsfBuild, ResolvedDeconvolve, RichardsonLucy
-from workers.intake.compatibility import check, noise_of, suits
+from workers.intake.compatibility import check, suits
 from workers.intake.uploads import image_row, uploaded_psf_row
 
 AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171, "CDELT1": 0.6, "CDELT2": 0.6}
@@ -104,15 +103,6 @@ def test_pixels_of_another_size_are_refused_with_the_factor_that_helps(tmp_path:
     assert (error.code, error.fields["factor"]) == ("plate-scale-mismatch", 4)
     odd = {**header, "cards": {**header["cards"], "CDELT1": 1.5, "CDELT2": 1.5}}
     assert refusal(request(other_channel=True), psf, odd).fields["factor"] is None
-
-
-def test_noise_realisations_need_figures(tmp_path: Path) -> None:
-    header, psf = summary_of(tmp_path, **AIA), psf_of(tmp_path, **AIA)
-    error = refusal(request(error_draws=8), psf, header)
-    assert error.code == "no-noise-figures" and "--noise GAIN READ" in error.message
-    given = request(error_draws=8, noise=NoiseFigures(photon_gain_dn=2.0, read_noise_dn=1.0))
-    check(given, psf, header)
-    assert noise_of(given, {}) == given.noise and noise_of(request(), {}) is None
 
 
 def test_the_summary_of_a_file_that_was_not_uploaded_is_checked_too(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def made(service: InProcess, transit: Path, tmp_path_factory: pytest.TempPathFac
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """The arguments of each diagnosis, whose result is replaced by a prepared one."""
-    monkeypatch.setattr(gap_task, "gap_png", lambda found, report: b"\x89PNG")
+    monkeypatch.setattr("psfcore.gap.report.plot.gap_png", lambda found, report: b"\x89PNG")
     return answer_at_once(monkeypatch, small_gaps.found())
 
 

@@ -94,7 +94,9 @@ def keep_picture(context: Context, draw: Callable[[Path], object]) -> str:
         return context.store.keep(picture)
 
 
-def details_of(context: Context, request: ResolvedDeconvolve, product: Product) -> dict[str, Any]:
+def details_of(
+    context: Context, request: ResolvedDeconvolve, product: Product, psf: PsfRow
+) -> dict[str, Any]:
     """The details of the product's row: the request, the versions of the software, and the details of the product."""
     header = product.image.header
     return {
@@ -106,5 +108,5 @@ def details_of(context: Context, request: ResolvedDeconvolve, product: Product) 
         "libraries": library_versions(),
         "parameters": request.model_dump(mode="json", exclude_none=True),
         "job_id": context.job_id,
-        **product.details(),
+        **product.details(used_psf(psf), psf.details.get("provenance")),
     }

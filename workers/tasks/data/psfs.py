@@ -6,19 +6,23 @@ import json
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from psfcore.fits.psfs import read_psf, write_psf
 from psfcore.psf import Psf, light_beyond_pct
-from workers.catalogue.tables import PsfRow
-from workers.files.store import Store
 from workers.rows import row_of
-from workers.tasks.context import Context
 from workers.versions import TOTAL, PsfStatus, channel_of, series_of
+
+if TYPE_CHECKING:
+    from workers.catalogue.tables import PsfRow
+    from workers.files.store import Store
+    from workers.tasks.context import Context
 
 
 def named_psf(context: Context, psf_id: str) -> PsfRow:
     """The catalogue's row of a PSF. Raises DataError "no-such-psf"."""
+    from workers.catalogue.tables import PsfRow  # a command with --local needs no catalogue
+
     return row_of(context.catalogue, PsfRow, psf_id, context.owner)
 
 
@@ -48,6 +52,8 @@ def keep_psf(
 
     draw: draws the picture into a PNG file. channel: None: as the PSF says. details: further entries for the details of the row.
     """
+    from workers.catalogue.tables import PsfRow  # a command with --local needs no catalogue
+
     store = context.store
     with store.temporary() as file, store.temporary() as picture:
         write_psf(file, psf, instrument_file=instrument_file)

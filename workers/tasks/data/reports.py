@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from workers.catalogue.tables import ReportRow
 from workers.contract.requests import Parameters
 from workers.settings import library_versions, software_version
-from workers.tasks.context import Context
+
+if TYPE_CHECKING:
+    from workers.tasks.context import Context
 
 
 @dataclass(frozen=True)
@@ -20,13 +21,13 @@ class Finished:
     """A finished report whose files are not yet written.
 
     content: the report as JSON. details: the entry "sentence" and the main figures; lists of reports show them. draw: draws its
-    picture into a PNG file. page: the report as HTML; None if it has no page.
+    picture into a PNG file. page: makes the report as HTML; None if it has no page.
     """
 
     content: dict[str, Any]
     details: dict[str, Any]
     draw: Callable[[Path], object]
-    page: str | None = None
+    page: Callable[[], str] | None = None
 
 
 def provenance_of(job_id: str, request: Parameters) -> dict[str, Any]:
@@ -42,6 +43,13 @@ def provenance_of(job_id: str, request: Parameters) -> dict[str, Any]:
     }
 
 
+def report_made(context: Context, identity: str) -> bool:
+    """Whether an earlier job has made the report with this identity."""
+    from workers.catalogue.tables import ReportRow  # a command with --local needs no catalogue
+
+    return context.made(ReportRow, identity) is not None
+
+
 def keep_report(context: Context, identity: str, kind: str, report: Finished, *, transit_id: str) -> None:
     """Write the files of a report on a transit into the store, and add its row to the catalogue."""
     store = context.store
@@ -50,7 +58,7 @@ def keep_report(context: Context, identity: str, kind: str, report: Finished, *,
         report.draw(picture)
         of_page = {}
         if report.page is not None:
-            page.write_text(report.page, "utf-8")
+            page.write_text(report.page(), "utf-8")
             of_page = {"page_sha256": store.keep(page)}
         add_report(
             context,
@@ -79,6 +87,8 @@ def add_report(
     details: see `Finished`. transit_id, about_id: the transit, or the PSF or product, that the report is about; reports can be
     listed by these ids.
     """
+    from workers.catalogue.tables import ReportRow  # a command with --local needs no catalogue
+
     file_sha256 = context.store.keep(text)
     context.add(
         ReportRow(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 import time
+from typing import TYPE_CHECKING
 
 from psfcore.errors import DataError
 from psfcore.scatter.inversion import ALGORITHM_VERSION, Inverter, invert
@@ -20,12 +21,12 @@ from psfcore.scatter.kept import read_solution, write_solution
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.scatter.shapes import Shape, Vector
 from psfcore.transit.transit import Transit
-from workers.catalogue.owners import OverQuota
-from workers.catalogue.tables import SolutionRow
 from workers.contract.identities import canonical_hash, diffraction_identity
 from workers.contract.requests import ResolvedOnTransit
 from workers.settings import library_versions, software_version
-from workers.tasks.context import Context
+
+if TYPE_CHECKING:
+    from workers.tasks.context import Context
 
 log = logging.getLogger(__name__)
 
@@ -90,6 +91,8 @@ def solution_identity(
 
 def _kept(context: Context, identity: str, transit: Transit) -> Solution | None:
     """The owner's stored solution with this identity; None if it does not exist or cannot be read."""
+    from workers.catalogue.tables import SolutionRow  # a command with --local needs no catalogue
+
     row = context.catalogue.get(SolutionRow, identity, context.owner)
     if row is None:
         return None
@@ -107,6 +110,9 @@ def _kept(context: Context, identity: str, transit: Transit) -> Solution | None:
 
 def _keep(context: Context, identity: str, solution: Solution) -> None:
     """Store a solution if the owner's quota allows it."""
+    from workers.catalogue.owners import OverQuota  # a command with --local needs no catalogue
+    from workers.catalogue.tables import SolutionRow
+
     try:
         with context.store.temporary() as file:
             write_solution(file, solution)

@@ -1,0 +1,89 @@
+"""Parameters as users of astropy give them: numbers in the documented unit, or quantities in any unit that fits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from astropy import units
+
+from psfcore.errors import DataError
+from psfcore.fits.header import optional_exposure_s
+from psfcore.noise import Noise
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+Number: TypeAlias = "float | units.Quantity"
+NoiseFigures: TypeAlias = "tuple[Number, Number] | Noise"
+# Three names of the number of the A/D converter.
+COUNTS = (units.DN, units.adu, units.ct)
+
+
+def plain(name: str, value: Any, *allowed: Any) -> NDArray[np.float64]:
+    """The values of a parameter in the first of these units that fits. Raises DataError "bad-quantity"."""
+    expected = f"{name}: expected a number" + (f" of {allowed[0]}, or a quantity in it" if allowed else "")
+    if isinstance(value, units.Quantity):
+        for unit in allowed or (units.dimensionless_unscaled,):
+            if value.unit.is_equivalent(unit):
+                return np.asarray(value.to_value(unit), dtype=np.float64)
+        raise DataError("bad-quantity", f"{expected}; got the unit {value.unit}")
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError("bad-quantity", f"{expected}; got {value!r:.80}") from error
+
+
+def number(name: str, value: Any, *allowed: Any) -> float:
+    """As `plain`, for one number."""
+    found = plain(name, value, *allowed)
+    if found.ndim or isinstance(value, str | bool):
+        raise DataError("bad-quantity", f"{name}: expected one number; got {value!r:.80}")
+    return float(found)
+
+
+def whole(name: str, value: Any, code: str, *allowed: Any) -> int:
+    """A whole number. Raises DataError with this code."""
+    found = value.to_value(allowed[0]) if isinstance(value, units.Quantity) and allowed else value
+    if not isinstance(found, int | float | np.integer) or isinstance(found, bool) or int(found) != found:
+        raise DataError(code, f"{name}: expected a whole number; got {value!r:.80}")
+    return int(found)
+
+
+def noise_of(noise: Any) -> Noise | None:
+    """The noise figures of the user. Raises DataError "bad-noise" and "bad-quantity"."""
+    if noise is None or isinstance(noise, Noise):
+        return noise
+    if not isinstance(noise, tuple | list | np.ndarray) or len(noise) != 2:
+        raise DataError(
+            "bad-noise",
+            "noise: expected two numbers, photon gain (DN per photon) and read noise (DN rms), such as noise=(1.12, 1.15); got "
+            f"{noise!r:.80}",
+        )
+    gain = number("photon gain", noise[0], *COUNTS, *(one / units.ph for one in COUNTS))
+    return Noise(gain, number("read noise", noise[1], *COUNTS))
+
+
+def saturation_dn(level: Any, header: Mapping[str, Any]) -> float | None:
+    """The saturation level in DN of one exposure. A level per second is multiplied by the exposure time in the header.
+
+    Raises DataError "bad-quantity", and "no-exposure" for a level per second of an image without an exposure time.
+    """
+    if level is None:
+        return None
+    rates = tuple(one / units.s for one in COUNTS)
+    if isinstance(level, units.Quantity) and any(level.unit.is_equivalent(one) for one in rates):
+        exposure_s = optional_exposure_s(header)
+        if exposure_s is None:
+            message = f"expected XPOSURE or EXPTIME in the header, because saturation_dn is in {level.unit}; got neither"
+            raise DataError("no-exposure", message)
+        return number("saturation_dn", level, *rates) * exposure_s
+    return number("saturation_dn", level, *COUNTS)
+
+
+def radii_px(radii: ArrayLike | units.Quantity, plate_scale_arcsec: float | None) -> NDArray[np.float64]:
+    """Radii in px. Angles need the plate scale. Raises DataError "bad-quantity"."""
+    if isinstance(radii, units.Quantity) and radii.unit.is_equivalent(units.arcsec) and plate_scale_arcsec:
+        return plain("radii", radii, units.arcsec) / plate_scale_arcsec
+    return plain("radii", radii, units.pix)

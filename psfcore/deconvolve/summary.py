@@ -1,0 +1,40 @@
+"""A deconvolution in a few lines, from the details of its product: image and PSF, what changed, and the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def summary_lines(details: Mapping[str, Any]) -> list[str]:
+    """The lines. details: `psfcore.deconvolve.run.Product.details`."""
+    psf, noise, region = details["psf"], details["noise"], details["region"]
+    doubts = f": {', '.join(psf['assumed'])}" if psf["assumed"] else ""
+    stopped = "" if details["stopped_because"].startswith("all ") else f" ({details['stopped_because']})"
+    lines = [
+        f"{details['image']}, PSF {psf['name']} {psf['version']} ({psf['status']}{doubts})",
+        f"{details['steps_done']} steps{stopped}: flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
+        f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",
+    ]
+    if region is not None:
+        lines.append(
+            f"region {region['box']}, rim {region['rim_px']} px: differs from the same pixels of the whole image by at most "
+            f"{region['error']:.3g} (estimated bound, in the unit of the image)"
+        )
+    if noise is not None:
+        lines.append(f"errors from the noise: {noise['text']}")
+    return lines
+
+
+def assumptions(provenance: Mapping[str, Any]) -> list[str]:
+    """What of a built PSF is not known, from its provenance. Empty for other PSFs."""
+    if "mount_basis" not in provenance:
+        return []
+    scatter = {None: ["without diffuse scatter"], "inferred": ["scatter inferred"]}
+    mount = ["mount of the filter assumed"] if provenance["mount_basis"] == "assumed" else []
+    return mount + scatter.get(provenance.get("scatter_basis"), [])
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """A relative change as text. value: in percent; None if the reference contains no light."""
+    return "n/a (no light)" if value is None else f"{value:+.{digits}f} %"
