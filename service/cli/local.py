@@ -337,6 +337,8 @@ class Local(Operations):
             recipe = recipe_of(self._builds[identity])
             psf = kept_psf(psf_cache(), recipe, LIMITS, parts=False, threads=cores())
         else:
+            if identity not in self._psfs:
+                raise _no_such_psf(identity)
             named = self._psfs[identity]
             named.files.check()
             psf = read_psf(named.path, LIMITS, parts=parts)

@@ -164,7 +164,7 @@ def test_the_sentence_says_how_sure_a_gap_is() -> None:
     assert "dark offset (60 %) or a cause outside the library (38 %)." in unsure
     # More hypotheses than a sentence can hold are counted.
     many = with_shares({OFFSET: 0.3, UNKNOWN: 0.2, NONE: 0.18, GAIN: 0.16, BLUR: 0.16})
-    assert gap_report(many)["sentence"].endswith(" or 1 other of smaller probability.")
+    assert " or 1 other of smaller probability. To decide, take " in gap_report(many)["sentence"]
 
 
 def test_pairs_and_ties_name_what_is_certain_and_what_is_tied() -> None:
