@@ -146,7 +146,9 @@ def best_prior(cases: Sequence[Case], temperature: float) -> dict[Kind, float]:
         other = prior(factors)
         return _loss(case.true_share(temperature, other) for case in cases)
 
-    return prior(minimize(loss, np.zeros(len(FITTED)), method="Powell", options={"xtol": 0.02, "ftol": 1e-4}).x)
+    return prior(
+        minimize(loss, np.zeros(len(FITTED)), method="Powell", options={"xtol": 0.02, "ftol": 1e-4}).x
+    )
 
 
 def _loss(true_shares: Iterable[float]) -> float:
