@@ -73,6 +73,11 @@ class DarkOffsetStudy:
         """Largest change of C(R) of the scatter kernel, percentage points."""
         return self._largest("curve_change_points")
 
+    @property
+    def largest_total_curve_change_points(self) -> float:
+        """Largest change of C(R) of the total PSF, percentage points."""
+        return self._largest("total_curve_change_points")
+
     def _largest(self, name: str) -> float:
         return max(float(np.abs(getattr(offset, name)).max()) for offset in self.offsets)
 
