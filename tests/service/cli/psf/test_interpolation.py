@@ -50,7 +50,7 @@ def test_a_series_is_interpolated_for_an_image_between_two_psfs(command: Command
     made = command("deconvolve", image, "-o", tmp_path / "o.fits", "--steps", 2)
     with fits.open(tmp_path / "o.fits") as hdus:
         psf_id, version = hdus[0].header["PSFID"], hdus[0].header["PSFVERS"]
-    assert psf_id[:12] in best and version == f"0.1.0+{psf_id[:8]}" and f"PSF {version}" in made
+    assert psf_id[:12] in best and version == f"0.1.0+{psf_id[:8]}" and f" {version} (" in made
     lines = command("psf", "lineage", psf_id).splitlines()
     assert "hri_euv-interpolated" in lines[0]
     assert lines[1].startswith(f"  psf {early}  (fitted 1.0.0 certified; weight 0.800")

@@ -99,7 +99,7 @@ def test_the_best_psf_for_an_image_is_the_one_that_deconvolve_uses(
     assert told.startswith(certified) and "This PSF is certified" in told
     write_image(tmp_path / "aia.fits", TELESCOP="SDO/AIA", INSTRUME="AIA_3", WAVELNTH=1600)
     told = command("psf", "best", "--image", tmp_path / "aia.fits", code=1)
-    assert "What to do next:" in told and "aia_171" in told
+    assert "--psf FILE.toml" in told and "psf fit TRANSIT" in told
 
 
 def test_contexts(command: Command, client: Client, tmp_path: Path) -> None:
