@@ -20,12 +20,12 @@ from service.app import create_app
 from service.http.state import State
 from tests.conftest import write_image
 from tests.service.conftest import execute, job_after, upload
-from tests.whole.stack import Missing, Redis, free_port
+from tests.whole.stack import Missing, Redis, free_port, wait_for
 from workers import logs
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.stage_times import KeptStageTimes
-from workers.catalogue.tables import DEFAULT_OWNER, JobRow
+from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
 from workers.settings import Settings
 
 Lines = Callable[[], list[dict[str, Any]]]
@@ -312,6 +312,23 @@ def test_not_ready_if_a_job_waits_for_workers_that_do_nothing(api: TestClient) -
     execute(catalogue, text("DELETE FROM workers"))
     parts = api.get("/readyz").json()["parts"]
     assert parts["jobs"] == "ok" and "no worker" in parts["worker"]
+
+
+def test_a_server_says_what_it_would_delete_and_deletes_it_when_told(
+    settings: Settings, lines: Lines, image_file: Path
+) -> None:
+    with TestClient(create_app(settings)) as api:
+        image = upload(api, image_file)
+        execute(handles(api).catalogue, update(ImageRow).values(created_at=0.0))
+    for dry_run, done, status in ((True, "would delete", 200), (False, "deleted", 404)):
+        keeping = settings.model_copy(update={"keep_days": "image=30", "keep_dry_run": dry_run})
+        with TestClient(create_app(keeping)) as api:
+
+            def told(done: str = done) -> bool:
+                return any(one.get("kind") == "image" and done in one["message"] for one in lines())
+
+            wait_for(told, "the server says what it does")
+            assert api.get(f"/v1/images/{image}").status_code == status
 
 
 FEW = {"method": {"name": "richardson-lucy", "steps": 3}}
