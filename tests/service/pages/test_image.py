@@ -87,7 +87,7 @@ def test_the_advice_is_that_of_the_error(api: TestClient, psf_file: Path, tmp_pa
 
 def test_an_error_plane_needs_no_figures_and_the_form_takes_them(api: TestClient, tmp_path: Path) -> None:
     hri = image(api, tmp_path, **HRI)
-    assert checked(api, hri, error_draws="8")[0].startswith("PSF hri_euv 0.2.0. No PSF of hri_euv")
+    assert checked(api, hri, error_draws="8")[0].startswith("PSF hri_euv 0.2.0, built for")
     figures = {"photon_gain_dn": "4", "read_noise_dn": "1.5"}
     assert checked(api, hri, error_draws="8", **figures)[0].startswith("PSF hri_euv 0.2.0, built for")
     sent = api.post(f"/images/{hri}/start", data={"error_draws": "8", **figures}, follow_redirects=False)
