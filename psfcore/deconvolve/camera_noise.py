@@ -23,12 +23,14 @@ they also hold for means of pixels; for a single pixel they are an upper limit.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, uniform_filter
+from scipy.special import ndtri
 
 from psfcore.deconvolve.assess.artefacts import classes_of, filled, second_difference
 from psfcore.errors import DataError
@@ -52,7 +54,8 @@ PUBLISHED = {
 }
 _BLOCK_ROWS, _MOST_PIXELS = 64, 2**20
 _LOWEST = 0.75
-_LOWEST_MEAN = 0.5148  # mean of this share of the absolute values of a normal distribution with variance 1
+# Mean of this share of the absolute values of a normal distribution with variance 1.
+_LOWEST_MEAN = math.sqrt(2 / math.pi) * -math.expm1(-(ndtri((1 + _LOWEST) / 2) ** 2) / 2) / _LOWEST
 
 Plane = NDArray[np.floating[Any]]
 

@@ -27,7 +27,7 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, p_value_of_gap
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.expected_gap import ExpectedGap, expected_gap
-from psfcore.gap.evidence.fields import UNKNOWN, Field, fields_of, refittable
+from psfcore.gap.evidence.fields import UNKNOWN, Field, fields_of
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
 from psfcore.gap.library.registry import LIBRARY
@@ -214,11 +214,13 @@ def diagnose_solution(
     named = judged.verdict in ("attributed", "tie")
     corrected = refits.of([judged.form(names) for names in judged.named]) if refit and named else ()
     with_field = None
-    if refit and judged.verdict == "unknown" and told and refittable(told[0].field):
+    if refit and judged.verdict == "unknown" and told and told[0].form.refittable:
         with_field = next(iter(refits.of([told[0].form])), None)
     held_out = [hold_out(model, (), scheme) for scheme in (time_blocks(model), pointings(model))]
     shrinking, after = _shrinking(model, judged, fits, refits, held_out, rng)
     judged = earned(judged, None if best is None else shrinking[best].closure)
+    if judged.verdict == "inconclusive":  # a name that closes too little has no corrected PSF
+        corrected = ()
     before, gone = held_out[0], None if best is None else after[best]
     explained = fits[best] if best is not None and judged.answer else None
     named = judged.verdict in ("attributed", "tie") and gone is not None
@@ -321,7 +323,7 @@ def linear_fits(
     hypotheses = [names for names in (judged.best or NONE, *judged.named) if names != NONE]
     forms = [*(judged.form(names) for names in hypotheses), *(one.form for one in told)]
     for form in forms:
-        if form in fits or not (form.field is None or refittable(form.field)):
+        if form in fits or not form.refittable:
             continue
         with_field = refits.model_with(form)
         names = form.names(tuple(effects))

@@ -2,7 +2,7 @@
 
 A field is a sum of bumps with random coefficients. Its bumps are Gaussians on a grid of the detector, of time, or of the
 logarithm of the radius in the PSF. A field stands for every cause that acts at its stage and is smooth on the scale of its
-width. The fields of some forms have the name of an effect of the library (NAMES): a smooth gain error is a flat-field
+width. The fields of some forms have the name of an effect of the library (`Field.effect`): a smooth gain error is a flat-field
 residual, whatever its form. All other fields are an unknown cause. A field goes through the operator of its stage, as the
 effects of the library do: a cell with the sensitivity q changes by q . e (`cells`). e is constant in boxes of the detector,
 which are much smaller than a bump.
@@ -295,9 +295,10 @@ class FieldColumns:
         return size * self._static[field, y.size]
 
     def _of_kernel(self, field: Field, n: int) -> Planes:
-        """The scene of image n, convolved with the changes of the PSF."""
+        """The scene of image n, convolved with the changes of the PSF; 0 for an image without a disc, whose scene is not kept."""
         if n not in self._through_kernels:
-            scene = KERNEL_LIKELY * self._scenes[n]
+            nothing = np.zeros([one.size for one in self._at])
+            scene = KERNEL_LIKELY * self._scenes.get(n, nothing)
             through = linear_convolve(self._kernels, scene, scene.shape)
             self._through_kernels[n] = through.astype(np.float32)
         every = self._through_kernels[n].astype(np.float64)
@@ -421,7 +422,7 @@ def widest_fields(evidence: Evidence) -> tuple[Directions, list[range]]:
 
 
 def with_field(evidence: Evidence, effect: Effect, directions: Directions) -> Evidence:
-    """The evidence with a field as one more effect. An effect with the same name is left out.
+    """The evidence with a field as one more effect. It takes the place of an effect with the same name.
 
     effect, directions: of `FieldColumns.effect` and `FieldColumns.of`.
     """
@@ -430,12 +431,14 @@ def with_field(evidence: Evidence, effect: Effect, directions: Directions) -> Ev
         for disc, change in zip(evidence.discs, directions.discs, strict=True)
     )
     blocks = evidence.unocculted
-    columns = {name: here for name, here in evidence.columns.items() if name != effect.name}
     own = tuple(range(evidence.size, evidence.size + len(effect.parameters)))
+    effects = {one.name: one for one in evidence.effects} | {
+        effect.name: effect
+    }  # in the order of the library
     return replace(
         evidence,
-        effects=(*(one for one in evidence.effects if one.name != effect.name), effect),
-        columns={**columns, effect.name: own},
+        effects=tuple(effects.values()),
+        columns=evidence.columns | {effect.name: own},
         discs=discs,
         unocculted=replace(blocks, errors=np.concatenate([blocks.errors, directions.unocculted])),
     )

@@ -370,7 +370,7 @@ def _explained(found: Diagnosis) -> str:
     in_short = in_short_if_many([value for value, _, _ in values.values()])
     told = (
         f"The gap is explained by {words(best.label)} ({in_short or ', '.join(numbers)}), with a probability of "
-        f"{percent_words(judged.hypotheses[best.names])}"
+        f"{percent_words(judged.hypotheses[judged.named[0]])}"
     )
     closure = found.shrinking[judged.form(judged.named[0])].closure
     if _shown_by_blocks(found):

@@ -161,7 +161,8 @@ def model_with_field(model: LinearModel, columns: FieldColumns, field: Field, na
     known = float(np.sum(1 - np.diag(step.covariance)[own] / widest**2))
     size = float(np.sqrt(np.sum(step.values[own] ** 2) / max(known, 1e-9)))
     sized = with_likely(effect, float(np.clip(size, LIKELY, widest)))
-    return replace(model, evidence=with_field(model.evidence, sized, directions))
+    effects = tuple(sized if one is effect else one for one in evidence.effects)
+    return replace(model, evidence=replace(evidence, effects=effects))
 
 
 def _rms(vectors: Sequence[NDArray[np.float64]]) -> float:

@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
-from psfcore.gap.evidence.fields import refittable
 from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.verdict.posterior import NONE, Form, Names, Posterior, kind_of, posterior
@@ -97,7 +96,7 @@ def _to_refit(now: Posterior, done: set[Form]) -> Form | None:
         if share < PLAUSIBLE * max(of_known, 1e-300):
             return None
         form = now.leading(names)
-        if names == NONE or form in done or now.forms[form].visible_error <= VISIBLE or not _can_refit(form):
+        if names == NONE or form in done or now.forms[form].visible_error <= VISIBLE or not form.refittable:
             continue
         alone = [Form((name,)) for name in form.effects]
         if len(alone) + (form.field is not None) > 1 and alone and not done.intersection(alone):
@@ -111,7 +110,3 @@ def _leading(now: Posterior, done: set[Form]) -> Form | None:
     names, share = next(iter(now.probabilities().items()))
     form = now.leading(names)
     return form if share > LEADING and names != NONE and form not in done and form.field is None else None
-
-
-def _can_refit(form: Form) -> bool:
-    return form.field is None or refittable(form.field)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfcore.gap.evidence.fields import UNKNOWN, Field, FieldColumns, FieldShape
+from psfcore.gap.evidence.fields import Field, FieldColumns, FieldShape
 from psfcore.gap.evidence.likelihood import Likelihood
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
 from psfcore.gap.verdict.posterior import Form, Names, Posterior
@@ -61,15 +61,19 @@ def unknown_fields(model: LinearModel, found: Posterior) -> tuple[UnknownField, 
     """The most probable fields if an unknown cause acts, the most probable first. model: without any refit."""
     shares = found.fields()
     listed = [one for one, share in shares.items() if share >= LIKELY_FIELD][:MOST_FIELDS]
+    models = {beside: found.models.get(Form(beside), model) for beside, _ in listed}
+    columns = {beside: FieldColumns(own.evidence) for beside, own in models.items()}
     return tuple(
-        _fitted(found.models.get(Form(beside), model), found, Form(beside, field), shares[beside, field])
+        _fitted(models[beside], columns[beside], found, Form(beside, field), shares[beside, field])
         for beside, field in listed
     )
 
 
-def _fitted(model: LinearModel, found: Posterior, form: Form, share: float) -> UnknownField:
+def _fitted(
+    model: LinearModel, columns: FieldColumns, found: Posterior, form: Form, share: float
+) -> UnknownField:
     assert form.field is not None
-    evidence, columns = model.evidence, FieldColumns(model.evidence)
+    evidence = model.evidence
     likelihood = Likelihood(model).with_further(columns.of(form.field))
     further = list(likelihood.further_columns)
     groups = [list(evidence.columns[name]) for name in form.effects]
@@ -121,6 +125,3 @@ def bounds(model: LinearModel, fields: Sequence[Field]) -> dict[Field, tuple[flo
             here = np.hypot(*(shape.at[:, None] - places[None]).transpose(2, 0, 1)).argmin(axis=0)
         out[field] = float(np.max(np.abs(shape.values[here]) + UPPER * shape.sigma[here])), shape.unit
     return out
-
-
-__all__ = ["UNKNOWN", "UnknownField", "bounds", "unknown_fields"]

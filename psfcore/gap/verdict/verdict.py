@@ -28,7 +28,7 @@ from typing import Literal
 from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration
 from psfcore.gap.verdict.closure import Interval
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form, Names, Posterior, without_idle
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form, Names, Posterior, known_effects, without_idle
 
 Verdict = Literal["none", "attributed", "tie", "unknown", "inconclusive"]
 
@@ -71,8 +71,11 @@ class Judgement:
         return next((names for names in self.hypotheses if names not in (NONE, UNKNOWN)), None)
 
     def form(self, names: Names) -> Form:
-        """The most probable form of a hypothesis."""
-        return self.posterior.leading(names)
+        """The most probable form of a hypothesis that can be refitted; if there is none, its effects without the field."""
+        forms = [form for form in self.posterior.hypotheses[names] if form.refittable]
+        return max(
+            forms, key=self.posterior.hypotheses[names].__getitem__, default=Form(known_effects(names))
+        )
 
     @property
     def certain(self) -> Names:

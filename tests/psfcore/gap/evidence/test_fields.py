@@ -19,6 +19,7 @@ from psfcore.gap.evidence.fields import (
     FieldColumns,
     bumps,
     fields_of,
+    with_field,
 )
 from psfcore.gap.verdict.posterior import UNKNOWN, posterior
 from psfcore.gap.verdict.unknown import bounds, unknown_fields
@@ -124,6 +125,24 @@ def test_light_beside_the_field_lights_its_own_pointing_most_near_that_side(evid
     assert np.argmax(below.mean(axis=1)) == 0 and (below > 0).all()
     other = next(n for n, info in enumerate(evidence.image_info) if info.pointing != first)
     assert not columns.planes(field, other).any()
+
+
+def test_a_field_takes_the_place_of_the_effect_with_its_name(evidence: Evidence) -> None:
+    columns, gain = FieldColumns(evidence), Field("detector", "gain", 0.8)
+    names = [effect.name for effect in evidence.effects]
+    name = names[0]
+    new = with_field(evidence, columns.effect(gain, name), columns.of(gain))
+    assert [effect.name for effect in new.effects] == names and new.effects[0].exact
+    assert list(new.columns[name]) == list(range(evidence.size, new.size))
+    other = with_field(evidence, columns.effect(gain, UNKNOWN[0]), columns.of(gain))
+    assert [effect.name for effect in other.effects] == [*names, *UNKNOWN]
+
+
+def test_a_change_of_the_psf_leaves_an_image_without_a_disc_as_it_is(evidence: Evidence) -> None:
+    lost = evidence.discs[0].index
+    columns = FieldColumns(replace(evidence, discs=evidence.discs[1:]))
+    assert not columns.planes(Field("optics", "kernel"), lost).any()
+    assert columns.planes(Field("optics", "kernel"), evidence.discs[1].index).any()
 
 
 def test_data_have_only_the_fields_that_they_can_show(evidence: Evidence) -> None:

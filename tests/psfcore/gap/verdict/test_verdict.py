@@ -5,16 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from psfcore.errors import DataError
+from psfcore.gap.evidence.fields import Field
 from psfcore.gap.verdict.calibration import COVERAGE, Calibration, shipped_calibration, true_share
 from psfcore.gap.verdict.closure import Interval
-from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Names, Posterior
+from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form, Names, Posterior
 from psfcore.gap.verdict.verdict import EARNED, LEAST_IMAGES, Judgement, earned, of_effects, verdict_of
-from tests.psfcore.gap.posteriors import of_weights
+from tests.psfcore.gap.posteriors import of_weights, weighed
 
 A, B, C, AB, AC = ("a",), ("b",), ("c",), ("a", "b"), ("a", "c")
 AU, BU = ("a", "unknown"), ("b", "unknown")
@@ -80,6 +82,19 @@ def test_a_name_that_closes_too_little_is_not_named_alone() -> None:
     low = Interval(0.0, 0.0, 0.0)
     for other in (judged({NONE: 0.95, A: 0.05}), judged({AU: 0.93, A: 0.04, UNKNOWN: 0.03})):
         assert earned(other, low) is other
+
+
+def test_the_form_that_a_report_refits_is_one_that_images_can_show() -> None:
+    formless, spot = Field(None, "each_disc", parts=("each_disc",)), Field("detector", "light", 0.2)
+    logs = {Form(A): 0.0, Form(A, formless): 9.0, Form(A, spot): 7.0, Form(B): 0.0, Form(B, formless): 8.0}
+    found = replace(
+        judged({A: 0.9, NONE: 0.1}),
+        posterior=Posterior({form: weighed(log) for form, log in logs.items()}, (*A, *B)),
+    )
+    assert found.posterior.leading(AU) == Form(A, formless) and found.form(AU) == Form(A, spot)
+    assert found.form(BU) == Form(B), (
+        "without a field, because no field of the hypothesis has a change of the images"
+    )
 
 
 def test_improbable_members_of_the_set_do_not_change_the_verdict() -> None:
