@@ -45,6 +45,7 @@ from psfcore.gap.verdict.posterior import (
     Kind,
     Names,
     kind_of,
+    posterior,
     probabilities,
     without_idle,
 )
@@ -106,7 +107,7 @@ def weights_of(folder: Path) -> tuple[dict[Names, float], tuple[float, ...]]:
     view = View(invert(transit))
     model, _ = linear_model_of(view, LIBRARY)
     refits = Refits(view, model)
-    found, _ = settled_posterior(model, refits.weighed)
+    found, _ = settled_posterior(posterior(model, refits.columns), refits.weighed)
     return found.log_weights, tuple(refits.departures)
 
 

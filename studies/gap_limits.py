@@ -28,7 +28,7 @@ from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict.calibration import shipped_calibration
 from psfcore.gap.verdict.correction import hold, images_without
 from psfcore.gap.verdict.limits import ParameterLimits, limits
-from psfcore.gap.verdict.posterior import NONE, without_idle
+from psfcore.gap.verdict.posterior import NONE, posterior, without_idle
 from psfcore.gap.verdict.refits import Refits
 from psfcore.gap.verdict.settled import settled_posterior
 from psfcore.gap.view import View
@@ -90,7 +90,8 @@ def case_of(number: int, asked: Settings) -> Case:
         return Case(name, leading.name, None, False, None, f"{leading.found_90:.3g}: {error.code}")
     view = View(solution)
     model, _ = linear_model_of(view, LIBRARY)
-    found, _ = settled_posterior(model, Refits(view, model).weighed)
+    refits = Refits(view, model)
+    found, _ = settled_posterior(posterior(model, refits.columns), refits.weighed)
     shares = without_idle(found.probabilities(asked.temperature))
     best = next(iter(shares))
     answer = {names for names, share in shares.items() if share >= asked.threshold} | {best}

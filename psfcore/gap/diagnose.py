@@ -27,7 +27,7 @@ from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, p_value_of_gap
 from psfcore.gap.evidence.evidence import Evidence, gather
 from psfcore.gap.evidence.expected_gap import ExpectedGap, expected_gap
-from psfcore.gap.evidence.fields import UNKNOWN, Field, fields_of
+from psfcore.gap.evidence.fields import UNKNOWN, Field, FieldColumns, fields_of
 from psfcore.gap.evidence.linear_model import FLOOR, LinearModel
 from psfcore.gap.evidence.measured_noise import MeasuredNoise, measured_noise
 from psfcore.gap.library.registry import LIBRARY
@@ -44,7 +44,7 @@ from psfcore.gap.verdict.closure import (
 )
 from psfcore.gap.verdict.correction import Corrected
 from psfcore.gap.verdict.limits import Limits, limits
-from psfcore.gap.verdict.posterior import NONE, Form
+from psfcore.gap.verdict.posterior import NONE, Form, posterior
 from psfcore.gap.verdict.refits import Refits, linear_start
 from psfcore.gap.verdict.settled import settled_posterior
 from psfcore.gap.verdict.unknown import UnknownField, bounds, unknown_fields
@@ -203,12 +203,16 @@ def diagnose_solution(
     view = View(solution)
     model, expected = linear_model_of(view, library, seed=seed, progress=progress)
     refits = Refits(view, model, progress)
-    settled, failed = settled_posterior(model, refits.weighed if refit else None)
+    settled, failed = settled_posterior(posterior(model, refits.columns), refits.weighed if refit else None)
     rng = np.random.default_rng(seed)
     judged = verdict_of(
         settled, calibration, images=len(model.evidence.discs), coverage=coverage, failed=failed
     )
-    told = unknown_fields(model, settled) if any(UNKNOWN in names for names in judged.members) else ()
+    told = (
+        unknown_fields(model, refits.columns, settled)
+        if any(UNKNOWN in names for names in judged.members)
+        else ()
+    )
     fits = linear_fits(refits, model, judged, told)
     best = next((form for form in fits if judged.best and form == judged.form(judged.best)), None)
     named = judged.verdict in ("attributed", "tie")
@@ -234,7 +238,7 @@ def diagnose_solution(
         calibration=calibration,
         fits=fits,
         p_value=p_value_of_gap(model),
-        limits=_limits(model, calibration, coverage, corrected),
+        limits=_limits(model, refits.columns, calibration, coverage, corrected),
         solution=solution,
         model=model,
         expected=expected,
@@ -255,7 +259,7 @@ def diagnose_solution(
         corrected=corrected,
         with_field=with_field,
         unknown=told,
-        bounds=bounds(model, fields_of(model.evidence)),
+        bounds=bounds(model, refits.columns, fields_of(model.evidence)),
         residual=before,
         residual_after=gone if named else None,
         cautions=tuple(cautions),
@@ -298,13 +302,22 @@ def _favoured(judged: Judgement, explained: EffectFit | None, told: Sequence[Unk
 
 
 def _limits(
-    model: LinearModel, calibration: Calibration, coverage: float, refits: Sequence[Corrected]
+    model: LinearModel,
+    fields: FieldColumns,
+    calibration: Calibration,
+    coverage: float,
+    refits: Sequence[Corrected],
 ) -> Limits:
     """The limits of all effects.
 
     If full refits contain an effect, its excluded_95 comes from the best of these refits.
     """
-    found = limits(model, threshold=calibration.threshold(coverage), temperature=calibration.temperature)
+    found = limits(
+        model,
+        threshold=calibration.threshold(coverage),
+        temperature=calibration.temperature,
+        fields=fields,
+    )
     for fit in reversed(refits):
         for effect in fit.effects:
             if effect.name in found.effects:

@@ -123,6 +123,25 @@ def invert(
     return solver.solution(at)
 
 
+def solution_at(
+    transit: Transit,
+    total: TotalPsf,
+    at: Vector,
+    *,
+    threads: int = 1,
+    progress: Progress = lambda stage, step, steps: None,
+) -> Solution:
+    """The scenes, occulters, residuals and errors of a transit with the PSF at these coordinates, without any fit.
+
+    total: of the shape of scatter. Raises the errors of `invert`.
+    """
+    kernel = total.kernel(at)
+    optics = Optics(kernel, transit.shape, threads=threads)
+    sky = TransitScenes.reconstructed(transit, optics, progress)
+    sky.find(optics, kernel)
+    return Solver(sky, total, [1] * len(transit.frames), threads, progress).solution(at)
+
+
 def solution_of(
     transit: Transit,
     shape: Shape,

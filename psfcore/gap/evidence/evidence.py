@@ -265,9 +265,10 @@ def residuals_at(
     changes: Sequence[Change] = (),
     progress: Progress = lambda stage, step, steps: None,
 ) -> Evidence:
-    """The evidence of another fit to the same transit: its residuals, with the Jacobian of `evidence`.
+    """The evidence of another PSF for the same transit: its residuals and its Jacobian of the PSF, with the Jacobian of the effects
+    of `evidence`.
 
-    The Jacobian takes most of the time of `gather`, and hardly differs between two fits. view: of the other fit. columns:
+    The Jacobian of the effects takes most of the time of `gather`, and hardly differs. view: of the other PSF. columns:
     the columns after the base that are kept; changes: the changes that belong to them, for discs whose cells have moved.
     The result has no effects. Discs that `evidence` lacks are left out.
     """
@@ -293,11 +294,14 @@ def _disc_at(view: View, disc: DiscCells, kept: Sequence[int], changes: Sequence
     if cells.pixels.size != disc.pixels.size:  # its outermost dark pixels moved
         return disc_with_jacobian(view, disc.index, changes)
     residual, expected = other.residual(disc.index)
+    jacobian = disc.jacobian[list(kept)]
+    for k, slope in enumerate(view.slopes):
+        jacobian[k] = cells.weights @ other.jacobian(disc.index, slope)
     return replace(
         disc,
         residual=cells.weights @ residual,
         expected=cells.weights @ expected,
-        jacobian=disc.jacobian[list(kept)],
+        jacobian=jacobian,
     )
 
 

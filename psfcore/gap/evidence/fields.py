@@ -39,8 +39,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.convolution.convolver import linear_convolve
+from psfcore.convolution.convolver import Convolver, linear_convolve
 from psfcore.gap.effect import Change, Effect, EffectParameter, Stage
+from psfcore.gap.evidence.cells import DiscCells
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Directions
 from psfcore.gap.evidence.patterns import in_disc
@@ -162,9 +163,13 @@ def bumps(at: Sequence[float] | Vector, width: float) -> Matrix:
 
 
 class FieldColumns:
-    """The columns of fields: the changes of the cells and blocks by their bumps."""
+    """The columns of fields: the changes of the cells and blocks by their bumps.
 
-    def __init__(self, evidence: Evidence) -> None:
+    evidence: only its data count, not its effects. before: the columns of another fit to the same images. Its columns are used
+    for the discs whose cells are the same, because they hardly differ.
+    """
+
+    def __init__(self, evidence: Evidence, before: FieldColumns | None = None) -> None:
         self._evidence = evidence
         self._discs, self._blocks = evidence.discs, evidence.unocculted
         self._infos = evidence.image_info
@@ -180,18 +185,27 @@ class FieldColumns:
         self._block_at = _middles(down), _middles(self._blocks.across)
         self._static: dict[tuple[Field, int], Planes] = {}
         self._through_kernels: dict[int, NDArray[np.float32]] = {}
+        self._before = before
+        self._of: dict[Field, Directions] = {}
+        self._numbers = {disc.index: k for k, disc in enumerate(self._discs)}
 
     def of(self, field: Field) -> Directions:
-        """The columns of a field."""
-        if field.stage is None or field.form == "disc_shape":
-            return self._without_planes(field)
+        """The columns of a field. They are computed once."""
+        if field not in self._of:
+            formless = field.stage is None or field.form == "disc_shape"
+            self._of[field] = self._without_planes(field) if formless else self._with_planes(field)
+        return self._of[field]
+
+    def _with_planes(self, field: Field) -> Directions:
         cells = max(disc.residual.size for disc in self._discs)
         in_discs = []
         for disc in self._discs:
-            planes = self.planes(field, disc.index)
-            q = disc.boxes[int(_relative(field))].reshape(disc.residual.size, -1)
-            change = q.astype(np.float64) @ planes.reshape(len(planes), -1).T
-            in_discs.append(np.pad(change, ((0, cells - len(q)), (0, 0))))
+            change = None if self._before is None else self._before.in_disc(field, disc)
+            if change is None:
+                planes = self.planes(field, disc.index)
+                q = disc.boxes[int(_relative(field))].reshape(disc.residual.size, -1)
+                change = q.astype(np.float64) @ planes.reshape(len(planes), -1).T
+            in_discs.append(np.pad(change, ((0, cells - len(change)), (0, 0))))
         in_blocks = np.zeros((in_discs[0].shape[1], *self._blocks.levels.shape))
         if _in_blocks(field):
             for n in range(in_blocks.shape[1]):
@@ -200,6 +214,13 @@ class FieldColumns:
                 if _relative(field):
                     in_blocks[:, n] *= self._blocks.means[n]
         return Directions(np.array(in_discs), in_blocks, LIKELY)
+
+    def in_disc(self, field: Field, disc: DiscCells) -> Matrix | None:
+        """The columns of a field in the cells of a disc (cells, columns); None if these columns have other cells for the disc."""
+        k = self._numbers.get(disc.index)
+        if k is None or self._discs[k].residual.size != disc.residual.size:
+            return None
+        return self.of(field).discs[k, : disc.residual.size]
 
     def planes(self, field: Field, n: int) -> Planes:
         """The change of image n for one unit of each coefficient (columns, boxes along y, boxes along x), DN/s; for a gain
@@ -297,10 +318,8 @@ class FieldColumns:
     def _of_kernel(self, field: Field, n: int) -> Planes:
         """The scene of image n, convolved with the changes of the PSF; 0 for an image without a disc, whose scene is not kept."""
         if n not in self._through_kernels:
-            nothing = np.zeros([one.size for one in self._at])
-            scene = KERNEL_LIKELY * self._scenes.get(n, nothing)
-            through = linear_convolve(self._kernels, scene, scene.shape)
-            self._through_kernels[n] = through.astype(np.float32)
+            scene = KERNEL_LIKELY * self._scenes.get(n, np.zeros([one.size for one in self._at]))
+            self._through_kernels[n] = np.array([kernel.apply(scene) for kernel in self._kernels])
         every = self._through_kernels[n].astype(np.float64)
         if field.form == "kernel":
             return every
@@ -372,17 +391,18 @@ class FieldColumns:
         return np.asarray(np.exp(-0.5 * (apart / OCTAVES) ** 2) / (OCTAVES * np.sqrt(2 * np.pi)))
 
     @cached_property
-    def _kernels(self) -> Planes:
-        """The changes of the PSF on the boxes, each of sum 1 before its factor of the azimuth."""
+    def _kernels(self) -> list[Convolver]:
+        """The convolutions with the changes of the PSF on the boxes, each of sum 1 before its factor of the azimuth."""
         reach = max(one.size for one in self._at)
         d = np.arange(-reach + 1, reach)
         r, a = np.hypot(d[:, None], d[None, :]), np.arctan2(d[:, None], d[None, :])
         octave = np.log2(np.maximum(r, 0.5))
+        shape = self._at[0].size, self._at[1].size
         kernels = []
         for centre in self._octaves:
             ring = np.exp(-0.5 * ((octave - centre) / OCTAVES) ** 2)
-            kernels += [ring / ring.sum() * factor(a) for factor in _FACTORS]
-        return np.array(kernels)
+            kernels += [Convolver(ring / ring.sum() * factor(a), shape) for factor in _FACTORS]
+        return kernels
 
 
 @dataclass(frozen=True, eq=False)
@@ -407,9 +427,8 @@ class FieldShape:
         return int(np.argmax(np.abs(self.values) / np.maximum(self.sigma, 1e-300)))
 
 
-def widest_fields(evidence: Evidence) -> tuple[Directions, list[range]]:
+def widest_fields(evidence: Evidence, columns: FieldColumns) -> tuple[Directions, list[range]]:
     """The columns of all fields of an unknown cause that are the widest of their form, together; the numbers of the columns of each."""
-    columns = FieldColumns(evidence)
     fields = [f for f in fields_of(evidence) if f.effect == UNKNOWN and f.width in (None, WIDTHS[-1])]
     each = [columns.of(field) for field in fields]
     ends = np.cumsum([0, *(len(one.unocculted) for one in each)]).tolist()

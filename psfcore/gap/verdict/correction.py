@@ -24,14 +24,15 @@ from psfcore.gap.evidence.effect_fits import EffectFit, fit_effects, label_of, l
 from psfcore.gap.evidence.evidence import Evidence, gather, residuals_at
 from psfcore.gap.evidence.linear_model import LinearModel
 from psfcore.gap.view import View, return_unused_memory
-from psfcore.scatter.inversion import invert
+from psfcore.scatter.inversion import invert, solution_at
 from psfcore.scatter.reconstruction import Progress, Solution
 from psfcore.transit.transit import Transit
 
 Vector = NDArray[np.float64]
 
-ROUNDS = 3
-SETTLED = 0.3  # the rounds end when the parameters change by less than this fraction of their errors, rms
+ROUNDS = 6
+SETTLED = 0.3  # the rounds end when the remaining step is less than this fraction of the errors, rms
+LONGEST = 3.0  # longest step of the PSF in one round, in units of `Parameter.largest_step`
 # A round may leave more chi2 than the best round by WORSE or, if larger, by WORSE_SHARE times the gain of the effect.
 WORSE = 9.0
 WORSE_SHARE = 0.05
@@ -100,7 +101,9 @@ def add_to_model(
     view: View | None = None,
     progress: Progress = lambda stage, step, steps: None,
 ) -> Corrected:
-    """Fit the PSF and effects together, starting from the linear fit `found` in the linear model `model`.
+    """Fit the PSF and effects together with Gauss-Newton steps. The first step is the linear fit `found` in the linear model `model`.
+
+    A step that changes the PSF too much is shortened as a whole.
 
     beside: further effects, which are not fitted; `Corrected.beside` contains them. view: the view of the solution, if it
     exists already. Raises the errors of `invert` if the first round fails, DataError "effect-unseen" if the images do not constrain the
@@ -110,19 +113,20 @@ def add_to_model(
     # An effect that searches for a position keeps the position that it found first.
     view = view or View(solution)
     held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
-    theta = np.array([value for value, _, _ in found.values.values()])
+    wanted = np.array([value for value, _, _ in found.values.values()])
     in_images = _in_images(held, view)
     base = len(model.evidence.base)
-    here, start = view, _stepped(solution, found.step.values[:base])
+    here, at, theta = view, solution.inversion.coordinates, np.zeros(wanted.size)
+    move = found.step.values[:base]
     least = np.inf
     taken: _Round | None = None
     for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
         try:
             if in_images.any():
+                share = _share_of(move, solution)
+                at, theta = at + share * move, theta + share * (wanted - theta)
                 images = images_without(transit, here, held, theta)
-                shape, threads = solution.inversion.shape, solution.threads
-                near = start is not None
-                fit = invert(images, shape, start=start, near=near, threads=threads, progress=progress)
+                fit = solution_at(images, solution.total, at, threads=solution.threads, progress=progress)
                 here = View(fit)
                 return_unused_memory()  # the planes of the view before
             seen = _fit_remaining(_with_old_jacobian(model, here, held), held, theta, in_images)
@@ -130,14 +134,12 @@ def add_to_model(
             if taken is None:
                 raise
             break  # the step was too long: the fit failed, or the images no longer constrain the effect
-        gone = theta
-        steps, theta = seen.theta - theta, seen.theta
-        start = _stepped(here.solution, seen.left.step.values[:base])
+        wanted, move = seen.theta, seen.left.step.values[:base]
         # A parameter that must be positive is dropped if its fitted value is not positive.
-        acts = ~(_positive(held) & (theta <= 0))
+        acts = ~(_positive(held) & (wanted <= 0))
         if not acts.all() and rounds < ROUNDS:
             held = _those_that_act(held, acts)
-            theta, in_images = theta[acts], in_images[acts]
+            theta, wanted, in_images = theta[acts], wanted[acts], in_images[acts]
             taken, least = None, np.inf
             continue
         left_over = float(left_chi2(seen.model, seen.left.step).sum())
@@ -146,8 +148,19 @@ def add_to_model(
         ):  # the effect is too strong for first-order steps
             break
         least = min(least, left_over)
-        taken = _Round(here.solution, gone, rounds)
-        if float(np.sqrt(np.mean((steps / np.maximum(seen.sigma, 1e-300)) ** 2))) < SETTLED:
+        taken = _Round(here.solution, theta, rounds)
+        steps = np.append(move, np.where(in_images, wanted - theta, 0.0))
+        if float(np.sqrt(np.mean((steps / np.maximum(seen.sigmas, 1e-300)) ** 2))) < SETTLED:
+            if in_images.any():  # the steps weigh cells; the PSF is fitted to pixels, as without effects
+                fit = invert(
+                    here.solution.transit,
+                    solution.inversion.shape,
+                    start=at,
+                    near=True,
+                    threads=solution.threads,
+                    progress=progress,
+                )
+                taken = _Round(fit, theta, rounds)
             break
     assert taken is not None
     del here  # its planes, before those of another view are made
@@ -248,9 +261,9 @@ class _Remaining:
     theta: Vector
 
     @property
-    def sigma(self) -> Vector:
-        """Errors of theta."""
-        return np.array([sigma for _, sigma, _ in self.left.values.values()])
+    def sigmas(self) -> Vector:
+        """Errors of the coordinates of the PSF, then of theta."""
+        return np.sqrt(np.diag(self.left.step.covariance))
 
 
 def _fit_remaining(
@@ -276,13 +289,10 @@ def _fit_remaining(
     return _Remaining(model, left, np.where(in_images, out + found, found))
 
 
-def _stepped(current: Solution, step: Vector) -> Vector | None:
-    """The coordinates of a fit after a step.
-
-    None if the step is too long to be trusted; the next fit then starts from the default start of the shape.
-    """
-    step, whole = current.inversion.shape.shortened(step)
-    return current.inversion.coordinates + step if whole else None
+def _share_of(move: Vector, solution: Solution) -> float:
+    """The share of a step of the coordinates that is short enough to be trusted."""
+    largest = np.array([parameter.largest_step for parameter in solution.inversion.shape.parameters])
+    return float(min(1.0, LONGEST / max(float((np.abs(move) / largest).max()), 1e-9)))
 
 
 def _in_images(effects: Sequence[Effect], view: View) -> NDArray[np.bool_]:

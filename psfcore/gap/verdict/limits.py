@@ -45,7 +45,7 @@ from scipy.optimize import brentq, nnls
 from scipy.special import logsumexp, ndtr, ndtri
 
 from psfcore.gap.effect import Effect
-from psfcore.gap.evidence.fields import LIKELY, widest_fields
+from psfcore.gap.evidence.fields import LIKELY, FieldColumns, widest_fields
 from psfcore.gap.evidence.likelihood import MEASURED, SCALES, Likelihood
 from psfcore.gap.evidence.linear_model import WEAKEST, LinearModel
 from psfcore.gap.verdict.posterior import PRIOR, Kind
@@ -161,17 +161,18 @@ def limits(
     temperature: float,
     prior: Mapping[Kind, float] = PRIOR,
     observed: bool = True,
+    fields: FieldColumns | None = None,
 ) -> Limits:
     """The limits of all effects.
 
     threshold: the smallest probability of a hypothesis in the answer set. temperature, prior: the temperature and the
     prior of the posterior. observed: whether the residuals of the model come from real data. Only then they can exclude
-    strengths.
+    strengths. fields: the columns of the fields of the model, if they exist already.
     """
     every = model.evidence.effects
     endless = [e.name for e in every if not all(math.isfinite(p.likely) for p in e.parameters)]
     evidence = replace(model.evidence, effects=tuple(e for e in every if e.name not in endless))
-    hypotheses = _Hypotheses(replace(model, evidence=evidence), prior)
+    hypotheses = _Hypotheses(replace(model, evidence=evidence), prior, fields or FieldColumns(model.evidence))
     margin = partial(_margin, threshold=threshold, temperature=temperature)
     effects = {}
     for effect in evidence.effects:
@@ -239,9 +240,9 @@ class _Hypothesis:
 class _Hypotheses:
     """The normal matrix of all columns, and the hypotheses about the cause."""
 
-    def __init__(self, model: LinearModel, prior: Mapping[Kind, float]) -> None:
+    def __init__(self, model: LinearModel, prior: Mapping[Kind, float], columns: FieldColumns) -> None:
         evidence = self._evidence = model.evidence
-        directions, fields = widest_fields(evidence)
+        directions, fields = widest_fields(evidence, columns)
         self._likelihood = Likelihood(model).with_further(directions)
         self._columns = {e.name: list(evidence.columns_of(e.name).values()) for e in evidence.effects}
         unknown = [[evidence.size + k for k in field] for field in fields]

@@ -201,9 +201,10 @@ def _sorted(probabilities: Mapping[Names, float]) -> dict[Names, float]:
     return dict(sorted(probabilities.items(), key=lambda one: -one[1]))
 
 
-def posterior(model: LinearModel) -> Posterior:
-    """The posterior in the linear model, without any full refit."""
+def posterior(model: LinearModel, columns: FieldColumns | None = None) -> Posterior:
+    """The posterior in the linear model, without any full refit. columns: its fields, if they exist already."""
     evidence = model.evidence
+    columns = columns or FieldColumns(evidence)
     likelihood = Likelihood(model)
     order = tuple(effect.name for effect in evidence.effects)
     singles = [Form((name,)) for name in order]
@@ -211,19 +212,19 @@ def posterior(model: LinearModel) -> Posterior:
     forms = {form: weigh(likelihood, evidence, form) for form in (Form(), *singles, *pairs)}
     forms |= _triples(likelihood, evidence, {form: forms[form] for form in pairs}, order)
     best = sorted(singles, key=lambda form: -forms[form].log_evidence)[:1]
-    forms |= _with_fields(likelihood, evidence, [Form(), *best], singles)
+    forms |= _with_fields(likelihood, evidence, columns, [Form(), *best], singles)
     return Posterior(forms, order)
 
 
 def _with_fields(
     likelihood: Likelihood,
     evidence: Evidence,
+    columns: FieldColumns,
     beside: Sequence[Form],
     others: Sequence[Form] = (),
     taken: Mapping[str, Sequence[float]] | None = None,
 ) -> dict[Form, Weighed]:
     """Weigh every field beside each of these forms, and the most probable fields also beside the `others`."""
-    columns = FieldColumns(evidence)
     out: dict[Form, Weighed] = {}
 
     def weigh_beside(field: Field, forms: Sequence[Form]) -> None:
@@ -264,6 +265,7 @@ def _triples(
 def at_refit(
     refit: LinearModel,
     before: LinearModel,
+    columns: FieldColumns,
     form: Form,
     taken: Mapping[str, Sequence[float]],
     moved: Vector,
@@ -272,8 +274,8 @@ def at_refit(
     """The evidence from a full refit of a form, and the model in which it was weighed.
 
     After a refit of a single effect in the form of the library, the result also contains the pairs, triples and fields beside it.
-    refit: the linear model at the refit, with the effects that may act. before: the linear model without any effect.
-    taken: the amounts of the parameters that the refit subtracted from the images, by effect. moved: the coordinates of
+    refit: the linear model at the refit, with the effects that may act. before, columns: the linear model without any effect, and
+    its fields.     taken: the amounts of the parameters that the refit subtracted from the images, by effect. moved: the coordinates of
     the PSF of the refit minus those of the fit without any effect. order: the effects that the data can show.
     """
     evidence = with_same_data(before.evidence, refit.evidence, taken, moved)
@@ -287,7 +289,7 @@ def at_refit(
         ]
         of_pairs = {pair: weigh(likelihood, evidence, pair, taken) for pair in pairs}
         found |= of_pairs | _triples(likelihood, evidence, of_pairs, order, taken)
-        found |= _with_fields(likelihood, evidence, [form], (), taken)
+        found |= _with_fields(likelihood, evidence, FieldColumns(evidence, columns), [form], (), taken)
     return found, model
 
 

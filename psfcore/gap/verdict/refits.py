@@ -25,13 +25,16 @@ MOST_TRIES = 2
 
 
 class Refits:
-    """Full refits of forms of hypotheses. view, model: the view and the linear model of the fit. failures: sentences."""
+    """Full refits of forms of hypotheses.
+
+    view, model: the view and the linear model of the fit. columns: its fields. failures: sentences.
+    """
 
     def __init__(
         self, view: View, model: LinearModel, progress: Progress = lambda stage, step, steps: None
     ) -> None:
         self._view, self._model, self._progress = view, model, progress
-        self._columns = FieldColumns(model.evidence)
+        self.columns = FieldColumns(model.evidence)
         self._order = tuple(effect.name for effect in model.evidence.effects)
         self._made: dict[Form, Corrected | None] = {}
         self._with_field: dict[Field, LinearModel] = {}
@@ -48,7 +51,9 @@ class Refits:
             return None
         at = refit.model if refit.beside is None else refit.beside
         moved = refit.solution.inversion.coordinates - self._view.solution.inversion.coordinates
-        evidence, model = at_refit(at, self.model_with(form), form, refit.subtracted, moved, self._order)
+        evidence, model = at_refit(
+            at, self.model_with(form), self.columns, form, refit.subtracted, moved, self._order
+        )
         if evidence[form].visible_error > most_visible:
             self.failures.append(
                 f"The full refit with {refit.label} in the model did not settle; the linear model was used instead."
@@ -63,7 +68,7 @@ class Refits:
             return self._model
         if form.field not in self._with_field:
             name = name_of(form.field, self._order)
-            self._with_field[form.field] = model_with_field(self._model, self._columns, form.field, name)
+            self._with_field[form.field] = model_with_field(self._model, self.columns, form.field, name)
         return self._with_field[form.field]
 
     @property

@@ -26,7 +26,7 @@ from collections.abc import Callable, Mapping
 from psfcore.gap.evidence.fields import UNKNOWN as UNKNOWN_NAME
 from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.verdict.posterior import NONE, Form, Names, Posterior, kind_of, posterior
+from psfcore.gap.verdict.posterior import NONE, Form, Names, Posterior, kind_of
 
 MOST_REFITS = 3  # for example, an effect alone, a pair that contains it, and a rival
 VISIBLE = 9.0  # an error of the first order is visible if it adds this much to chi2
@@ -39,13 +39,13 @@ LEADING = 0.5
 Refit = Callable[[Form, float], "tuple[Mapping[Form, Weighed], LinearModel] | None"]
 
 
-def settled_posterior(model: LinearModel, refit: Refit | None) -> tuple[Posterior, tuple[Names, ...]]:
+def settled_posterior(linear: Posterior, refit: Refit | None) -> tuple[Posterior, tuple[Names, ...]]:
     """Two results: the posterior after the full refits, and the hypotheses whose refit failed. The posterior excludes
     these.
 
-    refit: makes the full refit of a form. If it is None, the posterior is that of the linear model.
+    linear: the posterior of the linear model. refit: makes the full refit of a form. If it is None, the posterior stays as it is.
     """
-    now = posterior(model)
+    now = linear
     failed: list[Names] = []
     done: set[Form] = set()
     if refit is None:

@@ -57,14 +57,14 @@ class UnknownField:
         return float(self.shape.values[k]), float(self.shape.sigma[k])
 
 
-def unknown_fields(model: LinearModel, found: Posterior) -> tuple[UnknownField, ...]:
-    """The most probable fields if an unknown cause acts, the most probable first. model: without any refit."""
+def unknown_fields(model: LinearModel, columns: FieldColumns, found: Posterior) -> tuple[UnknownField, ...]:
+    """The most probable fields if an unknown cause acts, the most probable first. model: without any refit; columns: its fields."""
     shares = found.fields()
     listed = [one for one, share in shares.items() if share >= LIKELY_FIELD][:MOST_FIELDS]
     models = {beside: found.models.get(Form(beside), model) for beside, _ in listed}
-    columns = {beside: FieldColumns(own.evidence) for beside, own in models.items()}
+    of_models = {beside: FieldColumns(own.evidence, columns) for beside, own in models.items()}
     return tuple(
-        _fitted(models[beside], columns[beside], found, Form(beside, field), shares[beside, field])
+        _fitted(models[beside], of_models[beside], found, Form(beside, field), shares[beside, field])
         for beside, field in listed
     )
 
@@ -109,9 +109,11 @@ def _distances(
     return out
 
 
-def bounds(model: LinearModel, fields: Sequence[Field]) -> dict[Field, tuple[float, str]]:
+def bounds(
+    model: LinearModel, columns: FieldColumns, fields: Sequence[Field]
+) -> dict[Field, tuple[float, str]]:
     """The bound of each of these fields that has a map of the detector or a curve in time, and its unit."""
-    columns, likelihood = FieldColumns(model.evidence), Likelihood(model)
+    likelihood = Likelihood(model)
     places = np.array([(info.x_px, info.y_px) for info in model.evidence.image_info])
     out = {}
     for field in fields:

@@ -84,27 +84,28 @@ def mean_light(evidence: Evidence) -> float:
 
 
 def test_a_spot_of_light_is_an_unknown_cause_at_its_place(evidence: Evidence) -> None:
-    rows, columns = evidence.discs[0].boxes.shape[-2:]
+    down, across = evidence.discs[0].boxes.shape[-2:]
     place = evidence.image_info[evidence.discs[4].index]
-    x_px, y_px = ((np.arange(n) + 0.5) * evidence.box_px - 0.5 for n in (columns, rows))
+    x_px, y_px = ((np.arange(n) + 0.5) * evidence.box_px - 0.5 for n in (across, down))
     away = np.hypot(y_px[:, None] - place.y_px, x_px[None, :] - place.x_px)
-    spot = 0.5 * mean_light(evidence) * np.exp(-0.5 * (away / (0.1 * columns * evidence.box_px)) ** 2)
+    spot = 0.5 * mean_light(evidence) * np.exp(-0.5 * (away / (0.1 * across * evidence.box_px)) ** 2)
     rng = np.random.default_rng(3)
 
     def residual(disc: DiscCells) -> np.ndarray:
         return np.einsum("cyx,yx->c", disc.boxes[0], spot) + noise_of(disc, rng)
 
     model = replace(with_left(with_residuals(evidence, {}), residual), scale_error=0.1)
-    found = posterior(model)
+    columns = FieldColumns(model.evidence)
+    found = posterior(model, columns)
     assert next(iter(found.probabilities())) == UNKNOWN
-    best = unknown_fields(model, found)[0]
+    best = unknown_fields(model, columns, found)[0]
     assert (best.field.stage, best.field.form, best.beside) == (
         "detector",
         "light",
         (),
     ) and best.probability > 0.5
     k = best.shape.clearest
-    assert np.hypot(*(best.shape.at[k] - (place.x_px, place.y_px))) < 0.15 * columns * evidence.box_px
+    assert np.hypot(*(best.shape.at[k] - (place.x_px, place.y_px))) < 0.15 * across * evidence.box_px
     assert best.strength is not None
     value, sigma = best.strength
     assert value == pytest.approx(spot.max(), rel=0.5) and sigma < value / 3
@@ -112,9 +113,9 @@ def test_a_spot_of_light_is_an_unknown_cause_at_its_place(evidence: Evidence) ->
     # No effect of the library makes this spot, and the bound of the light is above it.
     distances = [distance for _, distance in best.resembles]
     assert distances == sorted(distances) and distances[0] > 3.0
-    assert bounds(model, [best.field])[best.field][0] > value
-    shifted = bounds(replace(with_residuals(evidence, {}), scale_error=0.1), [best.field])[best.field][0]
-    assert shifted < value / 2
+    assert bounds(model, columns, [best.field])[best.field][0] > value
+    nothing = replace(with_residuals(evidence, {}), scale_error=0.1)
+    assert bounds(nothing, columns, [best.field])[best.field][0] < value / 2
 
 
 def test_light_beside_the_field_lights_its_own_pointing_most_near_that_side(evidence: Evidence) -> None:

@@ -40,8 +40,9 @@ def with_shares(shares: Mapping[Names, float], images: int = 12) -> Diagnosis:
     )
     judgement = verdict_of(of_weights(logs), calibration, images=images)
     model = found().model
-    told = unknown_fields(model, judgement.posterior) if UNKNOWN in judgement.members else ()
-    fits = linear_fits(Refits(View(found().solution), model), model, judgement, told)
+    refits = Refits(View(found().solution), model)
+    told = unknown_fields(model, refits.columns, judgement.posterior) if UNKNOWN in judgement.members else ()
+    fits = linear_fits(refits, model, judgement, told)
     shrinking = {form: found().shrinking.get(form, Shrinking(None, None, None)) for form in fits}
     changed = replace(
         found(),

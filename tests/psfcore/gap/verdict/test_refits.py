@@ -139,7 +139,7 @@ def test_a_second_effect_is_found_in_the_discs_beside_one_of_the_unocculted_fiel
     view = View(solution)
     library = [effect(name) for name in ("gain_mismatch", "intensity_gradient", "dark_offset", "core_blur")]
     model = replace(LinearModel(gather(solution, library, view=view), FLOOR), scale_error=0.1)
-    settled, failed = settled_posterior(model, Refits(view, model).weighed)
+    settled, failed = settled_posterior(posterior(model), Refits(view, model).weighed)
     shares = without_idle(settled.probabilities())
     best = next(iter(shares))
     assert set(best) == {"gain_mismatch", "intensity_gradient"} and shares[best] > 0.9

@@ -12,7 +12,6 @@ import pytest
 from psfcore.gap.evidence.evidence import Evidence
 from psfcore.gap.evidence.likelihood import Weighed
 from psfcore.gap.evidence.linear_model import LinearModel
-from psfcore.gap.verdict import settled
 from psfcore.gap.verdict.posterior import NONE, UNKNOWN, Form, Names, Posterior, posterior, without_idle
 from psfcore.gap.verdict.settled import MOST_REFITS, VISIBLE, settled_posterior
 from tests.psfcore.gap.linear_models import with_residuals
@@ -43,7 +42,7 @@ class Refitted:
 
 
 @pytest.fixture
-def settle(monkeypatch: pytest.MonkeyPatch) -> Settle:
+def settle() -> Settle:
     """A function that settles a posterior of the linear model: ln of the evidence by hypothesis, the evidence by refitted
     hypothesis, and the visible error of every template. It returns the posterior, the refitted hypotheses and the failed ones."""
 
@@ -52,8 +51,7 @@ def settle(monkeypatch: pytest.MonkeyPatch) -> Settle:
     ) -> tuple[Posterior, list[Names], tuple[Names, ...]]:
         others = dict.fromkeys(((name,) for name in "abc"), -1e4)
         linear = of_evidence(others | {UNKNOWN: -50.0} | dict(logs), visible)
-        monkeypatch.setattr(settled, "posterior", lambda model: linear)
-        found, failed = settled_posterior(MODEL, refit)
+        found, failed = settled_posterior(linear, refit)
         return found, refit.asked, failed
 
     return settled_from
@@ -65,23 +63,24 @@ def best_of(found: Posterior) -> Names:
 
 def test_a_strong_effect_is_refitted_and_a_weak_one_is_not(evidence: Evidence) -> None:
     strong = replace(with_residuals(evidence, {"dark_offset": 300.0}), scale_error=0.1)
-    assert posterior(strong).forms[Form(OFFSET)].visible_error > VISIBLE
+    linear = posterior(strong)
+    assert linear.forms[Form(OFFSET)].visible_error > VISIBLE
     refit = Refitted({OFFSET: {OFFSET: -1e6}})
-    found, failed = settled_posterior(strong, refit)
+    found, failed = settled_posterior(linear, refit)
     assert refit.asked[0] == OFFSET and OFFSET not in failed
     assert len(set(refit.asked)) == len(refit.asked)
     assert OFFSET not in list(found.probabilities())[:2]  # the evidence of the refit counts
     # A hypothesis whose refit fails is left out.
-    found, failed = settled_posterior(strong, Refitted({}))
+    found, failed = settled_posterior(linear, Refitted({}))
     assert failed[0] == OFFSET and not set(failed) & set(found.probabilities())
     assert sum(without_idle(found.probabilities()).values()) == pytest.approx(1.0)
     refit = Refitted({})
     weak = replace(with_residuals(evidence, {}, noise=0.5), scale_error=0.1)
-    settled_posterior(weak, refit)
+    settled_posterior(posterior(weak), refit)
     assert refit.asked == []
     # Without refits the posterior is that of the linear model.
-    found, failed = settled_posterior(strong, None)
-    assert failed == () and found.log_weights == posterior(strong).log_weights
+    found, failed = settled_posterior(linear, None)
+    assert failed == () and found.log_weights == linear.log_weights
 
 
 def test_before_a_pair_the_more_probable_of_its_effects_is_refitted_alone(settle: Settle) -> None:
