@@ -46,6 +46,7 @@ Values = Mapping[str, float]
 Kernel = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
+FARTHEST = 700.0  # exp of a larger coordinate is no double
 DIFFERENCE = 1e-3  # step of a coordinate for central differences
 HALO_B_PX = 120.0
 KNEE_PX = 100.0
@@ -74,7 +75,13 @@ class Parameter:
         return math.log(value / (1 - value)) if self.scale == "logit" else value
 
     def value(self, coordinate: float) -> float:
-        """The value at a coordinate."""
+        """The value at a coordinate. Raises DataError "transit-says-too-little" if a fit left the range of numbers."""
+        if self.scale != "linear" and not abs(coordinate) < FARTHEST:
+            raise DataError(
+                "transit-says-too-little",
+                f"expected images that determine {self.name}; the fit left the range of its values: add images, or fit a shape "
+                "with fewer parameters",
+            )
         if self.scale == "log":
             return math.exp(coordinate)
         return 1 / (1 + math.exp(-coordinate)) if self.scale == "logit" else coordinate

@@ -276,10 +276,11 @@ def _print_estimate(estimate: Row) -> None:
     ]
     if estimate["example_output"]:
         lines.append(f"for example: {estimate['example_output']}")
-    if not estimate["complete"]:
-        lines.append(
-            "the time of a dry run was not enough to find and examine all of them: the run may be larger"
-        )
+    lines.append(
+        "complete: no other file matches"
+        if estimate["complete"]
+        else "the time of a dry run was not enough to find and examine all of them: the run may be larger"
+    )
     lines += [f"refused: {one['source']}: {one['error']['message']}" for one in estimate["refused"]]
     if more > 0:
         lines.append(f"... and {more} more")

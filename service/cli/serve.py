@@ -113,8 +113,6 @@ def worker(
         except ValueError as error:
             raise click.BadParameter(str(error), param_hint="--queues") from error
     settings = read_settings(data)
-    if stop_with_parent is None:  # otherwise the server that started this worker has printed the folder
-        echo(f"heliopsf worker (data in {settings.data_dir.resolve()})", err=True)
     os.environ |= environment(settings.model_copy(update=options))
     from workers.run.worker import main as run
 

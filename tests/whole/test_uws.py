@@ -61,15 +61,20 @@ def listed(astronomer: Astronomer, **filters: object) -> list[str]:
     return [job.jobid for job in parse_job_list(io.BytesIO(answer.content))]
 
 
-def long_job(astronomer: Astronomer, folder: Path, psf_file: Path, **more: str) -> AsyncTAPJob:
+def long_job(astronomer: Astronomer, folder: Path, psf_file: Path) -> AsyncTAPJob:
     """A job that takes long enough for something to happen to it, at work."""
+    job = started_long_job(astronomer, folder, psf_file)
+    wait_for(lambda: astronomer.client.job(job.job_id)["progress"]["step"] > 2, "the job is at work")
+    return job
+
+
+def started_long_job(astronomer: Astronomer, folder: Path, psf_file: Path, **more: str) -> AsyncTAPJob:
     write_image(folder / "image.fits", shape=(2048, 2048))
     image_id = astronomer.client.upload_image(folder / "image.fits")["id"]
     psf_id = astronomer.client.upload_psf(psf_file)["id"]
     method = '{"name": "richardson-lucy", "steps": 200}'
     job = astronomer.created(KIND="deconvolve", image_id=image_id, psf_id=psf_id, method=method, **more)
     job.run()
-    wait_for(lambda: astronomer.client.job(job.job_id)["progress"]["step"] > 2, "the job is at work")
     return job
 
 
@@ -148,7 +153,7 @@ def test_a_job_that_executes_too_long_is_aborted_and_one_that_is_due_is_destroye
 ) -> None:
     soon = Time(time.time() + 1.5, format="unix").isot + "Z"
     due = astronomer.created(**BUILD, DESTRUCTION=soon)
-    job = long_job(astronomer, tmp_path, psf_file, EXECUTIONDURATION="1")
+    job = started_long_job(astronomer, tmp_path, psf_file, EXECUTIONDURATION="1")
     wait_for(lambda: job.phase == "ABORTED", "the job is aborted", 60)
     wait_for(lambda: due.job_id not in listed(astronomer), "the job is destroyed", 60)
 

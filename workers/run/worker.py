@@ -185,6 +185,7 @@ def main(parent: int | None = None) -> None:
     revision of this version.
     """
     logs.configure(settings)  # before Celery logs anything
+    log.info("the worker starts; data in %s", settings.data_dir.resolve())
     if parent is not None:
         threading.Thread(target=_stop_with, args=(parent,), daemon=True).start()
     pool = ["--pool", "prefork", "--concurrency", str(settings.worker_processes)]

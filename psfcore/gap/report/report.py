@@ -77,7 +77,6 @@ def gap_report(found: Diagnosis) -> dict[str, Any]:
         "ties": [list(judged.tied)] if judged.verdict == "tie" else [],
         "would_separate": would_separate(found),
         "untestable": [{"name": name, "why": why} for name, why in found.evidence.untestable.items()],
-        "looks_like": [{"form": one.field.words, "probability": one.probability} for one in found.unknown],
         "unknown": unknown(found),
         "cautions": list(found.cautions),
         "expected": {

@@ -150,6 +150,9 @@ def test_extreme_coordinates_stay_within_bounds() -> None:
     for at in (-30.0, 30.0):
         values = SOFTENED_POWER_LAW.values(np.array([at, 2.5, at]))
         assert values["b_px"] > 0 and 0 < values["total"] < 1
+    for beyond in ([800.0, 2.5, 0.0], [0.0, 2.5, -800.0], [np.nan, 2.5, 0.0]):
+        with pytest.raises(DataError, match="transit-says-too-little.*expected images that determine"):
+            SOFTENED_POWER_LAW.values(np.array(beyond))
 
 
 def test_an_unknown_shape_is_refused_with_the_known_ones() -> None:

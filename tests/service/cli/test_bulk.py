@@ -73,10 +73,15 @@ def test_a_dry_run_names_the_path_of_a_product(service: MagicMock) -> None:
         "output_bytes": 2**20, "seconds": 8.0, "workers": 1, "memory_mib": 100,
     }  # fmt: skip
     path = "/out/SOLO/2021/03/01/a.fits"
-    for more, named in (({"example_output": path}, True), ({"example_output": None}, False)):
+    for more, named in (
+        ({"example_output": path}, True),
+        ({"example_output": None, "complete": False}, False),
+    ):
         service.estimate_bulk.return_value = estimate | more
         told = CliRunner().invoke(main, ["bulk", "submit", "/x/*.fits", "--psf", "a" * 64, "--dry-run"])
         assert told.exit_code == 0 and (f"for example: {path}" in told.output) == named, told.output
+        assert ("complete: no other file matches" in told.output) == named, told.output
+        assert ("the run may be larger" in told.output) != named, told.output
 
 
 @pytest.fixture
