@@ -79,7 +79,7 @@ def main() -> None:
 
 def write(measured: list[dict[str, Any]]) -> None:
     """Correct the times in estimates.json by these measurements."""
-    from workers.intake.estimates import COSTS_FILE, Costs
+    from workers.intake.costs import COSTS_FILE, Costs
 
     content = json.loads(COSTS_FILE.read_text("utf-8"))
     ratios: dict[tuple[str, str], list[float]] = defaultdict(list)

@@ -25,6 +25,9 @@ class PastChange(BaseModel):
     reason: str
 
 
+MOST_SHARE = 0.99  # a job that takes longer than estimated is not done yet
+
+
 class Progress(BaseModel):
     """Progress of a job."""
 
@@ -32,8 +35,13 @@ class Progress(BaseModel):
     step: int
     steps: int
     time_left_s: float | None = Field(
-        description="estimated time until the last of `steps`, s; null: unknown. The estimate uses the speed since the "
-        "job began to count these steps"
+        description="estimated time until the last of `steps`, or until the end of a job that counts several times, s; null: "
+        "unknown. The estimate uses the speed since the job began to count these steps, or the estimated time of the job"
+    )
+    share: float | None = Field(
+        None,
+        description="share of the estimated time of a job that counts several times, 0 to 1; null: the steps count the whole job, or "
+        "unknown",
     )
 
 
@@ -93,7 +101,13 @@ class JobView(BaseModel):
             attempt=row.attempt,
             cancel_requested=row.cancel_requested,
             waiting_before=waiting_before,
-            progress=Progress(stage=row.stage, step=row.step, steps=row.steps, time_left_s=time_left_s(row)),
+            progress=Progress(
+                stage=row.stage,
+                step=row.step,
+                steps=row.steps,
+                time_left_s=time_left_s(row),
+                share=share_of_time(row),
+            ),
             estimate=Estimate.model_validate(row.estimate) if row.estimate else None,
             parameters=row.parameters,
             result=f"{KINDS[row.kind].result}/{row.result_id}" if row.result_id else None,
@@ -105,14 +119,31 @@ class JobView(BaseModel):
 def time_left_s(row: JobRow, now: float | None = None) -> float | None:
     """Estimated remaining time of a running job, s; None if unknown.
 
-    The estimate uses the speed since the job began to count its present steps. Earlier work, such as reading the
-    images, does not count. now: seconds since 1970; default: this machine's clock.
+    If the steps count the whole job, the estimate uses the speed since the job began to count its present steps. Earlier work, such
+    as reading the images, does not count. Otherwise it is the rest of the estimated time of the job. now: seconds since 1970;
+    default: this machine's clock.
     """
     now = time.time() if now is None else now
+    if not KINDS[row.kind].counted_whole:
+        share = share_of_time(row, now)
+        if share is None or share >= MOST_SHARE or row.estimate is None:
+            return None
+        return float(row.estimate["seconds"] * (1 - share))
     done = row.step - row.count_step
-    if not KINDS[row.kind].counted_whole or row.phase != Phase.EXECUTING or done <= 0 or row.count_at is None:
+    if row.phase != Phase.EXECUTING or done <= 0 or row.count_at is None:
         return None
     return max(0.0, (now - row.count_at) * (row.steps - row.step) / done)
+
+
+def share_of_time(row: JobRow, now: float | None = None) -> float | None:
+    """The share of its estimated time that a running job has used, at most MOST_SHARE; None if its steps count the whole job, or if no
+    estimate is known. now: as for `time_left_s`."""
+    if KINDS[row.kind].counted_whole or row.phase != Phase.EXECUTING or row.started_at is None:
+        return None
+    if not row.estimate or not row.estimate["seconds"]:
+        return None
+    used_s = (time.time() if now is None else now) - row.started_at
+    return float(min(max(used_s / row.estimate["seconds"], 0.0), MOST_SHARE))
 
 
 class ProductView(BaseModel):

@@ -8,6 +8,7 @@ the command asks for a file of it.
 from __future__ import annotations
 
 import shutil
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -69,6 +70,7 @@ from workers.contract.requests import (
 )
 from workers.contract.suggestions import explained
 from workers.files.archive import safe_name
+from workers.intake.costs import BYTES_A_PIXEL, COSTS, linear_s
 from workers.machine import cores, free_bytes
 from workers.settings import Settings, software_version
 from workers.stage_timer import StageTimer
@@ -234,12 +236,17 @@ class Local(Operations):
         return self._resolved(kind, parameters)[1]
 
     def wait(self, job: dict[str, Any], *, progress: Progress | None = None) -> dict[str, Any]:
-        """Compute the result of a request."""
+        """Compute the result of a request. The progress of a job that counts several times is the percent of its estimated time."""
+        request, started_s = self._jobs.pop(job["id"]), time.monotonic()
+        expected_s = self._expected_s(job["kind"], request)
 
         def report(stage: str, step: int, steps: int) -> None:
             with self.times.step(stage, step):
-                if progress is not None:
+                if progress is not None and expected_s is None:
                     progress(stage, step, max(steps, 1))
+                elif progress is not None and expected_s is not None:
+                    share = (time.monotonic() - started_s) / expected_s
+                    progress(stage, min(round(100 * share), 99), 100)
 
         def compiling(done: bool) -> None:
             with self.times.step(COMPILING, int(done)):
@@ -248,8 +255,15 @@ class Local(Operations):
 
         compute: Callable[[Any, str, _Report], str] = getattr(self, f"_{job['kind'].replace('-', '_')}")
         with listening(compiling):
-            address = compute(self._jobs.pop(job["id"]), job["id"], report)
+            address = compute(request, job["id"], report)
         return job | {"result": address}
+
+    def _expected_s(self, kind: str, request: Any) -> float | None:
+        """The estimated time of a job on a transit, s; None for other jobs, whose steps count the whole job."""
+        if KINDS[kind].counted_whole or getattr(request, "transit_id", None) not in self._transits:
+            return None
+        pixels = sum(self._transits[request.transit_id].contents.files.values()) / BYTES_A_PIXEL
+        return linear_s(kind, request.model_dump(), pixels) / cores() ** COSTS.threads_exponent
 
     def get(self, address: str) -> dict[str, Any]:
         """The description of a result."""

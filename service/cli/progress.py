@@ -70,8 +70,10 @@ def duration(seconds: float) -> str:
 def step_text(stage: str, step: int, steps: int) -> str:
     """The stage and its step as text. If the number of steps is unknown, the text contains only the stage.
 
-    A task reports an unknown number of steps as 1.
+    A task reports an unknown number of steps as 1. A job of several counts reports percents of its estimated time.
     """
+    if steps == 100:
+        return f"{stage}: {step} %"
     if (steps <= 1 and step < steps) or not steps:
         return stage
     return f"{stage}: {STEPS_OF.get(stage, 'step')} {step} of {steps}"
@@ -93,7 +95,8 @@ class _Teller:
         now_s = time.monotonic()
         with self.lock:
             left_s = self.pace.left_s(step, steps, now_s)
-            left = "" if left_s is None else f", {duration(left_s)} left"
+            # A job that takes longer than estimated has no time left, but goes on.
+            left = "" if left_s is None or left_s < 1 < steps - step else f", {duration(left_s)} left"
             if self.bar:
                 filled = round(20 * step / max(steps, 1))
                 drawn = "#" * filled + "-" * (20 - filled)

@@ -147,7 +147,11 @@ class Client(Connection, Operations):
                 job = Patience(self.say, GOES_ON).repeat(lambda: self.job(job_id))
                 now = job["progress"]
                 if progress is not None and now["stage"]:
-                    progress(now["stage"], now["step"], max(now["steps"], 1))
+                    share = now.get("share")  # a service of an earlier version sends none
+                    if share is None:
+                        progress(now["stage"], now["step"], max(now["steps"], 1))
+                    else:
+                        progress(now["stage"], round(100 * share), 100)
         except KeyboardInterrupt as stop:
             raise WaitInterrupted("job", job["id"], self.server) from stop
         return self._ended(job)

@@ -31,7 +31,8 @@ from psfcore.scatter import power_law
 from psfcore.transit.manifest import parse_manifest
 from tests.fuzz.fits_inputs import compressed_image, plain_image
 from tests.fuzz.text_inputs import instrument, manifest
-from workers.intake.estimates import COSTS, _build
+from workers.intake.costs import COSTS
+from workers.intake.estimates import _build
 from workers.run.child import Child
 
 LIMITS = FitsLimits(max_pixels=128 * 128, max_header_bytes=64 * 1024, max_hdus=8)

@@ -1,12 +1,8 @@
 """Estimates the time and memory of a job from the sizes of its inputs, before the job is accepted.
 
-The initial values are in ``estimates.json``; ``python -m benchmarks.estimates --write`` measured these values. The time is
-then multiplied by a factor that was measured in this catalogue: on the completed jobs of the same kind that were of the
-most similar size, and for the images of a bulk run on the images of the newest run. A wrong estimate does little harm,
-because a job that takes too long is stopped, and no memory is reserved.
-
-In ``estimates.json``, times in seconds are processor time on one core of a machine of 2026. Times per pixel are in ns,
-memory per pixel in bytes.
+The initial values are those of ``costs``. The time is then multiplied by a factor that was measured in this catalogue: on the
+completed jobs of the same kind that were of the most similar size, and for the images of a bulk run on the images of the newest
+run. A wrong estimate does little harm, because a job that takes too long is stopped, and no memory is reserved.
 
 | symbol | name | unit |
 |---|---|---|
@@ -20,12 +16,9 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from importlib.resources import files
 from statistics import median_low
 from typing import Any
 from weakref import WeakKeyDictionary
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from psfcore.deconvolve.box import EXPECTED_RIM_PX, Box
 from psfcore.deconvolve.memory import MIB, Asked, of_method, product_bytes
@@ -37,9 +30,8 @@ from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
 from workers.contract.identities import instrument_text
 from workers.contract.kinds import KINDS
 from workers.contract.requests import PsfBuild
+from workers.intake.costs import BYTES_A_PIXEL, COSTS, linear_s
 from workers.settings import Settings
-
-BYTES_A_PIXEL = 4.0  # assumed for the files of a transit, because only their length is known here
 
 # The factor is the median of the NEAREST jobs or images, by the estimated time, of the newest MOST_JOBS. Of short jobs
 # FEWEST_JOBS are needed, because the first one may have compiled kernels; one job of LONG_S is enough.
@@ -52,94 +44,6 @@ BULK = "bulk-image"  # takes the place of a kind for the images of bulk runs
 FOUND = 0.05
 KEEP_FACTOR_S = 60.0
 _times: WeakKeyDictionary[Catalogue, dict[str, tuple[list[tuple[float, float]], float]]] = WeakKeyDictionary()
-
-
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Linear(_Frozen):
-    """Time and memory as a constant plus a part that is proportional to the number of pixels that the job reads.
-
-    as_published, shapes: if the request sets the parameter of this name, the time is multiplied by this factor.
-    """
-
-    base_s: float
-    pixel_ns: float
-    base_mib: float
-    pixel_bytes: float
-    as_published: float = 1.0
-    shapes: float = 1.0
-    run: dict[str, tuple[float, float]] = {}  # time of one run, by scheme: s, and ns per pixel
-
-
-class Deconvolution(_Frozen):
-    """Time of a deconvolution. The plane is the image with its margins. `psfcore.deconvolve.memory` has the memory.
-
-    step_ns: for each method, the time of one step for one pixel of the plane, ns.
-    """
-
-    base_s: float
-    image_ns: float
-    step_ns: dict[str, float]
-    psf_draws: int  # deconvolutions with other PSFs, for the errors of a fitted PSF: two per parameter
-
-
-class Build(_Frozen):
-    """The time that a PSF build takes for each spectral line of the bandpass, and the memory that it needs.
-
-    A mask is sampled at S^2 points per pixel. ``psfcore.instruments.workload`` counts the points, cells, windows and
-    entries. Suffix _ns: the time for one point, cell, window or entry; suffix _bytes: the memory for one.
-    """
-
-    disc_s: float
-    mesh_s: float
-    mask_s: float
-    fewest_samples: int  # smallest S
-    samples_exponent: float
-    grid_px: int
-    grid_exponent: float
-    grid_mib: float
-    meshes_mib: float
-    airy_ns: float
-    airy_bytes: float
-    cell_ns: float
-    cell_bytes: float
-    window_ns: float  # for each window and pixel of an edge of the grid
-    outlines: int  # outlines of a mount that ``mask_s`` includes
-    entry_ns: float  # for each further entry of the list of edges, times S
-    entry_bytes: float
-    spectrum_bytes: float  # for each row of the mask and pixel of an edge of the grid
-    image_bytes: float  # for each pixel of a mask image
-
-
-class Costs(_Frozen):
-    """The content of ``estimates.json``.
-
-    threads_exponent: p. With n threads, the time is the time of one thread multiplied by n ** -p.
-    """
-
-    class Kinds(BaseModel):
-        """The models by kind of job. Every kind except ``deconvolve`` and ``psf-build`` is Linear; a kind without an entry uses "other"."""
-
-        model_config = ConfigDict(frozen=True, extra="allow")
-        __pydantic_extra__: dict[str, Linear]
-
-        deconvolve: Deconvolution
-        psf_build: Build = Field(alias="psf-build")
-        other: Linear
-
-    worker_mib: float  # memory of a worker with its libraries, before its first job
-    threads_exponent: float
-    kinds: Kinds
-
-    def linear(self, kind: str) -> Linear:
-        """The linear model of a kind; the model "other" if the kind has no entry."""
-        return (self.kinds.__pydantic_extra__ or {}).get(kind, self.kinds.other)
-
-
-COSTS_FILE = files(__package__).joinpath("estimates.json")
-COSTS = Costs.model_validate_json(COSTS_FILE.read_text("utf-8"))
 
 
 @dataclass(frozen=True)
@@ -297,17 +201,11 @@ def _linear(
     kind: str, parameters: Mapping[str, Any], catalogue: Catalogue, owner: str
 ) -> tuple[float, float]:
     cost, pixels = COSTS.linear(kind), _pixels(parameters, catalogue, owner)
-    cpu_s = cost.base_s + cost.pixel_ns * 1e-9 * pixels
-    for parameter, times in (("as_published", cost.as_published), ("shapes", cost.shapes)):
-        if parameters.get(parameter):
-            cpu_s *= times
-    if parameters.get("scheme") in cost.run:
-        run_s, run_ns = cost.run[parameters["scheme"]]
-        cpu_s += parameters["runs"] * (run_s + run_ns * 1e-9 * pixels)
     built_s, built_mib = 0.0, 0.0
     if parameters.get("diffraction_recipe") is not None:
         built_s, built_mib = _build(parameters["diffraction_recipe"], catalogue, owner)
-    return built_s + cpu_s, max(built_mib, cost.base_mib + cost.pixel_bytes * pixels / MIB)
+    cpu_s = built_s + linear_s(kind, parameters, pixels)
+    return cpu_s, max(built_mib, cost.base_mib + cost.pixel_bytes * pixels / MIB)
 
 
 def _pixels(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> float:

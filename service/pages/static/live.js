@@ -144,8 +144,9 @@ function showJob(place, job) {
 
 function showOneJob(place, part, job) {
   const bar = part("bar");
-  bar.max = job.progress.steps || 1;
-  bar.value = job.progress.step;
+  const { step, steps, share } = job.progress;
+  bar.max = share === null ? steps || 1 : 1;
+  bar.value = share ?? step;
   bar.hidden = ENDED.includes(job.phase);
   const waiting = part("place");
   waiting.hidden = job.phase !== "QUEUED";

@@ -18,7 +18,8 @@ from psfcore.instruments.files import instrument_names
 from psfcore.instruments.model import MOST_BYTES, load_instrument, parse_instrument
 from psfcore.instruments.workload import MOST_CELLS, MOST_SAMPLES, PERIOD_PX, check_workload, workload
 from tests.conftest import REPOSITORY, SMALL_INSTRUMENT
-from workers.intake.estimates import COSTS, _build
+from workers.intake.costs import COSTS
+from workers.intake.estimates import _build
 
 MIB = 2**20
 MESH = "[[meshes]]\nname = 'm'\nplace = 'entrance'\npitch_um = 300.0\nwire_um = 30.0\n"

@@ -151,7 +151,7 @@ def test_extreme_coordinates_stay_within_bounds() -> None:
         values = SOFTENED_POWER_LAW.values(np.array([at, 2.5, at]))
         assert values["b_px"] > 0 and 0 < values["total"] < 1
     for beyond in ([800.0, 2.5, 0.0], [0.0, 2.5, -800.0], [np.nan, 2.5, 0.0]):
-        with pytest.raises(DataError, match="transit-says-too-little.*expected images that determine"):
+        with pytest.raises(DataError, match=r"transit-says-too-little.*expected images that determine"):
             SOFTENED_POWER_LAW.values(np.array(beyond))
 
 

@@ -91,6 +91,7 @@ def test_a_stage_and_its_step_as_text(subtests: pytest.Subtests) -> None:
     for stage, step, steps, text in (
         ("reading", 3, 20, "reading: step 3 of 20"),
         ("error estimate", 3, 12, "error estimate: realisation 3 of 12"),
+        ("fit: round 2", 43, 100, "fit: round 2: 43 %"),
         ("saving", 0, 1, "saving"),
         ("saving", 1, 1, "saving: step 1 of 1"),
         ("compiling kernels (only once)", 0, 0, "compiling kernels (only once)"),

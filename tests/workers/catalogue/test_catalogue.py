@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 from sqlalchemy import Double, literal_column, update
 
-from service.views import time_left_s
+from service.views import share_of_time, time_left_s
 from tests.workers.databases import BOTH, change, database
 from tests.workers.jobs import claimed, job_row
 from tests.workers.psf_examples import product
@@ -230,6 +230,18 @@ def test_a_cancelled_job_is_not_tried_again(catalogue: Catalogue) -> None:
     assert row.phase == Phase.ABORTED
     assert row.ended_at is not None and row.lease is None
     assert waiting(catalogue) == [] and catalogue.jobs.claim(job.id, "other") is None
+
+
+def test_a_job_that_counts_several_times_is_told_by_its_estimated_time() -> None:
+    row = JobRow(
+        kind="gap-diagnose", phase="EXECUTING", started_at=1000.0, estimate={"seconds": 60.0}, step=3, steps=9
+    )
+    for now, share, left_s in ((1015.0, 0.25, 45.0), (1045.0, 0.75, 15.0), (1100.0, 0.99, None)):
+        assert (share_of_time(row, now), time_left_s(row, now)) == (pytest.approx(share), left_s)
+    row.estimate = None
+    assert share_of_time(row, 1015.0) is None and time_left_s(row, 1015.0) is None
+    counted = JobRow(kind="psf-fit", phase="EXECUTING", started_at=1000.0, estimate={"seconds": 60.0})
+    assert share_of_time(counted, 1015.0) is None
 
 
 def test_the_beginning_of_each_count_of_steps_is_kept(

@@ -27,7 +27,8 @@ from workers.catalogue.tables import ImageRow, JobRow, TransitRow
 from workers.contract.phases import Phase
 from workers.contract.requests import Method, PsfBuild, RichardsonLucy
 from workers.intake import estimates
-from workers.intake.estimates import BOUNDS, COSTS, FEWEST_JOBS, KEEP_FACTOR_S, checked, estimate
+from workers.intake.costs import COSTS
+from workers.intake.estimates import BOUNDS, FEWEST_JOBS, KEEP_FACTOR_S, checked, estimate
 from workers.settings import Settings
 from workers.tasks.context import Context
 

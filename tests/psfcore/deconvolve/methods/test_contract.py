@@ -20,7 +20,7 @@ from psfcore.simulate.observe import observe
 from psfcore.simulate.scene import solar_scene
 from tests.psfcore.conftest import gaussian, make_image, make_psf
 from workers.contract.requests import Method
-from workers.intake.estimates import COSTS
+from workers.intake.costs import COSTS
 
 # What the file of a method must define, and what each constant means.
 CONSTANTS = {
