@@ -25,7 +25,7 @@ from service.cli.options import (
 from service.cli.progress import echo
 from workers.contract.requests import GapDiagnose
 
-SHOWN = 6
+SHOWN = 3
 
 
 class _DiagnosisByDefault(click.Group):
@@ -115,18 +115,40 @@ def diagnose(
         if corrected_file is not None and corrected is not None:
             service.download(f"/v1/psfs/{corrected}/file", corrected_file, overwrite=overwrite)
     echo("\n".join(_lines(report)))
+    written = [str(path) for path in (output, json_file, plot) if path is not None]
+    if corrected_file is not None and corrected is not None:
+        written.append(str(corrected_file))
+    if written:
+        echo(f"written: {', '.join(written)}")
+    step = _next_step(report, transit, output, corrected_file)
+    if step:
+        echo(f"next: {step}")
     if corrected_file is not None and corrected is None:
         raise click.ClickException(
             f"{corrected_file} was not written: the diagnosis found no effect for a corrected PSF (verdict {report['verdict']})"
         )
 
 
+def _next_step(report: dict[str, Any], transit: Path, page: Path | None, corrected: Path | None) -> str:
+    """What to do with this verdict, in one line; empty if there is nothing to do."""
+    if report["verdict"] in ("attributed", "tie") and corrected is None:
+        return f"`heliopsf gap {transit} --corrected PSF.fits` writes the PSF without the effect"
+    if report["verdict"] in ("inconclusive", "tie"):
+        return "`heliopsf gap plan PLAN` tells whether images that are not taken yet would decide"
+    if report["verdict"] == "unknown":
+        where = "-o PAGE.html writes a page with" if page is None else f"{page} has"
+        return f"{where} the map or the curve of the unknown cause"
+    return ""
+
+
 def _lines(report: dict[str, Any]) -> list[str]:
-    """The report as lines to print."""
+    """The answer of the report as lines to print. The JSON and the page have all effects."""
     so_far = "most probable: " if report["verdict"] == "inconclusive" else ""
     answer = f" ({so_far}{', '.join(report['answer'])})" if report["answer"] else ""
     out = [report["sentence"], f"verdict: {report['verdict']}{answer}"]
-    for effect in [*report["together"], *report["effects"]][:SHOWN]:
+    in_set = {" + ".join(names) for names in report["set"]["members"]}
+    named = [one for one in (*report["together"], *report["effects"]) if one["name"] in in_set]
+    for effect in named[:SHOWN]:
         closure = effect["closure"]
         closed = "" if closure is None else f", held-out closure {100 * closure['value']:.0f} %"
         numbers = ", ".join(
@@ -135,7 +157,8 @@ def _lines(report: dict[str, Any]) -> list[str]:
         )
         out.append(f"  {effect['name']:<24} P = {effect['probability']:.2f}{closed}: {numbers}")
     out += [f"  looks like: {_field(one)}" for one in report["unknown"]["fields"]]
-    out += [f"  not testable: {one['name']} ({one['why']})" for one in report["untestable"]]
+    if report["untestable"]:
+        out.append(f"  not testable: {', '.join(one['name'] for one in report['untestable'])}")
     return out + [f"  caution: {caution}" for caution in report["cautions"]]
 
 

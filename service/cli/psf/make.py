@@ -73,6 +73,9 @@ def build(
         echo(f"  light beyond {radius:>5} px  {beyond_pct:6.2f} %")
 
 
+TOLD_PX = (10, 100)  # the JSON and `psf show` have the curve at more radii
+
+
 @click.command("fit")
 @TRANSIT
 @click.option("-o", "--output", required=True, type=OUTPUT, help="Write the PSF (FITS)")
@@ -108,18 +111,19 @@ def fit(
     say_fit(found)
     for limit in found["limits"]:
         echo(f"  note: {limit}")
+    echo(f"next: `heliopsf report {transit} -o PAGE.html` tests the fit on images that it did not use")
 
 
 def say_fit(fit: dict[str, Any]) -> None:
-    """Print the sentence of a fitted shape, its parameters and its curve, with their errors."""
+    """Print the sentence of a fitted shape, its parameters, and its curve at two radii, with their errors."""
     echo(fit["sentence"])
     for name, parameter in fit["parameters"].items():
         echo(f"  {name:<12} {parameter['value']:10.4f} ± {parameter['sigma']:.4f} {parameter['unit']}")
     curve = fit["curve"]
-    for radius, beyond, sigma in zip(
-        curve["radii_px"], curve["light_beyond_pct"], curve["sigma"], strict=True
-    ):
-        echo(f"  light beyond {radius:>6g} px  {beyond:6.2f} ± {sigma:.2f} %")
+    told = zip(curve["radii_px"], curve["light_beyond_pct"], curve["sigma"], strict=True)
+    for radius, beyond, sigma in told:
+        if radius in TOLD_PX:
+            echo(f"  light beyond {radius:>3g} px  {beyond:6.2f} ± {sigma:.2f} %")
 
 
 @click.command("crossval")
