@@ -17,7 +17,7 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
@@ -33,7 +33,8 @@ from psfcore.blind.score import required_causes, wilson
 from psfcore.build import known_diffraction
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import linear_model_of
-from psfcore.gap.evidence.likelihood import TEMPLATE_ERRORS
+from psfcore.gap.evidence.fields import Field
+from psfcore.gap.evidence.likelihood import TEMPLATE_ERRORS, Weighed
 from psfcore.gap.evidence.measured_noise import measured_noise
 from psfcore.gap.library.registry import LIBRARY
 from psfcore.gap.verdict import calibration
@@ -42,8 +43,10 @@ from psfcore.gap.verdict.posterior import (
     NONE,
     PRIOR,
     UNKNOWN,
+    Form,
     Kind,
     Names,
+    Posterior,
     kind_of,
     posterior,
     probabilities,
@@ -96,8 +99,8 @@ class Case:
         return true_share(shares, self.true)
 
 
-def weights_of(folder: Path) -> tuple[dict[Names, float], tuple[float, ...]]:
-    """Two results for the transit in a folder: the weights of all hypotheses; how far the refits differ from the first order."""
+def posterior_of(folder: Path) -> tuple[Posterior, tuple[float, ...]]:
+    """Two results for the transit in a folder: the settled posterior; how far the refits differ from the first order."""
     transit = read_transit(
         folder, LIMITS, diffraction=lambda instrument, _shape: known_diffraction(instrument, threads=1)
     )
@@ -108,7 +111,7 @@ def weights_of(folder: Path) -> tuple[dict[Names, float], tuple[float, ...]]:
     model, _ = linear_model_of(view, LIBRARY)
     refits = Refits(view, model)
     found, _ = settled_posterior(posterior(model, refits.columns), refits.weighed)
-    return found.log_weights, tuple(refits.departures)
+    return found, tuple(refits.departures)
 
 
 def in_calibration(cases: Sequence[Case]) -> list[Case]:
@@ -207,20 +210,28 @@ def _file(kept: Path, number: int) -> Path:
 def _read(made: BlindSet, number: int, kept: Path) -> Case:
     truth = made.truth(number)
     found = json.loads(_file(kept, number).read_text("utf-8"))
-    weights = {tuple(names): float(weight) for names, weight in found["log_weights"]}
+    forms = {
+        Form(
+            tuple(effects), None if field is None else Field(**field | {"parts": tuple(field["parts"])})
+        ): Weighed(evidence, (), np.zeros(0), 0.0)
+        for effects, field, evidence in found["forms"]
+    }
+    weights = Posterior(forms, tuple(found["order"])).log_weights
     return Case(number, str(truth["kind"]), required_causes(truth), weights, tuple(found["departures"]))
 
 
 def _keep(transit: Path, file: Path) -> str:
-    """Compute the weights of a case and write them. Returns a line for the log."""
+    """Compute the evidence of the forms of all hypotheses of a case and write it. Returns a line for the log."""
     try:
-        weights, departures = weights_of(transit)
+        found, departures = posterior_of(transit)
     except DataError as error:
         return f"case {file.stem}: {error.message}"
-    listed = [[list(names), weight] for names, weight in weights.items()]
-    write_whole(file, json.dumps({"log_weights": listed, "departures": departures}))
-    best = max(weights, key=lambda names: weights[names])
-    return f"case {file.stem}: {'+'.join(best) or 'none'}"
+    listed = [
+        [form.effects, None if form.field is None else asdict(form.field), weighed.log_evidence]
+        for form, weighed in found.forms.items()
+    ]
+    write_whole(file, json.dumps({"order": found.order, "forms": listed, "departures": departures}))
+    return f"case {file.stem}: {'+'.join(next(iter(found.probabilities()))) or 'none'}"
 
 
 def main() -> None:

@@ -105,9 +105,10 @@ class Field:
         """The name of the effect of the library whose form is free in this field; UNKNOWN if there is none."""
         if self.form == "light" and self.width == WIDTHS[-1]:
             return "intensity_gradient"
-        return {"gain": "flat_field_residual", "kernel_over_field": "field_dependent_scatter"}.get(
-            self.form, UNKNOWN
-        )
+        # Bumps of the smallest width can change every disc by its own amount, so they say nothing of a flat field.
+        if self.form == "gain" and self.width != WIDTHS[0]:
+            return "flat_field_residual"
+        return "field_dependent_scatter" if self.form == "kernel_over_field" else UNKNOWN
 
     @property
     def axes(self) -> tuple[str, ...]:
