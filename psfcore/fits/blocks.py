@@ -48,11 +48,12 @@ END_CARD = b"END" + b" " * 77
 # this module.
 _SIMPLE = re.compile(rb"SIMPLE  = *[TF] *(/[ -~]*)?")
 _DAMAGED_END = re.compile(rb"END[^A-Z0-9_-]")
+_SCALED = ", whose values are scaled for display: use the FITS file of the image"
 _KNOWN_STARTS = (
-    (b"\x00\x00\x00\x0cjP", "a JPEG 2000 file"),
-    (b"\xff\x4f\xff\x51", "a JPEG 2000 codestream"),
-    (b"\x89PNG", "a PNG file"),
-    (b"\xff\xd8\xff", "a JPEG file"),
+    (b"\x00\x00\x00\x0cjP", f"a JPEG 2000 file{_SCALED}"),
+    (b"\xff\x4f\xff\x51", f"a JPEG 2000 codestream{_SCALED}"),
+    (b"\x89PNG", f"a PNG file{_SCALED}"),
+    (b"\xff\xd8\xff", f"a JPEG file{_SCALED}"),
     (b"PK\x03\x04", "a zip archive"),
     (b"BZh", "a bzip2 file"),
     (b"\xfd7zXZ", "an xz file"),

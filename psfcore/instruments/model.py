@@ -326,7 +326,7 @@ def _turned(corners: tuple[tuple[float, float], ...], angle_deg: float) -> tuple
 def load_instrument(name_or_path: str | Path) -> Instrument:
     """Read an instrument by its name, or from a TOML file given as a Path or as a string that ends in .toml.
 
-    Raises DataError "unknown-instrument" or "bad-instrument-file" (a line for each wrong key).
+    Raises DataError "unknown-instrument", "no-such-file", or "bad-instrument-file" (a line for each wrong key).
     """
     is_file = isinstance(name_or_path, Path) or name_or_path.endswith(".toml")
     path = Path(name_or_path) if is_file else instrument_path(str(name_or_path))
@@ -336,11 +336,15 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
 def read_instrument_text(path: Path) -> str:
     """Read an instrument file, but at most one character more than the limit, so that `parse_instrument` can refuse it.
 
-    Raises DataError "bad-instrument-file".
+    Raises DataError "no-such-file", "bad-instrument-file".
     """
     try:
         with path.open("rb") as file:
             return file.read(MOST_BYTES + 1).decode("utf-8")
+    except FileNotFoundError:
+        raise DataError(
+            "no-such-file", f"expected an instrument file; got '{path}', and there is none"
+        ) from None
     except (OSError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
         raise DataError("bad-instrument-file", f"{path.name}: expected TOML in UTF-8; {reason}") from None

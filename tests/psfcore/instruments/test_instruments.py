@@ -104,6 +104,11 @@ def with_values(**values: float | str) -> str:
     return text
 
 
+def test_a_file_that_is_missing_is_told() -> None:
+    with pytest.raises(DataError, match=r"no-such-file: expected an instrument file; got 'no\.toml'"):
+        load_instrument("no.toml")
+
+
 def test_an_impossible_size_is_refused_with_its_limit() -> None:
     sizes = ("wavelength_angstrom", "focal_length_mm", "diameter_mm", "pixel_pitch_um", "plate_scale_arcsec")
     limits = (("1e-320", "0.000000001"), ("1e300", "1000000000"), ("inf", "finite"))
