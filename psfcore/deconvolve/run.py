@@ -396,6 +396,11 @@ def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
         "PSFVERS": (psf.version, "PSF version"),
         "PSFNAME": (psf.name, "PSF name"),
         "PSFSTAT": (psf.status, "PSF status"),
+        **(
+            {"PSFDOI": (doi, "DOI of the PSF's publication")}
+            if (doi := product.psf.provenance.get("doi"))
+            else {}
+        ),
         "DCNVMETH": (product.method, "deconvolution method"),
         "DCNVITER": (product.steps_done, "deconvolution steps done"),
         "DCNVSTOP": (
@@ -427,10 +432,11 @@ def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
 
 def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
     """The lines of HISTORY that say how an image was deconvolved."""
-    box = product.of_box
+    box, citation = product.of_box, product.psf.provenance.get("citation")
     return [
         f"heliopsf {software_version()}: {product.method}, {product.steps_done} steps, "
         f"edges {product.edges}, PSF {psf.name} {psf.version} ({psf.status})",
+        *([] if citation is None else [f"publication of the PSF: {citation}"]),
         *(
             []
             if box is None
