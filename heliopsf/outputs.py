@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Cards with statistics of the input's pixels. These values are wrong for the result, so the cards are removed.
-_STATISTICS = re.compile(r"data(min|max|mean|medn|rms|std|skew|kurt|cent|p\d\d)", re.IGNORECASE)
+# Cards with statistics of the input's pixels, and the DOI of an earlier PSF. They are wrong for the result, so they are removed.
+_STATISTICS = re.compile(r"data(min|max|mean|medn|rms|std|skew|kurt|cent|p\d\d)|psfdoi", re.IGNORECASE)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

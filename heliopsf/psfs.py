@@ -25,10 +25,11 @@ from psfcore.psf import Psf as CorePsf
 from psfcore.psf import cumulative_curve
 from psfcore.psf_cache import kept_psf
 from psfcore.psf_sampling import rebinned
+from psfcore.published_psfs import PUBLISHED, kept_file
 from psfcore.recipe import Recipe
 from psfcore.scatter.interpolation import Epoch, interpolated_psf
 from psfcore.whole_files import sha256_of
-from workers.cache_folder import psf_cache
+from workers.cache_folder import psf_cache, published_folder
 from workers.machine import cores
 
 if TYPE_CHECKING:
@@ -147,7 +148,8 @@ def build_psf(
 
 
 def given_psf(psf: Any, *, threads: int, progress: Steps | None) -> Psf:
-    """The PSF that a user gives: a PSF, a file, the name or the file of an instrument, or weights.
+    """The PSF that a user gives: a PSF, a file, the name or the file of an instrument, the name of a published PSF, or
+    weights.
 
     Raises ``DataError`` "bad-input", "no-such-file", and the errors of reading and building.
     """
@@ -156,6 +158,8 @@ def given_psf(psf: Any, *, threads: int, progress: Steps | None) -> Psf:
     if isinstance(psf, str | Path):
         if str(psf).endswith(".toml") or (str(psf) in instrument_names() and not Path(psf).exists()):
             return built_psf(psf, parts=False, threads=threads, progress=progress)
+        if str(psf) in PUBLISHED and not Path(psf).exists():
+            return read_psf(kept_file(published_folder(), str(psf)))
         return read_psf(psf)
     weights = getattr(psf, "data", None) if hasattr(psf, "uncertainty") else psf
     try:
@@ -173,7 +177,7 @@ def existing_file(path: str | Path) -> Path:
     if Path(path).is_file():
         return Path(path)
     what = "it is a folder" if Path(path).is_dir() else "there is none"
-    meant = did_you_mean(str(path), instrument_names())
+    meant = did_you_mean(str(path), [*instrument_names(), *PUBLISHED])
     raise DataError("no-such-file", f"expected a FITS file; got {str(path)!r:.200}, and {what}{meant}")
 
 

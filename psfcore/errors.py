@@ -11,7 +11,7 @@ from typing import Any
 _OWN = ("heliopsf", "psfcore", "workers", "service")
 # The extra that installs a package; every other package that can be missing belongs to the service.
 _EXTRAS = {"matplotlib": "plot", "jinja2": "plot", "markupsafe": "plot", "sunpy": "map", "s3fs": "s3"}
-_EXTRAS |= {"opentelemetry": "traces"}
+_EXTRAS |= {"opentelemetry": "traces", "pooch": "published"}
 MOST_TOLD = 20  # if a request has many errors, only the texts of the first ones are given
 
 

@@ -38,7 +38,7 @@ from psfcore.fits.cards import Cards
 from psfcore.fits.channel import binning_factor
 from psfcore.fits.frame import SILENT_DEG, UNIT, Matrix, frame_of, plate_scale_arcsec
 from psfcore.image import Image
-from psfcore.psf import PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred
+from psfcore.psf import LARGEST_SUM, PLATE_SCALE_TOLERANCE, REACH_GRID_PX, Psf, crop_centred
 
 LARGEST_FACTOR = 64
 Kernel = NDArray[np.float64]
@@ -186,8 +186,11 @@ def rebinned(psf: Psf, factor: int) -> Psf:
 
 
 def rebinned_kernel(kernel: Kernel, factor: int) -> Kernel:
-    """Eq. (1) along both axes. Only weights within the full reach (in unbinned pixels) are used; their sum is unchanged."""
+    """Eq. (1) along both axes; the sum of the used weights is unchanged. Of a larger array that sums to 1 over the full reach
+    (in unbinned pixels), only the weights within the reach are used."""
     inner = crop_centred(kernel, (min(kernel.shape[0], REACH_GRID_PX), min(kernel.shape[1], REACH_GRID_PX)))
+    if inner.sum() < 2 - LARGEST_SUM and kernel.sum() <= LARGEST_SUM:  # it sums to 1 over the whole array
+        inner = kernel
     rows = _rebin_axis(inner, factor)
     return np.ascontiguousarray(_rebin_axis(rows.T, factor).T)
 

@@ -15,7 +15,10 @@ from psfcore.psf_cache import PsfCache
 
 FOLDER, LARGEST = "HELIOPSF_CACHE_DIR", "HELIOPSF_CACHE_MIB"
 DEFAULT_MIB = 2048  # about 15 PSFs of 2048 px with their components
-_PSFS = "psfs"  # a separate subfolder, because the cache makes its folder inaccessible to other users
+_PSFS, _PUBLISHED = (
+    "psfs",
+    "published",
+)  # a separate subfolder, because the cache makes its folder inaccessible to other users
 
 
 def psf_cache() -> PsfCache:
@@ -23,11 +26,19 @@ def psf_cache() -> PsfCache:
 
     Raises DataError "bad-setting" if HELIOPSF_CACHE_MIB is not a whole number.
     """
-    named = os.environ.get(FOLDER)
-    folder = Path(named).expanduser() if named else user_cache_path("heliopsf", appauthor=False)
     largest = os.environ.get(LARGEST) or str(DEFAULT_MIB)
     if not (largest.isascii() and largest.isdigit()):
         raise DataError(
             "bad-setting", f"{LARGEST}: expected a whole number of MiB, 0 for no cache; got {largest!r}"
         )
-    return PsfCache(folder / _PSFS, int(largest) * 2**20)
+    return PsfCache(_folder() / _PSFS, int(largest) * 2**20)
+
+
+def published_folder() -> Path:
+    """The folder of published PSFs (`psfcore.published_psfs`), beside the cache of built PSFs. Users may share it."""
+    return _folder() / _PUBLISHED
+
+
+def _folder() -> Path:
+    named = os.environ.get(FOLDER)
+    return Path(named).expanduser() if named else user_cache_path("heliopsf", appauthor=False)

@@ -50,6 +50,8 @@ class Made(BaseModel):
     name: str | None = None
     version: str | None = None
     status: str | None = None
+    doi: str | None = Field(None, description="DOI of the publication of a PSF, if its file names one")
+    citation: str | None = Field(None, description="publication of a PSF, if its file names one")
     origin: str | None = None
     file_sha256: str
     kind: str | None = Field(None, description="kind of the job that made it; null for an upload")
@@ -203,7 +205,9 @@ def _made_of(row: ProductRow | PsfRow) -> Made:
     if isinstance(row, PsfRow):
         details = _provenance(row) | row.details
         names |= {"name", "version", "status", "origin"}
-    recorded = {
+    cards = row.details.get("cards") or {}
+    recorded = {"doi": cards.get("PSFDOI"), "citation": cards.get("PSFREF")}
+    recorded |= {
         name: details.get(name) for name in ("job_id", "algorithm_version", "software_version", "libraries")
     }
     uploaded = isinstance(row, PsfRow) and row.origin == "uploaded"

@@ -16,6 +16,7 @@ from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from psfcore import software_version as software_version
+from psfcore.fits.blocks import FitsLimits
 from psfcore.transit.archive import ArchiveLimits
 from workers.contract.queues import Queue, queues_named
 from workers.machine import cores, memory_bytes
@@ -70,9 +71,18 @@ class Settings(BaseSettings):
     broker_url: str = Field(
         EMBEDDED_BROKER, description="URL of the Celery broker; the default needs no server"
     )
-    max_upload_mib: int = Field(160, ge=1, le=65_536, description="largest uploaded image or PSF file, MiB")
+    max_upload_mib: int = Field(160, ge=1, le=65_536, description="largest uploaded image, MiB")
     max_pixels: int = Field(
-        4096 * 4096, ge=256, description="largest number of pixels of an image or PSF, as its header declares"
+        4096 * 4096, ge=256, description="largest number of pixels of an image, as its header declares"
+    )
+    max_psf_mib: int = Field(
+        640,
+        ge=1,
+        le=65_536,
+        description="largest uploaded PSF file, MiB; default: room for 8192 x 8192 doubles",
+    )
+    max_psf_pixels: int = Field(
+        8192 * 8192, ge=256, description="largest number of pixels of a PSF, as its header declares"
     )
     max_transit_mib: int = Field(4096, ge=1, le=1_048_576, description="largest uploaded transit, MiB")
     max_transit_unpacked_mib: int = Field(
@@ -304,8 +314,18 @@ class Settings(BaseSettings):
 
     @property
     def max_upload_bytes(self) -> int:
-        """Largest uploaded image or PSF file, bytes."""
+        """Largest uploaded image, bytes."""
         return self.max_upload_mib * 2**20
+
+    @property
+    def max_psf_bytes(self) -> int:
+        """Largest uploaded PSF file, bytes."""
+        return self.max_psf_mib * 2**20
+
+    @property
+    def psf_limits(self) -> FitsLimits:
+        """Limits on the FITS files of PSFs."""
+        return FitsLimits(max_pixels=self.max_psf_pixels)
 
     @property
     def max_transit_bytes(self) -> int:

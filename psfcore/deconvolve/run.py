@@ -18,6 +18,7 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore import software_version
+from psfcore.convolution.offsets import needed_kernel
 from psfcore.deconvolve.assess.quality import MEANINGS
 from psfcore.deconvolve.box import EXPECTED_RIM_PX, LARGEST_ERROR, Box, region_without_errors
 from psfcore.deconvolve.conditions import (
@@ -58,6 +59,7 @@ BUILDING = "building the PSF"
 DECONVOLVING = "deconvolving"  # the stage whose steps are the steps of the method
 LARGEST_CLIPPED = 0.01  # share of the light of an image; a product's total is accurate to about this share
 MOST_DRAWS = 64
+LARGEST_CUT = 0.001  # share of the light of a PSF; a PSF sums to 1 with about this tolerance
 
 Cards = dict[str, tuple[str | int | float, str]]
 
@@ -394,6 +396,11 @@ def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
         "PSFVERS": (psf.version, "PSF version"),
         "PSFNAME": (psf.name, "PSF name"),
         "PSFSTAT": (psf.status, "PSF status"),
+        **(
+            {"PSFDOI": (doi, "DOI of the PSF's publication")}
+            if (doi := product.psf.provenance.get("doi"))
+            else {}
+        ),
         "DCNVMETH": (product.method, "deconvolution method"),
         "DCNVITER": (product.steps_done, "deconvolution steps done"),
         "DCNVSTOP": (
@@ -425,10 +432,11 @@ def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
 
 def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
     """The lines of HISTORY that say how an image was deconvolved."""
-    box = product.of_box
+    box, citation = product.of_box, product.psf.provenance.get("citation")
     return [
         f"heliopsf {software_version()}: {product.method}, {product.steps_done} steps, "
         f"edges {product.edges}, PSF {psf.name} {psf.version} ({psf.status})",
+        *([] if citation is None else [f"publication of the PSF: {citation}"]),
         *(
             []
             if box is None
@@ -455,9 +463,25 @@ def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel:
     if image.saturation is not None and image.saturation.warning is not None:
         warnings["saturation"] = image.saturation.warning
     if method is not None:
+        warnings |= _cut_warning(psf, image)
         warnings |= {} if may_be_negative(method) else _negative_warning(image)
         warnings |= doubts(image, psf.kernel)
     return warnings
+
+
+def _cut_warning(psf: Psf, image: Image) -> dict[str, str]:
+    """The warning if a PSF that is larger than the usual reach is cut, and more than LARGEST_CUT of its light is cut off."""
+    if max(psf.kernel.shape) <= REACH_GRID_PX:
+        return {}
+    needed, _ = needed_kernel(psf.kernel, image.pixels.shape)
+    off = 1 - float(needed.sum()) / psf.total
+    if off <= LARGEST_CUT:
+        return {}
+    (ny, nx), (rows, columns) = psf.kernel.shape, needed.shape
+    return {
+        "psf-cut": f"of the PSF of {nx} x {ny} px, the image needs {columns} x {rows} px: {100 * off:.3g} % of its light falls "
+        "farther, and such light from sources beyond the image is not removed: use a larger image if it matters"
+    }
 
 
 def _negative_warning(image: Image) -> dict[str, str]:

@@ -42,6 +42,7 @@ TABLE_CARD = re.compile(
 )
 _TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 _OTHER_FILLING = 0x2A
+_PIECE_BYTES = 2**23  # a large image is read in pieces, so that it is in memory only once
 _NUMBERS = {name: np.dtype(name) for name in ("uint8", "int16", "int32", "int64", "float32", "float64")}
 _RIGHT = 1  # astropy returns this value if the checksum card exists and its value is correct
 # Exceptions that astropy raises for a damaged data unit. The position of the damage decides which exception
@@ -109,15 +110,18 @@ def read_pixels(
 def _plain_pixels(source: Source, image: Hdu, summary: HeaderSummary) -> NDArray[np.float64]:
     """The pixels of a plain image, from a source that stands at its data. FITS standard 4.0, Eqs. (3) and (4)."""
     ny, nx = summary.shape
-    size = image.end - image.start
-    raw = source.read(size)
-    if len(raw) < size:
-        raise HeaderError(
-            "truncated-data",
-            f"expected {nx} x {ny} pixels in HDU {summary.hdu}; the file ends too early: copy the file again",
-        )
-    stored = np.frombuffer(raw, _TYPES[summary.bitpix])
-    pixels = stored.astype(np.float64).reshape(summary.shape)
+    stored = np.dtype(_TYPES[summary.bitpix])
+    pixels = np.empty(summary.shape)
+    some = max(1, _PIECE_BYTES // (nx * stored.itemsize))
+    for first in range(0, ny, some):
+        rows = pixels[first : first + some]
+        raw = source.read(rows.size * stored.itemsize)
+        if len(raw) < rows.size * stored.itemsize:
+            raise HeaderError(
+                "truncated-data",
+                f"expected {nx} x {ny} pixels in HDU {summary.hdu}; the file ends too early: copy the file again",
+            )
+        rows[...] = np.frombuffer(raw, stored).reshape(rows.shape)
     scale, zero = (optional_number(image.header, key) for key in ("BSCALE", "BZERO"))
     blank = optional_number(image.header, "BLANK") if summary.bitpix > 0 else None
     is_blank = None if blank is None else pixels == blank

@@ -53,7 +53,7 @@ FILTER_CARDS = ("FILTER", "EC_FW1_", "EC_FW2_")
 # The cards that are compared to find out whether a PSF and an image fit together.
 ORIGIN_CARDS = ("TELESCOP", "OBSRVTRY", "INSTRUME", "DETECTOR", *FILTER_CARDS)
 _FIT_CARDS = (
-    *ORIGIN_CARDS, "WAVELNTH", "WAVEUNIT", "GAINCOMB", "PSFNAME", "LVL_NUM", "LEVEL",
+    *ORIGIN_CARDS, "PSFDOI", "PSFREF", "WAVELNTH", "WAVEUNIT", "GAINCOMB", "PSFNAME", "LVL_NUM", "LEVEL",
     # The cards that `psfcore.fits.frame` reads.
     "CDELT1", "CDELT2", "CUNIT1", "CUNIT2", "CTYPE1", "CTYPE2", "CD1_1", "CD1_2", "CD2_1", "CD2_2", "PC1_1", "PC1_2",
     "PC2_1", "PC2_2", "CROTA", "CROTA1", "CROTA2", "SAT_ROT", "INST_ROT", "P2_ROLL",
@@ -65,7 +65,7 @@ class HeaderSummary:
     """The first 2-D image of a file: its HDU, its shape (ny, nx) and values of its header.
 
     A value is None if its card is missing or unusable. content: IMAGE, PRODUCT or PSF, see `content_of`. cards: the usable
-    cards that are compared to find out whether a PSF and an image fit together.
+    cards that are compared to find out whether a PSF and an image fit together, and those of the publication of a PSF.
     """
 
     hdu: int

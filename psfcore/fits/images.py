@@ -19,6 +19,7 @@ CREATOR and LEVEL.
 | LEVEL | L3, a product derived from calibrated data; left out if the input has none |
 | DATE | left out: the time of writing would make files of equal content differ. The catalogue stores the time |
 | ORIGIN, VERSION, JOBID | left out: they describe the institute, the version and the run that made the input |
+| PSFDOI | that of the PSF that was used; left out if it has none |
 
 The lines of HISTORY contain the values of these cards in the input. LVL_NUM is not changed: it is the level of the
 calibration, which a deconvolution does not change.
@@ -52,7 +53,7 @@ Meanings = Mapping[IntFlag, str]
 LARGEST_MASK_PX = 16384
 CARD_OF_PASS = "DCNVPASS"
 _LEVEL = "L3"
-_OF_FILE = ("FILENAME", "DATE", "PARENT", "CREATOR", "LEVEL", "ORIGIN", "VERSION", "JOBID")
+_OF_FILE = ("FILENAME", "DATE", "PARENT", "CREATOR", "LEVEL", "ORIGIN", "VERSION", "JOBID", "PSFDOI")
 _BITS_STORED = {1: np.uint8, 2: np.uint16}
 # Cards that say where on the sky each pixel is, who observed it, and when. Viewers and sunpy need them to show a plane.
 _PLACE_CARD = re.compile(

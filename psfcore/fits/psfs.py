@@ -22,6 +22,8 @@ from psfcore.fits.hdus import PIXEL_TROUBLE, as_written, ascii_text, read_pixels
 from psfcore.fits.header import all_hdus, origin_of, wavelength_angstrom
 from psfcore.psf import FittedShape, Psf, cumulative_curve, encircled_energy, radial_profile
 
+# The cards of the publication of a PSF, by their names in the provenance.
+_PUBLICATION = {"doi": ("PSFDOI", "DOI of its publication"), "citation": ("PSFREF", "")}
 _STATED = re.compile(r"psf_id: ([0-9a-f]{64})")
 
 
@@ -45,6 +47,11 @@ def write_psf(path: str | Path, psf: Psf, *, instrument_file: bytes | None = Non
     write_hdus(path, hdus)
 
 
+def write_kernel(path: str | Path, psf: Psf) -> None:
+    """Write the kernel of a PSF and its header, as `write_psf`, but no tables, which a large PSF would need much memory for."""
+    write_hdus(path, [fits.PrimaryHDU(psf.kernel.astype(np.float32), _psf_header(psf))])
+
+
 def _psf_header(psf: Psf) -> fits.Header:
     header = fits.Header()
     header["PSFNAME"] = (ascii_text(psf.name), "name of this point-spread function")
@@ -54,6 +61,12 @@ def _psf_header(psf: Psf) -> fits.Header:
     header["REACH"] = (psf.reach_px, "[pixel] farthest pixel from the centre")
     if psf.instrument is not None:
         header["INSTRUME"] = (ascii_text(psf.instrument), "instrument description")
+    for key, text in psf.cards.items():
+        if key not in header:
+            header[key] = ascii_text(text)
+    for key, (card, comment) in _PUBLICATION.items():
+        if key in psf.provenance:
+            header[card] = (ascii_text(psf.provenance[key]), comment)
     if psf.turn_deg:
         header["PSFTURN"] = (psf.turn_deg, "[deg] from +x of the detector to +x of the PSF")
     if psf.wavelength_angstrom is not None:
@@ -64,7 +77,7 @@ def _psf_header(psf: Psf) -> fits.Header:
             header[f"CDELT{axis}"] = (psf.plate_scale_arcsec, "[arcsec] pixel scale")
             header[f"CUNIT{axis}"] = "arcsec"
     for key, value in psf.provenance.items():
-        if key != "instrument_toml":
+        if key != "instrument_toml" and key not in _PUBLICATION:
             header.add_history(ascii_text(f"{key}: {value}"))
     return header
 
@@ -131,7 +144,7 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
     Weights are not changed. The file must have the centre of the PSF at [ny // 2, nx // 2]. If the card PSFNAME is
     missing, the PSF is named after the file.
     parts: also read the components, the instrument description and the fitted shape, if `write_psf` wrote the file. A
-    convolution does not need them.
+    convolution does not need them. The provenance has "doi" and "citation", if the file says how to cite the PSF.
     Raises HeaderError; DataError "unreadable-pixels" and the errors of `Psf` ("psf-not-centred", "psf-sum", ...).
     """
     stored = read_pixels(path, limits)
@@ -141,6 +154,11 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
         _read_extras(path, limits, kernel.shape) if own and parts else ({}, {}, None)
     )
     instrument, cards = origin_of(header)
+    publication = {
+        key: text
+        for key, (card, _) in _PUBLICATION.items()
+        if (text := optional_text(header, card)) is not None
+    }
     return Psf(
         kernel=kernel,
         name=optional_text(header, "PSFNAME") or Path(path).name.split(".")[0],
@@ -150,7 +168,7 @@ def read_psf(path: str | Path, limits: FitsLimits, *, parts: bool = True) -> Psf
         plate_scale_arcsec=plate_scale_arcsec(header),
         wavelength_angstrom=wavelength_angstrom(header),
         components=components,
-        provenance={"file": Path(path).name, **provenance},
+        provenance={"file": Path(path).name, **publication, **provenance},
         fitted=fitted,
         cards=cards,
         turn_deg=optional_number(header, "PSFTURN") or 0.0,

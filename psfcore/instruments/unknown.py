@@ -90,8 +90,8 @@ TELESCOPES = (
         reason=_NO_SOURCE,
         ways={
             "upload": "The SolarSoft package euvdeconpak has the PSFs of Shearer et al. (2012, ApJ 749, L8) as FITS images, "
-            "for example psf_171_A_2048.fts for STEREO-A at 171 angstrom: upload the PSF of the spacecraft and channel of "
-            "the image",
+            "for example psf_171_A_2048.fts for STEREO-A at 171 angstrom: `heliopsf psf get euvi_171_a_2012 --from FOLDER` "
+            "takes the PSF of the spacecraft and channel of the image",
             "fit": "Shearer et al. (2012) used the transit of the Moon of 2007 for EUVI on STEREO-B",
         },
     ),
@@ -115,8 +115,8 @@ TELESCOPES = (
         reason="an instrument file describes pupils and meshes, but not mirrors that reflect X-rays at grazing incidence",
         ways={
             "upload": "SolarSoft has PSFs of XRT as FITS images in hinode/xrt/idl/util: XRT20170324_151721.0.PSF560.fits at "
-            "560 eV and XRT20170324_161721.0.PSF1000.fits at 1 keV; upload the PSF whose energy suits the filters of the "
-            "image",
+            "560 eV and XRT20170324_161721.0.PSF1000.fits at 1 keV; `heliopsf psf get xrt_560ev_2017` or xrt_1kev_2017 brings the "
+            "PSF whose energy suits the filters of the image",
             "fit": "In images of the transit of Venus of 2012, the PSF at 560 eV removes 5 % of the light in the disc of Venus; "
             "heliopsf can fit the remaining scatter to these images",
         },

@@ -168,7 +168,7 @@ async def get_cutout(
         return same
 
     def cut() -> Cutout:
-        return cutout(files.found(state.store, row.file_sha256, row.bytes), size, state.limits)
+        return cutout(files.found(state.store, row.file_sha256, row.bytes), size, state.settings.psf_limits)
 
     with as_problems():
         part = await anyio.to_thread.run_sync(cut, limiter=state.cutouts)

@@ -15,11 +15,13 @@ from click.shell_completion import CompletionItem
 
 from psfcore.errors import did_you_mean
 from psfcore.instruments.files import instrument_names
+from psfcore.published_psfs import PUBLISHED, kept_file
 from service.cli.fields import options_of
 from service.cli.options import user_errors
 from service.cli.progress import echo, say
 from service.client.address import DEFAULT_SERVER, SHOWN_DIGITS
 from service.client.operations import Operations
+from workers.cache_folder import published_folder
 from workers.contract.requests import FEWEST_DIGITS, Deconvolve
 
 if TYPE_CHECKING:
@@ -35,7 +37,7 @@ Row = dict[str, Any]
 
 class _Id(click.ParamType):
     """An id, or its first digits. or_file: or the name of a file with a PSF. or_instrument: or an instrument, whose PSF is
-    built: its name, or its file (TOML)."""
+    built: its name, or its file (TOML); or the name of a published PSF."""
 
     name = "id"
 
@@ -52,10 +54,11 @@ class _Id(click.ParamType):
         if not self.or_instrument:
             expected = f"a PSF id ({_DIGITS}) or a file" if self.or_file else f"an id, or its first {_DIGITS}"
             self.fail(f"expected {expected}; got {value!r}", param, ctx)
-        if text in instrument_names():
+        names = [*instrument_names(), *PUBLISHED]
+        if text in names:
             return text
-        meant = did_you_mean(text, instrument_names())
-        expected = f"a file, the name of an instrument or a PSF id ({_DIGITS})"
+        meant = did_you_mean(text, names)
+        expected = f"a file, the name of an instrument or of a published PSF, or a PSF id ({_DIGITS})"
         self.fail(f"expected {expected}; got {value!r}{meant}", param, ctx)
 
     def shell_complete(
@@ -115,7 +118,7 @@ SERVER = server_option("Address of the service, which this command needs")
 LOCAL = click.option("--local", is_flag=True, help="Run in this process, without a service")
 SERVER_FOR_IDS = server_option("Address of the service, which is needed only if a PSF is given by its id")
 PSF = psf_option(
-    "PSF: an id or a file; or an instrument (aia_171, FILE.toml) [default: the certified PSF for the image, else the one built]",
+    "PSF: an id or a file; an instrument (aia_171, FILE.toml); or a published PSF (aia_171_2025) [default: the certified PSF for the image, else the one built]",
     or_instrument=True,
 )
 CONTEXT = options_of(Deconvolve, "context")
@@ -201,11 +204,16 @@ def psf_file(server: str | None, psf: str) -> Iterator[Path]:
 
 
 def named_psf(service: Operations, psf: str | None) -> str | None:
-    """The id of the PSF that the user named with ``--psf``; a file is uploaded first, and the PSF of an instrument is built."""
+    """The id of the PSF that the user named with ``--psf``; a file is uploaded first, the PSF of an instrument is
+    built, and a published PSF is uploaded if the service has none of this name."""
     if psf is None:
         return None
     if psf.endswith(".toml") or (psf in instrument_names() and is_psf_id(psf)):
         return service.psf_of_instrument(psf)
+    if psf in PUBLISHED and is_psf_id(psf):
+        # A service may have the PSF, so that it need not be sent.
+        there = [] if service.server is None else service.get(f"/v1/psfs?name={psf}&limit=1")["items"]
+        return str(there[0]["id"] if there else service.upload_psf(kept_file(published_folder(), psf))["id"])
     if is_psf_id(psf):
         return whole_id(service, "psfs", psf)
     return str(service.upload_psf(psf)["id"])

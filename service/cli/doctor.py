@@ -187,7 +187,7 @@ def storage(settings: Settings) -> Finding:
             return Finding("broken", found, "give this user write access, or free disk space")
     free = checks.free_bytes(there)
     found = f"{folder}{'' if there == folder else ' (not made yet)'}, {_gib(free)} free"
-    largest = max(settings.max_upload_bytes, settings.max_transit_bytes)
+    largest = max(settings.max_upload_bytes, settings.max_psf_bytes, settings.max_transit_bytes)
     if free < settings.max_upload_bytes:
         return Finding("broken", f"{found}: no room for one upload", "free disk space")
     if free < max(LITTLE_ROOM_BYTES, largest):

@@ -16,6 +16,7 @@ from service.cli.options import (
     PLOT,
     SATURATION,
     limits,
+    psf_limits,
     user_errors,
     write_json,
     writes_files,
@@ -74,7 +75,7 @@ def flare(
 
     with user_errors():
         with psf_file(server, psf) as file:
-            tested = read_psf(file, limits())
+            tested = read_psf(file, psf_limits())
         found = judge_on_flare(
             read_observation(image, limits(), saturation_dn=saturation_dn),
             read_observation(background, limits(), saturation_dn=saturation_dn),

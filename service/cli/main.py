@@ -52,6 +52,8 @@ PSF_SECTIONS = {
         "instruments": Lazy("service.cli.psf.versions", "instruments", "List instruments that can be built."),
     },
     "Read": {
+        "published": Lazy("service.cli.psf.published", "list_published", "List PSFs that others published."),
+        "get": Lazy("service.cli.psf.published", "get_psfs", "Bring published PSFs to this machine."),
         "show": Lazy("service.cli.psf.make", "show", "Show what a PSF file contains."),
         "query": Lazy("service.cli.psf.query", "query", "Show the light beyond given radii."),
         "cutout": Lazy("service.cli.psf.query", "cutout", "Write the central part of a PSF."),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,18 +15,23 @@ import click
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
+from psfcore.fits.header import read_summary
+from psfcore.whole_files import sha256_of
 from service.cli.options import DATA, read_settings, user_errors
 from service.cli.progress import echo
+from service.cli.psf.published import NAMES, SOURCE, brought
 from workers import checks
 from workers.catalogue.access import MEANINGS, OWNER, OWNER_RULE, Scope
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.owners import MIB, Usage
 from workers.catalogue.schema import SchemaError, SchemaStatus
-from workers.catalogue.tables import KeyRow
+from workers.catalogue.tables import DEFAULT_OWNER, KeyRow
 from workers.files.collection import collect, examine
 from workers.files.modes import keep_private, private_folder
 from workers.files.store import open_store
 from workers.intake.again import repair
+from workers.intake.uploads import uploaded_psf_row
+from workers.versions import TOTAL
 
 DAY_S = 86_400
 UNITS_S = {"h": 3600, "d": DAY_S, "w": 7 * DAY_S}
@@ -212,6 +218,45 @@ def quota(owner: str, mib: int | None, as_all: bool, data: Path | None) -> None:
     with opened_catalogue(data) as catalogue:
         catalogue.owners.set_quota(owner, mib)
         echo(_line(catalogue.owners.usage(owner, read_settings(data).quota_mib)))
+
+
+@store.group("psf", short_help="Add published PSFs to a service.")
+def store_psf() -> None:
+    """Add published PSFs to a service, for all of its owners."""
+
+
+@store_psf.command("get", short_help="Bring a published PSF and add it for all owners.")
+@NAMES
+@SOURCE
+@click.option("--owner", "owners", multiple=True,
+              help="Add it for this owner; can be repeated [default: every owner with a valid key, and requests without a key]")  # fmt: skip
+@DATA
+def store_psf_get(
+    names: tuple[str, ...], source: Path | None, owners: tuple[str, ...], data: Path | None
+) -> None:
+    """Bring published PSFs and add them to the service as drafts of kind total, so that requests name them and
+    `heliopsf psf certify` makes one the PSF of its telescope.
+
+    Owners who get their first key later need the command again.
+    """
+    for owner in owners:
+        if not OWNER.fullmatch(owner):
+            raise click.BadParameter(f"expected {OWNER_RULE}; got {owner!r}", param_hint="--owner")
+    settings = read_settings(data)
+    with opened_catalogue(data) as catalogue:
+        catalogue.upgrade()
+        valid = {key.owner for key in catalogue.keys.all() if _state(key) == "good"}
+        store = open_store(settings)
+        for name in names:
+            file = brought(name, source)
+            for owner in sorted(owners or valid | {DEFAULT_OWNER}):
+                with user_errors(), store.temporary() as copy:
+                    shutil.copyfile(file, copy)
+                    summary, sha256 = read_summary(copy, settings.psf_limits), sha256_of(copy)
+                    row = uploaded_psf_row(owner, sha256, copy.stat().st_size, file.name, summary, kind=TOTAL)
+                    with store.kept_if(copy, sha256):
+                        row, new = catalogue.add(row)
+                echo(f"  {row.id}  {owner}: {'added' if new else 'was there'}")
 
 
 def _line(usage: Usage) -> str:

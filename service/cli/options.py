@@ -270,6 +270,11 @@ def read_settings(data: Path | None = None) -> Settings:
         raise click.ClickException("; ".join(faults)) from error
 
 
+def psf_limits() -> FitsLimits:
+    """The limits on PSF files that a command reads, from HELIOPSF_MAX_PSF_PIXELS."""
+    return read_settings().psf_limits
+
+
 def limits() -> FitsLimits:
     """The limits on FITS files that a command reads, from HELIOPSF_MAX_PIXELS."""
     from psfcore.fits.blocks import FitsLimits

@@ -118,8 +118,9 @@ def _image_content(path: Path, state: State) -> HeaderSummary:
 
 
 def _psf_content(path: Path, state: State) -> HeaderSummary:
-    summary = read_summary(path, state.limits)
-    check_is_psf(path, summary, state.limits)
+    limits = state.settings.psf_limits
+    summary = read_summary(path, limits)
+    check_is_psf(path, summary, limits)
     return summary
 
 
@@ -130,7 +131,7 @@ def _transit_content(path: Path, state: State) -> ArchiveContents:
 _FITS = ("a FITS file, which starts with 'SIMPLE  ='", "not-fits")
 _FITS_START = (max(map(len, FITS_STARTS)), _could_be_fits)
 IMAGE = Kind("/v1/images", *_FITS, ImageRow, *_FITS_START, _image_content, image_row)
-PSF = Kind("/v1/psfs", *_FITS, PsfRow, *_FITS_START, _psf_content, uploaded_psf_row)
+PSF = Kind("/v1/psfs", *_FITS, PsfRow, *_FITS_START, _psf_content, uploaded_psf_row, limit="max_psf_bytes")
 TRANSIT = Kind(
     "/v1/transits",
     "a .zip, .tar or .tar.gz",

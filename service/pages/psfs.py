@@ -70,7 +70,7 @@ def psf_list(request: Request, caller: PageReading, state: Shared, cursor: Curso
         instruments={name: telescope_of(name) for name in instrument_names()},
         components=get_args(Component),
         usual_size=PsfBuild.model_fields["size"].default,
-        most_bytes=state.settings.max_upload_bytes,
+        most_bytes=state.settings.max_psf_bytes,
         may_submit=Scope.SUBMIT in caller.scopes,
     )
 

@@ -69,13 +69,13 @@ def make(
 ) -> Made:
     """Deconvolve an image and measure the changes. ``preview``: also draw the preview picture."""
     threads, digest = context.settings.threads, psf_row.file_sha256
-    scale = request.plate_scale_arcsec
+    scale, limits = request.plate_scale_arcsec, context.settings.psf_limits
     prepared = _prepared(context.settings.psf_cache_mib * 2**20)
 
     def read(*, parts: bool = False) -> Psf:
-        return with_scale(read_psf(context.store.verified(digest), context.limits, parts=parts), scale)
+        return with_scale(read_psf(context.store.verified(digest), limits, parts=parts), scale)
 
-    psf = prepared.on_pixels_of(image.header, (digest, context.limits, scale), read)
+    psf = prepared.on_pixels_of(image.header, (digest, limits, scale), read)
 
     def begin(stage: str, steps: int) -> Callable[[int, int], None]:
         if stage == run.DECONVOLVING:

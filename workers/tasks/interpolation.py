@@ -82,7 +82,7 @@ def interpolated_row(context: Context, request: PsfInterpolate) -> PsfRow:
 def _epoch(context: Context, psf_id: str, time: str) -> Epoch:
     """A PSF of the catalogue, and the time at which it holds."""
     row = named_psf(context, psf_id)
-    psf = read_psf(context.store.verified(row.file_sha256), context.limits)
+    psf = read_psf(context.store.verified(row.file_sha256), context.settings.psf_limits)
     # The request of an upload or of a certification may give an instrument and a channel that the file does not contain.
     instrument, angstrom = of_upload(row, psf.instrument, psf.wavelength_angstrom)
     psf = replace(

@@ -124,7 +124,7 @@ def psf_tables(context: Context, parameters: Mapping[str, Any]) -> str:
     from psfcore.drawing.plots import psf_png  # matplotlib is loaded only if a picture is drawn
 
     context.report("reading", 0, 3)
-    psf = read_psf(context.store.verified(row.file_sha256), context.limits)
+    psf = read_psf(context.store.verified(row.file_sha256), context.settings.psf_limits)
     context.report("making tables", 1, 3)
     tables_sha256 = keep_tables(psf, context.store, context.settings.threads)
     context.report("drawing", 2, 3)

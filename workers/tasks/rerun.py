@@ -102,7 +102,7 @@ def _made_again(context: Context, request: ResolvedRerun, first: Thing) -> Thing
 
 def _instrument_text(context: Context, first: Thing) -> str:
     """The text of the instrument file that the first run used, because shipped files can change with the software."""
-    psf = read_psf(context.store.verified(first.file_sha256), context.limits)
+    psf = read_psf(context.store.verified(first.file_sha256), context.settings.psf_limits)
     text: str = psf.provenance["instrument_toml"]
     return text
 
@@ -112,7 +112,7 @@ def _arrays(context: Context, row: Thing) -> dict[str, NDArray[Any]]:
     path = context.store.verified(row.file_sha256)
     if isinstance(row, ProductRow):
         return {"IMAGE": read_plane(path, context.limits), **read_planes(path)}
-    psf = read_psf(path, context.limits)
+    psf = read_psf(path, context.settings.psf_limits)
     return {"PSF": psf.kernel, **psf.components}
 
 

@@ -63,4 +63,4 @@ def _built_diffraction(
     from workers.tasks.psf_build import built_psf  # a command with --local needs no catalogue
 
     row = built_psf(context, request.diffraction_recipe)
-    return read_psf(context.store.verified(row.file_sha256), context.limits, parts=False).kernel
+    return read_psf(context.store.verified(row.file_sha256), context.settings.psf_limits, parts=False).kernel

@@ -139,7 +139,9 @@ def measure_changes(
         # The filters of the artefact check run at the same time as the percentiles.
         artefacts = beside.submit(check).result if threads > 1 else check
         positive = before > 0
-        change = _change_pct(before[positive], after[positive])
+        # The planes of the percentiles are freed before the next ones are made: here most memory is in use.
+        change_pct = _percentiles(_change_pct(before[positive], after[positive])) if positive.any() else {}
+        difference = _percentiles(after - before)
         old, new = (np.where(counted, plane, 0.0) for plane in (image.pixels, result))
         blocks = [
             _described(before, after, 1) if block_px == 1 else _blocks(old, new, counted, block_px)
@@ -147,7 +149,6 @@ def measure_changes(
         ]
         structures = tuple(row for part in blocks for row in _structures(part))
         ranges = tuple(row for part in blocks for row in _ranges(part))
-        change_pct, difference = _percentiles(change) if change.size else {}, _percentiles(after - before)
     return Changes(
         pixels=int(before.size),
         edge_px=edge_px,

@@ -17,8 +17,8 @@ from service.cli.options import (
     JSON,
     OUTPUT,
     PLOT,
-    limits,
     progress_bar,
+    psf_limits,
     user_errors,
     writes_files,
 )
@@ -168,7 +168,7 @@ def show(file: Path, plot: Path | None, overwrite: bool) -> None:
     from psfcore.psf import cumulative_curve
 
     with user_errors():
-        psf = read_psf(file, limits())
+        psf = read_psf(file, psf_limits())
         if plot is not None:
             from psfcore.drawing.plots import psf_png
 

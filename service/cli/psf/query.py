@@ -17,7 +17,7 @@ import click
 from psfcore.psf_cache import PROVENANCE, CachedPsf, PsfCache
 from psfcore.tables import lookup
 from service.cli.connection import ID_OR_FILE, SERVER_FOR_IDS, is_psf_id, psf_file, remote, short, whole_id
-from service.cli.options import JSON, OUTPUT, limits, user_errors, write_json, writes_files
+from service.cli.options import JSON, OUTPUT, psf_limits, user_errors, write_json, writes_files
 from service.cli.progress import echo
 from service.client.outputs import written
 from workers.cache_folder import psf_cache
@@ -184,7 +184,7 @@ def _asking(server: str | None, psf: str, other: str | None) -> Iterator[Callabl
 def _read(file: str) -> Psf:
     from psfcore.fits.psfs import read_psf
 
-    return read_psf(file, limits())
+    return read_psf(file, psf_limits())
 
 
 def _write(output: Path, psf: Psf, overwrite: bool) -> None:

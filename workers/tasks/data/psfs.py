@@ -33,7 +33,9 @@ def given_psf(context: Context, psf_id: str | None) -> Psf | None:
     """
     if psf_id is None:
         return None
-    return read_psf(context.store.verified(named_psf(context, psf_id).file_sha256), context.limits)
+    return read_psf(
+        context.store.verified(named_psf(context, psf_id).file_sha256), context.settings.psf_limits
+    )
 
 
 def keep_psf(

@@ -1,0 +1,97 @@
+"""``heliopsf psf published|get``, ``store psf get`` and a deconvolution that names a published PSF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner
+from fastapi.testclient import TestClient
+
+import heliopsf
+from psfcore.errors import DataError
+from psfcore.published_psfs import PUBLISHED
+from service.cli.main import main
+from service.client.http import Client
+from tests.conftest import write_image
+from tests.published_server import NAME, published_fits, stand_in
+from workers.settings import Settings
+
+DOI = "10.3847/1538-4365/adbaed"
+
+
+@pytest.fixture(autouse=True)
+def image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An image of the PSF's channel. The published PSFs are kept in a folder of the test."""
+    monkeypatch.setenv("HELIOPSF_CACHE_DIR", str(tmp_path / "cache"))
+    cards = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_2", "WAVELNTH": 193, "CUNIT1": "arcsec", "CDELT1": 0.6}
+    write_image(tmp_path / "i.fits", **cards | {"CUNIT2": "arcsec", "CDELT2": 0.6, "PSFDOI": "10.1/earlier"})
+    return tmp_path / "i.fits"
+
+
+def local(*words: object, code: int = 0) -> str:
+    """A command without the client of the application in this process."""
+    done = CliRunner().invoke(main, [str(word) for word in words])
+    assert done.exit_code == code, done.output
+    return done.output
+
+
+def test_get_deconvolve_and_header_with_the_doi(image: Path, tmp_path: Path) -> None:
+    product = tmp_path / "o.fits"
+    asked = ("deconvolve", image, "--psf", NAME, "--local", "--steps", 2, "-o", product)
+    assert f"`heliopsf psf get {NAME}`" in local(*asked, code=1)
+    with pytest.raises(DataError, match="psf-not-fetched"):
+        heliopsf.deconvolve(image, NAME)
+    with stand_in("/psf"):
+        assert DOI in local("psf", "get", NAME)
+    assert f"* {NAME} " in local("psf", "published") and f"  {'xrt_1kev_2017':<16}" in local(
+        "psf", "published"
+    )
+    local(*asked)
+    header = fits.getheader(product)
+    assert (header["PSFNAME"], header["PSFVERS"], header["PSFDOI"]) == (NAME, "2025", DOI)
+    assert PUBLISHED[NAME].citation in "".join(header["HISTORY"])
+    same = heliopsf.deconvolve(fits.open(image), NAME, steps=2)
+    assert same[0].header["PSFDOI"] == DOI and same[0].header["PSFID"] == header["PSFID"]
+    other = heliopsf.deconvolve(
+        fits.open(image), heliopsf.read_psf(tmp_path / "cache/published" / f"{NAME}.fits").kernel, steps=2
+    )
+    assert "PSFDOI" not in other[0].header, "that of an earlier product does not stay"
+    write_image(tmp_path / "171.fits", TELESCOP="SDO/AIA", WAVELNTH=171)
+    assert "193" in local("deconvolve", tmp_path / "171.fits", *asked[2:-1], tmp_path / "x.fits", code=1)
+    assert f"did you mean '{NAME}'" in local(
+        "deconvolve", image, "--psf", "aia_193_2052", "-o", product, code=2
+    )
+
+
+def test_an_operator_adds_a_psf_for_all_and_its_citation_is_in_the_lineage(
+    image: Path,
+    tmp_path: Path,
+    api: TestClient,
+    settings: Settings,
+    command: Callable[..., str],
+    client: Client,
+) -> None:
+    (tmp_path / "usb").mkdir()
+    (tmp_path / "usb" / PUBLISHED[NAME].file).write_bytes(published_fits())
+    api.app.state.heliopsf.catalogue.keys.make("ann", {"read"})
+    get = ("store", "psf", "get", NAME, "--from", tmp_path / "usb", "--data", settings.data_dir)
+    told = command(*get)
+    assert "ann: added" in told and "local: added" in told and "local: was there" in command(*get)
+    (row,) = client.psfs(name=NAME)
+    assert [row[key] for key in ("instrument", "channel", "kind", "status")] == [
+        "aia_193",
+        "193",
+        "total",
+        "draft",
+    ]
+    (tmp_path / "cache" / "published" / f"{NAME}.fits").unlink()  # the service has it
+    command("deconvolve", image, "--psf", NAME, "--steps", 2, "-o", tmp_path / "o.fits")
+    header = fits.getheader(tmp_path / "o.fits")
+    assert (header["PSFID"], header["PSFDOI"]) == (row["id"], DOI)
+    parents = client.get(f"/v1/products/{header['PRODID']}/lineage")["parents"]
+    (made,) = [one["made"] for one in parents if one["type"] == "psf"]
+    assert (made["doi"], made["citation"]) == (DOI, PUBLISHED[NAME].citation)
+    assert "1.0.0: certified" in command("psf", "certify", row["id"], "--version", "1.0.0")
