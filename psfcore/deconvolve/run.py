@@ -451,6 +451,11 @@ def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel:
     channel = check_channel(psf, image.header, other_channel=other_channel)
     warnings = frame_warnings(psf, image.header)
     warnings |= {} if channel is None else {"channel": channel}
+    if psf.provenance.get("mesh_basis") == "assumed":
+        warnings["assumed-mesh"] = (
+            "the instrument file of the PSF assumes a part of its filter meshes: compare the arms of a bright point with it "
+            "(heliopsf arms), or use a published PSF"
+        )
     warnings |= image.warnings
     if image.saturation is not None and image.saturation.warning is not None:
         warnings["saturation"] = image.saturation.warning
