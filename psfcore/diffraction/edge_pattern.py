@@ -49,8 +49,8 @@ def edge_kernel(
 ) -> NDArray[np.float64]:
     """The share of all light in each pixel, shape (size, size), centre at [size // 2, size // 2].
 
-    The sum is below 1, because light falls outside the array. Compared with the exact pattern of a disc that needs 40
-    samples a pixel, the light beyond 1 px and beyond 10 px is right to 2 %.
+    The sum is below 1, because light falls outside the array. Beside the exact patterns of pupils that need 36 to 88
+    samples a pixel (disc, ring, quadrant, hexagon), the light outside the central pixel is right to 2 %.
     """
     angles, lengths_mm, area_mm2 = edges(aperture)
     reach_mm = wavelength_angstrom * _MM_PER_ANGSTROM * focal_length_mm
