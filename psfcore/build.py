@@ -29,7 +29,7 @@ from psfcore.instruments.model import Instrument, load_instrument, parse_instrum
 from psfcore.instruments.workload import LARGEST_SIZE_PX, check_workload
 from psfcore.psf import REACH_GRID_PX, Psf, crop_centred
 from psfcore.recipe import Recipe
-from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel
+from psfcore.scatter.power_law import amplitude_for_total, described_kernel
 
 SMALLEST_SIZE_PX = 64
 SCATTER = "SCATTER"
@@ -84,7 +84,7 @@ def build_psf(
     del patterns
     law = instrument.scatter
     if law is not None and SCATTER in names:
-        kernels[SCATTER] = scatter_kernel(law.b_px, law.c, law.total, grid)
+        kernels[SCATTER] = described_kernel(law, grid)
     if component is not None:
         kernel, kernels = kernels[component], {}
         provenance["component"] = component
@@ -162,21 +162,27 @@ def _on_full_reach(kernel: Kernel) -> tuple[Kernel, float]:
 def _provenance(instrument: Instrument, notes: dict[str, Any]) -> dict[str, Any]:
     law, mount = instrument.scatter, instrument.mount
     model = "simplified-combined: entrance pupil convolved with filter-wheel mesh series"
+    shape = "a softened power law"
+    if law is not None and law.b_px is None:
+        shape = f"{len(law.laws)} power laws" if law.laws else f"a table of {len(law.table)} radii"
     about: dict[str, Any] = {
-        "model": model if law is None else f"{model}, and with a softened power law",
+        "model": model if law is None else f"{model}, and with {shape}",
         "mount_basis": "none" if mount is None else mount.basis,
         "lines": [[line.wavelength_angstrom, line.weight] for line in instrument.spectral_lines],
         "past_reach": {},
         **notes,
     }
+    if any(mesh.basis == "assumed" for mesh in instrument.meshes):
+        about["mesh_basis"] = "assumed"
     if law is not None:
         about |= {
             "scatter_basis": law.basis,
             "scatter_b_px": law.b_px,
             "scatter_c": law.c,
             "scatter_total": law.total,
-            "scatter_a": amplitude_for_total(law.b_px, law.c, law.total),
         }
+        if law.b_px is not None and law.c is not None:
+            about["scatter_a"] = amplitude_for_total(law.b_px, law.c, law.total)
     return about
 
 

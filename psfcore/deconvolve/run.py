@@ -46,6 +46,8 @@ from psfcore.fits.header import known_instrument, optional_text, seen_by
 from psfcore.fits.images import described, write_image
 from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.image import Image, MaskBit
+from psfcore.instruments.files import instrument_names
+from psfcore.instruments.model import load_instrument
 from psfcore.instruments.unknown import unknown_instrument
 from psfcore.noise import Noise
 from psfcore.psf import REACH_GRID_PX, Psf
@@ -459,6 +461,11 @@ def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel:
     channel = check_channel(psf, image.header, other_channel=other_channel)
     warnings = frame_warnings(psf, image.header)
     warnings |= {} if channel is None else {"channel": channel}
+    if _mesh_is_assumed(psf):
+        warnings["assumed-mesh"] = (
+            "the instrument file of the PSF assumes a part of its filter meshes: compare the arms of a bright point with it "
+            "(heliopsf arms), or use a published PSF"
+        )
     warnings |= image.warnings
     if image.saturation is not None and image.saturation.warning is not None:
         warnings["saturation"] = image.saturation.warning
@@ -482,6 +489,16 @@ def _cut_warning(psf: Psf, image: Image) -> dict[str, str]:
         "psf-cut": f"of the PSF of {nx} x {ny} px, the image needs {columns} x {rows} px: {100 * off:.3g} % of its light falls "
         "farther, and such light from sources beyond the image is not removed: use a larger image if it matters"
     }
+
+
+def _mesh_is_assumed(psf: Psf) -> bool:
+    """Whether a PSF was built from an instrument file that assumes a part of its meshes.
+
+    A file of a PSF has no provenance, but the name of its instrument file.
+    """
+    if psf.name == psf.instrument and psf.name in instrument_names():
+        return any(mesh.basis == "assumed" for mesh in load_instrument(psf.name).meshes)
+    return psf.provenance.get("mesh_basis") == "assumed"
 
 
 def _negative_warning(image: Image) -> dict[str, str]:

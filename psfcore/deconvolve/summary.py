@@ -32,7 +32,8 @@ def assumptions(provenance: Mapping[str, Any]) -> list[str]:
         return []
     scatter = {None: ["without diffuse scatter"], "inferred": ["scatter inferred"]}
     mount = ["mount of the filter assumed"] if provenance["mount_basis"] == "assumed" else []
-    return mount + scatter.get(provenance.get("scatter_basis"), [])
+    mesh = ["mesh of the filter assumed"] if "mesh_basis" in provenance else []
+    return mount + mesh + scatter.get(provenance.get("scatter_basis"), [])
 
 
 def percent(value: float | None, digits: int = 1) -> str:

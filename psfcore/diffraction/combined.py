@@ -8,8 +8,9 @@ spectral lines of the bandpass are multiplied by the weights of the lines and ad
 One rule decides how each component of the entrance is computed, and the provenance records the decision:
 
 - The mask is transformed if at most 32 samples per pixel are needed (fraunhofer, Eq. (3)). Otherwise the pattern of
-  the aperture is an analytic Airy pattern, and a mount is left out.
-- The transformed mask contains the entrance meshes if all of them cover the whole pupil and are parallel to the pixels.
+  the aperture is analytic (an Airy pattern, or that of the edges of a sector or polygon), and a mount is left out.
+- The transformed mask contains the entrance meshes if all of them are square, cover the whole pupil and are parallel to the
+  pixels.
   Otherwise each mesh is an analytic series, rotated by the angle of the mesh. The series of meshes side by side are
   multiplied by their shares and added. The result is convolved with the pattern of the aperture and its mount.
 
@@ -30,7 +31,9 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import linear_convolve
 from psfcore.diffraction.airy import airy_kernel
+from psfcore.diffraction.edge_pattern import edge_kernel
 from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
+from psfcore.diffraction.hexagonal_mesh import hexagonal_mesh_kernel
 from psfcore.diffraction.mesh_series import mesh_line, rotated_mesh_kernel
 from psfcore.diffraction.pupil import entrance_pupil
 from psfcore.instruments.model import Instrument, Mesh, Mount
@@ -53,11 +56,13 @@ class Route:
     mask: bool
     meshes_in_mask: bool
     mount: bool
+    round: bool
 
     def __str__(self) -> str:
         if not self.mask:
             too_many = f"{self.samples} samples a pixel are more than {MOST_MASK_SAMPLES}"
-            return f"{too_many}: analytic Airy pattern, entrance meshes as series, no mount"
+            pattern = "Airy pattern" if self.round else "pattern of the edges"
+            return f"{too_many}: analytic {pattern}, entrance meshes as series, no mount"
         meshes = "in it" if self.meshes_in_mask else "as series"
         return f"Fraunhofer transform of the mask, {self.samples} samples a pixel, entrance meshes {meshes}"
 
@@ -82,9 +87,16 @@ def route_of(instrument: Instrument) -> Route:
         for line in instrument.spectral_lines
     )
     mask = samples <= MOST_MASK_SAMPLES
-    plain = all(mesh.share == 1 and mesh.angle_deg % 90 == 0 for mesh in _meshes(instrument, "entrance"))
+    plain = all(
+        mesh.share == 1 and mesh.angle_deg % 90 == 0 and mesh.openings == "square"
+        for mesh in _meshes(instrument, "entrance")
+    )
     return Route(
-        samples=samples, mask=mask, meshes_in_mask=mask and plain, mount=mask and instrument.mount is not None
+        samples=samples,
+        mask=mask,
+        meshes_in_mask=mask and plain,
+        mount=mask and instrument.mount is not None,
+        round=instrument.aperture.round,
     )
 
 
@@ -171,7 +183,7 @@ class _OneWavelength:
         there, in_mask = self.kernels, self.route.meshes_in_mask
         meshes, mount = _meshes(self.instrument, "entrance"), self.instrument.mount
         if name == AIRY:
-            return self._airy()
+            return self._aperture(progress)
         if name == ENTRANCE_MESH and in_mask:
             return self._far_field(name, meshes, None, progress)
         if name == ENTRANCE_MESH:
@@ -190,15 +202,23 @@ class _OneWavelength:
             return self._far_field(name, meshes, mount, progress)
         return self._convolved(there[MOUNT], self._series("entrance"))
 
-    def _airy(self) -> Kernel:
+    def _aperture(self, progress: Progress) -> Kernel:
+        """The pattern of the open aperture."""
         aperture = self.instrument.aperture
+        if self.route.mask and not aperture.round:
+            return self._far_field(AIRY, (), None, progress)
+        optics: dict[str, Any] = {
+            "wavelength_angstrom": self.wavelength_angstrom,
+            "focal_length_mm": self.instrument.focal_length_mm,
+            "pixel_pitch_um": self.instrument.detector.pixel_pitch_um,
+            "size": self.size,
+        }
+        if not aperture.round:
+            return edge_kernel(aperture, **optics)
         return airy_kernel(
-            wavelength_angstrom=self.wavelength_angstrom,
-            focal_length_mm=self.instrument.focal_length_mm,
             diameter_mm=aperture.diameter_mm,
             obscuration_diameter_mm=aperture.obscuration_diameter_mm,
-            pixel_pitch_um=self.instrument.detector.pixel_pitch_um,
-            size=self.size,
+            **optics,
         )
 
     def _far_field(
@@ -253,6 +273,8 @@ class _OneWavelength:
             "pixel_pitch_um": self.instrument.detector.pixel_pitch_um,
             "size": self.size,
         }
+        if mesh.openings == "hexagonal":
+            return hexagonal_mesh_kernel(angle_deg=mesh.angle_deg, **optics)
         if mesh.angle_deg % 90 == 0:
             line = mesh_line(**optics)
             return np.outer(line, line)

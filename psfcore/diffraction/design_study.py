@@ -33,7 +33,7 @@ from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
 from psfcore.instruments.model import Instrument
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
-from psfcore.scatter.power_law import scatter_kernel
+from psfcore.scatter.power_law import described_kernel
 
 NEAR_PX = 10.0
 FAR_PX = 100.0
@@ -86,8 +86,8 @@ def design_study(
     *,
     flare_px: int = FLARE_PX,
 ) -> DesignStudy:
-    """Compute every combination of pitch and wire at the entrance of `instrument`, and also the first entrance mesh of
-    the instrument.
+    """Compute every combination of pitch and wire at the entrance of `instrument`, and also the first square entrance mesh
+    of the instrument.
 
     Raises DataError "bad-design" for no mesh or more than 400 meshes, for a wire that is not narrower than every pitch,
     and for a flare smaller than 1 px.
@@ -96,11 +96,11 @@ def design_study(
     _check(pitches, wires, flare_px)
     halo = None
     if instrument.scatter is not None:
-        law = instrument.scatter
-        kernel = scatter_kernel(law.b_px, law.c, law.total, REACH_GRID_PX)
+        kernel = described_kernel(instrument.scatter, REACH_GRID_PX)
         halo = kernel[REACH_GRID_PX // 2, REACH_GRID_PX // 2 :]
     rows = [_mesh(instrument, pitch, wire, flare_px, halo) for wire in wires for pitch in pitches]
-    own = next((mesh for mesh in instrument.meshes if mesh.place == "entrance"), None)
+    square = [mesh for mesh in instrument.meshes if mesh.openings == "square"]
+    own = next((mesh for mesh in square if mesh.place == "entrance"), None)
     flown = None if own is None else _mesh(instrument, own.pitch_um, own.wire_um, flare_px, halo)
     return DesignStudy(instrument.name, flare_px, tuple(rows), flown)
 

@@ -174,7 +174,13 @@ def light_path(instrument: Instrument) -> LightPath:
         count = sum(mesh.place == place for mesh in meshes)
         if count != 1:
             raise _lacking(instrument, "meshes", f"one mesh at place {place!r}", str(count))
+    if not instrument.aperture.round:
+        raise _lacking(instrument, "aperture", "a whole disc or ring", "a sector or a polygon")
     entrance, wheel = meshes
+    if "hexagonal" in (entrance.openings, wheel.openings):
+        raise _lacking(
+            instrument, "meshes.openings", "square meshes, for propagation in one dimension", "hexagonal"
+        )
     if (entrance.angle_deg - wheel.angle_deg) % 90:
         wanted = "meshes with the same axes, for propagation in one dimension"
         got = f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees"

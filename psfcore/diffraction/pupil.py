@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
 from psfcore.errors import DataError
-from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount
+from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount, Sector, signed_area
 
 CIRCLE_CORNERS = 4096
 _UM_PER_MM = 1e3
@@ -87,14 +87,34 @@ def entrance_pupil(
     is far outside, or if the mask image is missing or cannot be used. The message names the key.
     """
     radius_mm = aperture.diameter_mm / 2
-    opening: Outline = (circle(radius_mm),)
-    if aperture.obscuration_diameter_mm > 0:
-        opening += (circle(aperture.obscuration_diameter_mm / 2)[::-1],)
     opaque = [] if mount is None else _mount_outlines(mount, radius_mm)
     picture = None
     if mount is not None and mount.mask_image is not None:
         picture = _mask_picture(mount.mask_image, mount_image, aperture)
-    return Pupil(opening, tuple(opaque), tuple(meshes), picture)
+    return Pupil(_opening(aperture), tuple(opaque), tuple(meshes), picture)
+
+
+def _opening(aperture: Aperture) -> Outline:
+    outer_mm, inner_mm = aperture.diameter_mm / 2, aperture.obscuration_diameter_mm / 2
+    if aperture.corners_mm:
+        corners = np.array(aperture.corners_mm, dtype=np.float64)
+        return (corners if signed_area(aperture.corners_mm) > 0 else corners[::-1],)
+    if aperture.sector is not None:
+        return (_sector(outer_mm, inner_mm, aperture.sector),)
+    hole = (circle(inner_mm)[::-1],) if inner_mm > 0 else ()
+    return (circle(outer_mm), *hole)
+
+
+def _sector(outer_mm: float, inner_mm: float, sector: Sector) -> Corners:
+    """Corners in mm, counter-clockwise, of a polygon that has the area of a sector of a disc or ring."""
+    opening = math.radians(sector.opening_deg)
+    steps = math.ceil(CIRCLE_CORNERS * opening / (2 * math.pi))
+    angle = math.radians(sector.first_angle_deg) + np.arange(steps + 1) * opening / steps
+    arc = math.sqrt((opening / steps) / math.sin(opening / steps)) * np.stack(
+        [np.cos(angle), np.sin(angle)], axis=1
+    )
+    inner = inner_mm * arc[::-1] if inner_mm > 0 else np.zeros((1, 2))
+    return np.concatenate([outer_mm * arc, inner])
 
 
 def circle(radius_mm: float) -> Corners:

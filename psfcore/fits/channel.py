@@ -100,7 +100,7 @@ def _other_instrument(psf: Origin, header: Cards) -> str | None:
     # The wavelength is compared separately. An instrument file without [match] cannot say which images are of its
     # instrument.
     wanted = {key: text for key, text in match_table(psf.instrument).items() if isinstance(text, str)}
-    cards = {key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR")}
+    cards = {key: optional_text(header, key) for key in ("TELESCOP", "OBSRVTRY", "INSTRUME", "DETECTOR")}
     named = " ".join(text for text in cards.values() if text)
     compared = [_same_words(text, wanted[key]) for key, text in cards.items() if text and key in wanted]
     return named or None if wanted and not (compared and all(compared)) else None

@@ -11,7 +11,7 @@ of the spacecraft, without a flip. Then the offset p on the image is, up to the 
     T = M_0^-1 M,   both with columns of length 1                                        Eq. (2)
 
 T is the unit matrix for an image as the detector gives it. The roll of M_0 is known where a card states it, although the image
-was turned later: SAT_ROT + INST_ROT of AIA, CROTA of Solar Orbiter. Other spacecraft keep solar north near +y.
+was turned later: SAT_ROT + INST_ROT of AIA, CROTA of Solar Orbiter, SC_ROLL of STEREO. Other spacecraft keep solar north near +y.
 
 | symbol | name | unit |
 |---|---|---|
@@ -139,6 +139,8 @@ def _detector_roll_deg(header: Cards) -> float | None:
         return optional_number(header, "CROTA")
     if (optional_text(header, "INSTRUME") or "").upper() == "SWAP":
         return optional_number(header, "P2_ROLL")
+    if (optional_text(header, "DETECTOR") or "").upper() == "EUVI":
+        return optional_number(header, "SC_ROLL")
     return None
 
 

@@ -201,9 +201,7 @@ def wavelength_angstrom(header: Cards) -> float | None:
 
 def known_instrument(header: Cards) -> str | None:
     """Name of the shipped instrument whose table [match] agrees with this header; None if there is none."""
-    cards: dict[str, object] = {
-        key: optional_text(header, key) for key in ("TELESCOP", "INSTRUME", "DETECTOR", *FILTER_CARDS)
-    }
+    cards: dict[str, object] = {key: optional_text(header, key) for key in ORIGIN_CARDS}
     cards |= {"WAVELNTH": wavelength_angstrom(header), "CDELT1": plate_scale_arcsec(header)}
     return match_instrument(cards)
 

@@ -20,7 +20,7 @@ PLATE_SCALE_TOLERANCE = 0.01
 _TOLERANCES = {"WAVELNTH": WAVELENGTH_TOLERANCE, "CDELT1": PLATE_SCALE_TOLERANCE}
 _FOLDER = Path(__file__).parent
 # Names of telescopes whose files match a card that does not name the spacecraft.
-_TELESCOPES = {"HRI_EUV": "Solar Orbiter EUI/HRI_EUV"}
+_TELESCOPES = {"HRI_EUV": "Solar Orbiter EUI/HRI_EUV", "EUVI": "STEREO/EUVI"}
 _STATUS = re.compile(r'^status = "draft" +# (.+)$', re.MULTILINE)
 
 
@@ -74,7 +74,7 @@ def match_instrument(cards: Mapping[str, object]) -> str | None:
 
     Several instruments may match: the file of a variant of an instrument, for one filter or plate scale, has the cards of
     the instrument and further ones. The instrument with the most cards is chosen; of several, the first by name.
-    cards: TELESCOP, INSTRUME, DETECTOR, FILTER, EC_FW1_ and EC_FW2_ as texts, WAVELNTH in angstrom, CDELT1 in arcsec/px.
+    cards: TELESCOP, OBSRVTRY, INSTRUME, DETECTOR, FILTER, EC_FW1_ and EC_FW2_ as texts, WAVELNTH in angstrom, CDELT1 in arcsec/px.
     `psfcore.fits.header.known_instrument` reads them from a header.
     """
     best, most = None, 0

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import field, is_dataclass, replace
 from decimal import Decimal
 from difflib import get_close_matches
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args, get_type_hints
 
@@ -51,6 +52,7 @@ MOST_BYTES = 65_536
 MOST_LINES, MOST_MIRRORS, MOST_MESHES, MOST_WINDOWS = 64, 16, 16, 10_000
 MOST_RAYS, MOST_RINGS, MOST_POLYGONS, MOST_CORNERS = 256, 64, 64, 1024
 MOST_KEYS = 64
+MOST_LAWS, MOST_ROWS = 8, 1024
 Windows = Annotated[Whole, Field(ge=1, le=MOST_WINDOWS)]
 Name = Annotated[str, Field(max_length=80)]
 Share = Annotated[Number, Field(gt=0, lt=1)]
@@ -62,6 +64,7 @@ class Match(TypedDict, total=False):
     __pydantic_config__ = _CONFIG  # type: ignore[misc]
 
     TELESCOP: Name
+    OBSRVTRY: Name
     INSTRUME: Name
     DETECTOR: Name
     FILTER: Name
@@ -93,11 +96,49 @@ class Detector:
 
 
 @dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Sector:
+    """The part of a disc or ring from the direction ``first_angle_deg`` through ``opening_deg`` towards +y."""
+
+    first_angle_deg: Number
+    opening_deg: Annotated[Number, Field(ge=1, le=359)]
+
+
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
 class Aperture:
-    """The entrance pupil: a disc, or a ring where the centre is obscured."""
+    """The entrance pupil: a disc, a ring (the centre is obscured), a sector of one of these, or a polygon.
+
+    ``corners_mm``: the corners (x, y) of the polygon from the optical axis, all within the circle of ``diameter_mm``.
+    """
 
     diameter_mm: Size
     obscuration_diameter_mm: SizeOrNone = 0.0
+    sector: Sector | None = None
+    corners_mm: Annotated[tuple[tuple[Place, Place], ...], Field(max_length=MOST_CORNERS)] = ()
+
+    @property
+    def round(self) -> bool:
+        """Whether the pupil is a whole disc or ring, whose pattern depends on the radius alone."""
+        return self.sector is None and not self.corners_mm
+
+    @model_validator(mode="after")
+    def _polygon_is_one(self) -> Self:
+        if not self.corners_mm:
+            return self
+        if self.sector is not None or self.obscuration_diameter_mm:
+            raise ValueError(
+                "expected corners_mm alone, or a disc or ring with or without a sector; got corners_mm with another shape: "
+                "describe opaque parts of a polygon in [mount]"
+            )
+        farthest = max(math.hypot(x, y) for x, y in self.corners_mm)
+        if farthest > self.diameter_mm / 2 * (1 + 1e-9):
+            raise ValueError(
+                f"expected corners_mm within {self.diameter_mm / 2} mm of the axis; got a corner at {farthest:.6g} mm"
+            )
+        if abs(signed_area(self.corners_mm)) < 1e-6 * self.diameter_mm**2:
+            raise ValueError(
+                "expected corners_mm that enclose an area; got almost none: list them around the pupil"
+            )
+        return self
 
     @model_validator(mode="after")
     def _obscuration_is_smaller(self) -> Self:
@@ -140,11 +181,15 @@ class Distances:
 
 @dataclass(frozen=True, kw_only=True, config=_CONFIG)
 class Mesh:
-    """A square mesh that supports a filter.
+    """A mesh with square or hexagonal openings that supports a filter.
+
+    ``pitch_um``: from the centre of an opening to that of the next. ``angle_deg``: the direction of this step; in a square
+    mesh, the wires have this direction and the one across it.
 
     ``windows``: number of windows of the diffraction series in each direction. At the entrance, this is the diameter of
     the aperture divided by the pitch; at the filter wheel, the number of windows that the light crosses.
     ``share``: the fraction of the light that crosses this mesh, if several meshes are mounted side by side.
+    ``basis``: "assumed" if any of these numbers is; each use of the PSF then says so.
     """
 
     name: Name
@@ -153,6 +198,8 @@ class Mesh:
     wire_um: Size
     windows: Windows
     angle_deg: Number = 0.0
+    openings: Literal["square", "hexagonal"] = "square"
+    basis: Literal["published", "assumed"] = "published"
     share: Annotated[Number, Field(gt=0, le=1)] = 1.0
 
     @model_validator(mode="after")
@@ -230,13 +277,50 @@ class Mount:
 
 
 @dataclass(frozen=True, kw_only=True, config=_CONFIG)
-class Scatter:
-    """The softened power law a / (b + r)^c; ``total`` is its sum over r > 0 on the full reach."""
+class PowerLaw:
+    """One of several softened power laws 1 / (b + r)^c; the shares are normalised to sum 1."""
 
     b_px: Positive
     c: Positive
+    share: Size
+
+
+@dataclass(frozen=True, kw_only=True, config=_CONFIG)
+class Scatter:
+    """Diffuse scatter. Its shape is one softened power law, the sum of several, or a table of (radius in px, weight).
+
+    ``total`` is its sum over r > 0 on the full reach.
+    """
+
     total: Share
     basis: Literal["published", "fitted", "inferred"]
+    b_px: Positive | None = None
+    c: Positive | None = None
+    laws: Annotated[tuple[PowerLaw, ...], Field(max_length=MOST_LAWS)] = ()
+    table: Annotated[tuple[tuple[Size, Size], ...], Field(max_length=MOST_ROWS)] = ()
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        law = (self.b_px is not None) + (self.c is not None)
+        if law == 1 or bool(law) + bool(self.laws) + bool(self.table) != 1:
+            given = [key for key in ("b_px", "c", "laws", "table") if getattr(self, key)]
+            raise ValueError(
+                f"expected one shape: b_px and c, or laws, or table; got {' and '.join(given) or 'none of them'}"
+            )
+        radii = [radius for radius, _ in self.table]
+        if radii and (len(radii) < 2 or any(b <= a for a, b in pairwise(radii))):
+            raise ValueError(
+                "table: expected at least two rows [radius_px, weight] with growing radii; got others"
+            )
+        return self
+
+    @property
+    def power_laws(self) -> tuple[PowerLaw, ...]:
+        """The power laws with shares that sum to 1; empty if the shape is a table."""
+        if self.b_px is not None and self.c is not None:
+            return (PowerLaw(b_px=self.b_px, c=self.c, share=1.0),)
+        whole = sum(law.share for law in self.laws)
+        return tuple(replace(law, share=law.share / whole) for law in self.laws)
 
 
 @dataclass(frozen=True, kw_only=True, config=_CONFIG)
@@ -289,7 +373,14 @@ class Instrument:
                 replace(one, corners_mm=_turned(one.corners_mm, -self.turn_deg)) for one in mount.polygons
             )
             mount = replace(mount, rays=rays, polygons=polygons)
-        return replace(self, meshes=meshes, mount=mount)
+        aperture, sector = self.aperture, self.aperture.sector
+        if sector is not None:
+            aperture = replace(
+                aperture, sector=replace(sector, first_angle_deg=sector.first_angle_deg - self.turn_deg)
+            )
+        if aperture.corners_mm:
+            aperture = replace(aperture, corners_mm=_turned(aperture.corners_mm, -self.turn_deg))
+        return replace(self, aperture=aperture, meshes=meshes, mount=mount)
 
     def gain_mode(self, name: str | None) -> GainMode | None:
         """The readout mode that the card GAINCOMB names, in upper or lower case; None if the file does not have it."""
@@ -316,6 +407,12 @@ class Instrument:
                 f"{self.name}: distances: expected this table, because mesh {mesh.name!r} is at the filter wheel; got none",
             )
         return self.distances.filter_wheel_to_detector_mm
+
+
+def signed_area(corners: Sequence[tuple[float, float]]) -> float:
+    """The area of a polygon with these corners (x, y), in the square of their unit; above 0 if they run from +x to +y."""
+    following = (*corners[1:], corners[0])
+    return sum(x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(corners, following, strict=True)) / 2
 
 
 def _turned(corners: tuple[tuple[float, float], ...], angle_deg: float) -> tuple[tuple[float, float], ...]:

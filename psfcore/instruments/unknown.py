@@ -76,24 +76,21 @@ TELESCOPES = (
     Telescope(
         name="TRACE",
         cards=({"instrume": "TRACE"}, {"telescop": "TRACE"}),
-        reason=_NO_SOURCE,
+        reason="the instrument files describe its channels at 171, 195 and 284 angstrom alone",
         ways={
-            "fit": "DeForest et al. (2009, ApJ 690, 1264) derived a PSF at 171 angstrom from the transit of Venus of 2004; "
-            "heliopsf can fit the scatter to the same images",
-            "upload": "Gburek et al. (2006, Solar Physics 239, 531) and DeForest et al. (2009) derived a PSF at 171 angstrom: "
-            + _ASK,
+            "fit": "TRACE observed the transit of Venus of 2004; heliopsf can fit the scatter to such images"
         },
     ),
     Telescope(
-        name="STEREO/EUVI",
-        cards=({"detector": "EUVI"},),
+        name="SOHO/EIT",
+        # Reprocessed files have no INSTRUME. Other instruments of SOHO have other wavelengths, or none.
+        cards=({"telescop": "SOHO"}, {"instrume": "EIT"}),
         reason=_NO_SOURCE,
         ways={
-            "upload": "The SolarSoft package euvdeconpak has the PSFs of Shearer et al. (2012, ApJ 749, L8) as FITS images, "
-            "for example psf_171_A_2048.fts for STEREO-A at 171 angstrom: `heliopsf psf get euvi_171_a_2012 --from FOLDER` "
-            "takes the PSF of the spacecraft and channel of the image",
-            "fit": "Shearer et al. (2012) used the transit of the Moon of 2007 for EUVI on STEREO-B",
+            "upload": "We found no file of its PSF. SolarSoft's eit_degrid removes the shadow of the grid near the detector: "
+            "use it first, and then a PSF of your own"
         },
+        angstrom=(171.0, 195.0, 284.0, 304.0),
     ),
     Telescope(
         name="PROBA2/SWAP",

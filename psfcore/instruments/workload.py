@@ -26,6 +26,7 @@ FINEST_CELL_PX = 0.02  # cells of the pattern of a rotated mesh are at most this
 AIRY_STEP = 0.02  # step in v of the table of the analytic pattern
 MOST_SAMPLES = 256
 MOST_CELLS = 2_000_000
+MOST_ORDERS = 10_000  # of a hexagonal mesh, from the centre to the corner of the largest array
 _MM_PER_ANGSTROM, _MM_PER_UM = 1e-7, 1e-3
 
 
@@ -34,7 +35,7 @@ class Workload:
     """Sizes of the arrays for one spectral line: the line with the shortest wavelength, which needs the largest arrays.
 
     airy_points: points of the table of the analytic pattern. cells: cells of one axis of each rotated mesh. windows:
-    terms of the series of each mesh that is parallel to the pixels. mask: whether the mask of the pupil is transformed.
+    terms of the series of each mesh that is parallel to the pixels. orders: of each hexagonal mesh, up to the corner. mask: whether the mask of the pupil is transformed.
     mount_entries: entries of the list of edges by rows of the mask.
     """
 
@@ -42,6 +43,7 @@ class Workload:
     airy_points: int
     cells: tuple[int, ...]
     windows: tuple[int, ...]
+    orders: tuple[int, ...]
     mask: bool
     mask_cells: int
     mount_entries: int
@@ -56,17 +58,25 @@ def workload(instrument: Instrument, size: int) -> Workload:
     # The error of a missing table of distances is raised when the PSF is built.
     known = ("entrance",) if instrument.distances is None else ("entrance", "filter_wheel")
     meshes = [mesh for mesh in instrument.meshes if mesh.place in known]
-    mask = samples <= MOST_MASK_SAMPLES and (instrument.mount is not None or bool(instrument.meshes))
+    drawn = instrument.mount is not None or bool(instrument.meshes) or not instrument.aperture.round
+    mask = samples <= MOST_MASK_SAMPLES and drawn
     mask_cells = 2 * math.ceil(max(size, PERIOD_PX) * samples / 4) + 2 if mask else 0
     mount = instrument.mount
     outlines = 0 if mount is None else mount.ray_count + 4 * len(mount.rings) + mount.corner_count
+    outlines += len(instrument.aperture.corners_mm)
+    square = [mesh for mesh in meshes if mesh.openings == "square"]
     return Workload(
         samples=samples,
         airy_points=math.ceil(math.pi * samples / 2 * corner_px / AIRY_STEP),
         cells=tuple(
-            _cells(instrument, mesh, shortest_mm, corner_px) for mesh in meshes if mesh.angle_deg % 90 != 0
+            _cells(instrument, mesh, shortest_mm, corner_px) for mesh in square if mesh.angle_deg % 90 != 0
         ),
-        windows=tuple(windows_of(mesh) for mesh in meshes if mesh.angle_deg % 90 == 0),
+        windows=tuple(windows_of(mesh) for mesh in square if mesh.angle_deg % 90 == 0),
+        orders=tuple(
+            math.ceil(corner_px / _spacing_px(instrument, mesh, shortest_mm))
+            for mesh in meshes
+            if mesh not in square
+        ),
         mask=mask,
         mask_cells=mask_cells,
         mount_entries=outlines * mask_cells,
@@ -96,11 +106,19 @@ def check_workload(instrument: Instrument, label: str) -> None:
         wanted = f"meshes: expected at most {MOST_CELLS} cells along an axis of a rotated mesh"
         advice = "use fewer windows, a smaller pitch_um or a longer distance"
         raise DataError("bad-instrument-file", f"{label}: {wanted}; got {max(largest.cells):.3g}: {advice}")
+    if max(largest.orders, default=0) > MOST_ORDERS:
+        wanted = f"meshes: expected at most {MOST_ORDERS} orders of a hexagonal mesh up to the corner"
+        advice = "use a smaller pitch_um or a longer distance"
+        raise DataError("bad-instrument-file", f"{label}: {wanted}; got {max(largest.orders):.3g}: {advice}")
 
 
 def _cells(instrument: Instrument, mesh: Mesh, wavelength_mm: float, corner_px: float) -> int:
     """Cells of one axis of the pattern of a rotated mesh, before they are combined (see `mesh_series`)."""
-    reach_mm2 = wavelength_mm * instrument.mesh_distance_mm(mesh)
-    spacing_px = reach_mm2 / (mesh.pitch_um * _MM_PER_UM) / (instrument.detector.pixel_pitch_um * _MM_PER_UM)
-    lobe_px = spacing_px / windows_of(mesh)
+    lobe_px = _spacing_px(instrument, mesh, wavelength_mm) / windows_of(mesh)
     return math.ceil(corner_px / lobe_px * max(1, math.ceil(lobe_px / FINEST_CELL_PX)))
+
+
+def _spacing_px(instrument: Instrument, mesh: Mesh, wavelength_mm: float) -> float:
+    """lambda z / d, the spacing of the orders of a square mesh, px."""
+    reach_mm2 = wavelength_mm * instrument.mesh_distance_mm(mesh)
+    return reach_mm2 / (mesh.pitch_um * _MM_PER_UM) / (instrument.detector.pixel_pitch_um * _MM_PER_UM)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from psfcore import build
 from psfcore import psf as psf_module
 from psfcore.build import build_psf, component_names
+from psfcore.deconvolve.summary import assumptions
 from psfcore.diffraction import combined
 from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
@@ -26,14 +27,17 @@ from psfcore.instruments.model import (
     MaskImage,
     Mesh,
     Mount,
+    PowerLaw,
     Rays,
+    Scatter,
+    Sector,
     SpectralLine,
     load_instrument,
     parse_instrument,
 )
-from psfcore.psf import Psf, cumulative_curve
+from psfcore.psf import Psf, cumulative_curve, squared_radii
 from psfcore.psf_sampling import psf_for_image
-from psfcore.scatter.power_law import amplitude_for_total, scatter_kernel
+from psfcore.scatter.power_law import amplitude_for_total, described_kernel, scatter_kernel
 from tests.conftest import SMALL_INSTRUMENT
 
 HRI = load_instrument("hri_euv")
@@ -102,6 +106,31 @@ def test_scatter_amplitude_and_tail() -> None:
     assert kernel[1024, 1034] == pytest.approx(amplitude / 16.15**2.53)
     smaller = scatter_kernel(6.15, 2.53, 0.411, 1024)
     assert 0.01 < 1 - smaller.sum() < 0.03  # "about 2 percentage points less light"
+
+
+def test_scatter_as_two_laws_or_as_a_table() -> None:
+    """Two laws sum by their shares; a table at the values of a law is this law up to its last radius."""
+    near, far = (6.15, 2.53), (30.0, 3.1)
+    two = Scatter(
+        total=0.4,
+        basis="published",
+        laws=tuple(PowerLaw(b_px=b, c=c, share=share) for (b, c), share in ((near, 3.0), (far, 1.0))),
+    )
+    kernel = described_kernel(two, 2048)
+    expected = 0.75 * scatter_kernel(*near, 0.4, 2048) + 0.25 * scatter_kernel(*far, 0.4, 2048)
+    np.testing.assert_allclose(kernel, expected, rtol=1e-12)
+    radii = np.geomspace(1.0, 1449.0, 300)
+    table = tuple((float(r), 5.0 * float((6.15 + r) ** -2.53)) for r in radii)
+    whole, cut = (Scatter(total=0.411, basis="fitted", table=rows) for rows in (table, table[:200]))
+    law = scatter_kernel(*near, 0.411, 2048)
+    np.testing.assert_allclose(described_kernel(whole, 2048), law, rtol=1e-3)
+    np.testing.assert_array_equal(
+        described_kernel(whole, 256), described_kernel(whole, 2048)[896:1152, 896:1152]
+    )
+    kernel = described_kernel(cut, 2048)
+    r = np.sqrt(squared_radii(kernel.shape))
+    assert kernel.sum() == pytest.approx(1, abs=1e-12) and kernel[1024, 1024] == 1 - 0.411
+    assert kernel[r > table[199][0]].max() == 0 < kernel[r <= table[199][0]].min()
 
 
 def test_total_psf_meets_the_published_curve(hri_psf: Psf) -> None:
@@ -249,6 +278,30 @@ def test_a_wide_aperture_is_analytic_and_leaves_the_mount_out(small_reach: None)
     assert component_names(wide) == ("AIRY", "ENTRANCE", "FILTER_WHEEL", "DIFFRACTION")
 
 
+def test_a_sector_and_a_hexagonal_mesh_are_built_by_both_routes(small_reach: None) -> None:
+    """The mask and the edges of the same pupil give the same light beyond a pixel; the hexagonal mesh keeps its orders."""
+    sector = Aperture(diameter_mm=100.0, sector=Sector(first_angle_deg=0.0, opening_deg=90.0))
+    mesh = replace(FINE_MESH, openings="hexagonal", basis="assumed")
+    masked, wide = (
+        changed(aperture=sector, meshes=(mesh,)),
+        changed(aperture=replace(sector, diameter_mm=300.0), meshes=(mesh,)),
+    )
+    psf, of_edges = (build_psf(one, size=64, threads=2) for one in (masked, wide))
+    assert "meshes as series" in psf.provenance["entrance_route"]
+    assert "pattern of the edges" in of_edges.provenance["entrance_route"]
+    assert (
+        psf.provenance["mesh_basis"] == "assumed"
+        and assumptions(psf.provenance)[0] == "mesh of the filter assumed"
+    )
+    beyond = [cumulative_curve(one.components["AIRY"], [0.5, 5.5]) for one in (psf, of_edges)]
+    # The light that edges diffract is proportional to their length divided by the area.
+    np.testing.assert_allclose(beyond[0], 3 * beyond[1], rtol=0.05)
+    outside = cumulative_curve(of_edges.components["ENTRANCE_MESH"], [9.0])[0]
+    assert outside == pytest.approx(100 * (1 - (1 - 30 / 400) ** 2), abs=2.5), (
+        "some orders are beyond the reach"
+    )
+
+
 def test_spectral_lines_add_by_weight(small_reach: None) -> None:
     lines = (
         SpectralLine(wavelength_angstrom=171.0, weight=3.0),
@@ -294,6 +347,18 @@ def test_the_psf_of_turned_images_has_all_parts_at_their_angles_on_the_images(
     mask = "[mount]\nbasis = 'assumed'\n[mount.mask_image]\nfile = 'a.png'\nwidth_mm = 4.0\n"
     with pytest.raises(DataError, match="turn_deg: expected 0"):
         parse_instrument("turn_deg = 1.0\n" + SMALL_INSTRUMENT + mask, "c")
+
+
+def test_sectors_and_polygons_are_turned_with_the_images() -> None:
+    sector = "sector = { first_angle_deg = 10.0, opening_deg = 90.0 }"
+    for shape in (sector, "corners_mm = [[-1.0, -1.0], [1.5, 0.0], [0.0, 1.5]]"):
+        text = SMALL_INSTRUMENT.replace("diameter_mm = 4.0", f"diameter_mm = 4.0\n{shape}")
+        aperture, turned = (parse_instrument(turn + text, "a").aperture for turn in ("", "turn_deg = 30.0\n"))
+        if aperture.sector is not None and turned.sector is not None:
+            assert turned.sector.first_angle_deg == -20.0
+        else:
+            by_angle = np.array(aperture.corners_mm) @ [1, 1j] * np.exp(-1j * np.radians(30))
+            np.testing.assert_allclose(np.array(turned.corners_mm) @ [1, 1j], by_angle)
 
 
 def test_progress_is_reported_and_may_stop_the_work(small_reach: None) -> None:

@@ -33,8 +33,8 @@ def test_the_real_hri_image(open_stack: Stack, shared: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "psf"), [(AIA, "aia_304"), (AIA_GZ, "aia_171")])
-def test_real_aia_images_need_no_option(
+@pytest.mark.parametrize(("name", "psf"), [(AIA, "aia_304"), (AIA_GZ, "aia_171"), (TRACE, "trace_171")])
+def test_real_images_need_no_option(
     open_stack: Stack, shared: Path, tmp_path: Path, name: str, psf: str
 ) -> None:
     product = open_stack.client.deconvolve(shared / name, tmp_path / "out.fits")
@@ -50,7 +50,7 @@ def test_images_of_other_telescopes_need_a_psf_of_theirs(
     open_stack: Stack, shared: Path, tmp_path: Path, psf_file: Path
 ) -> None:
     psf_id = open_stack.client.upload_psf(psf_file)["id"]
-    for name in (SWAP, TRACE):
+    for name in (SWAP,):
         with pytest.raises(ServiceError) as refused:
             open_stack.client.deconvolve(shared / name)
         assert (refused.value.code, refused.value.status) == ("no-psf-for-instrument", 409), name

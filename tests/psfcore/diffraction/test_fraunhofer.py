@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,10 +11,11 @@ from scipy.special import j0, j1, jn_zeros
 
 from psfcore.diffraction import fraunhofer, mirrored
 from psfcore.diffraction.airy import airy_kernel, airy_light_beyond
+from psfcore.diffraction.edge_pattern import edge_kernel
 from psfcore.diffraction.fraunhofer import FarField, far_field, samples_per_pixel
 from psfcore.diffraction.mesh_series import mesh_line
 from psfcore.diffraction.pupil import MaskGrid, MaskPicture, Pupil, bar, circle, entrance_pupil
-from psfcore.instruments.model import Aperture, Mesh, load_instrument
+from psfcore.instruments.model import Aperture, Mesh, Sector, load_instrument
 from psfcore.psf import cumulative_curve, squared_radii
 
 HRI = load_instrument("hri_euv")
@@ -193,3 +196,48 @@ def test_progress_is_reported_and_may_stop_the_work() -> None:
         far(small((POLYGON,)), 32, progress=stop)
     assert [done for done, _ in reported] == [1, 2, 3]
     assert len({of for _, of in reported}) == 1
+
+
+def test_a_square_pupil_is_the_product_of_two_slits() -> None:
+    """The share of a slit of width a in a pixel is the integral of a sinc^2(a q) over it."""
+    side_mm, size, fine = 9.0, 32, 200
+    corners = tuple((side_mm / 2 * x, side_mm / 2 * y) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    found = far(entrance_pupil(Aperture(diameter_mm=13.0, corners_mm=corners)), size, period=1024).pattern
+    q = (np.arange(size * fine) + 0.5) / fine - 0.5 - size // 2
+    slit = side_mm / LAMBDA_F_OVER_P_MM * np.sinc(side_mm / LAMBDA_F_OVER_P_MM * q) ** 2
+    line = slit.reshape(size, fine).mean(axis=1)
+    np.testing.assert_allclose(found, np.outer(line, line), atol=2e-3 * found.max())
+    assert found.sum() == pytest.approx(line.sum() ** 2, abs=3e-4)
+
+
+WIDE = {"wavelength_angstrom": 171.0, "focal_length_mm": 1750.0, "pixel_pitch_um": 13.5, "size": 64}
+
+
+def test_the_edges_of_a_wide_disc_or_ring_give_its_airy_pattern() -> None:
+    for obscuration_mm in (0.0, 65.0):
+        ring = Aperture(diameter_mm=98.0, obscuration_diameter_mm=obscuration_mm)
+        found = edge_kernel(ring, **WIDE)  # type: ignore[arg-type]
+        exact = airy_kernel(diameter_mm=98.0, obscuration_diameter_mm=obscuration_mm, **WIDE)  # type: ignore[arg-type]
+        assert found[32, 32] == pytest.approx(exact[32, 32], abs=1e-3)
+        radii = [1.5, 5.5, 20.5]
+        beyond = [cumulative_curve(one, radii) - 100 * (1 - one.sum()) for one in (found, exact)]
+        np.testing.assert_allclose(100 * (1 - found.sum()), 100 * (1 - exact.sum()), rtol=0.02)
+        np.testing.assert_allclose(beyond[0], beyond[1], rtol=0.02)
+
+
+def test_the_edges_of_a_sector_and_of_a_polygon_give_their_far_field() -> None:
+    """In the spikes of the straight edges and in the fan of the arc."""
+    optics = {"wavelength_angstrom": 171.0, "focal_length_mm": 1750.0, "pixel_pitch_um": 13.5}
+    quadrant = Sector(first_angle_deg=0.0, opening_deg=90.0)
+    turned = [(20 * math.cos(a), 20 * math.sin(a)) for a in np.radians(np.arange(15.0, 375.0, 60.0))]
+    for aperture in (
+        Aperture(diameter_mm=52.0, obscuration_diameter_mm=16.0, sector=quadrant),
+        Aperture(diameter_mm=40.0, corners_mm=tuple(turned)),
+    ):
+        found = edge_kernel(aperture, size=32, **optics)  # type: ignore[arg-type]
+        exact = far_field(entrance_pupil(aperture), size=32, period=256, threads=1, **optics).pattern  # type: ignore[arg-type]
+        assert found[16, 16] == pytest.approx(exact[16, 16], abs=4e-3)
+        bright = exact > 1e-4
+        bright[16, 16] = False
+        assert bright.sum() > 20 and found[bright].sum() == pytest.approx(exact[bright].sum(), rel=0.02)
+        np.testing.assert_allclose(found[bright], exact[bright], rtol=0.15, atol=2e-5)

@@ -10,6 +10,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import linear_convolve
+from psfcore.diffraction.hexagonal_mesh import hexagonal_mesh_kernel
 from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px, rotated_mesh_kernel
 from psfcore.instruments.model import Instrument, Mesh, load_instrument
 from psfcore.psf import cumulative_curve
@@ -75,6 +76,52 @@ def test_the_pattern_rotates_from_x_towards_y() -> None:
         along = order * spacing
         x, y = along * np.cos(np.deg2rad(20)), along * np.sin(np.deg2rad(20))
         assert kernel[64 + round(y), 64 + round(x)] > 100 * kernel[64 - round(y), 64 + round(x)]
+
+
+HEXAGONAL = {**AIA, "pitch_um": 350.0, "wire_um": 35.0, "windows": 400}
+
+
+def hexagonal(angle_deg: float, size: int = 257) -> NDArray[np.float64]:
+    return hexagonal_mesh_kernel(**HEXAGONAL, angle_deg=angle_deg, size=size)  # type: ignore[arg-type]
+
+
+def test_the_orders_of_a_hexagonal_mesh_are_the_fourier_sum_of_its_openings() -> None:
+    """A rectangle of 1 x sqrt(3) pitches repeats the mesh; a point is open if its nearest centre is within w / 2 of it
+    in the directions of all three pairs of sides."""
+    points, half_width = 1200, 0.45
+    x, y = np.meshgrid(
+        (np.arange(points) + 0.5) / points, (np.arange(points) + 0.5) / points * np.sqrt(3), indexing="xy"
+    )
+    mask = np.zeros(x.shape, dtype=bool)
+    for cx, cy in ((0, 0), (1, 0), (0.5, np.sqrt(3) / 2), (0, np.sqrt(3)), (1, np.sqrt(3))):
+        sides = [
+            abs((x - cx) * np.cos(a) + (y - cy) * np.sin(a)) < half_width for a in np.radians([0, 60, 120])
+        ]
+        mask |= np.logical_and.reduce(sides)
+    light = np.abs(np.fft.fft2(mask) / mask.size) ** 2 / mask.mean()
+    kernel, spacing = hexagonal(0.0), order_spacing_px(**{key: HEXAGONAL[key] for key in AIA})
+    assert kernel[128, 128] == pytest.approx(0.81, abs=1e-9), "the open share"
+    for m, n in ((1, 1), (0, 2), (-1, 1), (2, 0), (3, 1), (0, 4), (1, 2), (4, 2)):
+        column, row = round(128 + m * spacing), round(128 + n / np.sqrt(3) * spacing)
+        near = kernel[row - 1 : row + 2, column - 1 : column + 2].sum()
+        assert near == pytest.approx(light[n, m], rel=0.02, abs=2e-5), (m, n)
+    assert 0.97 < kernel.sum() < 1
+
+
+def test_the_nearest_orders_of_a_hexagonal_mesh_are_60_degrees_apart() -> None:
+    for angle_deg in (0.0, 13.0, 47.0):
+        kernel = hexagonal(angle_deg)
+        y, x = np.mgrid[-128:129, -128:129]
+        spacing = 2 / np.sqrt(3) * order_spacing_px(**{key: HEXAGONAL[key] for key in AIA})
+        near = abs(np.hypot(x, y) - spacing) < 1.5
+        angles = np.degrees(np.arctan2(y, x))[near & (kernel > 1e-3)]
+        light = kernel[near & (kernel > 1e-3)]
+        turns = np.exp(6j * np.radians(angles - angle_deg - 30))
+        assert abs(np.angle((light * turns).sum())) < np.radians(6 * 1.0), (
+            "30 degrees from the openings' own axis"
+        )
+        assert (light * turns.real).sum() > 0.97 * light.sum()
+        np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-12)
 
 
 # --- AIA 171 against aiapy --------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from psfcore.diffraction.pupil import MaskGrid, MaskPicture, Pupil, bar, circle, entrance_pupil
 from psfcore.errors import DataError
-from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount, Polygon, Rays, Ring
+from psfcore.instruments.model import Aperture, MaskImage, Mesh, Mount, Polygon, Rays, Ring, Sector
 
 CELL_MM = 0.05
 APERTURE = Aperture(diameter_mm=10.0)
@@ -53,6 +53,33 @@ def test_discs_rings_bars_and_hubs_have_their_area() -> None:
     mount = Mount(basis="assumed", rings=(Ring(radius_mm=3.0, width_mm=0.4),), hub_diameter_mm=2.0)
     wanted = DISC_MM2 - 2 * math.pi * 3.0 * 0.4 - math.pi
     assert area_mm2(entrance_pupil(APERTURE, mount=mount)) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_sectors_and_polygons_are_the_points_inside_them() -> None:
+    """A sector across the x axis, one beyond a half turn, and a polygon with a corner inwards, listed clockwise."""
+    notched = ((-4.0, -3.0), (-3.0, 3.0), (0.0, 0.5), (4.0, 2.0), (3.0, -3.5))
+
+    def sector(
+        x: NDArray[np.float64], y: NDArray[np.float64], first: float, opening: float
+    ) -> NDArray[np.bool_]:
+        r = np.hypot(x, y)
+        return (r < 5) & (r > 2) & ((np.degrees(np.arctan2(y, x)) - first) % 360 < opening)
+
+    def polygon(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
+        crossings = np.zeros(x.shape, dtype=int)
+        for (x0, y0), (x1, y1) in zip(notched, notched[1:] + notched[:1], strict=True):
+            crossings += ((y0 > y) != (y1 > y)) & (x < (x1 - x0) * (y - y0) / (y1 - y0) + x0)
+        return crossings % 2 == 1
+
+    ring = {"diameter_mm": 10.0, "obscuration_diameter_mm": 4.0}
+    for first, opening in ((-20.0, 90.0), (100.0, 250.0)):
+        part = Aperture(**ring, sector=Sector(first_angle_deg=first, opening_deg=opening))  # type: ignore[arg-type]
+        found = mask(entrance_pupil(part), 0.1)
+        wanted = by_points(lambda x, y, a=first, b=opening: sector(x, y, a, b), len(found), 0.1)
+        assert np.abs(found - wanted).mean() < 2e-4
+        assert found.sum() * 0.01 == pytest.approx(math.radians(opening) / 2 * (25 - 4), rel=1e-6)
+    found = mask(entrance_pupil(Aperture(diameter_mm=10.0, corners_mm=notched)), 0.1)
+    assert np.abs(found - by_points(polygon, len(found), 0.1)).mean() < 2e-4
 
 
 def test_the_open_area_with_wires_is_right_to_1e_5() -> None:

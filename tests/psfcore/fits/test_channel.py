@@ -43,7 +43,7 @@ OTHER_CHANNELS = [
     (AIA_171, HRI, "hri_euv"),
     (HRI_EUV, AIA, "aia_171"),
     (HRI_EUV, {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3"}, "SDO/AIA AIA_3"),
-    (AIA_171, {**AIA, "TELESCOP": "TRACE"}, "TRACE"),
+    (AIA_171, {**AIA, "TELESCOP": "TRACE"}, "trace_171"),
     (HRI_EUV, {**HRI, "DETECTOR": "FSI"}, "FSI"),
     (psf_with(wavelength_angstrom=171.0, cards={"TELESCOP": "TRACE"}), AIA, "TRACE"),
     (psf_with(wavelength_angstrom=171.0, cards={"INSTRUME": "AIA_2"}), AIA, "AIA_2"),

@@ -63,7 +63,7 @@ REAL = [
     ("aia/derived_aia193_coronalhole_20161123_map.fits.gz", (667, 667), None, "aia_193"),
     ("occultation/AIA1600_venus_20120606_040731_UTC.0041.fits", (480, 854), "RICE_1", None),
     ("other/swap_lv1_20110607_063329.fits.gz", (1024, 1024), None, None),
-    ("other/trace_19980519_222143_171.fits.gz", (1024, 1024), None, None),
+    ("other/trace_19980519_222143_171.fits.gz", (1024, 1024), None, "trace_171"),
     ("occultation/L1_XRT20120605_215839.9.fits", (384, 384), None, None),
 ]
 
@@ -78,9 +78,9 @@ def test_real_headers(real: Callable[[str], Path]) -> None:
 SUNPY = [
     ("aia_171_level1.fits", "aia_171", 171.0),
     ("swap_lv1_20140606_000113.header", None, 174.0),
-    ("euvi_20090615_000900_n4euA_s.header", None, 171.0),
+    ("euvi_20090615_000900_n4euA_s.header", "euvi_171_a", 171.0),
     ("solo_L1_eui-fsi304-image_20201021T145510206_V03.header", None, 304.0),
-    ("tsi20010130_025823_a2.header", None, 171.0),
+    ("tsi20010130_025823_a2.header", "trace_171", 171.0),
     ("HinodeXRT.header", None, None),
 ]
 

@@ -156,6 +156,9 @@ def test_turns_and_flips_against_the_detector() -> None:
         ({"CROTA2": 30.0}, 30.0, False, False),
         ({"CDELT2": -0.599489}, 0.0, True, True),
         ({"TELESCOP": "SOLO/EUI/HRI_EUV", "CROTA": 33.0, "CROTA2": 33.0}, 0.0, False, True),
+        # A rolled STEREO, and the same image after it was turned to north.
+        ({"TELESCOP": "STEREO", "DETECTOR": "EUVI", "SC_ROLL": 3.7, "CROTA2": 3.7}, 0.0, False, True),
+        ({"TELESCOP": "STEREO", "DETECTOR": "EUVI", "SC_ROLL": 3.7, "CROTA2": 0.0}, -3.7, False, False),
     ):
         frame = frame_of(header(**cards))
         assert frame.turn_deg == pytest.approx(turn_deg, abs=1e-6) and frame.flipped is flipped, cards
@@ -236,6 +239,18 @@ def test_a_psf_of_the_other_spacecraft_or_filter_is_refused() -> None:
             check_channel(psf, header(**cards))
         assert caught.value.code == "channel-mismatch"
         check_channel(psf, header(**cards | of_psf))
+
+
+def test_every_use_of_a_psf_with_an_assumed_mesh_is_warned_about() -> None:
+    """Also if the PSF comes from a file without provenance; not if it only is for images of such a telescope."""
+    image = observation_of(scene(), header(TELESCOP="TRACE", INSTRUME="TRACE", WAVELNTH=171))
+    for fields, warned in (
+        ({"name": "trace_171", "instrument": "trace_171"}, True),
+        ({"name": "published", "instrument": "trace_171"}, False),
+        ({"name": "mine", "instrument": None, "provenance": {"mesh_basis": "assumed"}}, True),
+    ):
+        warnings = heliopsf.deconvolve(image, gaussian(**fields), steps=1, full=True).warnings
+        assert ("assumed-mesh" in warnings) is warned, fields
 
 
 def write(path: Path, *hdus: Any) -> Path:

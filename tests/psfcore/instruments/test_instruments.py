@@ -32,7 +32,12 @@ def test_every_shipped_instrument_loads_under_its_own_name() -> None:
 
 
 def test_telescopes_are_named_as_people_name_them() -> None:
-    assert telescopes() == {"SDO/AIA": "94 to 335", "Solar Orbiter EUI/HRI_EUV": "174"}
+    assert telescopes() == {
+        "SDO/AIA": "94 to 335",
+        "STEREO/EUVI": "171 to 304",
+        "Solar Orbiter EUI/HRI_EUV": "174",
+        "TRACE": "171 to 284",
+    }
     assert telescope_of("aia_171") == "SDO/AIA"
 
 
@@ -53,7 +58,11 @@ def test_headers_are_matched() -> None:
         ({"TELESCOP": "SDO/AIA", "WAVELNTH": 1600.0}, None),
         ({"TELESCOP": "SDO/AIA", "WAVELNTH": "171"}, None),
         ({"TELESCOP": "SDO/AIA"}, None),
-        ({"TELESCOP": "TRACE", "WAVELNTH": 171.0}, None),
+        ({"TELESCOP": "TRACE", "WAVELNTH": 171.0}, "trace_171"),
+        ({"TELESCOP": "TRACE", "WAVELNTH": 1600.0}, None),
+        ({"OBSRVTRY": "STEREO_A", "DETECTOR": "EUVI", "WAVELNTH": 195.0}, "euvi_195_a"),
+        ({"OBSRVTRY": "STEREO_B", "DETECTOR": "EUVI", "WAVELNTH": 195.0}, "euvi_195_b"),
+        ({"DETECTOR": "EUVI", "WAVELNTH": 195.0}, None),
         ({"DETECTOR": 174}, None),
         ({}, None),
     ):
@@ -200,3 +209,29 @@ def test_the_meshes_have_the_measured_arms_and_orders() -> None:
         assert (focal.place, focal.angle_deg) == ("filter_wheel", 45.0), channel
         for mesh in meshes:
             assert mesh.pitch_um == pytest.approx(25_400 / 70, rel=0.01) and mesh.wire_um == 34.0, channel
+
+
+def test_the_arms_of_trace_and_euvi_have_the_published_spacing_direction_and_light() -> None:
+    """TRACE: orders of 70 lines an inch at 19.4 px, arms at +-45 degrees, about 20 % of the light (Lin et al. 2001). EUVI: the
+    fine mesh of 0.36 mm with 82 % open, and the coarse grid of 5 mm with 98 % open."""
+    published = {
+        "trace_171": (19.4, 45.0, 20.0),
+        "euvi_284": (10.1, 45.0, 18.0),
+        "euvi_304": (10.9, 45.0, 18.0),
+    }
+    published |= {"euvi_171": (0.44, 0.0, 2.0), "euvi_195": (0.51, 0.0, 2.0)}
+    for file in (name for name in instrument_names() if name.startswith(("trace_171", "euvi"))):
+        instrument = load_instrument(file)
+        (mesh,) = instrument.meshes
+        spacing, angle, light_pct = published[file.removesuffix("_a").removesuffix("_b")]
+        found = order_spacing_px(
+            wavelength_angstrom=instrument.wavelength_angstrom,
+            distance_mm=instrument.mesh_distance_mm(mesh),
+            pitch_um=mesh.pitch_um,
+            pixel_pitch_um=instrument.detector.pixel_pitch_um,
+        )
+        assert found == pytest.approx(spacing, rel=0.03) and mesh.angle_deg == angle, file
+        assert 100 * (1 - (1 - mesh.wire_um / mesh.pitch_um) ** 2) == pytest.approx(light_pct, abs=2), file
+        assert mesh.basis == "assumed" and instrument.status == "draft", file
+        scale = instrument.detector.pixel_pitch_um * 1e-3 / instrument.focal_length_mm * 206264.8
+        assert scale == pytest.approx(instrument.detector.plate_scale_arcsec, rel=1e-4), file

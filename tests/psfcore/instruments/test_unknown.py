@@ -15,10 +15,10 @@ SUVI = "GOES-R Series Solar Ultraviolet Imager"
 
 # The cards of real headers: those of sunpy's tests, and others whose cards differ.
 HEADERS: list[tuple[str, dict[str, Any]]] = [
-    ("TRACE", {"TELESCOP": "TRACE", "INSTRUME": "TRACE", "WAVE_LEN": "171", "CDELT1": 0.5}),
+    ("TRACE", {"TELESCOP": "TRACE", "INSTRUME": "TRACE", "WAVE_LEN": "1600", "CDELT1": 0.5}),
     ("TRACE", {"TELESCOP": "TRACE   ", "WAVE_LEN": "WL"}),
-    ("STEREO/EUVI", {"OBSRVTRY": "STEREO_A", "INSTRUME": "SECCHI", "DETECTOR": "EUVI", "WAVELNTH": 171}),
-    ("STEREO/EUVI", {"OBSRVTRY": "STEREO_B", "INSTRUME": "SECCHI", "DETECTOR": "EUVI", "WAVELNTH": 284}),
+    ("SOHO/EIT", {"TELESCOP": "SOHO", "INSTRUME": "EIT", "WAVELNTH": 195}),
+    ("SOHO/EIT", {"TELESCOP": "SOHO", "WAVELNTH": 304}),
     ("PROBA2/SWAP", {"TELESCOP": "PROBA2", "INSTRUME": "SWAP", "DETECTOR": "SWAP", "WAVELNTH": 174}),
     ("PROBA2/SWAP", {"TELESCOP": "PROBA2", "INSTRUME": "SWAP", "DETECTOR": "CMOS 1Kx1K", "WAVELNTH": 174}),
     ("GOES/SUVI", {"TELESCOP": "GOES-R", "INSTRUME": SUVI, "DETECTOR": "SUVI", "WAVELNTH": 195}),
@@ -33,6 +33,9 @@ HEADERS: list[tuple[str, dict[str, Any]]] = [
 ]
 OTHERS: list[dict[str, Any]] = [
     {},
+    {"TELESCOP": "SOHO", "INSTRUME": "MDI", "WAVELNTH": 6768},
+    {"TELESCOP": "SOHO", "INSTRUME": "LASCO", "DETECTOR": "C2"},
+    {"INSTRUME": "SECCHI", "DETECTOR": "EUVI", "WAVELNTH": 171},
     {"TELESCOP": "SWIFT", "INSTRUME": "XRT"},
     {"TELESCOP": "HINODE", "INSTRUME": "SOT/WB"},
     {"INSTRUME": "SECCHI", "DETECTOR": "COR1"},

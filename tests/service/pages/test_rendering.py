@@ -184,7 +184,7 @@ def test_the_page_of_the_api_names_its_icon(api: TestClient) -> None:
 
 def test_the_first_page_names_the_telescopes_of_the_instrument_files(api: TestClient) -> None:
     page = api.get("/").text
-    assert "SDO/AIA 94 to 335 Å, Solar Orbiter EUI/HRI_EUV 174 Å" in page
+    assert "SDO/AIA 94 to 335 Å, STEREO/EUVI 171 to 304 Å, Solar Orbiter EUI/HRI_EUV 174 Å" in page
     assert not [name for name in instrument_names() if name in page]
 
 

@@ -356,8 +356,8 @@ def test_instruments_that_agree_most_come_first_also_in_another_process(
 
 PUBLISHED: tuple[tuple[dict[str, object], str, str], ...] = (
     ({"TELESCOP": "HINODE", "INSTRUME": "XRT"}, "upload", "SolarSoft"),
-    ({"TELESCOP": "TRACE", "INSTRUME": "TRACE", "WAVE_LEN": "171"}, "fit", "Venus of 2004"),
-    ({"OBSRVTRY": "STEREO_B", "INSTRUME": "SECCHI", "DETECTOR": "EUVI", "WAVELNTH": 171}, "fit", "2007"),
+    ({"TELESCOP": "TRACE", "INSTRUME": "TRACE", "WAVE_LEN": "1600"}, "fit", "Venus of 2004"),
+    ({"TELESCOP": "SOHO", "INSTRUME": "EIT", "WAVELNTH": 195}, "upload", "eit_degrid"),
     ({"TELESCOP": "PROBA2", "INSTRUME": "SWAP", "WAVELNTH": 174}, "fit", "covers a part of the Sun"),
 )
 
