@@ -30,6 +30,7 @@ from workers.bulk.listing import MOST_IMAGES
 from workers.bulk.runs import KIND, MOST_TURNS, begin, keep_turns
 from workers.bulk.task import TELL_EVERY_S
 from workers.contract.bulk import AT_WORK, BulkRequest
+from workers.machine import cores
 from workers.settings import Settings
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -172,7 +173,6 @@ def shortest_s(work: Callable[[], object]) -> float:
 
 def measure() -> dict[str, Any]:
     """Statements of an image, bytes of its rows and times of queries, measured in PostgreSQL. Raises Missing."""
-    from benchmarks.figures import kind_of_machine
     from tests.conftest import write_image, write_psf
     from tests.in_process import InProcess
     from tests.whole.stack import postgres_database
@@ -235,7 +235,7 @@ def measure() -> dict[str, Any]:
         "finish_s": finish_s,
         "metrics_s": metrics_s,
         "quota_s": quota_s,
-        "machine": f"{kind_of_machine()}, {time.strftime('%Y-%m-%d')}, load {os.getloadavg()[2]:.0f} in the last 15 minutes",
+        "machine": f"{cores()} cores, {time.strftime('%Y-%m-%d')}, load {os.getloadavg()[2]:.0f} in the last 15 minutes",
     }
 
 
