@@ -33,6 +33,8 @@ from workers.contract.queues import Queue, queues_named
 if TYPE_CHECKING:
     from service.client.http import Client
 
+# Longer than HELIOPSF_LEASE_S and HELIOPSF_RECONCILE_S together: the job of a lost worker is then found before others end.
+IDLE_S = 30.0
 DEMO_DATA = "data"
 DEMO_LOG = "server.log"  # a later demo recognises the folder of an earlier demo by this file
 
@@ -92,15 +94,21 @@ def browser_address(url: str) -> str:
 @click.command()
 @click.option("--processes", type=click.IntRange(1), help="Number of worker processes [default: 1]")
 @click.option("--queues", help=f"Queues to serve, separated by commas: {', '.join(Queue)} [default: all]")
+@click.option("--until-idle", type=click.FloatRange(0, min_open=True), is_flag=False, flag_value=IDLE_S, metavar="[SECONDS]",
+              help=f"End with status 0 when this worker has run no job, and no job of its queues has waited, for SECONDS [without SECONDS: {IDLE_S:g}]")  # fmt: skip
 @DATA
 @click.option("--stop-with-parent", type=int, metavar="PID", hidden=True)
 def worker(
-    processes: int | None, queues: str | None, data: Path | None, stop_with_parent: int | None
+    processes: int | None,
+    queues: str | None,
+    until_idle: float | None,
+    data: Path | None,
+    stop_with_parent: int | None,
 ) -> None:
     """Run jobs from the broker until interrupted. Start one worker on each machine.
 
     Jobs that people wait for (queue interactive) run first, then cross-validations (crossval), then bulk runs (bulk).
-    The order of the queues in --queues has no effect.
+    The order of the queues in --queues has no effect. Use --until-idle in jobs of Slurm, HTCondor or Kubernetes.
     """
     from service.server import environment
     from workers.files.modes import keep_private
@@ -117,7 +125,7 @@ def worker(
     from workers.run.worker import main as run
 
     keep_private()
-    run(stop_with_parent)
+    run(stop_with_parent, until_idle)
 
 
 @click.command()

@@ -343,6 +343,19 @@ class Jobs:
         with self._database.reading() as session:
             return session.scalars(query.limit(1)).first() is not None
 
+    def any_to_do(self, queues: Sequence[Queue], lease_s: float) -> bool:
+        """Whether a job of these queues waits and could start now, or has lost its worker: that job will wait soon.
+
+        lease_s: time without a heartbeat after which a worker counts as lost, s.
+        """
+        silent = JobRow.heartbeat_at < self._database.now - lease_s
+        waits = [JobRow.phase == Phase.QUEUED, no_equal_at_work()], [JobRow.phase == Phase.EXECUTING, silent]
+        with self._database.reading() as session:
+            return any(
+                session.scalars(select(JobRow.id).where(JobRow.queue.in_(queues), *one).limit(1)).first()
+                for one in waits
+            )
+
     def at_work_on(self, owner: str, work_key: str) -> bool:
         """Whether a job with this result executes now."""
         query = select(JobRow.id).where(

@@ -108,6 +108,31 @@ class Stopping:
         return self.asked and time.monotonic() >= self._let_go_at.value
 
 
+class Idle:
+    """For how long a worker has had nothing to do. Child processes that are forked later share this object.
+
+    A child reads the table of jobs, because the parent must hold no connection to the database when it forks. The
+    parent knows whether one of its children runs a job.
+    """
+
+    def __init__(self) -> None:
+        # The time of time.monotonic() since which there is nothing to do; 0: there is work, or no child has looked yet.
+        self._since = RawValue("d", 0.0)
+
+    def tell(self, *, work: bool) -> None:
+        """Record whether there is work now."""
+        if work:
+            self._since.value = 0.0
+        elif not self._since.value:
+            self._since.value = time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """The time since which there is nothing to do, s; 0 if there is work, or if it is not known."""
+        since = self._since.value
+        return time.monotonic() - since if since else 0.0
+
+
 def allowed_mib(estimate_mib: int) -> int:
     """The memory that a job with this estimate may use, MiB."""
     return round(MARGIN * estimate_mib)

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING
 
 from celery import Task
 from celery.signals import setup_logging, worker_init, worker_process_init, worker_shutting_down
+from celery.worker import state
 
 from workers import logs, traces
 from workers.broker import app as queue
 from workers.broker.order import TakeWhatCanStart
 from workers.contract.queues import broker_name, queue_of_broker
-from workers.run.child import Child, Stopping
+from workers.run.child import Child, Idle, Stopping
 from workers.settings import Settings, software_version
 
 if TYPE_CHECKING:
@@ -37,7 +38,12 @@ app.select_queues([broker_name(name) for name in settings.queues])
 app.steps["consumer"].add(TakeWhatCanStart)
 LOOK_EVERY_S = 0.5
 WAIT_S = 2.0  # time after which a database that does not answer is tried again
-stopping = Stopping()  # made before the fork, so that the children share it with their parent
+MOST_LOOK_S = 5.0  # longest time between two looks into the table of jobs
+# Both are made before the fork, so that the children share them with their parent.
+stopping, idle = Stopping(), Idle()
+until_idle_s: float | None = (
+    None  # the worker ends when it has had nothing to do for this time, s; None: it does not end
+)
 
 
 @app.task(name=queue.RUN_JOB, bind=True)
@@ -123,6 +129,34 @@ def _prepare_child(**_: object) -> None:
     traces.configure(settings, "worker")  # after the fork, because the sender has a thread
     _runner()
     threading.Thread(target=_be_present, name="presence", daemon=True).start()
+    if until_idle_s is not None:
+        looks = threading.Thread(target=_look_for_jobs, args=(until_idle_s,), name="jobs to do", daemon=True)
+        looks.start()
+
+
+def _look_for_jobs(within_s: float) -> None:
+    """Tell the parent whether there is a job to do. A database that does not answer may have one."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    while not stopping.asked:
+        try:
+            idle.tell(work=_catalogue().jobs.any_to_do(settings.queues, settings.lease_s))
+        except (SQLAlchemyError, MemoryError) as error:
+            log.warning("could not look for jobs: %s", str(error).split("\n")[0])
+            idle.tell(work=True)
+        time.sleep(min(MOST_LOOK_S, within_s / 4))
+
+
+def _end_when_idle(after_s: float) -> None:
+    """End this worker in the same way as SIGTERM, when it has had nothing to do for ``after_s`` seconds."""
+    while not stopping.asked:
+        if state.reserved_requests:
+            idle.tell(work=True)
+        elif idle.seconds >= after_s:
+            log.info("nothing to do for %g s: this worker ends", after_s)
+            os.kill(os.getpid(), signal.SIGTERM)
+            return
+        time.sleep(min(LOOK_EVERY_S, after_s / 4))
 
 
 def _be_present() -> None:
@@ -178,8 +212,9 @@ def _catalogue() -> Catalogue:
     return Catalogue(settings.catalogue_url)
 
 
-def main(parent: int | None = None) -> None:
-    """Run a worker in this process until it is told to stop, or until the process ``parent`` ends.
+def main(parent: int | None = None, idle_s: float | None = None) -> None:
+    """Run a worker in this process until it is told to stop, until the process ``parent`` ends, or until the worker has
+    had nothing to do for ``idle_s`` seconds.
 
     Raises SystemExit with status 1 if the worker ends for another reason; with a message if the database is not at the
     revision of this version.
@@ -188,6 +223,10 @@ def main(parent: int | None = None) -> None:
     log.info("the worker starts; data in %s", settings.data_dir.resolve())
     if parent is not None:
         threading.Thread(target=_stop_with, args=(parent,), daemon=True).start()
+    if idle_s is not None:
+        global until_idle_s
+        until_idle_s = idle_s
+        threading.Thread(target=_end_when_idle, args=(idle_s,), daemon=True).start()
     pool = ["--pool", "prefork", "--concurrency", str(settings.worker_processes)]
     quiet = ["--without-gossip", "--without-mingle", "--without-heartbeat"]
     app.worker_main(["--quiet", "worker", "--loglevel", "INFO", *pool, *quiet])

@@ -10,7 +10,9 @@ from pathlib import Path
 from workers.settings import Settings
 
 
-def started_worker(code: str, settings: Settings, log: Path, **changes: float) -> subprocess.Popen[bytes]:
+def started_worker(
+    code: str, settings: Settings, log: Path, **changes: float | str
+) -> subprocess.Popen[bytes]:
     """A process that runs this code with the data folder and the broker of the settings; its lines go into a file.
 
     changes: further settings by name. The caller ends the process.
