@@ -7,6 +7,7 @@ the command asks for a file of it.
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 import uuid
@@ -262,7 +263,12 @@ class Local(Operations):
         """The estimated time of a job on a transit, s; None for other jobs, whose steps count the whole job."""
         if KINDS[kind].counted_whole or getattr(request, "transit_id", None) not in self._transits:
             return None
-        pixels = sum(self._transits[request.transit_id].contents.files.values()) / BYTES_A_PIXEL
+        transit = self._transits[request.transit_id]
+        pixels = sum(transit.contents.files.values()) / BYTES_A_PIXEL
+        if transit.path.is_dir():
+            images = [image.file for image in transit.contents.manifest.images]
+            first = read_summary(transit.path / images[0], LIMITS)
+            pixels = len(images) * math.prod(first.shape)
         return linear_s(kind, request.model_dump(), pixels) / cores() ** COSTS.threads_exponent
 
     def get(self, address: str) -> dict[str, Any]:

@@ -268,14 +268,13 @@ def sentence(found: Diagnosis) -> str:
             f"{found.noise_pct:.1f} %.{_not_excluded(judged)}"
         )
     strongest = found.where[0]
-    along = AXIS_WORDS[strongest.name] + (", as the best effect does," if strongest.of_best else "")
+    along = AXIS_WORDS[strongest.name] + (", as the best effect does" if strongest.of_best else "")
     numbers = strongest.at.get("pointings", [])
     where = f"pointing{'s' if len(numbers) > 1 else ''} {' and '.join(map(str, numbers))}"
-    lead = f"There is a gap of {left}. It varies most {along} and is largest in {where}."
+    comma = "," if strongest.of_best else ""
+    lead = f"There is a gap of {left}. It varies most {along}{comma} and is largest in {where}."
     if _shown_by_blocks(found):
-        lead = (
-            f"There is a gap in the unocculted field, and it varies most {along}. The discs do not show it."
-        )
+        lead = f"There is a gap in the unocculted field. It varies most {along}. The discs do not show it."
     if judged.verdict == "unknown":
         return f"{lead} Its cause is not in the library{_unknown_words(found)}."
     if judged.verdict == "tie":

@@ -26,6 +26,7 @@ from service.cli.progress import echo
 from workers.contract.requests import GapDiagnose
 
 SHOWN = 3
+UNKNOWN = "unknown"
 
 
 class _DiagnosisByDefault(click.Group):
@@ -147,16 +148,20 @@ def _lines(report: dict[str, Any]) -> list[str]:
     answer = f" ({so_far}{', '.join(report['answer'])})" if report["answer"] else ""
     out = [report["sentence"], f"verdict: {report['verdict']}{answer}"]
     in_set = {" + ".join(names) for names in report["set"]["members"]}
-    named = [one for one in (*report["together"], *report["effects"]) if one["name"] in in_set]
+    # The fields of an unknown cause follow as their own lines.
+    named = [one for one in (*report["together"], *report["effects"]) if one["name"] in in_set - {UNKNOWN}]
     for effect in named[:SHOWN]:
         closure = effect["closure"]
         closed = "" if closure is None else f", held-out closure {100 * closure['value']:.0f} %"
         numbers = ", ".join(
             f"{name} {p['value']:.3g} ± {p['sigma']:.2g} {p['unit']}".strip()
             for name, p in effect["parameters"].items()
+            if not name.rpartition(".")[2].startswith("bump_")
         )
-        out.append(f"  {effect['name']:<24} P = {effect['probability']:.2f}{closed}: {numbers}")
-    out += [f"  looks like: {_field(one)}" for one in report["unknown"]["fields"]]
+        found = f"P = {effect['probability']:.2f}{closed}"
+        out.append(f"  {effect['name']:<24} {found}{': ' if numbers else ''}{numbers}")
+    if report["verdict"] != "none":
+        out += [f"  looks like: {_field(one)}" for one in report["unknown"]["fields"]]
     if report["untestable"]:
         out.append(f"  not testable: {', '.join(one['name'] for one in report['untestable'])}")
     return out + [f"  caution: {caution}" for caution in report["cautions"]]

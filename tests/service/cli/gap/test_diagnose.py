@@ -17,6 +17,7 @@ from fastapi.testclient import TestClient
 
 from psfcore.gap.diagnose import Diagnosis, diagnose
 from psfcore.transit.archive import pack
+from service.cli.gap.diagnose import _lines
 from service.cli.main import main
 from tests.gap_files import EDGE_GLOW, GLOW_DN_S, answer_at_once, quick_diagnosis, small_reach, write_gap
 from tests.html_page import check_stands_alone, read_page
@@ -170,3 +171,17 @@ def test_the_transit_may_come_after_the_options_and_help_names_both_commands(fol
     helped = run("--help").output
     assert "diagnose" in helped and "blind" in helped
     assert "--effects" in run("diagnose", "-h").output
+
+
+def test_the_numbers_of_a_field_are_not_printed(diagnosed: Diagnosed) -> None:
+    report = json.loads((diagnosed.out / "g.json").read_text())
+    fit = report["effects"][0]
+    bumps = {f"unknown.bump_{k}": fit["parameters"]["height"] for k in range(100)}
+    both = fit | {
+        "name": "edge_glow + unknown",
+        "parameters": bumps | {"edge_glow.height": fit["parameters"]["height"]},
+    }
+    report |= {"together": [both, fit | {"name": "unknown", "parameters": bumps}]}
+    report["set"]["members"] = [["edge_glow", "unknown"], ["unknown"]]
+    said = [line for line in _lines(report) if "P = " in line]
+    assert len(said) == 1 and "edge_glow.height" in said[0] and "bump" not in said[0]
