@@ -386,7 +386,7 @@ def _explained(found: Diagnosis) -> str:
 
 def tied_words(judged: Judgement) -> str:
     """The text for a tie: the effects that the data cannot separate, and the effects that all deciding members contain, if any."""
-    among = " or ".join(words(name) for name in judged.tied)
+    among = " or ".join(hypothesis_words((name,)) for name in judged.tied)
     beside = " and ".join(words(name) for name in judged.certain)
     alone = " alone or" if any(set(names) == set(judged.certain) for names in judged.named) else ""
     return f"{beside},{alone} together with {among}" if beside else among
