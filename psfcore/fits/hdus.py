@@ -110,6 +110,7 @@ def read_pixels(
 def _plain_pixels(source: Source, image: Hdu, summary: HeaderSummary) -> NDArray[np.float64]:
     """The pixels of a plain image, from a source that stands at its data. FITS standard 4.0, Eqs. (3) and (4)."""
     ny, nx = summary.shape
+    _ = image.end  # raises the errors of its declared size
     stored = np.dtype(_TYPES[summary.bitpix])
     pixels = np.empty(summary.shape)
     some = max(1, _PIECE_BYTES // (nx * stored.itemsize))

@@ -123,7 +123,7 @@ def test_the_core_depends_on_few_packages_and_extras_name_all_that_is_imported()
     few = {"astropy", "click", "numba", "numpy", "platformdirs", "pydantic", "pydantic-settings", "scipy"}
     assert names == few | {"threadpoolctl", "typing-extensions"}
     extras = project["optional-dependencies"]
-    assert {"map", "plot", "service", "s3", "traces", "all", "docs", "dev"} == set(extras)
+    assert {"map", "plot", "published", "service", "s3", "traces", "all", "docs", "dev"} == set(extras)
 
 
 @pytest.fixture(scope="module")

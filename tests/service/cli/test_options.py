@@ -32,7 +32,7 @@ def test_a_command_reads_as_many_pixels_as_the_settings_let_it(
     psf_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert CliRunner().invoke(main, ["psf", "query", str(psf_file)]).exit_code == 0
-    monkeypatch.setenv("HELIOPSF_MAX_PIXELS", str(32 * 32))
+    monkeypatch.setenv("HELIOPSF_MAX_PSF_PIXELS", str(32 * 32))
     for command in (["query"], ["show"]):
         result = CliRunner().invoke(main, ["psf", *command, str(psf_file)])
         assert result.exit_code == 1

@@ -29,7 +29,7 @@ MOST_S = 10.0  # of processor time: what else the machine does counts for nothin
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
-    limits = {"max_upload_mib": 8, "max_transit_mib": 8, "max_transit_unpacked_mib": 64}
+    limits = {"max_upload_mib": 8, "max_psf_mib": 8, "max_transit_mib": 8, "max_transit_unpacked_mib": 64}
     settings = settings_in(tmp_path_factory.mktemp("attacked"), max_pixels=2**26, **limits)
     with keyed(settings) as running:
         yield running

@@ -59,7 +59,7 @@ def test_the_hypotheses_of_a_kind_share_the_prior_of_their_kind() -> None:
 def test_an_effect_has_the_form_of_the_library_or_of_a_field_with_its_name() -> None:
     order = ("intensity_gradient", "flat_field_residual")
     wide, gain, fine = (
-        Field("detector", form, width) for form, width in (("light", 0.8), ("gain", 0.2), ("gain", 0.8))
+        Field("detector", form, width) for form, width in (("light", 0.8), ("gain", 0.4), ("gain", 0.8))
     )
     spot = Field("detector", "light", 0.2)
     logs = {
