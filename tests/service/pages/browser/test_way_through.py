@@ -244,6 +244,8 @@ def test_the_keyboard_alone_leads_from_a_file_to_a_blinked_product(
     expect(modes).to_have_value("blink")
     tab_to(page, page.locator("#canvas"))
     shown = page.locator("#tag-left")
+    # The tag of the new mode is written with the next picture.
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     first = shown.inner_text()
     assert first in ("before", "after")
     page.keyboard.press("b")
