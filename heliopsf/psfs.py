@@ -16,7 +16,7 @@ from heliopsf.shown import Shown
 from psfcore.deconvolve.run import BUILDING
 from psfcore.errors import DataError, did_you_mean, module_of_extra
 from psfcore.fits import psfs
-from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.blocks import LIMITS
 from psfcore.fits.header import utc_time
 from psfcore.fits.images import read_mask_image
 from psfcore.instruments.files import instrument_names, instrument_path, turned_text
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 AnyPsf: TypeAlias = "str | Path | CorePsf | NDArray[np.floating]"
-LIMITS = FitsLimits(max_pixels=2**26)
 
 
 class Psf(Shown, CorePsf):

@@ -19,13 +19,12 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from psfcore.errors import DataError, did_you_mean, module_of_extra
-from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.blocks import LIMITS
 from psfcore.whole_files import sha256_of
 
 if TYPE_CHECKING:
     from psfcore.psf import Psf
 
-LIMITS = FitsLimits(max_pixels=2**26)
 MIB = 2**20
 TRIES_AGAIN = 4
 _TIMEOUT_S = 60  # without a byte

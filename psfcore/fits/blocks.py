@@ -77,6 +77,10 @@ class FitsLimits:
     max_hdus: int = 64
 
 
+# Limits on files that the person who runs this process names. The memory is checked before an image is deconvolved.
+LIMITS = FitsLimits(max_pixels=2**26)
+
+
 @dataclass(frozen=True)
 class Hdu:
     """The header of an HDU, its number, its kind (see `_kind`), and where its data start in the file, bytes."""

@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 
 from psfcore.build import known_diffraction
 from psfcore.errors import DataError
-from psfcore.fits.blocks import FitsLimits
+from psfcore.fits.blocks import LIMITS
 from psfcore.gap.effect import Effect
 from psfcore.gap.evidence.cells import cells_of
 from psfcore.gap.evidence.evidence import Evidence, gather
@@ -69,7 +69,6 @@ from psfcore.whole_files import write_whole
 Vector = NDArray[np.float64]
 
 SCHEMA = "gap-ideal/1"
-LIMITS = FitsLimits(max_pixels=2**26)
 
 
 @dataclass(frozen=True)

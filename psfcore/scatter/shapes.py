@@ -144,14 +144,17 @@ class Shape:
         """Coordinates of these values. A parameter that is not in `values` gets the value at which a fit starts."""
         return np.array([p.coordinate(values.get(p.name, p.start)) for p in self.parameters])
 
+    def length(self, step: Vector) -> float:
+        """The length of a step: its largest change of a coordinate, in units of the largest step of this coordinate."""
+        return float((np.abs(step) / np.array([p.largest_step for p in self.parameters])).max())
+
     def shortened(self, step: Vector) -> tuple[Vector, bool]:
         """Shorten a step if it changes a coordinate by more than the largest step of this coordinate.
 
         Returns the step, and True if it was not shortened.
         """
-        largest = np.array([p.largest_step for p in self.parameters])
-        too_far = float((np.abs(step) / largest).max())
-        return (step, True) if too_far <= 1 else (step / too_far, False)
+        length = self.length(step)
+        return (step, True) if length <= 1 else (step / length, False)
 
     def kernel(self, coordinates: Vector, size: int) -> Kernel:
         """The scatter kernel [y, x] of Eq. (1) on (size, size), centre at [size // 2, size // 2]."""

@@ -29,8 +29,9 @@ from psfcore.deconvolve.box import Box
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.run import BUILDING, Identities, UsedPsf
 from psfcore.errors import DataError, module_of_extra
+from psfcore.fits.blocks import LIMITS
 from psfcore.fits.frame import frame_of
-from psfcore.fits.header import FitsLimits, HeaderSummary, check_not_deconvolved, optional_text, read_summary
+from psfcore.fits.header import HeaderSummary, check_not_deconvolved, optional_text, read_summary
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf, stated_id
 from psfcore.fits.stored_psf import check_is_psf
@@ -81,7 +82,6 @@ if TYPE_CHECKING:
     from psfcore.transit.prepare import Prepared
     from psfcore.transit.transit import Transit
 
-LIMITS = FitsLimits(max_pixels=2**26)  # the memory is checked before an image is deconvolved
 COMPILING = "compiling kernels (only once)"
 _NOW = "now"  # the context that a service without contexts has too
 _Report = Callable[[str, int, int], None]

@@ -147,7 +147,7 @@ class Client(Connection, Operations):
                 job = Patience(self.say, GOES_ON).repeat(lambda: self.job(job_id))
                 now = job["progress"]
                 if progress is not None and now["stage"]:
-                    share = now.get("share")  # a service of an earlier version sends none
+                    share = now["share"]
                     if share is None:
                         progress(now["stage"], now["step"], max(now["steps"], 1))
                     else:

@@ -32,7 +32,7 @@ Vector = NDArray[np.float64]
 
 ROUNDS = 6
 SETTLED = 0.3  # the rounds end when the remaining step is less than this fraction of the errors, rms
-LONGEST = 3.0  # longest step of the PSF in one round, in units of `Parameter.largest_step`
+LONGEST = 3.0  # longest step of the PSF in one round (`Shape.length`)
 # A round may leave more chi2 than the best round by WORSE or, if larger, by WORSE_SHARE times the gain of the effect.
 WORSE = 9.0
 WORSE_SHARE = 0.05
@@ -109,7 +109,7 @@ def add_to_model(
     exists already. Raises the errors of `invert` if the first round fails, DataError "effect-unseen" if the images do not constrain the
     effects, and "bad-effects" if an added effect fails.
     """
-    transit = solution.transit
+    transit, shape = solution.transit, solution.inversion.shape
     # An effect that searches for a position keeps the position that it found first.
     view = view or View(solution)
     held = [_acting(hold(effect, view), found, len(effects)) for effect in effects]
@@ -118,12 +118,12 @@ def add_to_model(
     base = len(model.evidence.base)
     here, at, theta = view, solution.inversion.coordinates, np.zeros(wanted.size)
     move = found.step.values[:base]
-    least = np.inf
+    least, settled = np.inf, False
     taken: _Round | None = None
     for rounds in range(1, 1 + (ROUNDS if in_images.any() else 1)):
         try:
             if in_images.any():
-                share = _share_of(move, solution)
+                share = min(1.0, LONGEST / max(shape.length(move), 1e-9))
                 at, theta = at + share * move, theta + share * (wanted - theta)
                 images = images_without(transit, here, held, theta)
                 fit = solution_at(images, solution.total, at, threads=solution.threads, progress=progress)
@@ -150,21 +150,16 @@ def add_to_model(
         least = min(least, left_over)
         taken = _Round(here.solution, theta, rounds)
         steps = np.append(move, np.where(in_images, wanted - theta, 0.0))
-        if float(np.sqrt(np.mean((steps / np.maximum(seen.sigmas, 1e-300)) ** 2))) < SETTLED:
-            if in_images.any():  # the steps weigh cells; the PSF is fitted to pixels, as without effects
-                fit = invert(
-                    here.solution.transit,
-                    solution.inversion.shape,
-                    start=at,
-                    near=True,
-                    threads=solution.threads,
-                    progress=progress,
-                )
-                taken = _Round(fit, theta, rounds)
+        settled = float(np.sqrt(np.mean((steps / np.maximum(seen.sigmas, 1e-300)) ** 2))) < SETTLED
+        if settled:
             break
     assert taken is not None
     del here  # its planes, before those of another view are made
     return_unused_memory()
+    if settled and in_images.any():  # the steps weigh cells; the PSF is fitted to pixels, as without effects
+        images, threads = taken.solution.transit, solution.threads
+        fit = invert(images, shape, start=at, near=True, threads=threads, progress=progress)
+        taken = replace(taken, solution=fit)
     return _corrected(taken, held, beside, in_images, model, progress)
 
 
@@ -207,7 +202,7 @@ def _corrected(
 
 
 def _with_old_jacobian(model: LinearModel, view: View, held: Sequence[Effect]) -> LinearModel:
-    """The linear model of another fit: its residuals, with the Jacobian and the noise of `model`."""
+    """The linear model at another PSF: its residuals and its Jacobian of the PSF, with the Jacobian of the effects and the noise of `model`."""
     before = model.evidence
     base, kept = len(before.base), list[int]()
     columns: dict[str, tuple[int, ...]] = {}
@@ -287,12 +282,6 @@ def _fit_remaining(
     found -= model.pull_of_prior(left.step, out_already)[base:]
     # For a subtracted parameter the fit gives only the remainder; for the other parameters it gives the full value.
     return _Remaining(model, left, np.where(in_images, out + found, found))
-
-
-def _share_of(move: Vector, solution: Solution) -> float:
-    """The share of a step of the coordinates that is short enough to be trusted."""
-    largest = np.array([parameter.largest_step for parameter in solution.inversion.shape.parameters])
-    return float(min(1.0, LONGEST / max(float((np.abs(move) / largest).max()), 1e-9)))
 
 
 def _in_images(effects: Sequence[Effect], view: View) -> NDArray[np.bool_]:

@@ -78,7 +78,7 @@ def test_the_client_takes_the_address_of_the_environment(monkeypatch: pytest.Mon
 
 
 JOB = {"id": "a" * 32, "kind": "deconvolve", "queue": "interactive", "result": None, "error": None}
-STILL = {"stage": "deconvolving", "step": 3, "steps": 20, "time_left_s": None}
+STILL = {"stage": "deconvolving", "step": 3, "steps": 20, "time_left_s": None, "share": None}
 
 
 def job(phase: str) -> dict[str, Any]:
