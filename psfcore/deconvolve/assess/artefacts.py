@@ -120,14 +120,18 @@ def classes_of(brightness: Plane) -> BrightnessClasses:
     """Divide pixels into classes by their brightness (n,). With fewer than 16 pixels there are no classes."""
     if brightness.size < _BRIGHTNESS_CLASSES:
         return BrightnessClasses([], np.empty(0))
-    ordered = np.argsort(brightness)
-    members = np.array_split(ordered, _BRIGHTNESS_CLASSES)
-    return BrightnessClasses(members, np.array([np.median(brightness[_middle(part)]) for part in members]))
-
-
-def _middle(ordered: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The one or two members in the middle, whose median is that of all."""
-    return ordered[(ordered.size - 1) // 2 : ordered.size // 2 + 1]
+    # A full sort would take five times as long. The upper half of a key is the bit pattern of the brightness in single precision, which
+    # orders numbers above 0 as their values and numbers below 0 in reverse; the lower half is the index.
+    keys = brightness.astype(np.float32).view(np.int32).astype(np.int64)
+    np.subtract(-(2**31) - 1, keys, out=keys, where=keys < 0)
+    keys <<= 32
+    keys |= np.arange(keys.size)
+    parts = np.array_split(np.arange(keys.size), _BRIGHTNESS_CLASSES)
+    middles = [part[(part.size - 1) // 2 : part.size // 2 + 1] for part in parts]
+    keys.partition(np.unique(np.concatenate([*(part[:1] for part in parts), *middles])))
+    ordered = keys & 0xFFFFFFFF
+    members = [ordered[part[0] : part[-1] + 1] for part in parts]
+    return BrightnessClasses(members, np.array([np.median(brightness[ordered[middle]]) for middle in middles]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,6 @@ bright only because of noise. This hardly matters for blocks of 4 px and more.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -230,7 +229,7 @@ def _levels(means: Plane) -> dict[float, tuple[float, float]]:
     if means.size == 0:
         return {}
     wanted = [level for tail in TAILS_PCT for level in (tail, 100 - tail)]
-    found = [float(level) for level in _levels_of(means, wanted)]
+    found = [float(level) for level in np.percentile(means, wanted)]
     return {tail: (found[2 * k], found[2 * k + 1]) for k, tail in enumerate(TAILS_PCT)}
 
 
@@ -288,13 +287,8 @@ def _contrast(means: Plane) -> float | None:
 
 
 def _percentiles(values: Plane) -> dict[str, float]:
-    found = _levels_of(values, CHANGE_PERCENTILES)
+    found = np.percentile(values, CHANGE_PERCENTILES)
     return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, found, strict=True)}
-
-
-def _levels_of(values: Plane, percentiles: Sequence[float]) -> NDArray[np.float64]:
-    """Percentiles of values (n,). numpy alone would search each of them in turn; to sort the values is quicker."""
-    return np.asarray(np.percentile(np.sort(values), percentiles, overwrite_input=True))
 
 
 def _change_pct(before: Any, after: Any) -> Any:

@@ -21,7 +21,6 @@ from typing import Any, BinaryIO, Literal
 
 import numpy as np
 from astropy.io import fits
-from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
@@ -122,6 +121,8 @@ def _window(region: Region, header: fits.Header, shape: tuple[int, int]) -> tupl
 
 def _pixels_of(points: Points, header: fits.Header) -> Points:
     """Helioprojective coordinates in arcsec as pixels, counted from 0."""
+    from astropy.wcs import WCS  # loads slowly, and a deconvolution of a box only moves the reference pixels
+
     # The cards of a file go into a C library, so it gets those of the two axes of the image alone.
     own = fits.Header([card for card in header.cards if _OF_TWO_AXES.fullmatch(card.keyword)])
     wcs = WCS(own, fix=False)
