@@ -6,7 +6,7 @@ RUN := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 DOCS := $(VENV)/.installed-docs
 
-.PHONY: demo test test-fast test-full browser bench bench-peers blind chaos lint docs openapi settings pins clean
+.PHONY: demo test test-fast test-full browser bench bench-peers blind chaos lint lines docs openapi settings pins clean
 .DELETE_ON_ERROR:
 
 $(RUN): pyproject.toml constraints.txt
@@ -71,6 +71,10 @@ lint: $(DEV)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/house
+
+# The lines, files and tests of each room, beside the lines that it is meant to have.
+lines: $(DEV)
+	$(BIN)/python -m tests.house.lines
 
 # The documentation site, docs/_build/html/index.html. Its tutorials run; neither the build nor the pages need a network.
 docs: $(DOCS)
