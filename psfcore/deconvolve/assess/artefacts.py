@@ -125,13 +125,18 @@ def classes_of(brightness: Plane) -> BrightnessClasses:
     keys = brightness.astype(np.float32).view(np.int32).astype(np.int64)
     np.subtract(-(2**31) - 1, keys, out=keys, where=keys < 0)
     keys <<= 32
-    keys |= np.arange(keys.size)
-    parts = np.array_split(np.arange(keys.size), _BRIGHTNESS_CLASSES)
-    middles = [part[(part.size - 1) // 2 : part.size // 2 + 1] for part in parts]
-    keys.partition(np.unique(np.concatenate([*(part[:1] for part in parts), *middles])))
-    ordered = keys & 0xFFFFFFFF
-    members = [ordered[part[0] : part[-1] + 1] for part in parts]
-    return BrightnessClasses(members, np.array([np.median(brightness[ordered[middle]]) for middle in middles]))
+    keys |= np.arange(keys.size, dtype=np.uint32)
+    share, more = divmod(keys.size, _BRIGHTNESS_CLASSES)
+    counts = share + (np.arange(_BRIGHTNESS_CLASSES) < more)
+    starts = np.cumsum(counts) - counts
+    middles = np.transpose(
+        [starts + (counts - 1) // 2, starts + counts // 2]
+    )  # their median is that of the class
+    keys.partition(np.unique([*starts, *middles.ravel()]))
+    keys &= 0xFFFFFFFF
+    return BrightnessClasses(
+        np.split(keys, starts[1:]), np.array([np.median(brightness[keys[middle]]) for middle in middles])
+    )
 
 
 @dataclass(frozen=True, eq=False)

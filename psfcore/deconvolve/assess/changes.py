@@ -139,11 +139,12 @@ def measure_changes(
         artefacts = beside.submit(check).result if threads > 1 else check
         positive = before > 0
         # The planes of the percentiles are freed before the next ones are made: here most memory is in use.
-        change_pct = _percentiles(_change_pct(before[positive], after[positive])) if positive.any() else {}
+        change_pct = _percentiles(_change_pct(*_chosen(positive, before, after))) if positive.any() else {}
         difference = _percentiles(after - before)
-        old, new = (np.where(counted, plane, 0.0) for plane in (image.pixels, result))
         blocks = [
-            _described(before, after, 1) if block_px == 1 else _blocks(old, new, counted, block_px)
+            _described(before, after, 1)
+            if block_px == 1
+            else _blocks(image.pixels, result, counted, block_px)
             for block_px in BLOCKS_PX
         ]
         structures = tuple(row for part in blocks for row in _structures(part))
@@ -183,8 +184,7 @@ def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
     """
     if block_px == 1:
         return np.asarray(plane[counted])
-    whole = _in_blocks(counted, block_px).all(axis=(1, 3))
-    return _means(np.where(counted, plane, 0.0), whole, block_px)
+    return _means(plane, _in_blocks(counted, block_px).all(axis=(1, 3)), block_px)
 
 
 def _in_blocks(plane: Any, block_px: int) -> Any:
@@ -193,8 +193,9 @@ def _in_blocks(plane: Any, block_px: int) -> Any:
     return plane[: ny * block_px, : nx * block_px].reshape(ny, block_px, nx, block_px)
 
 
-def _means(finite: Plane, whole: Flags, block_px: int) -> Plane:
-    return np.asarray(_in_blocks(finite, block_px).mean(axis=(1, 3))[whole])
+def _means(plane: Plane, whole: Flags, block_px: int) -> Plane:
+    with np.errstate(invalid="ignore"):  # a block with infinite pixels is not whole
+        return np.asarray(_in_blocks(plane, block_px).mean(axis=(1, 3))[whole])
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +215,7 @@ class _Blocks:
 
 
 def _blocks(before: Plane, after: Plane, counted: Flags, block_px: int) -> _Blocks:
-    """The blocks of planes that are finite everywhere."""
+    """The blocks whose pixels are all counted."""
     whole = _in_blocks(counted, block_px).all(axis=(1, 3))
     return _described(_means(before, whole, block_px), _means(after, whole, block_px), block_px)
 
@@ -287,9 +288,18 @@ def _contrast(means: Plane) -> float | None:
 
 
 def _percentiles(values: Plane) -> dict[str, float]:
-    found = np.percentile(values, CHANGE_PERCENTILES)
+    """Percentiles of the change. values: they are reordered."""
+    found = np.percentile(values, CHANGE_PERCENTILES, overwrite_input=True)
     return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, found, strict=True)}
 
 
+def _chosen(which: Flags, *planes: Plane) -> tuple[Plane, ...]:
+    """The chosen pixels (n,) of each plane: the plane itself if all are chosen."""
+    return planes if which.all() else tuple(plane[which] for plane in planes)
+
+
 def _change_pct(before: Any, after: Any) -> Any:
-    return 100 * (after / before - 1)  # Eq. (1)
+    change = np.asarray(after / before)  # Eq. (1)
+    change -= 1
+    change *= 100
+    return change
