@@ -23,8 +23,9 @@ from psfcore.deconvolve.box import LARGEST_ERROR
 from psfcore.deconvolve.camera_noise import measured_noise
 from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.methods.registry import may_be_negative
-from psfcore.deconvolve.run import BUILDING, DECONVOLVING, Options, input_warnings, read_and_deconvolve
+from psfcore.deconvolve.methods.registry import properties_of
+from psfcore.deconvolve.run import BUILDING, DECONVOLVING, input_warnings, read_and_deconvolve
+from psfcore.deconvolve.whole import Options
 from psfcore.errors import DataError, DataWarning
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import seen_by
@@ -280,7 +281,7 @@ def _clipped(image: Image, *, clip_negative: bool | None, method: str) -> Image:
         return image
     if clip_negative:
         return replace(image, pixels=np.where(negative, 0.0, image.pixels))
-    if not may_be_negative(method):
+    if not properties_of(method).may_be_negative:
         raise DataError(
             "negative-pixels",
             f"clip_negative=False: expected an image without negative pixels, or a method whose results may be negative "

@@ -87,9 +87,8 @@ def make(
     product = run.deconvolve(
         image,
         psf,
-        options_of(request, threads),
+        replace(options_of(request, threads), engine_for=prepared.engine_for),
         warnings=_warnings(context, request, psf_row, psf, image),
-        engine_for=prepared.engine_for,
         possible_psfs=lambda: _possible_psfs(read(parts=True), image, threads),
         begin=begin,
     )

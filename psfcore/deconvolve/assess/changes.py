@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.artefacts import Artefacts, NoiseAt, find_artefacts
+from psfcore.deconvolve.edges import inside_band
 from psfcore.errors import DataError
 from psfcore.fits.units import dn_per_unit
 from psfcore.image import Image
@@ -171,10 +172,7 @@ def _noise_at(image: Image, noise: Noise) -> NoiseAt:
 
 def counted_pixels(image: Image, result: Plane, edge_px: int) -> Flags:
     """Pixels [y, x] that are trusted, finite and outside the band at the edges."""
-    counted = image.valid & np.isfinite(result)
-    inner = np.zeros_like(counted)
-    inner[edge_px : counted.shape[0] - edge_px, edge_px : counted.shape[1] - edge_px] = True
-    return np.asarray(counted & inner)
+    return np.asarray(image.valid & np.isfinite(result) & inside_band(result.shape, edge_px))
 
 
 def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:

@@ -24,7 +24,6 @@ from psfcore.deconvolve.assess.artefacts import (
 from psfcore.deconvolve.assess.changes import BLOCKS_PX, block_means, measure_changes
 from psfcore.deconvolve.assess.contact_sheet import changes_from_json
 from psfcore.deconvolve.assess.plots import changes_png
-from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.noise import Noise
@@ -32,7 +31,7 @@ from psfcore.psf import Psf, crop_centred
 from psfcore.simulate.observe import observe
 from psfcore.simulate.scene import solar_scene
 from tests.psfcore.conftest import delta, make_image, make_psf
-from tests.psfcore.deconvolve.scattering import scattering_psf
+from tests.psfcore.deconvolve.scattering import richardson_lucy, scattering_psf
 
 Plane = NDArray[np.float64]
 SIZE_PX, EDGE_PX = 384, 24

@@ -26,7 +26,8 @@ from psfcore.deconvolve.assess.contact_sheet import (
 )
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
-from psfcore.deconvolve.run import Identities, Options, UsedPsf
+from psfcore.deconvolve.run import Identities, UsedPsf
+from psfcore.deconvolve.whole import Options
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
 from psfcore.image import Image
