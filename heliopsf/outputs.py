@@ -17,8 +17,7 @@ from astropy.utils.masked import Masked
 from numpy.typing import NDArray
 
 from heliopsf.inputs import hdu_of, is_hdu, is_map, is_nddata
-from heliopsf.psfs import Psf
-from heliopsf.shown import Shown
+from heliopsf.psfs import Psf, Shown
 from psfcore.deconvolve.run import Product, UsedPsf, deconvolution_cards, deconvolution_history
 from psfcore.deconvolve.summary import summary_lines
 from psfcore.errors import module_of_extra
@@ -65,14 +64,14 @@ class Deconvolution(Shown, Product):
     @property
     def changes(self) -> dict[str, Any]:
         """What the deconvolution changed: flux, bright and dark structures, signs of artefacts."""
-        return self.assessed.found.as_json()
+        return self.assessed.changes.as_json()
 
     def lines(self) -> list[str]:
         """The result in two lines: image, PSF and its doubts; and what changed."""
         ny, nx = self.pixels.shape
-        told = summary_lines(self.details())
+        first, *others = summary_lines(self.details())
         warned = f"; warnings: {', '.join(self.warnings)}" if self.warnings else ""
-        return [f"Deconvolution of {told[0]}", f"{nx} x {ny} px, {'; '.join(told[1:])}{warned}"]
+        return [f"Deconvolution of {first}", f"{nx} x {ny} px, {'; '.join(others)}{warned}"]
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the deconvolved image. Needs the extra "plot". axes None: new axes."""
@@ -127,10 +126,10 @@ def used_psf(psf: Psf) -> UsedPsf:
 
 def _as_map(image: Any, result: Deconvolution) -> Any:
     meta = _described(image.meta, result)
-    made = type(image)(result.pixels, meta, mask=_mask(image, result), uncertainty=_uncertainty(result))
+    smap = type(image)(result.pixels, meta, mask=_mask(image, result), uncertainty=_uncertainty(result))
     # The settings are set last, because the class of a Map may choose other settings for a new Map.
-    made.plot_settings.update(copy.deepcopy(image.plot_settings))
-    return made
+    smap.plot_settings.update(copy.deepcopy(image.plot_settings))
+    return smap
 
 
 def _as_nddata(image: Any, result: Deconvolution) -> Any:

@@ -133,8 +133,8 @@ def margin_for(shares: NDArray[np.float64], field_shape: tuple[int, int], *, sha
     the width of the field.
     """
     half_block = BLOCK_ROWS // 2
-    wanted = half_block * -(-band_px(shares, share) // half_block)
-    return min(wanted, min(field_shape) // 2)
+    width = half_block * -(-band_px(shares, share) // half_block)
+    return min(width, min(field_shape) // 2)
 
 
 def lay_out(image: Image, *, edges: Edges, margin_px: int) -> Domain:

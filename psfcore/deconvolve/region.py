@@ -100,11 +100,11 @@ class BoxWork:
 
     def run(self, progress: Progress | None = None) -> Deconvolved:
         """Deconvolve box and rim, and cut out the box. Flux and negative pixels are those of the box."""
-        found = self.work.run(progress=progress)
-        pixels = np.ascontiguousarray(found.pixels[self.box.inside(self.rim).slices])
+        of_rim = self.work.run(progress=progress)
+        pixels = np.ascontiguousarray(of_rim.pixels[self.box.inside(self.rim).slices])
         flux_in, flux_out, negative_pixels = fluxes(self.image, pixels)
         return replace(
-            found,
+            of_rim,
             pixels=pixels,
             flux_in=flux_in,
             flux_out=flux_out,
@@ -116,7 +116,7 @@ class BoxWork:
     def assess(self, result: Deconvolved, errors: ErrorPlanes | None = None) -> Assessed:
         """Measure the changes in the box, and make its quality plane."""
         near_edge = self._near_edge(result.edge_band_px)
-        found = measure_changes(
+        changes = measure_changes(
             self.image,
             result.pixels,
             self.work.psf,
@@ -126,8 +126,8 @@ class BoxWork:
         )
         quality = self.of_mask.copy()
         quality[near_edge] |= np.uint8(QualityBit.EDGE)
-        quality[found.artefacts.suspected] |= np.uint8(QualityBit.ARTEFACT)
-        return Assessed(found, quality)
+        quality[changes.artefacts.suspected] |= np.uint8(QualityBit.ARTEFACT)
+        return Assessed(changes, quality)
 
     def _near_edge(self, band_px: int) -> NDArray[np.bool_]:
         """The pixels of the box in the band along the edges of the whole image."""

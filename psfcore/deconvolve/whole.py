@@ -51,12 +51,12 @@ class Options(Conditions):
                 "bad-draws", f"error_draws: expected 0, or 2 to {MOST_DRAWS}; got {self.error_draws}"
             )
         of_method = signature(method_named(self.method)).parameters.values()
-        known = [one.name for one in of_method if one.kind is one.KEYWORD_ONLY]
+        names = [one.name for one in of_method if one.kind is one.KEYWORD_ONLY]
         for name in self.parameters:
-            if name not in known:
+            if name not in names:
                 raise DataError(
                     "unknown-parameter",
-                    f"expected parameters of {self.method}, {', '.join(known)}; got {name!r}",
+                    f"expected parameters of {self.method}, {', '.join(names)}; got {name!r}",
                 )
 
 
@@ -64,7 +64,7 @@ class Options(Conditions):
 class Assessed:
     """The measured changes of a deconvolution, and the quality plane [y, x] (bits of `QualityBit`)."""
 
-    found: Changes
+    changes: Changes
     quality: NDArray[np.uint8]
 
 
@@ -109,7 +109,7 @@ class Work:
         # Most deconvolutions compute no errors, and do not load SciPy.
         from psfcore.deconvolve.assess.error_planes import error_planes, spread_of_results
 
-        told = begin(ERROR_ESTIMATE, draws)
+        progress = begin(ERROR_ESTIMATE, draws)
         planes = error_planes(
             self.image,
             self.psf,
@@ -120,7 +120,7 @@ class Work:
             edge_px=result.edge_band_px,
             threads=self.options.threads,
             # The first run deconvolves the model image without noise.
-            progress=None if told is None else lambda done, of: told(done - 1, of - 1),
+            progress=None if progress is None else lambda done, of: progress(done - 1, of - 1),
         )
         psfs = possible_psfs()
         if not psfs:
@@ -134,7 +134,7 @@ class Work:
         """Measure the changes, and make the quality plane."""
         # At most a quarter of the shorter side is marked as an edge.
         edge_px = min(result.edge_band_px, min(result.pixels.shape) // 4)
-        found = measure_changes(
+        changes = measure_changes(
             self.image,
             result.pixels,
             self.psf,
@@ -146,7 +146,7 @@ class Work:
             self.image,
             result.pixels,
             edge_px=edge_px,
-            suspected=found.artefacts.suspected,
+            suspected=changes.artefacts.suspected,
             error=None if errors is None else errors.error,
         )
-        return Assessed(found, quality)
+        return Assessed(changes, quality)

@@ -11,6 +11,7 @@ from typing import Any
 
 from psfcore.deconvolve import run
 from psfcore.deconvolve.conditions import PreparedPsfs
+from psfcore.deconvolve.doubts import input_warnings
 from psfcore.fits.observation import check_exposure_of_sun, read_observation
 from psfcore.fits.psfs import read_psf
 from psfcore.image import Image
@@ -120,4 +121,4 @@ def _warnings(
     allowed = request.other_channel or context.anew
     warning = deprecated_warning(context.catalogue, row)
     deprecated = {} if warning is None else {CODE: warning}
-    return deprecated | run.input_warnings(psf, image, request.method.name, other_channel=allowed)
+    return deprecated | input_warnings(psf, image, request.method.name, other_channel=allowed)

@@ -227,9 +227,9 @@ def _levels(means: Plane) -> dict[float, tuple[float, float]]:
     """For each tail of p percent: (percentile p, percentile 100 - p) of the block means."""
     if means.size == 0:
         return {}
-    wanted = [level for tail in TAILS_PCT for level in (tail, 100 - tail)]
-    found = [float(level) for level in _levels_of(means, wanted)]
-    return {tail: (found[2 * k], found[2 * k + 1]) for k, tail in enumerate(TAILS_PCT)}
+    percentiles = [level for tail in TAILS_PCT for level in (tail, 100 - tail)]
+    levels = [float(level) for level in _levels_of(means, percentiles)]
+    return {tail: (levels[2 * k], levels[2 * k + 1]) for k, tail in enumerate(TAILS_PCT)}
 
 
 def _structures(blocks: _Blocks) -> list[Structure]:
@@ -286,8 +286,8 @@ def _contrast(means: Plane) -> float | None:
 
 
 def _percentiles(values: Plane) -> dict[str, float]:
-    found = _levels_of(values, CHANGE_PERCENTILES)
-    return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, found, strict=True)}
+    levels = _levels_of(values, CHANGE_PERCENTILES)
+    return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, levels, strict=True)}
 
 
 def _levels_of(values: Plane, percentiles: Sequence[float]) -> NDArray[np.float64]:

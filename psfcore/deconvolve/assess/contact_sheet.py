@@ -254,9 +254,9 @@ def _heading(treated: Sequence[Treated], shown: Sequence[Treated]) -> str:
 def _changes(row: Treated) -> str:
     parts = [] if row.taken is None else [row.taken]
     for kind in ("bright", "dark"):
-        found = row.structure(kind)
-        if found is not None:
-            parts.append(f"{kind} {found['sum_pct']:+.0f} %, up to {found['up_to_pct']:+.0f} %")
+        change = row.structure(kind)
+        if change is not None:
+            parts.append(f"{kind} {change['sum_pct']:+.0f} %, up to {change['up_to_pct']:+.0f} %")
     return "   ".join([*parts, f"flux {row.found.flux_change_pct:+.2f} %"])
 
 
@@ -283,11 +283,11 @@ def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[st
         "to_look_at": sum(row.score >= LOOK_FROM for row in treated),
     }
     for kind in ("bright", "dark"):
-        rows = [found for found in (row.structure(kind) for row in treated) if found is not None]
+        rows = [change for change in (row.structure(kind) for row in treated) if change is not None]
         if rows:
-            ups = [found["up_to_pct"] for found in rows]
+            ups = [change["up_to_pct"] for change in rows]
             out[kind] = {
-                "median_sum_pct": float(np.median([found["sum_pct"] for found in rows])),
+                "median_sum_pct": float(np.median([change["sum_pct"] for change in rows])),
                 "median_up_to_pct": float(np.median(ups)),
                 "extreme_pct": max(ups) if kind == "bright" else min(ups),
             }

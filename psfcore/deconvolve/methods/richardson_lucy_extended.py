@@ -54,11 +54,11 @@ class _Extended(LucyIteration):
         engine = problem.engine
         estimate = light_above_floor(problem)
         share_observed = engine.adjoint(problem.domain.trusted.astype(np.float32))
-        known = share_observed > LEAST_OBSERVED
-        gain = np.where(known, 1 / np.maximum(share_observed, np.float32(LEAST_OBSERVED)), np.float32(0))
+        observed = share_observed > LEAST_OBSERVED
+        gain = np.where(observed, 1 / np.maximum(share_observed, np.float32(LEAST_OBSERVED)), np.float32(0))
         super().__init__(problem, _NO_RATIO, float(estimate.max()))
         self._gain = engine.to_lanes(gain)
-        self.x = engine.to_lanes(np.where(known, estimate, np.float32(0)))
+        self.x = engine.to_lanes(np.where(observed, estimate, np.float32(0)))
         self._correction = np.zeros_like(self.x)
         engine.rows_forward(self.x)
 
