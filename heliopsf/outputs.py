@@ -21,15 +21,15 @@ from heliopsf.psfs import Psf, Shown
 from psfcore.deconvolve.run import Product, UsedPsf, deconvolution_cards, deconvolution_history
 from psfcore.deconvolve.summary import summary_lines
 from psfcore.errors import module_of_extra
-from psfcore.fits.images import CARD_OF_PASS, passes_of
+from psfcore.fits.images import CARD_OF_PASS, STATISTICS, passes_of
 from psfcore.image import Image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Cards with statistics of the input's pixels, and the DOI of an earlier PSF. They are wrong for the result, so they are removed.
-_STATISTICS = re.compile(r"data(min|max|mean|medn|rms|std|skew|kurt|cent|p\d\d)|psfdoi", re.IGNORECASE)
+# Cards that are wrong for the result: statistics of the input, and the DOI of an earlier PSF.
+_REMOVED = re.compile(rf"{STATISTICS}|PSFDOI", re.IGNORECASE)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -164,7 +164,7 @@ def _described(of_image: Any, result: Deconvolution) -> Any:
     meta = copy.deepcopy(of_image)
     used = used_psf(result.psf)
     is_header = isinstance(meta, Header)
-    for key in [key for key in meta if _STATISTICS.fullmatch(str(key))]:
+    for key in [key for key in meta if _REMOVED.fullmatch(str(key))]:
         del meta[key]
     cards = deconvolution_cards(result, used)
     cards[CARD_OF_PASS] = (passes_of(result.image.header) + 1, "deconvolutions of this image, with this one")

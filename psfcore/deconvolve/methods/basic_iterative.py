@@ -31,16 +31,13 @@ from psfcore.compiled import compiled
 from psfcore.convolution.engine import buffer_from_spectrum, spectrum_from_buffer
 from psfcore.convolution.fft_kernels import LANES, forward, inverse
 from psfcore.deconvolve.conditions import Conditions, Deconvolved
-from psfcore.deconvolve.methods.linear import TransferSample, noise_amplification, transfer_sample
-from psfcore.deconvolve.problem import (
-    Iteration,
-    Method,
-    Problem,
-    Stop,
-    first_estimate,
-    pose,
-    relative_change,
+from psfcore.deconvolve.methods.linear import (
+    LinearIteration,
+    TransferSample,
+    noise_amplification,
+    transfer_sample,
 )
+from psfcore.deconvolve.problem import Method, Problem, Stop, pose, relative_change
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import Psf
@@ -65,25 +62,19 @@ def deconvolve(
     return replace(result, noise_amplification=amplification)
 
 
-class _BasicIterative(Iteration):
+class _BasicIterative(LinearIteration):
     """Eq. (1) with one pass over the rows per step: `measure` computes the next estimate, and `update` adopts it."""
 
     def __init__(self, problem: Problem) -> None:
-        domain, engine = problem.domain, problem.engine
-        self._engine, self._judgement = engine, problem.judgement
-        self.x = engine.to_lanes(first_estimate(problem))
+        super().__init__(problem)
         self._next = np.zeros_like(self.x)
-        trusted = np.where(domain.trusted, domain.pixels, np.float32(np.nan))
-        self._observed = engine.to_lanes(trusted, padding=np.nan)
-        self._moved, self._total = np.zeros((2, engine.row_blocks))
-        engine.rows_forward(self.x)
 
     def measure(self) -> None:
-        self._engine.columns(adjoint=False)
-        self._engine.row_stage(
-            _step_rows, self._observed, self.x, self._next, self._moved, self._total, *self._judgement.numbers
+        self.engine.columns(adjoint=False)
+        self.engine.row_stage(
+            _step_rows, self.observed, self.x, self._next, self.moved, self.total, *self.judgement.numbers
         )
-        self.change = relative_change(self._moved.sum(), self._total.sum())
+        self.change = relative_change(self.moved.sum(), self.total.sum())
 
     def update(self, *, last: bool) -> None:
         self.x, self._next = self._next, self.x

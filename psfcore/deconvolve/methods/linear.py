@@ -84,7 +84,20 @@ def inverse_filter(engine: Engine) -> NDArray[np.float32]:
     return g
 
 
-class Additive(Iteration):
+class LinearIteration(Iteration):
+    """What the iterations of linear methods share: x_0 = y, and y without the masked pixels."""
+
+    def __init__(self, problem: Problem) -> None:
+        domain, engine = problem.domain, problem.engine
+        self.engine, self.judgement = engine, problem.judgement
+        self.x = engine.to_lanes(first_estimate(problem))
+        trusted = np.where(domain.trusted, domain.pixels, np.float32(np.nan))
+        self.observed = engine.to_lanes(trusted, padding=np.nan)
+        self.moved, self.total = np.zeros((2, engine.row_blocks))  # sums of (change)^2 and x^2
+        engine.rows_forward(self.x)
+
+
+class Additive(LinearIteration):
     """The iteration of Eq. (1).
 
     step_filter: G, divided by `engine.transfer_scale`, in the layout of `engine.transfer`. A constant G is
@@ -92,23 +105,17 @@ class Additive(Iteration):
     """
 
     def __init__(self, problem: Problem, step_filter: NDArray[np.float32]) -> None:
-        domain, engine = problem.domain, problem.engine
-        self._engine, self._judgement = engine, problem.judgement
+        super().__init__(problem)
         self._step_filter = step_filter
-        self.x = engine.to_lanes(first_estimate(problem))
-        trusted = np.where(domain.trusted, domain.pixels, np.float32(np.nan))
-        self._observed = engine.to_lanes(trusted, padding=np.nan)
-        self._moved, self._total = np.zeros((2, engine.row_blocks))
-        engine.rows_forward(self.x)
 
     def measure(self) -> None:
-        self._engine.columns(adjoint=False)
-        self._engine.row_stage(_residual_rows, self._observed, *self._judgement.numbers)
+        self.engine.columns(adjoint=False)
+        self.engine.row_stage(_residual_rows, self.observed, *self.judgement.numbers)
 
     def update(self, *, last: bool) -> None:
-        self._engine.multiply_columns(self._step_filter)
-        self._engine.row_stage(_add_rows, self.x, not last, self._moved, self._total)
-        self.change = relative_change(self._moved.sum(), self._total.sum())
+        self.engine.multiply_columns(self._step_filter)
+        self.engine.row_stage(_add_rows, self.x, not last, self.moved, self.total)
+        self.change = relative_change(self.moved.sum(), self.total.sum())
 
 
 @dataclass(frozen=True, eq=False)
