@@ -32,7 +32,8 @@ from astropy.io import fits
 from benchmarks.figures import tell
 from psfcore.build import build_psf
 from psfcore.deconvolve.conditions import PreparedPsfs
-from psfcore.deconvolve.run import Options, deconvolve
+from psfcore.deconvolve.run import deconvolve
+from psfcore.deconvolve.whole import Options
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.observation import read_observation
 from psfcore.fits.psfs import read_psf, write_psf
@@ -169,7 +170,8 @@ def bare(archive: Path, psf: Path, steps: int, processes: int, images: int) -> f
 def bare_process(archive: str, psf_file: str, steps: int, images: int) -> None:
     """Do the part of a worker's task that psfcore does: read an image, deconvolve it and measure the changes."""
     psf = read_psf(psf_file, LIMITS, parts=False)
-    prepared, options = PreparedPsfs(), Options(parameters={"steps": steps})
+    prepared = PreparedPsfs()
+    options = Options(parameters={"steps": steps}, engine_for=prepared.engine_for)
     paths = sorted(Path(archive).iterdir())[: images + 1]
     started = 0.0
     for number, path in enumerate(paths):
@@ -177,7 +179,7 @@ def bare_process(archive: str, psf_file: str, steps: int, images: int) -> None:
             started = time.perf_counter()
         image = read_observation(path, LIMITS)
         fitted = prepared.on_pixels_of(image.header, psf_file, lambda: psf)
-        product = deconvolve(image, fitted, options, warnings={}, engine_for=prepared.engine_for)
+        product = deconvolve(image, fitted, options, warnings={})
         assert product.assessed.quality.shape == image.pixels.shape
     print(time.perf_counter() - started)
 

@@ -33,9 +33,8 @@ from benchmarks.timing import THREADS, reference, seconds
 from psfcore.build import build_psf
 from psfcore.convolution.fft_kernels import LANES
 from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
-from psfcore.deconvolve.lucy_ratio import _ratio_rows
 from psfcore.deconvolve.methods.registry import method_named
-from psfcore.deconvolve.methods.richardson_lucy import EDGES, MARGIN_SHARE, _RichardsonLucy, _update_rows
+from psfcore.deconvolve.methods.richardson_lucy import METHOD, _ratio_rows, _RichardsonLucy, _update_rows
 from psfcore.deconvolve.problem import pose
 from psfcore.image import Image
 from psfcore.instruments.model import load_instrument
@@ -78,7 +77,7 @@ def transforms(length: int, count: float) -> float:
 
 def stages(iteration: _RichardsonLucy) -> list[Stage]:
     """The stages of a step, in the order in which the step runs them."""
-    engine, ratio = iteration._engine, iteration._ratio
+    engine, judged = iteration.engine, iteration.judgement.numbers
     pixels = math.prod(engine.lanes_shape)
     plane, spectrum, transfer = 4.0 * pixels, float(engine._spectrum.nbytes), float(engine.transfer.nbytes)
     columns, ly = engine.column_blocks * LANES, engine.column_plan.length
@@ -86,16 +85,15 @@ def stages(iteration: _RichardsonLucy) -> list[Stage]:
     of_columns = 2 * transforms(ly, columns) + multiplied
     # Each complex transform contains two real rows.
     of_rows = 2 * transforms(engine.row_plan.length, engine.row_blocks * LANES)
-    judged = ratio.judgement.numbers
     return [
         Stage("columns, transfer function", 2 * spectrum + transfer, of_columns,
               lambda: engine.columns(adjoint=False)),
         Stage("rows, ratio", 2 * spectrum + plane, of_rows + RATIO_FLOPS * pixels,
-              lambda: engine.row_stage(_ratio_rows, ratio._light_or_agreed, ratio.floor, *judged)),
+              lambda: engine.row_stage(_ratio_rows, iteration._light_or_agreed, iteration.floor, *judged)),
         Stage("columns, its conjugate", 2 * spectrum + transfer, of_columns,
               lambda: engine.columns(adjoint=True)),
         Stage("rows, update", 2 * spectrum + 2 * plane, of_rows + UPDATE_FLOPS * pixels,
-              lambda: engine.row_stage(_update_rows, iteration.x, iteration._dark, True, iteration._moved, iteration._total)),
+              lambda: engine.row_stage(_update_rows, iteration.x, iteration.dark, True, iteration._moved, iteration._total)),
     ]  # fmt: skip
 
 
@@ -112,7 +110,7 @@ def main() -> None:
     f_s, moved, computed = reference(), bandwidth(), rate()
     print(f"1 F = {f_s:.3f} s, {THREADS} threads, image of {size} px")
     print(f"limits: {moved / 1e9:.1f} GB/s, {computed / 1e9:.0f} Gflop/s")
-    problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=1, stop="fixed")
+    problem = pose(METHOD, image, psf, conditions, steps=1, stop="fixed")
     found = stages(_RichardsonLucy(problem))
     times = np.array([[seconds(stage.run) for stage in found] for _ in range(REPEATS)]).min(axis=0)
     floors = np.array([max(stage.bytes / moved, stage.operations / computed) for stage in found])

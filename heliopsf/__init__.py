@@ -59,9 +59,9 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'heliopsf' has no attribute {name!r}")
     from psfcore.errors import module_of_extra
 
-    found = getattr(module_of_extra(_MODULE_OF[name]), name)
-    globals()[name] = found
-    return found
+    value = getattr(module_of_extra(_MODULE_OF[name]), name)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

@@ -16,15 +16,16 @@ from numpy.typing import NDArray
 
 from heliopsf.inputs import box_of, cut, header_of, image_of, is_many, is_sequence, shape_of, uncertainty_of
 from heliopsf.outputs import Deconvolution, in_form_of
-from heliopsf.progress import Steps, Told, told
+from heliopsf.parameters import NoiseFigures, Number, Progress, Steps, noise_of, number, reporter, whole
 from heliopsf.psfs import AnyPsf, Psf, built_psf, given_psf
-from heliopsf.quantities import NoiseFigures, Number, noise_of, number, whole
 from psfcore.deconvolve.box import LARGEST_ERROR
 from psfcore.deconvolve.camera_noise import measured_noise
 from psfcore.deconvolve.conditions import PreparedPsfs
+from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.methods.registry import may_be_negative
-from psfcore.deconvolve.run import BUILDING, DECONVOLVING, Options, input_warnings, read_and_deconvolve
+from psfcore.deconvolve.methods.registry import properties_of
+from psfcore.deconvolve.run import BUILDING, DECONVOLVING, read_and_deconvolve
+from psfcore.deconvolve.whole import Options
 from psfcore.errors import DataError, DataWarning
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import seen_by
@@ -73,7 +74,7 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
     again: bool = False,
     full: bool = False,
     threads: int | None = None,
-    progress: Told = None,
+    progress: Progress = None,
 ) -> Any:
     """Deconvolve an image with the PSF of its telescope. The result has the form of the image.
 
@@ -183,7 +184,7 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
     )
 
     def begin(stage: str, _steps: int) -> Steps | None:
-        return told(progress if stage == DECONVOLVING else progress is True, stage)
+        return reporter(progress if stage == DECONVOLVING else progress is True, stage)
 
     prepared = PreparedPsfs()
     given = None if psf is None else given_psf(psf, threads=options.threads, progress=begin(BUILDING, 1))
@@ -232,7 +233,7 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
     return type(smap)(*results) if is_sequence(smap) and not full else results
 
 
-def psf_for(image: Any, *, threads: int | None = None, progress: Told = None) -> Psf:
+def psf_for(image: Any, *, threads: int | None = None, progress: Progress = None) -> Psf:
     """The PSF for an image, on the pixels of the image. A service without certified PSFs chooses the same PSF.
 
     The first call for a telescope takes up to a minute; the PSF is then kept in a cache (see ``heliopsf cache``).
@@ -250,7 +251,7 @@ def psf_for(image: Any, *, threads: int | None = None, progress: Told = None) ->
         "no-psf-for-instrument", "channel-mismatch" or "plate-scale-mismatch".
     """
     header = header_of(image)
-    psf = _built_for(header, told(progress is True, BUILDING), threads=threads or cores(), parts=True)
+    psf = _built_for(header, reporter(progress is True, BUILDING), threads=threads or cores(), parts=True)
     for code, message in input_warnings(psf, _header_only(header), None, other_channel=False).items():
         warnings.warn(DataWarning(code, message), stacklevel=2)
     return Psf.of(psf_for_image(psf, header))
@@ -280,7 +281,7 @@ def _clipped(image: Image, *, clip_negative: bool | None, method: str) -> Image:
         return image
     if clip_negative:
         return replace(image, pixels=np.where(negative, 0.0, image.pixels))
-    if not may_be_negative(method):
+    if not properties_of(method).may_be_negative:
         raise DataError(
             "negative-pixels",
             f"clip_negative=False: expected an image without negative pixels, or a method whose results may be negative "

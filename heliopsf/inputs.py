@@ -19,10 +19,11 @@ from astropy.io import fits
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
-from heliopsf.psfs import LIMITS, existing_file
-from heliopsf.quantities import saturation_dn
+from heliopsf.parameters import COUNTS, level_dn
+from heliopsf.psfs import existing_file
 from psfcore.deconvolve.box import Box
 from psfcore.errors import DataError, DataWarning
+from psfcore.fits.blocks import LIMITS
 from psfcore.fits.cards import card_trouble
 from psfcore.fits.header import first_image_header, read_summary
 from psfcore.fits.observation import observation_of, read_observation
@@ -30,7 +31,6 @@ from psfcore.fits.viewing.regions import moved_header
 from psfcore.image import Image
 
 _EXPECTED = "a sunpy Map, an NDData or CCDData, an array, an HDU or HDUList, a path of a FITS file, or a list of these"
-_RATE, _COUNT = "DN/s", "DN"
 _HDUS = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
 
 
@@ -83,7 +83,7 @@ def image_of(image: Any, *, saturation: Any, hdu: int | None = None) -> Image:
     """
     if isinstance(image, Image):
         return image
-    level = saturation_dn(saturation, {} if saturation is None else header_of(image, hdu))
+    level = level_dn(saturation, {} if saturation is None else header_of(image, hdu))
     if isinstance(image, str | Path):
         return read_observation(image, LIMITS, saturation_dn=level, hdu=hdu)
     parts = _parts_of(image, hdu)
@@ -107,9 +107,11 @@ def uncertainty_of(image: Any) -> NDArray[np.float64] | None:
     from astropy.nddata import StdDevUncertainty
 
     try:
-        found = uncertainty.represent_as(StdDevUncertainty)
+        deviation = uncertainty.represent_as(StdDevUncertainty)
         unit = image.unit or units.dimensionless_unscaled
-        return np.asarray(units.Quantity(found.array, found.unit or unit).to_value(unit), dtype=np.float64)
+        return np.asarray(
+            units.Quantity(deviation.array, deviation.unit or unit).to_value(unit), dtype=np.float64
+        )
     except (TypeError, units.UnitsError) as error:
         message = (
             f"the uncertainty of the image is not used: expected a standard deviation or variance; {error}"
@@ -148,13 +150,13 @@ def header_of(image: Any, hdu: int | None = None) -> Header:
 def hdu_of(hdus: fits.HDUList, number: int | None = None) -> Any:
     """The HDU with this number, or the first one with an image of two axes. Raises ``DataError`` "no-image"."""
     with_image = [n for n, one in enumerate(hdus) if is_hdu(one) and len(one.shape) == 2]
-    wanted = with_image[:1] if number is None else [n for n in with_image if n == number]
-    if not wanted:
+    numbers = with_image[:1] if number is None else [n for n in with_image if n == number]
+    if not numbers:
         raise DataError(
             "no-image",
             f"expected an HDU with an image of two axes; got {len(hdus)} HDUs, images in {with_image}",
         )
-    return hdus[wanted[0]]
+    return hdus[numbers[0]]
 
 
 def _parts_of(image: Any, hdu: int | None = None) -> _Parts:
@@ -168,13 +170,13 @@ def _parts_of(image: Any, hdu: int | None = None) -> _Parts:
         header = _header(image.meta)
         if not is_map(image):
             _add_coordinates(header, image.wcs)
-        found = _Parts(image.data, header, image.mask, image.uncertainty)
+        parts = _Parts(image.data, header, image.mask, image.uncertainty)
     elif isinstance(image, np.ndarray):
         plain = getattr(image, "unmasked", image)
         plain = plain.value if isinstance(plain, units.Quantity) else plain
-        found = _Parts(np.asarray(plain), header, getattr(image, "mask", None))
+        parts = _Parts(np.asarray(plain), header, getattr(image, "mask", None))
     elif _is_of(image, "dask.array", "Array"):
-        found = _Parts(image, header)
+        parts = _Parts(image, header)
     else:
         raise DataError("bad-input", f"expected {_EXPECTED}; got {type(image).__name__}")
     if "BUNIT" in header:
@@ -182,7 +184,7 @@ def _parts_of(image: Any, hdu: int | None = None) -> _Parts:
             unit_text(unit)  # refuses logarithmic units
     elif (text := unit_text(unit)) is not None:
         header["BUNIT"] = text
-    return found
+    return parts
 
 
 def _computed(data: Any) -> NDArray[Any]:
@@ -206,11 +208,11 @@ def unit_text(unit: Any) -> str | None:
             "the pixels first",
         )
     pixel_free = unit * units.pix if units.pix in getattr(unit, "bases", ()) else unit
-    for count in (units.DN, units.adu, units.ct):
+    for count in COUNTS:
         if pixel_free == count:
-            return _COUNT
+            return "DN"
         if pixel_free == count / units.s:
-            return _RATE
+            return "DN/s"
     return str(unit) or None
 
 

@@ -17,20 +17,19 @@ from astropy.utils.masked import Masked
 from numpy.typing import NDArray
 
 from heliopsf.inputs import hdu_of, is_hdu, is_map, is_nddata
-from heliopsf.psfs import Psf
-from heliopsf.shown import Shown
+from heliopsf.psfs import Psf, Shown
 from psfcore.deconvolve.run import Product, UsedPsf, deconvolution_cards, deconvolution_history
 from psfcore.deconvolve.summary import summary_lines
 from psfcore.errors import module_of_extra
-from psfcore.fits.images import CARD_OF_PASS, passes_of
+from psfcore.fits.images import CARD_OF_PASS, STATISTICS, passes_of
 from psfcore.image import Image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Cards with statistics of the input's pixels, and the DOI of an earlier PSF. They are wrong for the result, so they are removed.
-_STATISTICS = re.compile(r"data(min|max|mean|medn|rms|std|skew|kurt|cent|p\d\d)|psfdoi", re.IGNORECASE)
+# Cards that are wrong for the result: statistics of the input, and the DOI of an earlier PSF.
+_REMOVED = re.compile(rf"{STATISTICS}|PSFDOI", re.IGNORECASE)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -65,14 +64,14 @@ class Deconvolution(Shown, Product):
     @property
     def changes(self) -> dict[str, Any]:
         """What the deconvolution changed: flux, bright and dark structures, signs of artefacts."""
-        return self.assessed.found.as_json()
+        return self.assessed.changes.as_json()
 
     def lines(self) -> list[str]:
         """The result in two lines: image, PSF and its doubts; and what changed."""
         ny, nx = self.pixels.shape
-        told = summary_lines(self.details())
+        first, *others = summary_lines(self.details())
         warned = f"; warnings: {', '.join(self.warnings)}" if self.warnings else ""
-        return [f"Deconvolution of {told[0]}", f"{nx} x {ny} px, {'; '.join(told[1:])}{warned}"]
+        return [f"Deconvolution of {first}", f"{nx} x {ny} px, {'; '.join(others)}{warned}"]
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the deconvolved image. Needs the extra "plot". axes None: new axes."""
@@ -127,10 +126,10 @@ def used_psf(psf: Psf) -> UsedPsf:
 
 def _as_map(image: Any, result: Deconvolution) -> Any:
     meta = _described(image.meta, result)
-    made = type(image)(result.pixels, meta, mask=_mask(image, result), uncertainty=_uncertainty(result))
+    smap = type(image)(result.pixels, meta, mask=_mask(image, result), uncertainty=_uncertainty(result))
     # The settings are set last, because the class of a Map may choose other settings for a new Map.
-    made.plot_settings.update(copy.deepcopy(image.plot_settings))
-    return made
+    smap.plot_settings.update(copy.deepcopy(image.plot_settings))
+    return smap
 
 
 def _as_nddata(image: Any, result: Deconvolution) -> Any:
@@ -165,7 +164,7 @@ def _described(of_image: Any, result: Deconvolution) -> Any:
     meta = copy.deepcopy(of_image)
     used = used_psf(result.psf)
     is_header = isinstance(meta, Header)
-    for key in [key for key in meta if _STATISTICS.fullmatch(str(key))]:
+    for key in [key for key in meta if _REMOVED.fullmatch(str(key))]:
         del meta[key]
     cards = deconvolution_cards(result, used)
     cards[CARD_OF_PASS] = (passes_of(result.image.header) + 1, "deconvolutions of this image, with this one")

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import fields, replace
 from datetime import datetime
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from astropy import units
 
-from heliopsf.progress import Steps, Told, told
-from heliopsf.quantities import radii_px, whole
-from heliopsf.shown import Shown
+from heliopsf.parameters import Progress, Steps, radii_px, reporter, whole
 from psfcore.deconvolve.run import BUILDING
-from psfcore.errors import DataError, did_you_mean, module_of_extra
+from psfcore.errors import DataError, MissingExtra, did_you_mean, module_of_extra
 from psfcore.fits import psfs
 from psfcore.fits.blocks import LIMITS
 from psfcore.fits.header import utc_time
@@ -39,6 +39,30 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 AnyPsf: TypeAlias = "str | Path | CorePsf | NDArray[np.floating]"
+
+
+class Shown:
+    """A result that shows itself at a prompt and in a notebook: two lines, and its picture."""
+
+    def lines(self) -> list[str]:
+        """The result in two lines."""
+        raise NotImplementedError
+
+    def quicklook(self) -> Figure:
+        """The picture. Needs the extra "plot"."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return "\n".join(self.lines())
+
+    def _repr_html_(self) -> str:
+        text = "<br>".join(map(escape, self.lines()))
+        try:
+            png: bytes = module_of_extra("psfcore.drawing.plots").png_of(self.quicklook())
+        except MissingExtra as missing:
+            return f"<p>{text}<br>{escape(str(missing))}</p>"
+        data = base64.b64encode(png).decode("ascii")
+        return f'<p>{text}</p><img style="max-width: 100%" alt="" src="data:image/png;base64,{data}">'
 
 
 class Psf(Shown, CorePsf):
@@ -79,9 +103,9 @@ class Psf(Shown, CorePsf):
 
     def lines(self) -> list[str]:
         """The PSF in two lines: which it is, and where its light is."""
-        told = [self.instrument or "instrument unknown"]
-        told += [f"{self.wavelength_angstrom:g} angstrom"] if self.wavelength_angstrom else []
-        told += [f"{self.plate_scale_arcsec:.4g} arcsec/px"] if self.plate_scale_arcsec else []
+        origin = [self.instrument or "instrument unknown"]
+        origin += [f"{self.wavelength_angstrom:g} angstrom"] if self.wavelength_angstrom else []
+        origin += [f"{self.plate_scale_arcsec:.4g} arcsec/px"] if self.plate_scale_arcsec else []
         radii = [radius for radius in (1, 10, 100) if radius < self.reach_px]
         beyond = ", ".join(
             f"{pct:.3g} % beyond {radius} px"
@@ -89,7 +113,7 @@ class Psf(Shown, CorePsf):
         )
         ny, nx = self.kernel.shape
         return [
-            f"PSF {self.name} {self.version} ({self.status}): {', '.join(told)}",
+            f"PSF {self.name} {self.version} ({self.status}): {', '.join(origin)}",
             f"{nx} x {ny} px, central pixel {self.kernel.max():.3g}, {beyond}; components: "
             f"{', '.join(self.components).lower() or 'none'}",
         ]
@@ -106,7 +130,7 @@ def build_psf(
     size: int = 2048,
     component: str | None = None,
     threads: int | None = None,
-    progress: Told = None,
+    progress: Progress = None,
 ) -> Psf:
     """Compute the PSF of an instrument.
 
@@ -142,7 +166,7 @@ def build_psf(
         size=whole("size", size, "bad-size", units.pix),
         component=component,
         threads=threads,
-        progress=told(progress, BUILDING),
+        progress=reporter(progress, BUILDING),
     )
 
 
@@ -193,12 +217,12 @@ def built_psf(
     """As ``build_psf``. turn_deg: for images of a known instrument that are turned by this angle against its detector. parts:
     False: without the components, which a deconvolution does not need."""
     if not isinstance(instrument, str | Path):
-        known_names = ", ".join(instrument_names())
+        names = ", ".join(instrument_names())
         raise DataError(
             "unknown-instrument",
-            f"expected the name of an instrument ({known_names}) or its file; got {instrument!r:.80}",
+            f"expected the name of an instrument ({names}) or its file; got {instrument!r:.80}",
         )
-    known = load_instrument(instrument)
+    description = load_instrument(instrument)
     own = isinstance(instrument, Path) or instrument.endswith(".toml")
     text = (
         turned_text(str(instrument), turn_deg)
@@ -206,8 +230,8 @@ def built_psf(
         else read_instrument_text(Path(instrument) if own else instrument_path(str(instrument)))
     )
     mask, mask_id = None, None
-    if known.mount is not None and known.mount.mask_image is not None:
-        file = Path(instrument).parent / known.mount.mask_image.file
+    if description.mount is not None and description.mount.mask_image is not None:
+        file = Path(instrument).parent / description.mount.mask_image.file
         mask, mask_id = read_mask_image(file), sha256_of(file)
     recipe = Recipe(
         text=text,

@@ -6,12 +6,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from heliopsf.progress import Stages, told_stages
-from heliopsf.psfs import LIMITS, Psf, build_psf
-from heliopsf.quantities import NoiseFigures, Number, noise_of
-from heliopsf.quantities import saturation_dn as saturation_dn_of
+from heliopsf.parameters import NoiseFigures, Number, Stages, level_dn, noise_of, stage_reporter
+from heliopsf.psfs import Psf, build_psf
 from psfcore.build import check_known
 from psfcore.errors import module_of_extra
+from psfcore.fits.blocks import LIMITS
 from psfcore.gap import diagnose
 from psfcore.gap.report.report import gap_report
 from psfcore.gap.verdict.calibration import COVERAGE
@@ -115,9 +114,14 @@ def fit_scatter(
         For example "no-manifest" or "too-few-frames".
     """
     threads = threads or cores()
-    fitted = _read(transit, noise, saturation_dn, threads)
-    found = fit_transit(fitted, shape=shape, seed=seed, threads=threads, progress=told_stages(progress))
-    return ScatterFit(**{one.name: getattr(found, one.name) for one in fields(TransitFit)})
+    fit = fit_transit(
+        _read(transit, noise, saturation_dn, threads),
+        shape=shape,
+        seed=seed,
+        threads=threads,
+        progress=stage_reporter(progress),
+    )
+    return ScatterFit(**{one.name: getattr(fit, one.name) for one in fields(TransitFit)})
 
 
 def diagnose_gap(
@@ -145,14 +149,14 @@ def diagnose_gap(
         Its ``report()`` is the report (JSON).
     """
     threads = threads or cores()
-    found = diagnose.diagnose(
+    diagnosis = diagnose.diagnose(
         _read(transit, noise, saturation_dn, threads),
         coverage=coverage,
         seed=seed,
         threads=threads,
-        progress=told_stages(progress),
+        progress=stage_reporter(progress),
     )
-    return GapDiagnosis(**{one.name: getattr(found, one.name) for one in fields(diagnose.Diagnosis)})
+    return GapDiagnosis(**{one.name: getattr(diagnosis, one.name) for one in fields(diagnose.Diagnosis)})
 
 
 def _read(transit: str | Path, noise: NoiseFigures | None, level: Number | None, threads: int) -> Transit:
@@ -164,5 +168,5 @@ def _read(transit: str | Path, noise: NoiseFigures | None, level: Number | None,
         LIMITS,
         diffraction=diffraction,
         noise=noise_of(noise),
-        saturation_dn=saturation_dn_of(level, {}),
+        saturation_dn=level_dn(level, {}),
     )

@@ -86,7 +86,7 @@ FAULTS = (
     Fault("deconvolve-edge-share-counts-own-pixel", "psfcore/deconvolve/edges.py",
           "beyond = line[centre + 1 :]", "beyond = line[centre:]",
           ("tests/psfcore/deconvolve/test_deconvolve.py",), ("tests/psfcore/deconvolve",)),
-    Fault("deconvolve-read-noise-not-squared", "psfcore/deconvolve/stopping.py",
+    Fault("deconvolve-read-noise-not-squared", "psfcore/deconvolve/problem.py",
           "np.float32((read_noise / domain.scale) ** 2)", "np.float32(read_noise / domain.scale)",
           ("tests/psfcore/deconvolve/test_deconvolve.py",), ("tests/psfcore/deconvolve",)),
     Fault("deconvolve-same-noise-in-every-draw", "psfcore/deconvolve/assess/error_planes.py",

@@ -10,6 +10,7 @@ All light is in percent of the mean light of the box.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 import numpy as np
 from astropy.io.fits import Header
@@ -17,9 +18,9 @@ from scipy.ndimage import uniform_filter
 
 import heliopsf
 from psfcore.deconvolve.box import Box
-from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
+from psfcore.deconvolve.conditions import PreparedPsfs
 from psfcore.deconvolve.region import box_work
-from psfcore.deconvolve.whole import Work
+from psfcore.deconvolve.whole import Options, Work
 from psfcore.image import Image
 from psfcore.simulate.observe import observe
 from psfcore.simulate.scene import solar_scene
@@ -60,12 +61,12 @@ def main() -> None:
         )
         image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN", 1.0)
         for method in METHODS:
-            work = Work(image, psf, method, Conditions(threads=cores(), engine_for=PreparedPsfs().engine_for))
-            whole = work.run().pixels
+            options = Options(method=method, threads=cores(), engine_for=PreparedPsfs().engine_for)
+            whole = Work(image, psf, options).run().pixels
             for name, box in boxes(image).items():
                 mean = image.pixels[box.slices].mean() / 100
                 for error in ERRORS:
-                    alone = box_work(work, box, largest_error=error)
+                    alone = box_work(Work(image, psf, replace(options, region_error=error)), box)
                     what = f"{instrument} {method} {name}"
                     if alone.error == 0:
                         print(f"{what:<46} for {100 * error:g} %: whole image")

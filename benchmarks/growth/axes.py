@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks.figures import tell
-from psfcore.deconvolve.memory import Asked, deconvolution_bytes
+from psfcore.deconvolve.memory import Demand, deconvolution_bytes
 from workers.machine import free_bytes
 
 QUESTION_ROUNDS = 40
@@ -69,7 +69,7 @@ def _upto(most: float, values: tuple[int, ...]) -> list[int]:
 def image_size(quick: bool, most: float) -> Iterator[Point]:
     """Images of 256 to 8192 px. The largest one is left out if it does not fit into the free memory."""
     for size in _upto(most, (256, 512, 1024, 2048) if quick else (256, 512, 1024, 2048, 4096, 8192)):
-        needed = deconvolution_bytes(Asked("richardson-lucy", (size, size), (2048, 2048)))
+        needed = deconvolution_bytes(Demand("richardson-lucy", (size, size), (2048, 2048)))
         if needed > free_bytes():
             print(f"left out: {size} px need {needed / 2**20:.0f} MiB, more than the free memory")
             continue

@@ -14,7 +14,7 @@ import numpy as np
 
 import heliopsf
 from benchmarks.timing import THREADS, memory_bytes, seconds
-from psfcore.deconvolve.memory import Asked, deconvolution_bytes
+from psfcore.deconvolve.memory import Demand, deconvolution_bytes
 from psfcore.psf import central_part
 from psfcore.scatter.fit import fit_transit
 from psfcore.simulate.plan import default_plan
@@ -33,7 +33,7 @@ def deconvolution(case: dict[str, Any]) -> dict[str, Any]:
     psf = heliopsf.build_psf("hri_euv")
     if "psf" in case:
         psf = heliopsf.Psf.of(central_part(psf, case["psf"]))
-    asked = Asked(method, (size, size), (psf.kernel.shape[0], psf.kernel.shape[1]))
+    asked = Demand(method, (size, size), (psf.kernel.shape[0], psf.kernel.shape[1]))
     pixels = np.random.default_rng(0).gamma(2.0, 400.0, (size, size))
 
     def deconvolve(part: Any, iterations: int) -> Any:

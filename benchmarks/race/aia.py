@@ -191,12 +191,14 @@ def own_psf(channel: int, folder: Path) -> dict[str, Any]:
 def by_heliopsf(image: Kernel, kernel: Kernel) -> Kernel:
     from astropy.io.fits import Header
 
-    from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
+    from psfcore.deconvolve.conditions import Conditions
+    from psfcore.deconvolve.methods.richardson_lucy import deconvolve
     from psfcore.image import Image
     from psfcore.psf import Psf
 
     observed = Image(image, np.zeros(image.shape, np.uint8), Header(), "DN", 1.0)
-    return richardson_lucy(observed, Psf(kernel, "bench", "1", None, "draft"), steps=STEPS).pixels
+    psf = Psf(kernel, "bench", "1", None, "draft")
+    return deconvolve(observed, psf, Conditions(edges="zero"), steps=STEPS).pixels
 
 
 def inner(pixels: Kernel) -> Kernel:

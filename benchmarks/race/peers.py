@@ -60,13 +60,14 @@ Loop = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
 def heliopsf(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
     from astropy.io.fits import Header
 
-    from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
+    from psfcore.deconvolve.conditions import Conditions
+    from psfcore.deconvolve.methods.richardson_lucy import deconvolve
     from psfcore.image import Image
     from psfcore.psf import Psf
 
     observed = Image(image.astype(float), np.zeros(image.shape, np.uint8), Header(), "DN/s", 1.0)
     kernel = Psf(psf.astype(float), "bench", "1", None, "draft", None, None)
-    return richardson_lucy(observed, kernel, steps=steps, threads=THREADS).pixels
+    return deconvolve(observed, kernel, Conditions(edges="zero", threads=THREADS), steps=steps).pixels
 
 
 def plain_steps(

@@ -73,10 +73,10 @@ class CameraNoise(Noise):
 
     def __str__(self) -> str:
         figures = (self.photon_gain_dn, self.read_noise_dn)
-        told = [f"{value:.4g}" for value in figures]
+        texts = [f"{value:.4g}" for value in figures]
         if self.sigma is not None:
-            told = [f"{value:.3g} +- {error:.1g}" for value, error in zip(figures, self.sigma, strict=True)]
-        return f"photon gain {told[0]} DN, read noise {told[1]} DN, {self.source} ({self.basis})"
+            texts = [f"{value:.3g} +- {error:.1g}" for value, error in zip(figures, self.sigma, strict=True)]
+        return f"photon gain {texts[0]} DN, read noise {texts[1]} DN, {self.source} ({self.basis})"
 
     def as_json(self) -> dict[str, Any]:
         """The figures and their source."""

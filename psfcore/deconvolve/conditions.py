@@ -34,9 +34,9 @@ def new_engine(psf: Psf, shape: Shape, span: Shape, threads: int) -> Engine:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Options of a deconvolution. Raises DataError "bad-margin" for a negative margin.
+    """Options that all methods have. Raises DataError "bad-margin" for a negative margin.
 
-    edges: assumption about the scene beyond the field; None: the default of the method, EDGES.
+    edges: assumption about the scene beyond the field; None: the default of the method.
     margin_px: width of the margin beyond the field; None: the width is computed from the PSF. Edges "zero" have no
     margin. noise: noise of the camera; required if the stopping rule is "discrepancy".
     threads: number of threads; it does not change the result.
@@ -82,7 +82,7 @@ class Deconvolved:
     edge_band_px: width of the band along the edges in which the result depends on light from beyond the field.
     noise_amplification: rms noise of the estimate divided by the rms noise of the image, for uncorrelated noise; None if
     the method is not linear. chi2_per_pixel: chi2 of the fit divided by the number of judged pixels
-    (`psfcore.deconvolve.stopping`); None if the noise is not known. of_box: how the box was deconvolved, if the result is a
+    (`psfcore.deconvolve.problem`); None if the noise is not known. of_box: how the box was deconvolved, if the result is a
     box of an image; None for a whole image.
     """
 

@@ -111,21 +111,19 @@ def share_from_beyond(psf: Psf) -> NDArray[np.float64]:
     return np.asarray(shares.mean(axis=0)[: max(ny, nx) // 2 + 1])  # Eq. (1)
 
 
-def edge_band_px(psf: Psf, fraction: float = FLAGGED_SHARE) -> int:
+def band_px(shares: NDArray[np.float64], fraction: float) -> int:
     """Width of the band along an edge in which more than `fraction` of a pixel's light comes from beyond the edge.
 
-    The width holds for a uniform scene.
-
-    Raises DataError "bad-fraction".
+    shares: b of Eq. (1). The width holds for a uniform scene.
     """
-    if not 0 < fraction < 1:
-        raise DataError("bad-fraction", f"expected a fraction between 0 and 1; got {fraction}")
-    return band_px(share_from_beyond(psf), fraction)
-
-
-def band_px(shares: NDArray[np.float64], fraction: float) -> int:
-    """As `edge_band_px`, but from `shares`, which is b of Eq. (1). To compute b, the whole PSF must be read."""
     return int(np.count_nonzero(shares > fraction))
+
+
+def inside_band(shape: tuple[int, ...], band_px: int) -> Trust:
+    """True for the pixels [y, x] that are not in a band of this width along the edges."""
+    inside = np.zeros(shape, np.bool_)
+    inside[band_px : shape[0] - band_px, band_px : shape[1] - band_px] = True
+    return inside
 
 
 def margin_for(shares: NDArray[np.float64], field_shape: tuple[int, int], *, share: float) -> int:
@@ -135,8 +133,8 @@ def margin_for(shares: NDArray[np.float64], field_shape: tuple[int, int], *, sha
     the width of the field.
     """
     half_block = BLOCK_ROWS // 2
-    wanted = half_block * -(-band_px(shares, share) // half_block)
-    return min(wanted, min(field_shape) // 2)
+    width = half_block * -(-band_px(shares, share) // half_block)
+    return min(width, min(field_shape) // 2)
 
 
 def lay_out(image: Image, *, edges: Edges, margin_px: int) -> Domain:

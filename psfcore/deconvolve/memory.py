@@ -57,7 +57,7 @@ Figure = TypeVar("Figure", float, tuple[float, float])
 
 
 @dataclass(frozen=True)
-class Asked:
+class Demand:
     """A deconvolution: the method, the shapes (ny, nx) of image and PSF, and the options that determine its memory.
 
     edges, margin_px: None: the default of the method. draws: number of noise realisations.
@@ -98,22 +98,22 @@ class Asked:
         return _length(ny), _length(nx)
 
 
-def deconvolution_bytes(asked: Asked) -> float:
+def deconvolution_bytes(demand: Demand) -> float:
     """Eq. (1): the memory of a deconvolution, with its image, its PSF and its result, in bytes."""
-    image_bytes = IMAGE_BYTES + (ERRORS_BYTES if asked.draws else 0.0)
-    plane_bytes, transform_bytes = of_method(WORKING_BYTES, asked.method)
+    image_bytes = IMAGE_BYTES + (ERRORS_BYTES if demand.draws else 0.0)
+    plane_bytes, transform_bytes = of_method(WORKING_BYTES, demand.method)
     return (
-        plane_bytes * math.prod(asked.plane)
-        + transform_bytes * math.prod(asked.transform)
-        + image_bytes * math.prod(asked.image)
-        + PSF_BYTES * math.prod(asked.psf)
+        plane_bytes * math.prod(demand.plane)
+        + transform_bytes * math.prod(demand.transform)
+        + image_bytes * math.prod(demand.image)
+        + PSF_BYTES * math.prod(demand.psf)
     )
 
 
-def product_bytes(asked: Asked, image_px: int) -> float:
+def product_bytes(demand: Demand, image_px: int) -> float:
     """The memory of a deconvolution whose changes are measured, in bytes. image_px: pixels of the whole image."""
-    part_px = math.prod(asked.image)
-    return deconvolution_bytes(asked) + ASSESSED_BYTES * part_px + READ_BYTES * (image_px - part_px)
+    part_px = math.prod(demand.image)
+    return deconvolution_bytes(demand) + ASSESSED_BYTES * part_px + READ_BYTES * (image_px - part_px)
 
 
 def check_memory(image: Shape, needed_bytes: float, free_bytes: int) -> None:

@@ -46,10 +46,10 @@ from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.changes import measure_changes
 from psfcore.deconvolve.assess.quality import QualityBit, quality_plane
-from psfcore.deconvolve.box import LARGEST_ERROR, Box, region_without_discrepancy
+from psfcore.deconvolve.box import Box, region_without_discrepancy
 from psfcore.deconvolve.conditions import Deconvolved, OfBox, Progress, fluxes
 from psfcore.deconvolve.edges import Edges, margin_for, share_from_beyond
-from psfcore.deconvolve.methods.registry import defaults_of, keeps_flux
+from psfcore.deconvolve.methods.registry import properties_of
 from psfcore.deconvolve.whole import Assessed, Work
 from psfcore.errors import DataError
 from psfcore.fits.viewing.regions import moved_header
@@ -100,11 +100,11 @@ class BoxWork:
 
     def run(self, progress: Progress | None = None) -> Deconvolved:
         """Deconvolve box and rim, and cut out the box. Flux and negative pixels are those of the box."""
-        found = self.work.run(progress=progress)
-        pixels = np.ascontiguousarray(found.pixels[self.box.inside(self.rim).slices])
+        of_rim = self.work.run(progress=progress)
+        pixels = np.ascontiguousarray(of_rim.pixels[self.box.inside(self.rim).slices])
         flux_in, flux_out, negative_pixels = fluxes(self.image, pixels)
         return replace(
-            found,
+            of_rim,
             pixels=pixels,
             flux_in=flux_in,
             flux_out=flux_out,
@@ -116,18 +116,18 @@ class BoxWork:
     def assess(self, result: Deconvolved, errors: ErrorPlanes | None = None) -> Assessed:
         """Measure the changes in the box, and make its quality plane."""
         near_edge = self._near_edge(result.edge_band_px)
-        found = measure_changes(
+        changes = measure_changes(
             self.image,
             result.pixels,
             self.work.psf,
             noise=self.noise,
             edge_px=self._counted_edge_px(result.edge_band_px),
-            threads=self.work.conditions.threads,
+            threads=self.work.options.threads,
         )
         quality = self.of_mask.copy()
         quality[near_edge] |= np.uint8(QualityBit.EDGE)
-        quality[found.artefacts.suspected] |= np.uint8(QualityBit.ARTEFACT)
-        return Assessed(found, quality)
+        quality[changes.artefacts.suspected] |= np.uint8(QualityBit.ARTEFACT)
+        return Assessed(changes, quality)
 
     def _near_edge(self, band_px: int) -> NDArray[np.bool_]:
         """The pixels of the box in the band along the edges of the whole image."""
@@ -142,24 +142,24 @@ class BoxWork:
         return max(0, min(band_px - nearest, min(box.shape) // 4))
 
 
-def box_work(work: Work, box: Box, *, largest_error: float = LARGEST_ERROR) -> BoxWork:
+def box_work(work: Work, box: Box) -> BoxWork:
     """Prepare the deconvolution of a box: choose the rim, and subtract the light from beyond the rim.
 
-    work: the deconvolution of the whole image. largest_error: the rim is the narrowest one whose bound is at most this
-    share of the mean light of the box, or the whole image if no rim is wide enough.
+    work: the deconvolution of the whole image. The rim is the narrowest one whose bound is at most the option `region_error`,
+    as a share of the mean light of the box, or the whole image if no rim is wide enough.
 
     Raises DataError "region-outside", "region-too-small", "bad-region-error", "region-discrepancy", "all-masked", and
     "plate-scale-mismatch".
     """
-    image, conditions = work.image, work.conditions
+    image, options, method = work.image, work.options, properties_of(work.options.method)
     shape = (image.pixels.shape[0], image.pixels.shape[1])
     box.checked(shape)
-    if not 0 < largest_error <= 1:
+    if not 0 < options.region_error <= 1:
         raise DataError(
             "bad-region-error",
-            f"expected an error of the region above 0 and at most 1; got {largest_error:g}",
+            f"expected an error of the region above 0 and at most 1; got {options.region_error:g}",
         )
-    if work.parameters.get("stop") == "discrepancy":
+    if options.parameters.get("stop") == "discrepancy":
         raise region_without_discrepancy()
     valid = image.valid[box.slices]
     if not valid.any():
@@ -168,13 +168,12 @@ def box_work(work: Work, box: Box, *, largest_error: float = LARGEST_ERROR) -> B
             f"expected a region with pixels that are not masked; all pixels of {box} are masked: move it",
         )
     check_compatible(image, work.psf)
-    default_edges, margin_share = defaults_of(work.method)
-    edges = conditions.edges or default_edges
-    margin_px = 0 if edges == "zero" else conditions.margin_px
+    edges = options.edges or method.edges
+    margin_px = 0 if edges == "zero" else options.margin_px
     if margin_px is None:
-        margin_px = margin_for(share_from_beyond(work.psf), shape, share=margin_share)
-    far = _FarLight(work, margin_px)
-    largest = largest_error * abs(float(image.pixels[box.slices].mean(where=valid)))
+        margin_px = margin_for(share_from_beyond(work.psf), shape, share=method.margin_share)
+    far = _FarLight(work, margin_px, method.keeps_flux)
+    largest = options.region_error * abs(float(image.pixels[box.slices].mean(where=valid)))
     for width_px in _widths(shape):
         rim = box.wider(width_px, shape, RIM_STEP_PX)
         if rim.shape == shape:
@@ -189,7 +188,7 @@ def box_work(work: Work, box: Box, *, largest_error: float = LARGEST_ERROR) -> B
         alone = replace(
             work,
             image=_part(image, rim, pixels),
-            conditions=replace(conditions, edges="zero", margin_px=None, noise=None),
+            options=replace(options, edges="zero", margin_px=None, noise=None),
         )
         error = light.error
     seen = _part(image, rim, image.pixels[rim.slices])
@@ -201,7 +200,7 @@ def box_work(work: Work, box: Box, *, largest_error: float = LARGEST_ERROR) -> B
         shape=shape,
         edges=edges,
         of_mask=quality_plane(seen, seen.pixels, edge_px=0)[box.inside(rim).slices],
-        noise=conditions.noise,
+        noise=options.noise,
         error=error,
     )
 
@@ -234,11 +233,11 @@ class _Light:
 class _FarLight:
     """The coarse scene u of an image, and its light that comes from beyond any rim."""
 
-    def __init__(self, work: Work, margin_px: int) -> None:
+    def __init__(self, work: Work, margin_px: int, keeps_flux: bool) -> None:
         image, kernel = work.image, work.psf.kernel
         self.factor = min(_LARGEST_FACTOR, max(1, max(image.pixels.shape) // _COARSE_PX))
         self._brightest = float(np.abs(image.pixels).max(where=image.finite, initial=0))
-        self._threads, self._keeps_flux = work.conditions.threads, keeps_flux(work.method)
+        self._threads, self._keeps_flux = work.options.threads, keeps_flux
         self._kernel = rebinned_kernel(kernel, self.factor)
         coarse = _means(image, self.factor)
         margin = margin_px // self.factor

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,40 +17,26 @@ from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from psfcore import software_version
-from psfcore.convolution.offsets import needed_kernel
 from psfcore.deconvolve.assess.quality import MEANINGS
-from psfcore.deconvolve.box import EXPECTED_RIM_PX, LARGEST_ERROR, Box, region_without_errors
-from psfcore.deconvolve.conditions import (
-    Conditions,
-    Deconvolved,
-    EngineFor,
-    PreparedPsfs,
-    Progress,
-    new_engine,
-)
-from psfcore.deconvolve.edges import Edges
+from psfcore.deconvolve.box import EXPECTED_RIM_PX
+from psfcore.deconvolve.conditions import Deconvolved, PreparedPsfs, Progress
+from psfcore.deconvolve.doubts import input_warnings
 from psfcore.deconvolve.kernels import compiling_beside
-from psfcore.deconvolve.memory import Asked, check_memory, product_bytes
-from psfcore.deconvolve.methods.registry import may_be_negative, method_named, method_names
+from psfcore.deconvolve.memory import Demand, check_memory, product_bytes
+from psfcore.deconvolve.problem import no_noise_model
 from psfcore.deconvolve.region import BoxWork, box_work
-from psfcore.deconvolve.stopping import no_noise_model
 from psfcore.deconvolve.summary import assumptions
-from psfcore.deconvolve.whole import Assessed, Work
+from psfcore.deconvolve.whole import Assessed, Options, Work
 from psfcore.drawing.units import unit_label
-from psfcore.errors import DataError
 from psfcore.fits.channel import check_channel
-from psfcore.fits.doubts import doubts
 from psfcore.fits.frame import frame_of
 from psfcore.fits.header import known_instrument, optional_text, seen_by
 from psfcore.fits.images import described, write_image
 from psfcore.fits.observation import check_exposure_of_sun
 from psfcore.image import Image, MaskBit
-from psfcore.instruments.files import instrument_names
-from psfcore.instruments.model import load_instrument
 from psfcore.instruments.unknown import unknown_instrument
-from psfcore.noise import Noise
 from psfcore.psf import REACH_GRID_PX, Psf
-from psfcore.psf_sampling import frame_warnings, with_scale
+from psfcore.psf_sampling import with_scale
 
 if TYPE_CHECKING:
     from psfcore.deconvolve.assess.error_planes import ErrorPlanes
@@ -59,50 +44,8 @@ if TYPE_CHECKING:
 
 BUILDING = "building the PSF"
 DECONVOLVING = "deconvolving"  # the stage whose steps are the steps of the method
-LARGEST_CLIPPED = 0.01  # share of the light of an image; a product's total is accurate to about this share
-MOST_DRAWS = 64
-LARGEST_CUT = 0.001  # share of the light of a PSF; a PSF sums to 1 with about this tolerance
 
 Cards = dict[str, tuple[str | int | float, str]]
-
-
-@dataclass(frozen=True)
-class Options:
-    """How an image is deconvolved. Raises DataError "bad-draws", "region-errors", "unknown-method" and "unknown-parameter".
-
-    method: name of the method; parameters: its own parameters, such as steps and stop. edges, margin_px, noise, threads: see
-    `Conditions`. error_draws: number of noise realisations (2 to 64) for the planes of errors; 0: no such planes. region:
-    deconvolve only this box of the image, with a rim that is so wide that the bound of its error is at most `region_error`.
-    """
-
-    method: str = "richardson-lucy"
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    edges: Edges | None = None
-    margin_px: int | None = None
-    noise: Noise | None = None
-    error_draws: int = 0
-    region: Box | None = None
-    region_error: float = LARGEST_ERROR
-    threads: int = 1
-
-    def __post_init__(self) -> None:
-        if self.region is not None and self.error_draws:
-            raise region_without_errors(self.error_draws)
-        if self.error_draws and not 2 <= self.error_draws <= MOST_DRAWS:
-            raise DataError(
-                "bad-draws", f"error_draws: expected 0, or 2 to {MOST_DRAWS}; got {self.error_draws}"
-            )
-        known = [
-            name
-            for name, one in signature(method_named(self.method)).parameters.items()
-            if one.kind is one.KEYWORD_ONLY
-        ]
-        for name in self.parameters:
-            if name not in known:
-                raise DataError(
-                    "unknown-parameter",
-                    f"expected parameters of {self.method}, {', '.join(known)}; got {name!r}",
-                )
 
 
 @dataclass(frozen=True)
@@ -217,7 +160,7 @@ class Product(Deconvolved):
             "saturation": saturation
             and {"level": saturation.level, "unit": image.unit, "found": saturation.found},
             "warnings": [{"code": code, "message": message} for code, message in self.warnings.items()],
-            "changes": self.assessed.found.as_json(),
+            "changes": self.assessed.changes.as_json(),
         }
 
 
@@ -227,16 +170,15 @@ def deconvolve(
     options: Options,
     *,
     warnings: Mapping[str, str],
-    engine_for: EngineFor = new_engine,
     possible_psfs: Callable[[], Sequence[Psf]] = lambda: (),
     begin: Callable[[str, int], Progress | None] = lambda stage, steps: None,
     check_plane: Callable[[tuple[int, int]], None] = lambda shape: None,
 ) -> Product:
     """Deconvolve an image, or the box of it that the options name.
 
-    psf: the PSF on the pixels of the image. warnings: those of `input_warnings`, and others about the inputs. engine_for: see
-    `Conditions`. possible_psfs, begin: see `Work.errors`. check_plane: called with the shape (ny, nx) of box and rim, which is
-    known only after the image is read; it may raise.
+    psf: the PSF on the pixels of the image. warnings: those of `input_warnings`, and others about the inputs.
+    possible_psfs, begin: see `Work.errors`. check_plane: called with the shape (ny, nx) of box and rim, which is known only after
+    the image is read; it may raise.
 
     Raises DataError "no-noise-figures", "no-noise-model", and the errors of `box_work` and of the method.
     """
@@ -247,24 +189,17 @@ def deconvolve(
         from psfcore.deconvolve.camera_noise import camera_noise  # most deconvolutions do not load SciPy
 
         noise = camera_noise(image, options.noise, binning=int(psf.provenance.get("binning", 1)))
-    conditions = Conditions(
-        edges=options.edges,
-        margin_px=options.margin_px,
-        noise=noise or options.noise,
-        threads=options.threads,
-        engine_for=engine_for,
-    )
-    whole = Work(image, psf, options.method, conditions, options.parameters)
+    whole = Work(image, psf, replace(options, noise=noise or options.noise))
     work: Work | BoxWork = whole
     progress = begin(DECONVOLVING, int(options.parameters.get("steps") or 1))
     if options.region is not None:
-        work = box_work(whole, options.region, largest_error=options.region_error)
+        work = box_work(whole, options.region)
         check_plane(work.rim.shape)
         image = work.image
     result = work.run(progress=progress)
     errors = None
     if options.error_draws:
-        errors = whole.errors(result, options.error_draws, possible_psfs=possible_psfs, begin=begin)
+        errors = whole.errors(result, possible_psfs=possible_psfs, begin=begin)
     return Product(
         **vars(result), image=image, psf=psf, errors=errors, noise=noise, warnings=warnings, work=work
     )
@@ -304,7 +239,7 @@ def read_and_deconvolve(
 
     def check_plane(plane: tuple[int, int]) -> None:
         psf_shape = (REACH_GRID_PX, REACH_GRID_PX) if psf is None else psf.kernel.shape
-        asked = Asked(
+        demand = Demand(
             options.method,
             plane,
             (psf_shape[0], psf_shape[1]),
@@ -312,7 +247,7 @@ def read_and_deconvolve(
             margin_px=options.margin_px,
             draws=options.error_draws,
         )
-        check_memory(plane, product_bytes(asked, shape[0] * shape[1]), free_bytes)
+        check_memory(plane, product_bytes(demand, shape[0] * shape[1]), free_bytes)
 
     def as_built() -> Psf:
         if psf is not None:
@@ -338,9 +273,8 @@ def read_and_deconvolve(
     product = deconvolve(
         clip(image),
         fitted,
-        options,
+        replace(options, engine_for=prepared.engine_for),
         warnings=warnings,
-        engine_for=prepared.engine_for,
         possible_psfs=lambda: possible_psfs(whole, header),
         begin=begin,
         check_plane=check_plane,
@@ -386,8 +320,10 @@ def draw_changes(product: Product, psf: UsedPsf, path: Path) -> None:
     """Draw difference, ratio and histograms into a PNG file."""
     from psfcore.deconvolve.assess.plots import changes_png
 
-    before, found = product.image.pixels, product.assessed.found
-    changes_png(before, product.pixels, found, path, title=product.title(psf), unit=unit_label(product.image))
+    before, changes = product.image.pixels, product.assessed.changes
+    changes_png(
+        before, product.pixels, changes, path, title=product.title(psf), unit=unit_label(product.image)
+    )
 
 
 def deconvolution_cards(product: Product, psf: UsedPsf) -> Cards:
@@ -450,68 +386,6 @@ def deconvolution_history(product: Product, psf: UsedPsf) -> list[str]:
         *([] if product.noise is None or product.noise.source == "given" else [f"noise: {product.noise}"]),
         *(f"WARNING ({code}): {message}" for code, message in product.warnings.items()),
     ]
-
-
-def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel: bool) -> dict[str, str]:
-    """Warnings about the inputs: sentences by their codes, the most harmful first.
-
-    method: the method of the deconvolution; None: none was chosen yet. other_channel: whether the PSF may be of another
-    channel than the image. If it is of another channel and this is not allowed, raises DataError "channel-mismatch".
-    """
-    channel = check_channel(psf, image.header, other_channel=other_channel)
-    warnings = frame_warnings(psf, image.header)
-    warnings |= {} if channel is None else {"channel": channel}
-    if _mesh_is_assumed(psf):
-        warnings["assumed-mesh"] = (
-            "the instrument file of the PSF assumes a part of its filter meshes: compare the arms of a bright point with it "
-            "(heliopsf arms), or use a published PSF"
-        )
-    warnings |= image.warnings
-    if image.saturation is not None and image.saturation.warning is not None:
-        warnings["saturation"] = image.saturation.warning
-    if method is not None:
-        warnings |= _cut_warning(psf, image)
-        warnings |= {} if may_be_negative(method) else _negative_warning(image)
-        warnings |= doubts(image, psf.kernel)
-    return warnings
-
-
-def _cut_warning(psf: Psf, image: Image) -> dict[str, str]:
-    """The warning if a PSF that is larger than the usual reach is cut, and more than LARGEST_CUT of its light is cut off."""
-    if max(psf.kernel.shape) <= REACH_GRID_PX:
-        return {}
-    needed, _ = needed_kernel(psf.kernel, image.pixels.shape)
-    off = 1 - float(needed.sum()) / psf.total
-    if off <= LARGEST_CUT:
-        return {}
-    (ny, nx), (rows, columns) = psf.kernel.shape, needed.shape
-    return {
-        "psf-cut": f"of the PSF of {nx} x {ny} px, the image needs {columns} x {rows} px: {100 * off:.3g} % of its light falls "
-        "farther, and such light from sources beyond the image is not removed: use a larger image if it matters"
-    }
-
-
-def _mesh_is_assumed(psf: Psf) -> bool:
-    """Whether a PSF was built from an instrument file that assumes a part of its meshes.
-
-    A file of a PSF has no provenance, but the name of its instrument file.
-    """
-    if psf.name == psf.instrument and psf.name in instrument_names():
-        return any(mesh.basis == "assumed" for mesh in load_instrument(psf.name).meshes)
-    return psf.provenance.get("mesh_basis") == "assumed"
-
-
-def _negative_warning(image: Image) -> dict[str, str]:
-    """The warning if a method that counts negative pixels as 0 adds more than LARGEST_CLIPPED to the light of the image."""
-    light = float(image.pixels.sum(where=image.valid))
-    clipped = -float(image.pixels.sum(where=image.valid & (image.pixels < 0)))
-    if clipped <= LARGEST_CLIPPED * abs(light):
-        return {}
-    share = f"{100 * clipped / abs(light):.3g} % of the light" if light else "all of the light"
-    kept = ", ".join(name for name in method_names() if may_be_negative(name))
-    return {
-        "negative-pixels": f"negative pixels count as 0, which adds {share}: use a method that keeps them ({kept})"
-    }
 
 
 def _change_pct(before: NDArray[np.float64], after: NDArray[np.float64]) -> float | None:

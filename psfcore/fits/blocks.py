@@ -236,8 +236,8 @@ def skip_data(source: Source, hdu: Hdu, limits: FitsLimits) -> None:
     size = hdu.end - source.position
     there = source.skip(size)
     if there < size:
-        wanted = f"expected {size} bytes of data in HDU {hdu.number}, as its header declares"
-        raise HeaderError("truncated-data", f"{wanted}; got {there}: copy the file again")
+        expected = f"expected {size} bytes of data in HDU {hdu.number}, as its header declares"
+        raise HeaderError("truncated-data", f"{expected}; got {there}: copy the file again")
 
 
 def _check_size(source: Source, hdu: Hdu, limits: FitsLimits) -> None:
@@ -252,21 +252,21 @@ def _check_size(source: Source, hdu: Hdu, limits: FitsLimits) -> None:
 
 
 def _no_image(kinds: list[str]) -> HeaderError:
-    wanted, count = "expected a two-dimensional image", "1 HDU" if len(kinds) == 1 else f"{len(kinds)} HDUs"
+    expected, count = "expected a two-dimensional image", "1 HDU" if len(kinds) == 1 else f"{len(kinds)} HDUs"
     if any(kind.startswith("cube") for kind in kinds):
         hdu, kind = next((n, kind) for n, kind in enumerate(kinds) if kind.startswith("cube"))
         axes = int(kind.split()[1])
         first = ", ".join("0" * (axes - 2)) if axes < _MANY_AXES else "..."
         return HeaderError(
             "three-axes" if axes == 3 else "not-2d",
-            f"{wanted}; got an image of {axes} axes in HDU {hdu}: name another HDU (--hdu), or write one plane, for example with astropy: "
+            f"{expected}; got an image of {axes} axes in HDU {hdu}: name another HDU (--hdu), or write one plane, for example with astropy: "
             f"hdus = fits.open('FILE'); hdus[{hdu}].data = hdus[{hdu}].data[{first}]; hdus.writeto('NEW')",
         )
     if "line" in kinds:
-        return HeaderError("not-2d", f"{wanted}; got an image of one axis: store the image with two axes")
+        return HeaderError("not-2d", f"{expected}; got an image of one axis: store the image with two axes")
     if "table" in kinds:
-        return HeaderError("table-only", f"{wanted}; got only tables ({count}): use a file with an image")
-    message = f"{wanted}; got {count}, and none has data with two axes: use a file with an image"
+        return HeaderError("table-only", f"{expected}; got only tables ({count}): use a file with an image")
+    message = f"{expected}; got {count}, and none has data with two axes: use a file with an image"
     return HeaderError("no-image", message)
 
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from astropy.io.fits import Header
 
 LARGEST_COUNT = 2**63 - 1
+LONGEST_TEXT = 68  # characters of a card's value
 
 
 class Cards(Protocol):

@@ -83,10 +83,10 @@ def channel_differences(psf: Origin, header: Cards) -> list[str]:
         differences.append(
             f"the image is of {image_angstrom:g} angstrom, the PSF of {psf_angstrom:g} angstrom"
         )
-    for key, wanted in psf.cards.items():
-        found = optional_text(header, key)
-        if found is not None and not _same_words(found, wanted):
-            differences.append(f"the image has {key} {found!r}, the PSF {wanted!r}")
+    for key, of_psf in psf.cards.items():
+        of_image = optional_text(header, key)
+        if of_image is not None and not _same_words(of_image, of_psf):
+            differences.append(f"the image has {key} {of_image!r}, the PSF {of_psf!r}")
     return differences
 
 
@@ -94,24 +94,25 @@ def _other_instrument(psf: Origin, header: Cards) -> str | None:
     """The instrument of the image if it is certainly not the instrument of the PSF; otherwise None."""
     if psf.instrument not in instrument_names():
         return None
-    known = known_instrument(header)
-    if known is not None:
-        return None if known == psf.instrument else known
+    instrument = known_instrument(header)
+    if instrument is not None:
+        return None if instrument == psf.instrument else instrument
     # The wavelength is compared separately. An instrument file without [match] cannot say which images are of its
     # instrument.
-    wanted = {key: text for key, text in match_table(psf.instrument).items() if isinstance(text, str)}
+    matches = {key: text for key, text in match_table(psf.instrument).items() if isinstance(text, str)}
     cards = {key: optional_text(header, key) for key in ("TELESCOP", "OBSRVTRY", "INSTRUME", "DETECTOR")}
     named = " ".join(text for text in cards.values() if text)
-    compared = [_same_words(text, wanted[key]) for key, text in cards.items() if text and key in wanted]
-    return named or None if wanted and not (compared and all(compared)) else None
+    compared = [_same_words(text, matches[key]) for key, text in cards.items() if text and key in matches]
+    return named or None if matches and not (compared and all(compared)) else None
 
 
 def _image_wavelength(header: Cards) -> float | None:
     """Wavelength in angstrom, from the header or else from the file of the known instrument; None if neither gives
     it."""
-    found = wavelength_angstrom(header)
-    known = known_instrument(header)
-    return load_instrument(known).wavelength_angstrom if found is None and known is not None else found
+    angstrom, instrument = wavelength_angstrom(header), known_instrument(header)
+    if angstrom is None and instrument is not None:
+        return load_instrument(instrument).wavelength_angstrom
+    return angstrom
 
 
 def _psf_wavelength(psf: Origin) -> float | None:

@@ -136,8 +136,8 @@ def _check_keywords(header: Header) -> None:
 def _check_tiling(header: Header, nx: int, ny: int) -> None:
     tile_x, tile_y = card_count(header, "ZTILE1", default=nx), card_count(header, "ZTILE2", default=1)
     if not (1 <= tile_x <= _LARGEST_INT and 1 <= tile_y <= _LARGEST_INT):
-        wanted = f"expected tiles of 1 to {_LARGEST_INT} pixels on each axis"
-        raise HeaderError("bad-tiles", f"{wanted}; got {tile_x} x {tile_y}")
+        expected = f"expected tiles of 1 to {_LARGEST_INT} pixels on each axis"
+        raise HeaderError("bad-tiles", f"{expected}; got {tile_x} x {tile_y}")
     tiles = math.prod(-(-n // tile) for n, tile in ((nx, tile_x), (ny, tile_y)))
     rows = card_count(header, "NAXIS2")
     if rows != tiles:
@@ -155,9 +155,9 @@ def _settings(header: Header) -> dict[str, object]:
             break
         name = (card_text(header, f"ZNAME{number}") or "").upper()
         value = card_value(header, f"ZVAL{number}")
-        known = {"BYTEPIX", "BLOCKSIZE", "SCALE", "SMOOTH", "NOISEBIT"}
-        if name not in known or name in settings:
-            raise bad_card(f"ZNAME{number} of {', '.join(sorted(known))}, each once", f"{name!r:.40}")
+        names = {"BYTEPIX", "BLOCKSIZE", "SCALE", "SMOOTH", "NOISEBIT"}
+        if name not in names or name in settings:
+            raise bad_card(f"ZNAME{number} of {', '.join(sorted(names))}, each once", f"{name!r:.40}")
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST_INT:
             raise bad_card(f"a number in ZVAL{number} ({name})", f"{value!r:.40}")
         settings[name] = value
@@ -171,21 +171,21 @@ def _check_rice(settings: dict[str, object], bitpix: int) -> None:
             raise bad_card(f"{name} of {allowed} for RICE_1", f"{value!r:.40}")
     most = abs(bitpix) // 8
     if settings.get("BYTEPIX", 0) > most:  # type: ignore[operator]
-        wanted = f"BYTEPIX of at most {most}, the bytes of a pixel with ZBITPIX = {bitpix}"
-        raise bad_card(wanted, settings["BYTEPIX"])
+        expected = f"BYTEPIX of at most {most}, the bytes of a pixel with ZBITPIX = {bitpix}"
+        raise bad_card(expected, settings["BYTEPIX"])
 
 
 def _check_columns(header: Header) -> None:
     columns = read_columns(header)
     for number, column in enumerate(columns, start=1):
         if column.name in _ITEMS_OF:
-            wanted = f"1P or 1Q of {', '.join(_ITEMS_OF[column.name])}"
+            expected = f"1P or 1Q of {', '.join(_ITEMS_OF[column.name])}"
             good = column.in_heap and column.repeat == 1 and column.item in _ITEMS_OF[column.name]
         else:
-            wanted = f"one number of {', '.join(_NUMBERS_OF.get(column.name, _NUMBERS))}"
+            expected = f"one number of {', '.join(_NUMBERS_OF.get(column.name, _NUMBERS))}"
             good = column.repeat == 1 and column.form in _NUMBERS_OF.get(column.name, _NUMBERS)
         if not good:
-            raise bad_card(f"column {column.name:.40} as {wanted}", column)
+            raise bad_card(f"column {column.name:.40} as {expected}", column)
         for key in ("TSCAL", "TZERO", "TDIM"):
             if card_value(header, f"{key}{number}") is not None:
                 raise bad_card(f"no card {key}{number} in a compressed image", "one")

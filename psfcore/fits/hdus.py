@@ -193,8 +193,8 @@ def readable_pixels(path: str | Path, part: str) -> Iterator[None]:
     except PIXEL_TROUBLE as error:
         if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
             raise  # the disk caused the error; the content of a file causes others, such as a negative size
-        wanted = f"expected readable pixels in {part} of {Path(path).name}"
-        message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
+        expected = f"expected readable pixels in {part} of {Path(path).name}"
+        message = f"{expected}; got: {error!s:.120}: copy or make the file again"
         raise DataError("unreadable-pixels", message) from None
 
 

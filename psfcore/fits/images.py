@@ -65,10 +65,11 @@ _PLACE_CARD = re.compile(
     r"(HEE|HEQ|HCI|HAE|GAE|GSE)[XYZ]_OBS|OBSGEO-[XYZ]"
 )
 
-# Cards that say how the input file stores its pixels, and cards with statistics of these pixels.
+# Cards with statistics of the pixels of the input.
+STATISTICS = r"DATA(MIN|MAX|MEAN|MEDN|RMS|STD|SKEW|KURT|CENT|P\d\d)"
+# Cards that say how the input file stores its pixels, and the statistics.
 _STORAGE_CARD = re.compile(
-    rf"{TABLE_CARD.pattern}|SIMPLE|EXTEND|GROUPS|INHERIT|EXTNAME|EXTVER|EXTLEVEL|END|BSCALE|BZERO|BLANK|"
-    r"DATAMIN|DATAMAX|DATAMEAN|DATAMEDN|DATARMS|DATASTD|DATASKEW|DATAKURT|DATACENT|DATAP\d\d"
+    rf"{TABLE_CARD.pattern}|SIMPLE|EXTEND|GROUPS|INHERIT|EXTNAME|EXTVER|EXTLEVEL|END|BSCALE|BZERO|BLANK|{STATISTICS}"
 )
 
 

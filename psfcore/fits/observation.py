@@ -25,6 +25,7 @@ from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.cards import Cards, optional_number, optional_text
 from psfcore.fits.hdus import StoredImage, read_pixels
 from psfcore.fits.header import (
+    IMAGE,
     check_not_deconvolved,
     content_of,
     known_instrument,
@@ -32,7 +33,6 @@ from psfcore.fits.header import (
 )
 from psfcore.fits.saturation import with_saturation
 from psfcore.fits.units import check_linear, unit_of
-from psfcore.fits.viewing.planes import IMAGE
 from psfcore.image import Image, MaskBit
 from psfcore.instruments.model import load_instrument
 

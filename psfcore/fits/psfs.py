@@ -185,7 +185,7 @@ def stated_id(path: str | Path, limits: FitsLimits) -> str | None:
     try:
         with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
             lines = [str(line) for line in hdus[0].header.get("HISTORY", [])]
-            stated = [found[1] for line in lines if (found := _STATED.fullmatch(line))]
+            stated = [match[1] for line in lines if (match := _STATED.fullmatch(line))]
             # `read_psf` keeps the HISTORY of a file under this name, and `write_psf` writes it into files derived from
             # it.
             derived = any(line.startswith("history:") for line in lines)
@@ -221,8 +221,8 @@ def _read_extras(
                 elif hdu.name == "FIT":
                     fitted = _read_fitted(hdu)
     except PIXEL_TROUBLE as error:
-        wanted = f"expected readable extensions in {Path(path).name}"
-        message = f"{wanted}; got: {error!s:.120}: copy or make the file again"
+        expected = f"expected readable extensions in {Path(path).name}"
+        message = f"{expected}; got: {error!s:.120}: copy or make the file again"
         raise DataError("unreadable-pixels", message) from None
     return components, provenance, fitted
 

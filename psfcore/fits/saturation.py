@@ -59,30 +59,30 @@ def with_saturation(
     the request gives no level, the pixels are also tested, see Eq. (1). Raises DataError "saturation-unit" if the request
     gives a level and the unit of the image is neither counts nor a rate of counts, and "no-exposure".
     """
-    known = _levels(image, requested_dn, instrument_dn)
-    found = min(known, key=lambda key: known[key], default=None)
-    level = None if found is None else known[found]
+    levels = _levels(image, requested_dn, instrument_dn)
+    source = min(levels, key=lambda key: levels[key], default=None)
+    level = None if source is None else levels[source]
     warning = None
     mask = image.mask if level is None else _masked(image, level)
-    if found == "NSATPIX" and mask is not image.mask:
+    if source == "NSATPIX" and mask is not image.mask:
         warning = _missing_from(image, mask)
     if requested_dn is None:
         top, count, chance = largest_value(image.pixels, mask == 0)
-        confirmed = found in _LEVEL_CARDS and bool(np.any(mask & MaskBit.SATURATED.value))
+        confirmed = source in _LEVEL_CARDS and bool(np.any(mask & MaskBit.SATURATED.value))
         if chance < MASKED_BELOW and not confirmed:
-            if found is not None:
+            if source is not None:
                 warning = (
                     f"{count} pixels have the value {top:g}, the largest below the saturation level {level:g} "
-                    f"({found}); they are masked as saturated: if they are not, {_SETTING}"
+                    f"({source}); they are masked as saturated: if they are not, {_SETTING}"
                 )
-            found, level = PIXELS, top
+            source, level = PIXELS, top
             mask = _masked(image, top)
         elif chance < DOUBTED_BELOW:
             warning = (
                 f"{count} pixels have the largest value, {top:g}; they may be saturated, but are not masked: "
                 f"if they are saturated, {_SETTING}"
             )
-    return replace(image, mask=mask, saturation=Saturation(level, found, warning))
+    return replace(image, mask=mask, saturation=Saturation(level, source, warning))
 
 
 def largest_value(pixels: NDArray[np.float64], valid: NDArray[np.bool_]) -> tuple[float, int, float]:

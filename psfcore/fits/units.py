@@ -13,12 +13,11 @@ from functools import cache
 from typing import Any, Literal
 
 from psfcore.errors import DataError
-from psfcore.fits.cards import Cards, optional_text
+from psfcore.fits.cards import LONGEST_TEXT, Cards, optional_text
 from psfcore.image import Image
 
 Kind = Literal["count", "rate", "other", "unknown"]
 _MANY_DIGITS = re.compile(r"\d{4}")
-_LONGEST = 68  # characters of a card's value
 # Words of units in headers, in lower case, and the units of astropy that they mean.
 _WORDS = {
     **dict.fromkeys(("dn", "adu", "ct", "cts", "count", "counts"), "ct"),
@@ -59,7 +58,7 @@ def parse_unit(text: str | None) -> PixelUnit:
         return PixelUnit(None, "unknown")
     from astropy import units
 
-    unit = _parsed(text[:_LONGEST])
+    unit = _parsed(text[:LONGEST_TEXT])
     if unit is None:
         return PixelUnit(text, "other")
     unit *= units.pix ** -dict(zip(unit.bases, unit.powers, strict=True)).get(units.pix, 0)

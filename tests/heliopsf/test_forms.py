@@ -252,19 +252,15 @@ def test_an_uncertainty_is_the_noise_and_comes_back(psf: heliopsf.Psf) -> None:
         assert heliopsf.deconvolve(unknown, psf).uncertainty is None
 
 
-def test_a_map_sequence_gives_a_map_sequence(psf: heliopsf.Psf) -> None:
+def test_a_list_gives_a_list_a_sequence_a_sequence_and_an_error_names_the_image(psf: heliopsf.Psf) -> None:
     maps = [a_map(), a_map(pixels(2))]
-    result = heliopsf.deconvolve(sunpy.map.Map(maps, sequence=True), psf)
-    assert isinstance(result, sunpy.map.MapSequence)
-    for one, image in zip(result, maps, strict=True):
-        np.testing.assert_array_equal(one.data, heliopsf.deconvolve(image, psf).data)
-
-
-def test_a_list_gives_a_list_and_an_error_names_the_image(psf: heliopsf.Psf) -> None:
-    images = [a_map(), a_map(pixels(2))]
-    results = heliopsf.deconvolve(images, psf)
-    for image, result in zip(images, results, strict=True):
-        np.testing.assert_array_equal(result.data, heliopsf.deconvolve(image, psf).data)
+    wanted = [heliopsf.deconvolve(image, psf).data for image in maps]
+    sequence = sunpy.map.Map(maps, sequence=True)
+    for images, kind in ((maps, list), (sequence, sunpy.map.MapSequence)):
+        results = heliopsf.deconvolve(images, psf)
+        assert isinstance(results, kind)
+        for result, expected in zip(results, wanted, strict=True):
+            np.testing.assert_array_equal(result.data, expected)
     with pytest.raises(DataError, match=r"channel-mismatch: image 2 of 2: .*304"):
         heliopsf.deconvolve([a_map(), a_map(wavelnth=304)], psf)
 
@@ -349,11 +345,8 @@ def test_a_region_has_the_form_of_its_image(psf: heliopsf.Psf, tmp_path: Path) -
     options: dict[str, Any] = {"region": REGION, "region_error": 0.9, "other_channel": True}
     wanted = heliopsf.deconvolve(tmp_path / "image.fits", psf, **options)
     assert wanted.pixels.shape == wanted.quality.shape == wanted.image.pixels.shape == (32, 32)
-    assert (
-        wanted.image.header["CRPIX1"] == 64.5 - 32
-        and wanted.image.header["CRPIX2"] == 48.5 - 24
-        and wanted.of_box.rim_px > 0
-    )
+    assert [wanted.image.header[key] for key in ("CRPIX1", "CRPIX2")] == [64.5 - 32, 48.5 - 24]
+    assert wanted.of_box.rim_px > 0
     np.testing.assert_array_equal(wanted.image.pixels, pixels()[24:56, 32:64])
     for image in (
         NDData(pixels(), unit="DN", meta=cards()),

@@ -22,10 +22,10 @@ from astropy.io import fits
 from matplotlib.figure import Figure
 
 import heliopsf
-from heliopsf.psfs import LIMITS
 from psfcore.build import known_diffraction
 from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_named
+from psfcore.fits.blocks import LIMITS
 from psfcore.fits.observation import read_observation
 from psfcore.gap import diagnose
 from psfcore.scatter import fit as fit_module

@@ -89,12 +89,9 @@ def test_a_value_that_does_not_fit_is_a_data_error_with_its_code(psf: heliopsf.P
         with pytest.raises(heliopsf.DataError) as caught:
             call()
         assert caught.value.code == code
-
-
-def test_a_misspelt_instrument_is_told_the_one_that_is_meant() -> None:
-    for call in (heliopsf.build_psf, heliopsf.read_psf):
-        with pytest.raises(heliopsf.DataError, match="'aia_171'"):
-            call("aia171")
+    for read in (heliopsf.build_psf, heliopsf.read_psf):
+        with pytest.raises(heliopsf.DataError, match="'aia_171'"):  # the instrument that is meant
+            read("aia171")
 
 
 def test_a_level_per_second_needs_an_exposure_time(psf: heliopsf.Psf) -> None:

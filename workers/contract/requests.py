@@ -21,7 +21,7 @@ from psfcore.recipe import BUILD_VERSION
 from workers.versions import TIME, iso, seconds
 
 if TYPE_CHECKING:
-    from psfcore.deconvolve.run import Options
+    from psfcore.deconvolve.whole import Options
 
 # Texts of one line from outside: without control characters, of which PostgreSQL cannot store NUL.
 PRINTABLE, PRINTABLE_OR_EMPTY = r"^[^\x00-\x1f\x7f]+$", r"^[^\x00-\x1f\x7f]*$"
@@ -482,7 +482,7 @@ ResolvedOnTransit = ResolvedPsfFit | ResolvedCrossValidate | ResolvedReport | Re
 def options_of(request: Deconvolve, threads: int) -> Options:
     """The options of psfcore for a request."""
     # A request is checked without numerical libraries.
-    from psfcore.deconvolve.run import Options
+    from psfcore.deconvolve.whole import Options
 
     method = request.method
     return Options(

@@ -21,7 +21,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from psfcore.deconvolve.box import EXPECTED_RIM_PX, Box
-from psfcore.deconvolve.memory import MIB, Asked, of_method, product_bytes
+from psfcore.deconvolve.memory import MIB, Demand, of_method, product_bytes
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import workload
@@ -142,7 +142,7 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     whole_px = ny * nx
     if parameters.get("region") is not None:
         ny, nx = Box.parse(parameters["region"]).wider(EXPECTED_RIM_PX, (ny, nx)).shape
-    asked = Asked(
+    asked = Demand(
         method["name"],
         (ny, nx),
         (psf_shape[0], psf_shape[1]),

@@ -11,6 +11,7 @@ from typing import Any
 
 from psfcore.deconvolve import run
 from psfcore.deconvolve.conditions import PreparedPsfs
+from psfcore.deconvolve.doubts import input_warnings
 from psfcore.fits.observation import check_exposure_of_sun, read_observation
 from psfcore.fits.psfs import read_psf
 from psfcore.image import Image
@@ -87,9 +88,8 @@ def make(
     product = run.deconvolve(
         image,
         psf,
-        options_of(request, threads),
+        replace(options_of(request, threads), engine_for=prepared.engine_for),
         warnings=_warnings(context, request, psf_row, psf, image),
-        engine_for=prepared.engine_for,
         possible_psfs=lambda: _possible_psfs(read(parts=True), image, threads),
         begin=begin,
     )
@@ -121,4 +121,4 @@ def _warnings(
     allowed = request.other_channel or context.anew
     warning = deprecated_warning(context.catalogue, row)
     deprecated = {} if warning is None else {CODE: warning}
-    return deprecated | run.input_warnings(psf, image, request.method.name, other_channel=allowed)
+    return deprecated | input_warnings(psf, image, request.method.name, other_channel=allowed)

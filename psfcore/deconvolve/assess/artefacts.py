@@ -177,14 +177,14 @@ def _estimated_noise(pixels: Plane, brightness: Plane, counted: Flags, classes: 
 
 def second_difference(plane: Plane) -> Plane:
     """The second difference along both axes [y, x]; the plane is mirrored at its edges. Sums are in double precision."""
-    found = np.empty_like(plane)
+    difference = np.empty_like(plane)
     padded = np.pad(plane, 1, mode="symmetric")
     for top in range(0, len(plane), _BLOCK_ROWS):  # blocks of rows stay in the cache
-        rows = found[top : top + _BLOCK_ROWS]
+        rows = difference[top : top + _BLOCK_ROWS]
         block = padded[top : top + len(rows) + 2].astype(np.float64)
         along_y = block[:-2] - 2 * block[1:-1] + block[2:]
         rows[:] = along_y[:, :-2] - 2 * along_y[:, 1:-1] + along_y[:, 2:]
-    return found
+    return difference
 
 
 def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | None, int]:
@@ -201,26 +201,26 @@ def ringing_pct(before: Plane, after: Plane, counted: Flags) -> tuple[float | No
 
 def _holes(before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt) -> Flags:
     """Find the counted pixels that fulfil Eq. (1)."""
-    found = counted & (after < HOLE_SHARE * before)
-    places = np.nonzero(found)
-    found[places] = before[places] > DETECTION_SIGMA * noise_before(places)
-    return found
+    holes = counted & (after < HOLE_SHARE * before)
+    places = np.nonzero(holes)
+    holes[places] = before[places] > DETECTION_SIGMA * noise_before(places)
+    return holes
 
 
 def _overshoots(
     before: Plane, after: Plane, counted: Flags, noise_before: NoiseAt, peak_weight: float
 ) -> Flags:
     """Find the counted pixels that fulfil Eq. (2)."""
-    found = counted & (after > before.astype(np.float64) / peak_weight)
-    places = np.nonzero(found)
+    overshoots = counted & (after > before.astype(np.float64) / peak_weight)
+    places = np.nonzero(overshoots)
     limit = (before[places] + DETECTION_SIGMA * noise_before(places)) / peak_weight
-    found[places] = after[places] > limit
-    return found
+    overshoots[places] = after[places] > limit
+    return overshoots
 
 
 def _new_extremes(before: Plane, after: Plane, noise_before: NoiseAt, noise_after: NoiseAt) -> Flags:
     """Find the pixels that fulfil Eq. (3)."""
-    found = np.zeros(after.shape, dtype=np.bool_)
+    extremes = np.zeros(after.shape, dtype=np.bool_)
     # A median lies between the minimum and the maximum of its pixels. If a pixel differs from both by less than the
     # limit, it cannot fulfil Eq. (3). Medians are therefore needed only for the few remaining pixels.
     for sign, nearest, farthest in ((1, _maxima, _minima), (-1, _minima, _maxima)):
@@ -231,8 +231,8 @@ def _new_extremes(before: Plane, after: Plane, noise_before: NoiseAt, noise_afte
         away_after = sign * (after[places] - _medians(after, places))
         away_before = sign * (before[places] - _medians(before, places))
         # A real peak or pit is also visible in the image before, except for the noise.
-        found[places] |= (away_after > limit) & (away_before < noise_before(places))
-    return found
+        extremes[places] |= (away_after > limit) & (away_before < noise_before(places))
+    return extremes
 
 
 def _maxima(plane: Pixels, radius_px: int) -> Pixels:
@@ -249,19 +249,19 @@ def _extremes(plane: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:
     """As the filters of scipy.ndimage, but several times as fast: blocks of rows stay in the cache."""
     # Repeated edge pixels do not change the extremes.
     padded = np.pad(plane, radius_px, mode="edge")
-    found = np.empty_like(plane)
+    extremes = np.empty_like(plane)
     for top in range(0, len(plane), _BLOCK_ROWS):
-        rows = found[top : top + _BLOCK_ROWS]
+        rows = extremes[top : top + _BLOCK_ROWS]
         block = padded[top : top + len(rows) + 2 * radius_px]
         rows[:] = _slid(_slid(block, radius_px, chosen).T, radius_px, chosen).T
-    return found
+    return extremes
 
 
 def _slid(rows: Pixels, radius_px: int, chosen: np.ufunc) -> Pixels:
     """Extremes of 2 radius_px + 1 successive rows. The windows double their height until they are high enough."""
-    wanted, height = 2 * radius_px + 1, 1
-    while height < wanted:
-        more = min(height, wanted - height)
+    full_height, height = 2 * radius_px + 1, 1
+    while height < full_height:
+        more = min(height, full_height - height)
         rows = chosen(rows[:-more], rows[more:])
         height += more
     return rows
@@ -282,11 +282,11 @@ def _bright_sources(before: Plane, counted: Flags) -> NDArray[np.int64]:
     inside = np.zeros_like(counted)
     inner = np.s_[RING_RADIUS_PX:-RING_RADIUS_PX]
     inside[inner, inner] = _minima(counted, RING_RADIUS_PX)[inner, inner]
-    found = np.argwhere(inside & (before == _maxima(before, RING_RADIUS_PX)))
-    height = before[tuple(found.T)]
-    found = found[height > 2 * np.maximum(_median_on_circle(before, found), 0)]
-    order = np.argsort(-before[tuple(found.T)], kind="stable")
-    return found[order[:_SOURCES]]
+    peaks = np.argwhere(inside & (before == _maxima(before, RING_RADIUS_PX)))
+    height = before[tuple(peaks.T)]
+    peaks = peaks[height > 2 * np.maximum(_median_on_circle(before, peaks), 0)]
+    order = np.argsort(-before[tuple(peaks.T)], kind="stable")
+    return peaks[order[:_SOURCES]]
 
 
 def _median_on_circle(plane: Plane, places: NDArray[np.int64]) -> Plane:

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.deconvolve.assess.artefacts import Artefacts, NoiseAt, find_artefacts
+from psfcore.deconvolve.edges import inside_band
 from psfcore.errors import DataError
 from psfcore.fits.units import dn_per_unit
 from psfcore.image import Image
@@ -171,10 +172,7 @@ def _noise_at(image: Image, noise: Noise) -> NoiseAt:
 
 def counted_pixels(image: Image, result: Plane, edge_px: int) -> Flags:
     """Pixels [y, x] that are trusted, finite and outside the band at the edges."""
-    counted = image.valid & np.isfinite(result)
-    inner = np.zeros_like(counted)
-    inner[edge_px : counted.shape[0] - edge_px, edge_px : counted.shape[1] - edge_px] = True
-    return np.asarray(counted & inner)
+    return np.asarray(image.valid & np.isfinite(result) & inside_band(result.shape, edge_px))
 
 
 def block_means(plane: Plane, counted: Flags, block_px: int) -> Plane:
@@ -229,9 +227,9 @@ def _levels(means: Plane) -> dict[float, tuple[float, float]]:
     """For each tail of p percent: (percentile p, percentile 100 - p) of the block means."""
     if means.size == 0:
         return {}
-    wanted = [level for tail in TAILS_PCT for level in (tail, 100 - tail)]
-    found = [float(level) for level in np.percentile(means, wanted)]
-    return {tail: (found[2 * k], found[2 * k + 1]) for k, tail in enumerate(TAILS_PCT)}
+    percentiles = [level for tail in TAILS_PCT for level in (tail, 100 - tail)]
+    levels = [float(level) for level in np.percentile(means, percentiles)]
+    return {tail: (levels[2 * k], levels[2 * k + 1]) for k, tail in enumerate(TAILS_PCT)}
 
 
 def _structures(blocks: _Blocks) -> list[Structure]:
@@ -289,8 +287,8 @@ def _contrast(means: Plane) -> float | None:
 
 def _percentiles(values: Plane) -> dict[str, float]:
     """Percentiles of the change. values: they are reordered."""
-    found = np.percentile(values, CHANGE_PERCENTILES, overwrite_input=True)
-    return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, found, strict=True)}
+    levels = np.percentile(values, CHANGE_PERCENTILES, overwrite_input=True)
+    return {f"p{level:g}": float(value) for level, value in zip(CHANGE_PERCENTILES, levels, strict=True)}
 
 
 def _chosen(which: Flags, *planes: Plane) -> tuple[Plane, ...]:

@@ -8,7 +8,7 @@ elsewhere: `changes_in_product` reads the numbers from the details of a product,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,6 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.assess.artefacts import Artefacts
-from psfcore.deconvolve.assess.changes import Changes, Range, Structure
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.drawing.plots import (
     CHANGE,
@@ -55,14 +53,14 @@ Plane = NDArray[np.float64]
 class Treated:
     """One deconvolved image.
 
-    taken: date of the observation. found: the measured changes. before, after: thumbnails [y, x]. suspected: positions
+    taken: date of the observation. changes: the measured changes, as `Changes.as_json` gives them. before, after: thumbnails [y, x]. suspected: positions
     [y, x] of the thumbnail pixels with suspected artefacts, shape (n, 2).
     """
 
     name: str
     taken: str | None
     psf: str
-    found: Changes
+    changes: Mapping[str, Any]
     steps_done: int
     stopped_because: str
     before: Plane
@@ -72,13 +70,13 @@ class Treated:
     @property
     def score(self) -> float:
         """Artefact score; a score below 1 means that nothing was found."""
-        return self.found.artefacts.score
+        return float(self.changes["artefacts"]["score"])
 
     def structure(self, kind: str) -> dict[str, float] | None:
         """Change of the bright or dark blocks: sum_pct and up_to_pct of `Structure`; None if there are no such blocks."""
-        for row in self.found.structures:
-            if (row.kind, row.block_px, row.tail_pct) == (kind, BLOCK_PX, TAIL_PCT):
-                return {"sum_pct": row.sum_pct, "up_to_pct": row.up_to_pct}
+        for row in self.changes["structures"]:
+            if (row["kind"], row["block_px"], row["tail_pct"]) == (kind, BLOCK_PX, TAIL_PCT):
+                return {"sum_pct": row["sum_pct"], "up_to_pct": row["up_to_pct"]}
         return None
 
     def as_json(self) -> dict[str, Any]:
@@ -88,12 +86,12 @@ class Treated:
             "taken": self.taken,
             "psf": self.psf,
             "score": self.score,
-            "flux_change_pct": self.found.flux_change_pct,
+            "flux_change_pct": self.changes["flux_change_pct"],
             "bright": self.structure("bright"),
             "dark": self.structure("dark"),
             "steps_done": self.steps_done,
             "stopped_because": self.stopped_because,
-            "effects": self.found.as_json(),
+            "effects": self.changes,
         }
 
 
@@ -107,7 +105,7 @@ class Failure:
 
 
 def changes_in_product(
-    name: str, before: str | Path, product: str | Path, details: dict[str, Any], limits: FitsLimits
+    name: str, before: str | Path, product: str | Path, details: Mapping[str, Any], limits: FitsLimits
 ) -> Treated:
     """Make the row of one image. ``before``, ``product``: the FITS files of the image and of its product.
 
@@ -121,25 +119,12 @@ def changes_in_product(
         name=name,
         taken=optional_text(image.header, *DATE_KEYS),
         psf=f"{optional_text(after.header, 'PSFNAME')} {optional_text(after.header, 'PSFVERS')}",
-        found=changes_from_json(details["changes"], suspected),
+        changes=details["changes"],
         steps_done=details["steps_done"],
         stopped_because=details["stopped_because"],
         before=binned(image.pixels, step),
         after=binned(after.pixels, step),
         suspected=np.unique(np.argwhere(suspected) // step, axis=0),
-    )
-
-
-def changes_from_json(figures: dict[str, Any], suspected: NDArray[np.bool_]) -> Changes:
-    """Make a ``Changes`` from the numbers that ``Changes.as_json`` wrote and the plane of suspected pixels [y, x]."""
-    artefacts = figures["artefacts"]
-    return Changes(
-        **figures
-        | {
-            "structures": tuple(Structure(**row) for row in figures["structures"]),
-            "ranges": tuple(Range(**row) for row in figures["ranges"]),
-            "artefacts": Artefacts(suspected, artefacts["signs"], artefacts["sources"], artefacts["score"]),
-        }
     )
 
 
@@ -254,10 +239,10 @@ def _heading(treated: Sequence[Treated], shown: Sequence[Treated]) -> str:
 def _changes(row: Treated) -> str:
     parts = [] if row.taken is None else [row.taken]
     for kind in ("bright", "dark"):
-        found = row.structure(kind)
-        if found is not None:
-            parts.append(f"{kind} {found['sum_pct']:+.0f} %, up to {found['up_to_pct']:+.0f} %")
-    return "   ".join([*parts, f"flux {row.found.flux_change_pct:+.2f} %"])
+        change = row.structure(kind)
+        if change is not None:
+            parts.append(f"{kind} {change['sum_pct']:+.0f} %, up to {change['up_to_pct']:+.0f} %")
+    return "   ".join([*parts, f"flux {row.changes['flux_change_pct']:+.2f} %"])
 
 
 def _failure_lines(failures: Sequence[Failure]) -> list[str]:
@@ -283,11 +268,11 @@ def _summary(treated: Sequence[Treated], failures: Sequence[Failure]) -> dict[st
         "to_look_at": sum(row.score >= LOOK_FROM for row in treated),
     }
     for kind in ("bright", "dark"):
-        rows = [found for found in (row.structure(kind) for row in treated) if found is not None]
+        rows = [change for change in (row.structure(kind) for row in treated) if change is not None]
         if rows:
-            ups = [found["up_to_pct"] for found in rows]
+            ups = [change["up_to_pct"] for change in rows]
             out[kind] = {
-                "median_sum_pct": float(np.median([found["sum_pct"] for found in rows])),
+                "median_sum_pct": float(np.median([change["sum_pct"] for change in rows])),
                 "median_up_to_pct": float(np.median(ups)),
                 "extreme_pct": max(ups) if kind == "bright" else min(ups),
             }

@@ -22,9 +22,8 @@ A correction takes account of the scatter of sigma. The scatter of W(d_k^2 / n) 
 freedom nu by Satterthwaite's rule (1946). The root of a variance is too small on average, by the factor c4 for nu
 degrees of freedom; therefore sigma is divided by c4.
 
-The error from the uncertainty of the PSF is the standard deviation over deconvolutions with several PSFs. These PSFs
-are random samples, or the sigma points of a covariance (Julier and Uhlmann 1997). Sigma points need two deconvolutions
-per parameter and no random numbers.
+The error from the uncertainty of the PSF is the standard deviation over deconvolutions with several PSFs, the sigma
+points of a covariance (Julier and Uhlmann 1997). They need two deconvolutions per parameter and no random numbers.
 
 | symbol | name | unit |
 |---|---|---|
@@ -48,6 +47,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from psfcore.convolution.engine import Engine
+from psfcore.deconvolve.conditions import Progress
+from psfcore.deconvolve.edges import inside_band
 from psfcore.errors import DataError
 from psfcore.fits.units import dn_per_unit
 from psfcore.image import Image
@@ -60,9 +61,6 @@ REFERENCE_WINDOW_PX = 1.0
 SMALLEST_DRAWS = 2
 
 Plane = NDArray[np.float64]
-Run = Callable[[Image], Plane]
-RunWithPsf = Callable[[Psf], Plane]
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -72,26 +70,23 @@ class ErrorPlanes:
     error: standard deviation from photon and read noise. psf_error: standard deviation from the uncertainty of the PSF;
     None if this uncertainty is not known. amplification: median of error divided by the noise of the observation; None
     if the edge bands cover all pixels. degrees_of_freedom: degrees of freedom of the variance of a pixel; the relative
-    error of the variance is sqrt(2 / degrees_of_freedom). draws: number of noise realisations. seed: seed of the random
-    numbers.
+    error of the variance is sqrt(2 / degrees_of_freedom).
     """
 
     error: Plane
     psf_error: Plane | None
     amplification: float | None
     degrees_of_freedom: float
-    draws: int
-    seed: int
 
 
 def error_planes(
     image: Image,
     psf: Psf,
-    run: Run,
+    run: Callable[[Image], Plane],
     noise: Noise,
     *,
-    estimate: Plane | None = None,
-    draws: int = 8,
+    estimate: Plane,
+    draws: int,
     seed: int = 0,
     edge_px: int = 0,
     threads: int = 1,
@@ -99,14 +94,14 @@ def error_planes(
 ) -> ErrorPlanes:
     """Compute the error plane of `run(image)`. `run` deconvolves an image of this shape and mask with any method.
 
-    estimate: run(image), if it is already known. draws: number of noise realisations. edge_px: width of the band at the
+    estimate: run(image). draws: number of noise realisations. edge_px: width of the band at the
     edges that is left out of the amplification. The same seed gives the same planes. progress(done, of) is called after
     each run; its exceptions are not caught. Raises DataError "bad-draws", "no-exposure".
     """
     if draws < SMALLEST_DRAWS:
         raise DataError("bad-draws", f"expected at least {SMALLEST_DRAWS} noise realisations; got {draws}")
     scale = dn_per_unit(image)
-    expected = expected_image(image, run(image) if estimate is None else estimate, psf, threads=threads)
+    expected = expected_image(image, estimate, psf, threads=threads)
     base = run(_with_pixels(image, expected))
     _tell(progress, 1, draws + 1)
     reference_variance = noise.variance(_local_mean(expected, image.valid, REFERENCE_WINDOW_PX), scale)
@@ -118,7 +113,7 @@ def error_planes(
         total += local
         squares += local**2
         _tell(progress, k + 2, draws + 1)
-    counted = _away_from_edges(image.valid, edge_px)
+    counted = image.valid & inside_band(image.valid.shape, edge_px)
     freedom = _degrees_of_freedom(total[counted], squares[counted], draws)
     error = np.sqrt(reference_variance * total / draws) / mean_of_root(freedom)  # Eq. (3)
     ratio = error[counted] / np.sqrt(noise.variance(expected[counted], scale))
@@ -127,8 +122,6 @@ def error_planes(
         psf_error=None,
         amplification=float(np.median(ratio)) if ratio.size else None,
         degrees_of_freedom=freedom,
-        draws=draws,
-        seed=seed,
     )
 
 
@@ -145,19 +138,12 @@ def expected_image(image: Image, estimate: Plane, psf: Psf, *, threads: int = 1)
     return np.asarray(convolved * ratio)  # Eq. (1)
 
 
-def with_psf_error(planes: ErrorPlanes, psf_error: Plane) -> ErrorPlanes:
-    """Add a plane `psf_error` to the planes. The added plane is NaN where `error` is NaN."""
-    return replace(planes, psf_error=np.where(np.isnan(planes.error), np.nan, psf_error))
-
-
-def psf_error_plane(
-    psfs: Sequence[Psf], run: RunWithPsf, *, chance: bool = True, progress: Progress | None = None
+def spread_of_results(
+    psfs: Sequence[Psf], run: Callable[[Psf], Plane], *, progress: Progress | None = None
 ) -> Plane:
-    """Standard deviation [y, x] of run(psf) over `psfs`, all with equal weight.
+    """Standard deviation [y, x] of run(psf) over the sigma points of a covariance, whose variance is exact.
 
-    chance: True if `psfs` are n random samples: the sum of squares is divided by n - 1, and sigma by c4. False if they
-    are the sigma points of a covariance: their variance is exact, and the sum of squares is divided by n. Raises
-    DataError "bad-draws" for fewer than two PSFs.
+    Raises DataError "bad-draws" for fewer than two PSFs.
     """
     if len(psfs) < SMALLEST_DRAWS:
         raise DataError("bad-draws", f"expected at least {SMALLEST_DRAWS} PSFs; got {len(psfs)}")
@@ -169,10 +155,7 @@ def psf_error_plane(
         mean = mean + step / count
         spread = spread + step * (pixels - mean)
         _tell(progress, count, len(psfs))
-    if not chance:
-        return np.asarray(np.sqrt(spread / len(psfs)))
-    freedom = len(psfs) - 1
-    return np.asarray(np.sqrt(spread / freedom) / mean_of_root(freedom))
+    return np.asarray(np.sqrt(spread / len(psfs)))
 
 
 def sigma_points(mean: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -225,13 +208,6 @@ def _degrees_of_freedom(total: Plane, squares: Plane, draws: int) -> float:
         return float(draws)
     relative = float(np.mean(variance[positive] / mean[positive] ** 2))
     return max(1.0, 2 * draws / relative) if relative > 0 else 1e9
-
-
-def _away_from_edges(valid: NDArray[np.bool_], edge_px: int) -> NDArray[np.bool_]:
-    inner = np.zeros_like(valid)
-    ny, nx = valid.shape
-    inner[edge_px : ny - edge_px, edge_px : nx - edge_px] = True
-    return np.asarray(inner & valid)
 
 
 def _tell(progress: Progress | None, done: int, of: int) -> None:

@@ -32,11 +32,11 @@ Plane = NDArray[np.float64]
 
 
 def changes_png(
-    before: Plane, after: Plane, found: Changes, path: str | Path, *, title: str, unit: str
+    before: Plane, after: Plane, changes: Changes, path: str | Path, *, title: str, unit: str
 ) -> None:
     """Draw before, after, change in percent, difference, ratio and histogram into a PNG file.
 
-    before, after: pixels [y, x] in `unit`; row 0 is drawn at the bottom. found: the numbers below the panels.
+    before, after: pixels [y, x] in `unit`; row 0 is drawn at the bottom. changes: the numbers below the panels.
     """
     step = max(1, -(-max(before.shape) // PANEL_PX))
     old, new = binned(before, step), binned(after, step)
@@ -74,7 +74,7 @@ def changes_png(
     ratio_bar.set_yticks([], minor=True)
     left, bottom, width, height = _place(5)
     _draw_histogram(figure.add_axes((left + 0.02, bottom, width, height)), before, after, unit)
-    figure.text(0.045, 0.022, _figures(found), fontsize=10, color=INK, va="center")
+    figure.text(0.045, 0.022, _figures(changes), fontsize=10, color=INK, va="center")
     write_png(figure, path, pil_kwargs={"compress_level": 3})
 
 
@@ -109,19 +109,19 @@ def _draw_histogram(axes: Any, before: Plane, after: Plane, unit: str) -> None:
         axes.spines[side].set_visible(False)
 
 
-def _figures(found: Changes) -> str:
+def _figures(changes: Changes) -> str:
     """The line of text below the panels, for blocks of 4 px and the brightest and darkest 1 % of them."""
     parts = [
         f"{row.kind} {row.tail_pct:g} % of {row.block_px} px blocks: {row.sum_pct:+.0f} %, up to {row.up_to_pct:+.0f} %"
-        for row in found.structures
+        for row in changes.structures
         if (row.block_px, row.tail_pct) == (4, 1.0)
     ]
     parts += [
         f"dynamic range (percentile 99 / percentile 1): {_number(row.dynamic_before)} -> {_number(row.dynamic_after)}"
-        for row in found.ranges
+        for row in changes.ranges
         if (row.block_px, row.tail_pct) == (4, 1.0)
     ]
-    parts.append(f"artefact score {found.artefacts.score:.2f} (inspect from 1)")
+    parts.append(f"artefact score {changes.artefacts.score:.2f} (inspect from 1)")
     return "     ".join(parts)
 
 

@@ -7,6 +7,7 @@ from enum import IntFlag
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.deconvolve.edges import inside_band
 from psfcore.image import Image, MaskBit
 
 NEAR_MASKED_PX = 3
@@ -64,7 +65,7 @@ def quality_plane(
         plane[(image.mask & mask_bit) != 0] |= np.uint8(bit)
     if not image.valid.all():
         plane[image.valid & _near(~image.valid, NEAR_MASKED_PX)] |= np.uint8(QualityBit.NEAR_MASKED)
-    plane[_edge_band(result.shape, edge_px)] |= np.uint8(QualityBit.EDGE)
+    plane[~inside_band(result.shape, edge_px)] |= np.uint8(QualityBit.EDGE)
     if suspected is not None:
         plane[suspected] |= np.uint8(QualityBit.ARTEFACT)
     if error is not None:
@@ -82,9 +83,3 @@ def _near(marked: NDArray[np.bool_], radius_px: int) -> NDArray[np.bool_]:
             max(-dy, 0) : ny + min(-dy, 0), max(-dx, 0) : nx + min(-dx, 0)
         ]
     return near
-
-
-def _edge_band(shape: tuple[int, ...], edge_px: int) -> NDArray[np.bool_]:
-    band = np.ones(shape, dtype=bool)
-    band[edge_px : shape[0] - edge_px, edge_px : shape[1] - edge_px] = False
-    return band

@@ -30,18 +30,20 @@ import numpy as np
 from psfcore.compiled import compiled
 from psfcore.convolution.engine import buffer_from_spectrum, spectrum_from_buffer
 from psfcore.convolution.fft_kernels import LANES, forward, inverse
-from psfcore.deconvolve.additive import check_converges, noise_amplification, transfer_sample
 from psfcore.deconvolve.conditions import Conditions, Deconvolved
-from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.problem import Problem, first_estimate, pose
-from psfcore.deconvolve.stopping import Iteration, Stop
+from psfcore.deconvolve.methods.linear import (
+    LinearIteration,
+    TransferSample,
+    noise_amplification,
+    transfer_sample,
+)
+from psfcore.deconvolve.problem import Method, Problem, Stop, pose, relative_change
+from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import Psf
 
-METHOD = "basic-iterative"
-EDGES: Edges = "symmetric"
-MAY_BE_NEGATIVE = True
-MARGIN_SHARE = 0.015
+METHOD = Method("basic-iterative", edges="symmetric", margin_share=0.015, may_be_negative=True)
+LARGEST_GROWTH = 10.0
 
 
 def deconvolve(
@@ -52,41 +54,43 @@ def deconvolve(
     The result may be negative. It is NaN where the image is not finite. Saturated pixels keep their first estimate.
     Raises the errors of `problem.pose`, and DataError "method-diverges" if abs(1 - T) is too large.
     """
-    problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
+    problem = pose(METHOD, image, psf, conditions, steps=steps, stop=stop)
     sample = transfer_sample(problem.engine)
-    check_converges(sample, steps)
-    result = problem.solve(_BasicIterative(problem), method=METHOD, steps=steps, stop=stop)
+    _check_converges(sample, steps)
+    result = problem.solve(_BasicIterative(problem))
     amplification = noise_amplification(sample, np.ones_like(sample.values), result.steps_done)
     return replace(result, noise_amplification=amplification)
 
 
-class _BasicIterative(Iteration):
+class _BasicIterative(LinearIteration):
     """Eq. (1) with one pass over the rows per step: `measure` computes the next estimate, and `update` adopts it."""
 
     def __init__(self, problem: Problem) -> None:
-        domain, engine = problem.domain, problem.engine
-        self._engine, self._judgement = engine, problem.judgement
-        self.x = engine.to_lanes(first_estimate(problem))
+        super().__init__(problem)
         self._next = np.zeros_like(self.x)
-        trusted = np.where(domain.trusted, domain.pixels, np.float32(np.nan))
-        self._observed = engine.to_lanes(trusted, padding=np.nan)
-        self._moved, self._total = np.zeros((2, engine.row_blocks))
-        engine.rows_forward(self.x)
 
     def measure(self) -> None:
-        self._engine.columns(adjoint=False)
-        self._engine.row_stage(
-            _step_rows, self._observed, self.x, self._next, self._moved, self._total, *self._judgement.numbers
+        self.engine.columns(adjoint=False)
+        self.engine.row_stage(
+            _step_rows, self.observed, self.x, self._next, self.moved, self.total, *self.judgement.numbers
         )
+        self.change = relative_change(self.moved.sum(), self.total.sum())
 
     def update(self, *, last: bool) -> None:
         self.x, self._next = self._next, self.x
 
-    @property
-    def change(self) -> float:
-        """Rms of the change in the last step, divided by the rms of x."""
-        total = float(self._total.sum())
-        return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
+
+def _check_converges(sample: TransferSample, steps: int) -> None:
+    """Raise DataError "method-diverges" if `steps` steps with G = 1 can increase an error by more than
+    LARGEST_GROWTH."""
+    worst = float(np.abs(1 - sample.values).max())
+    if worst > 1 and steps * np.log(worst) > np.log(LARGEST_GROWTH):
+        advice = "use richardson-lucy or linear, or fewer steps"
+        raise DataError(
+            "method-diverges",
+            "expected a PSF whose Fourier transform T has abs(1 - T) <= 1 at all frequencies; got up to "
+            f"{worst:.3g}, and each of the {steps} steps multiplies an error by this number: {advice}",
+        )
 
 
 @compiled(fastmath={"contract", "reassoc"})

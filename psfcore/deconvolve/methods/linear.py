@@ -12,34 +12,51 @@ noise of every image by the same factor, `noise_amplification` (2 to 2.4 for HRI
 unchanged, and the result may be negative. A masked pixel (w = 0) does not influence the fit; its estimate follows from
 its neighbours.
 
+Another filter G in Eq. (1) makes another linear method; `Additive` is the iteration for any G.
+
+The noise amplification is computed frequency by frequency. T is the PSF's Fourier transform at one frequency.
+After n steps, the method has multiplied the amplitude of the image at this frequency by
+
+    A_n = A_(n-1) + G (1 - T A_(n-1)),   A_0 = 1        Eq. (2)
+
+The method multiplies the rms of uncorrelated noise by the root of the mean of abs(A)^2 over all frequencies. This
+factor holds away from edges and masked pixels. T varies smoothly from frequency to frequency. Therefore only every k-th
+frequency along y is used; k is 2, 3, 4 or 8, depending on the length of the transform.
+
 | symbol | name | unit |
 |---|---|---|
 | y | observed | image unit |
 | x | estimate | image unit |
 | w | trusted, 1 or 0 | - |
-| G | inverse | - |
+| G | inverse_filter, step_filter; step of Eq. (2): 1, or an inverse of T | - |
+| T | values of TransferSample | - |
+| A | gain | - |
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.convolution.engine import Engine
-from psfcore.deconvolve.additive import Additive, noise_amplification, transfer_sample
+from psfcore.compiled import compiled
+from psfcore.convolution.engine import Engine, buffer_from_spectrum, spectrum_from_buffer
+from psfcore.convolution.fft_kernels import LANES, forward, inverse
 from psfcore.deconvolve.conditions import Conditions, Deconvolved
-from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.problem import pose
-from psfcore.deconvolve.stopping import Stop
+from psfcore.deconvolve.problem import (
+    Iteration,
+    Method,
+    Problem,
+    Stop,
+    first_estimate,
+    pose,
+    relative_change,
+)
 from psfcore.image import Image
 from psfcore.psf import Psf
 
-METHOD = "linear"
-EDGES: Edges = "symmetric"
-MAY_BE_NEGATIVE = True
-MARGIN_SHARE = 0.015
+METHOD = Method("linear", edges="symmetric", margin_share=0.015, may_be_negative=True)
 LEAST_TRANSFER = 0.1
 
 
@@ -50,10 +67,8 @@ def deconvolve(
 
     The result may be negative. It is NaN where the image is not finite. Raises the same errors as `problem.pose`.
     """
-    problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
-    result = problem.solve(
-        Additive(problem, inverse_filter(problem.engine)), method=METHOD, steps=steps, stop=stop
-    )
+    problem = pose(METHOD, image, psf, conditions, steps=steps, stop=stop)
+    result = problem.solve(Additive(problem, inverse_filter(problem.engine)))
     sample = transfer_sample(problem.engine)
     g = np.conj(sample.values) / np.maximum(np.abs(sample.values) ** 2, LEAST_TRANSFER**2)
     return replace(result, noise_amplification=noise_amplification(sample, g, result.steps_done))
@@ -67,3 +82,125 @@ def inverse_filter(engine: Engine) -> NDArray[np.float32]:
     if not engine.symmetric:
         g[:, :, 1] *= -1
     return g
+
+
+class LinearIteration(Iteration):
+    """What the iterations of linear methods share: x_0 = y, and y without the masked pixels."""
+
+    def __init__(self, problem: Problem) -> None:
+        domain, engine = problem.domain, problem.engine
+        self.engine, self.judgement = engine, problem.judgement
+        self.x = engine.to_lanes(first_estimate(problem))
+        trusted = np.where(domain.trusted, domain.pixels, np.float32(np.nan))
+        self.observed = engine.to_lanes(trusted, padding=np.nan)
+        self.moved, self.total = np.zeros((2, engine.row_blocks))  # sums of (change)^2 and x^2
+        engine.rows_forward(self.x)
+
+
+class Additive(LinearIteration):
+    """The iteration of Eq. (1).
+
+    step_filter: G, divided by `engine.transfer_scale`, in the layout of `engine.transfer`. A constant G is
+    `np.full_like(engine.transfer[:, :, :1], G / engine.transfer_scale)`.
+    """
+
+    def __init__(self, problem: Problem, step_filter: NDArray[np.float32]) -> None:
+        super().__init__(problem)
+        self._step_filter = step_filter
+
+    def measure(self) -> None:
+        self.engine.columns(adjoint=False)
+        self.engine.row_stage(_residual_rows, self.observed, *self.judgement.numbers)
+
+    def update(self, *, last: bool) -> None:
+        self.engine.multiply_columns(self._step_filter)
+        self.engine.row_stage(_add_rows, self.x, not last, self.moved, self.total)
+        self.change = relative_change(self.moved.sum(), self.total.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class TransferSample:
+    """Values of T at some frequencies (float64 or complex128) and the weights of these frequencies, which sum to 1."""
+
+    values: NDArray[np.floating] | NDArray[np.complexfloating]
+    weights: NDArray[np.float64]
+
+
+def transfer_sample(engine: Engine) -> TransferSample:
+    """A sample of an engine's transfer function: along y, every k-th frequency (k: first radix of its transform)."""
+    rows = engine.column_plan.length // int(engine.column_plan.radices[0])
+    lanes = engine.transfer[:, :rows].astype(np.float64) * engine.transfer_scale
+    values = lanes[:, :, 0] if engine.symmetric else lanes[:, :, 0] + 1j * lanes[:, :, 1]
+    # Frequencies along x run from 0 to L / 2. Except the first and last, each also represents its negative.
+    k, half = np.arange(engine.column_blocks * LANES), engine.row_plan.length // 2
+    times = np.where((k == 0) | (k == half), 1.0, np.where(k < half, 2.0, 0.0))
+    weights = np.broadcast_to(times.reshape(-1, 1, LANES), values.shape)
+    used = weights > 0
+    return TransferSample(values[used], weights[used] / weights[used].sum())
+
+
+def noise_amplification(
+    sample: TransferSample, step: NDArray[np.floating] | NDArray[np.complexfloating], steps: int
+) -> float:
+    """Rms noise of the estimate after `steps` steps, divided by the rms noise of the image. step: G of Eq. (2)."""
+    # The closed form A_n = (1 - (1 - G T)^n (1 - T)) / T fails for T near 0.
+    gain = np.ones_like(sample.values)
+    for _ in range(steps):
+        gain = gain + step * (1 - sample.values * gain)  # Eq. (2)
+    return float(np.sqrt(np.sum(sample.weights * np.abs(gain) ** 2)))
+
+
+@compiled(fastmath={"contract", "reassoc"})
+def _residual_rows(spectrum, observed, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Replace H x by w (y - H x), where y is NaN if w is 0. Add up (y - H x)^2 / variance over the judged pixels."""
+    nx = observed.shape[1]
+    zero, least = np.float32(0.0), np.float32(1e-30)
+    z = buffer.reshape((-1, 2, LANES))
+    for block in range(start, stop):
+        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
+        inverse(buffer, length, passes, lengths, tw, offsets)
+        sum_here = 0.0
+        for i in range(nx):
+            sum_row = zero
+            for side in range(2):
+                for w in range(LANES):
+                    y, model = observed[block, i, side, w], z[i, side, w]
+                    misfit = y - model if y == y else zero
+                    variance = max(slope * max(model, zero) + ground, least)
+                    sum_row += judged[block, side, w] * misfit * misfit / variance
+                    z[i, side, w] = misfit
+            if first <= i < last:
+                sum_here += sum_row
+        sums[block] = sum_here
+        buffer[nx * 2 * LANES : length * 2 * LANES] = zero
+        forward(buffer, length, passes, lengths, tw, offsets)
+        spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
+
+
+@compiled(fastmath={"contract", "reassoc"})
+def _add_rows(spectrum, x, again, moved, total, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Compute x <- x + G w (y - H x), Eq. (1). Add up (change)^2 and x^2 for each block."""
+    nx = x.shape[1]
+    zero = np.float32(0.0)
+    z = buffer.reshape((-1, 2, LANES))
+    for block in range(start, stop):
+        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
+        inverse(buffer, length, passes, lengths, tw, offsets)
+        moved_here, total_here = 0.0, 0.0
+        for i in range(nx):
+            moved_row, total_row = zero, zero
+            for side in range(2):
+                for w in range(LANES):
+                    change = z[i, side, w]
+                    value = x[block, i, side, w] + change  # Eq. (1)
+                    x[block, i, side, w] = value
+                    z[i, side, w] = value
+                    moved_row += change * change
+                    total_row += value * value
+            moved_here += moved_row
+            total_here += total_row
+        moved[block], total[block] = moved_here, total_here
+        if again:
+            buffer[nx * 2 * LANES : length * 2 * LANES] = zero
+            forward(buffer, length, passes, lengths, tw, offsets)
+            spectrum_from_buffer(spectrum, buffer, corner, block, length, place)

@@ -9,6 +9,12 @@ that leaves the plane, so the ratios of the other pixels converge to 1 / s. A pi
 fainter by the factor s at each step. Negative pixels are due to noise around zero. They count as 0 in the ratio,
 because the method cannot represent negative light.
 
+The other Richardson-Lucy methods use the same ratio, with another value a for masked pixels:
+
+    w y / (H x) + (1 - w) a      Eq. (2)
+
+One plane stores the light (at least 0) of the trusted pixels, and -a for the masked pixels.
+
 In the paper the scene is zero beyond the field (edges "zero"). In this case, the outermost rows of the result become 4
 to 6 % too dark: light that enters from beyond the field replaces the light that leaves the field, but only on average.
 If the mirror image of the field continues the scene, the error is at most 1.3 % (`python -m studies.edges`). The
@@ -21,6 +27,7 @@ light that crosses the edge of the margin.
 | x | estimate | image unit |
 | w | trusted, 1 or 0 | - |
 | s | share of a pixel's light that falls on the plane and on the PSF's array; 1 / s is `agreed` | - |
+| a | agreed: ratio at which a masked pixel does not change the estimate; 1 / s here | - |
 | H, H^T | Engine.apply, Engine.adjoint | - |
 """
 
@@ -34,18 +41,28 @@ from numpy.typing import NDArray
 from psfcore.compiled import compiled
 from psfcore.convolution.engine import buffer_from_spectrum, spectrum_from_buffer
 from psfcore.convolution.fft_kernels import LANES, forward, inverse
-from psfcore.deconvolve.conditions import Conditions, Deconvolved, Progress
-from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
-from psfcore.deconvolve.problem import Problem, pose
-from psfcore.deconvolve.stopping import Iteration, Stop
+from psfcore.deconvolve.conditions import Conditions, Deconvolved
+from psfcore.deconvolve.problem import (
+    Iteration,
+    Method,
+    Problem,
+    Stop,
+    first_estimate,
+    pose,
+    relative_change,
+)
+from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import Psf
 
-METHOD = "richardson-lucy"
-EDGES: Edges = "symmetric"
-MARGIN_SHARE = 0.05
-KEEPS_FLUX = True
+METHOD = Method("richardson-lucy", edges="symmetric", margin_share=0.05, keeps_flux=True)
+# Smallest value of a model pixel, as a fraction of the brightest pixel (the "floor"). The floor is the resolution of
+# float32; smaller values are dominated by the rounding of the transform. The floor also avoids denormal numbers, which are
+# slow.
+FLOOR_OF_MAXIMUM = 2.0**-23
+# An estimate below this fraction of the floor is set to 0.
+DARK_OF_FLOOR = 1e-6
+# The compiler may reorder a sum within a block. The new order is fixed, so it does not depend on the threads.
 _SUMS: Any = {"contract", "reassoc"}
 _SUMMED = 16 * LANES
 
@@ -60,46 +77,65 @@ def deconvolve(
     The result is not negative. It is NaN where the image is not finite. Where the image is saturated, the result is an
     estimate from the surrounding pixels. Raises the errors of `problem.pose`, and DataError "no-signal".
     """
-    problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
-    return problem.solve(_RichardsonLucy(problem), method=METHOD, steps=steps, stop=stop)
+    problem = pose(METHOD, image, psf, conditions, steps=steps, stop=stop)
+    return problem.solve(_RichardsonLucy(problem))
 
 
-def richardson_lucy(
-    image: Image, psf: Psf, *, steps: int = 20, threads: int = 1, progress: Progress | None = None
-) -> Deconvolved:
-    """Run the published method: a fixed number of steps, and a scene that is zero beyond the field."""
-    conditions = Conditions(edges="zero", threads=threads, progress=progress)
-    return deconvolve(image, psf, conditions, steps=steps)
+class LucyIteration(Iteration):
+    """The first half of a step of every Richardson-Lucy method: `measure` replaces H x by the ratio of Eq. (2).
+
+    agreed [y, x]: a of Eq. (2), above 0. brightest: largest value of the first estimate; the floor is a fraction of it.
+    dark: estimates below this value are set to 0.
+    """
+
+    def __init__(self, problem: Problem, agreed: Single | float, brightest: float) -> None:
+        domain = problem.domain
+        self.engine, self.judgement = problem.engine, problem.judgement
+        self.floor = np.float32(FLOOR_OF_MAXIMUM * brightest)
+        self.dark = self.floor * np.float32(DARK_OF_FLOOR)
+        of_masked = np.broadcast_to(np.float32(agreed), domain.shape)
+
+        def light_or_agreed(rows: slice) -> Single:
+            return np.where(domain.trusted[rows], np.maximum(domain.pixels[rows], 0), -of_masked[rows])
+
+        self._light_or_agreed = self.engine.lanes_of(light_or_agreed)
+
+    def measure(self) -> None:
+        self.engine.columns(adjoint=False)
+        self.engine.row_stage(_ratio_rows, self._light_or_agreed, self.floor, *self.judgement.numbers)
 
 
-class _RichardsonLucy(Iteration):
+class _RichardsonLucy(LucyIteration):
     """The iteration of Eq. (1). A block of rows stays in the cache between two convolutions."""
 
     def __init__(self, problem: Problem) -> None:
         estimate = light_above_floor(problem)
         brightest = float(estimate.max())
-        self._engine = problem.engine
         self.x = problem.engine.to_lanes(estimate)
         del estimate  # makes room for the planes of the ratio
-        self._ratio = Ratio(problem, agreed(problem), brightest)
-        self._dark = self._ratio.floor * np.float32(DARK_OF_FLOOR)
+        super().__init__(problem, agreed(problem), brightest)
         self._moved, self._total = np.zeros((2, problem.engine.row_blocks))
-        self._engine.rows_forward(self.x)
-
-    def measure(self) -> None:
-        self._ratio.measure()
+        self.engine.rows_forward(self.x)
 
     def update(self, *, last: bool) -> None:
-        self._engine.columns(adjoint=True)
-        self._engine.row_stage(
-            _update_rows, self.x, self._dark, not last, self._moved, self._total
-        )  # Eq. (1)
+        self.engine.columns(adjoint=True)
+        self.engine.row_stage(_update_rows, self.x, self.dark, not last, self._moved, self._total)  # Eq. (1)
+        self.change = relative_change(self._moved.sum(), self._total.sum())
 
-    @property
-    def change(self) -> float:
-        """Rms of the change in the last step, divided by the rms of x."""
-        total = float(self._total.sum())
-        return float(np.sqrt(self._moved.sum() / total)) if total > 0 else 0.0
+
+def light_above_floor(problem: Problem) -> Single:
+    """The first estimate [y, x], with values below the floor raised to the floor.
+
+    Raises DataError "no-signal" if no trusted pixel is above zero.
+    """
+    domain = problem.domain
+    if not (domain.pixels[domain.trusted] > 0).any():
+        raise DataError(
+            "no-signal",
+            "expected at least one trusted pixel above zero; got none: use another image or the method linear",
+        )
+    estimate = first_estimate(problem)
+    return np.maximum(estimate, np.float32(FLOOR_OF_MAXIMUM * float(estimate.max())), out=estimate)
 
 
 def agreed(problem: Problem) -> Single | float:
@@ -108,6 +144,36 @@ def agreed(problem: Problem) -> Single | float:
         return 1.0
     ones = np.ones(problem.domain.shape, dtype=np.float32)
     return np.asarray(1 / np.maximum(problem.engine.adjoint(ones), np.finfo(np.float32).eps))
+
+
+@compiled(fastmath=_SUMS, error_model="numpy")
+def _ratio_rows(spectrum, light, floor, judged, first, last, slope, ground, sums, buffer, corner, start, stop, length, passes, lengths, tw, offsets, place):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Replace H x, raised to `floor` where it is smaller, by Eq. (2). Add up (y - H x)^2 / variance over the judged
+    pixels."""
+    nx = light.shape[1]
+    zero = np.float32(0.0)
+    least = np.float32(1e-30)
+    z = buffer.reshape((-1, 2, LANES))
+    for block in range(start, stop):
+        buffer_from_spectrum(spectrum, buffer, corner, block, length, place)
+        inverse(buffer, length, passes, lengths, tw, offsets)
+        sum_here = 0.0
+        for i in range(nx):
+            sum_row = zero
+            for side in range(2):
+                for w in range(LANES):
+                    y = light[block, i, side, w]
+                    model = max(z[i, side, w], floor)
+                    misfit = y - model
+                    part = judged[block, side, w] * misfit * misfit / max(slope * model + ground, least)
+                    sum_row += part if y >= zero else zero
+                    z[i, side, w] = y / model if y >= zero else -y
+            if first <= i < last:
+                sum_here += sum_row
+        sums[block] = sum_here
+        buffer[nx * 2 * LANES : length * 2 * LANES] = zero
+        forward(buffer, length, passes, lengths, tw, offsets)
+        spectrum_from_buffer(spectrum, buffer, corner, block, length, place)
 
 
 @compiled(fastmath=_SUMS, error_model="numpy")

@@ -20,19 +20,13 @@ import numpy as np
 
 from psfcore.compiled import compiled
 from psfcore.deconvolve.conditions import Conditions, Deconvolved
-from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
-from psfcore.deconvolve.methods.richardson_lucy import agreed
-from psfcore.deconvolve.problem import Problem, pose
-from psfcore.deconvolve.stopping import Iteration, Stop
+from psfcore.deconvolve.methods.richardson_lucy import LucyIteration, agreed, light_above_floor
+from psfcore.deconvolve.problem import Method, Problem, Stop, pose, relative_change
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import Psf
 
-METHOD = "richardson-lucy-accelerated"
-EDGES: Edges = "symmetric"
-MARGIN_SHARE = 0.05
-KEEPS_FLUX = True
+METHOD = Method("richardson-lucy-accelerated", edges="symmetric", margin_share=0.05, keeps_flux=True)
 # Biggs & Andrews require an acceleration below 1.
 _MOST_ACCELERATION = 0.999
 
@@ -53,20 +47,16 @@ def deconvolve(
     """
     if order not in (1, 2):
         raise DataError("bad-order", f"expected an order of 1 or 2; got {order}")
-    problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
-    return problem.solve(_Accelerated(problem, order), method=METHOD, steps=steps, stop=stop)
+    problem = pose(METHOD, image, psf, conditions, steps=steps, stop=stop)
+    return problem.solve(_Accelerated(problem, order))
 
 
-class _Accelerated(Iteration):
+class _Accelerated(LucyIteration):
     """The iteration of Eq. (1) to (3). Its `x` is the prediction, which `measure` convolves; after the last step it is x."""
-
-    change = 0.0
 
     def __init__(self, problem: Problem, order: int) -> None:
         estimate = light_above_floor(problem)
-        self._engine = problem.engine
-        self._ratio = Ratio(problem, agreed(problem), float(estimate.max()))
-        self._dark = self._ratio.floor * np.float32(DARK_OF_FLOOR)
+        super().__init__(problem, agreed(problem), float(estimate.max()))
         self._order = order
         self.x = problem.engine.to_lanes(estimate)
         self._x, self._before = self.x.copy(), self.x.copy()
@@ -74,34 +64,31 @@ class _Accelerated(Iteration):
         self._earlier = self.x.copy() if order == 2 else self._before
         self._gradient = np.zeros_like(self._x)
         self._corrected = np.zeros_like(self._x)
-        self._engine.rows_forward(self.x)
-
-    def measure(self) -> None:
-        self._ratio.measure()
+        self.engine.rows_forward(self.x)
 
     def update(self, *, last: bool) -> None:
-        self._engine.columns(adjoint=True)
-        self._engine.rows_inverse(self._corrected)
+        self.engine.columns(adjoint=True)
+        self.engine.rows_inverse(self._corrected)
         acceleration = self._correct()
         if last:
             self.x = self._x
         else:
             self._predict(acceleration)
-            self._engine.rows_forward(self.x)
+            self.engine.rows_forward(self.x)
 
     def _correct(self) -> float:
         """Compute Eq. (2); the new estimate replaces the oldest one. Returns a_k of Eq. (3)."""
         new, before = self._earlier, self._before
-        sums = np.zeros((self._engine.row_blocks, 4))
+        sums = np.zeros((self.engine.row_blocks, 4))
 
         def work(first: int, end: int, _: object) -> None:
-            _correct(new, self.x, self._corrected, self._x, self._gradient, self._dark, sums, first, end)
+            _correct(new, self.x, self._corrected, self._x, self._gradient, self.dark, sums, first, end)
 
-        self._engine.run(work, self._engine.row_blocks)
+        self.engine.run(work, self.engine.row_blocks)
         self._before, self._x = self._x, new
         self._earlier = before if self._order == 2 else self._before
         alike, length, moved, total = sums.sum(axis=0)
-        self.change = float(np.sqrt(moved / total)) if total > 0 else 0.0
+        self.change = relative_change(moved, total)
         return float(np.clip(alike / length, 0, _MOST_ACCELERATION)) if length > 0 else 0.0  # Eq. (3)
 
     def _predict(self, acceleration: float) -> None:
@@ -110,9 +97,9 @@ class _Accelerated(Iteration):
         curvature = np.float32(acceleration**2 / 2 if self._order == 2 else 0)
 
         def work(first: int, end: int, _: object) -> None:
-            _predict(self.x, self._x, self._before, self._earlier, a, curvature, self._dark, first, end)
+            _predict(self.x, self._x, self._before, self._earlier, a, curvature, self.dark, first, end)
 
-        self._engine.run(work, self._engine.row_blocks)
+        self.engine.run(work, self.engine.row_blocks)
 
 
 @compiled(fastmath={"contract", "reassoc"})

@@ -22,19 +22,14 @@ enough.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psfcore.deconvolve.conditions import Conditions, Deconvolved
-from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
-from psfcore.deconvolve.problem import Problem, pose
-from psfcore.deconvolve.stopping import Iteration, Stop
+from psfcore.deconvolve.methods.richardson_lucy import LucyIteration, light_above_floor
+from psfcore.deconvolve.problem import Method, Problem, Stop, pose, relative_change
 from psfcore.image import Image
 from psfcore.psf import Psf
 
-METHOD = "richardson-lucy-extended"
-EDGES: Edges = "extended"
-MARGIN_SHARE = 0.005
+METHOD = Method("richardson-lucy-extended", edges="extended", margin_share=0.005)
 LEAST_OBSERVED = 1e-3
 # A masked pixel has the ratio 0 in Eq. (1), because a already accounts for the pixel. The code needs a number above 0.
 _NO_RATIO = 1e-30
@@ -48,54 +43,43 @@ def deconvolve(
     The result covers only the field. It is not negative. It is NaN where the image is not finite.
     Raises the errors of `problem.pose`, and DataError "no-signal".
     """
-    problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
-    return problem.solve(_Extended(problem), method=METHOD, steps=steps, stop=stop)
+    problem = pose(METHOD, image, psf, conditions, steps=steps, stop=stop)
+    return problem.solve(_Extended(problem))
 
 
-class _Extended(Iteration):
+class _Extended(LucyIteration):
     """The iteration of Eq. (1)."""
-
-    change = 0.0
 
     def __init__(self, problem: Problem) -> None:
         engine = problem.engine
         estimate = light_above_floor(problem)
         share_observed = engine.adjoint(problem.domain.trusted.astype(np.float32))
-        known = share_observed > LEAST_OBSERVED
-        gain = np.where(known, 1 / np.maximum(share_observed, np.float32(LEAST_OBSERVED)), np.float32(0))
-        self._engine = engine
-        self._ratio = Ratio(problem, _NO_RATIO, float(estimate.max()))
-        self._dark = self._ratio.floor * np.float32(DARK_OF_FLOOR)
+        observed = share_observed > LEAST_OBSERVED
+        gain = np.where(observed, 1 / np.maximum(share_observed, np.float32(LEAST_OBSERVED)), np.float32(0))
+        super().__init__(problem, _NO_RATIO, float(estimate.max()))
         self._gain = engine.to_lanes(gain)
-        self.x = engine.to_lanes(np.where(known, estimate, np.float32(0)))
+        self.x = engine.to_lanes(np.where(observed, estimate, np.float32(0)))
         self._correction = np.zeros_like(self.x)
         engine.rows_forward(self.x)
 
-    def measure(self) -> None:
-        self._ratio.measure()
-
     def update(self, *, last: bool) -> None:
-        self._engine.columns(adjoint=True)
-        self._engine.rows_inverse(self._correction)
-        parts = self._engine.run(
-            lambda first, end, _: self._step(slice(first, end), last), self._engine.row_blocks
+        self.engine.columns(adjoint=True)
+        self.engine.rows_inverse(self._correction)
+        parts = self.engine.run(
+            lambda first, end, _: self._step(slice(first, end), last), self.engine.row_blocks
         )
         moved, total = np.sum(parts, axis=0)
-        self.change = float(np.sqrt(moved / total)) if total > 0 else 0.0
+        self.change = relative_change(moved, total)
         if not last:
-            self._engine.rows_forward(self.x)
+            self.engine.rows_forward(self.x)
 
-    def _step(self, blocks: slice, last: bool) -> tuple[float, float]:
+    def _step(self, blocks: slice, last: bool) -> list[float]:
         """Compute Eq. (1) on some blocks. Returns the sums of (change)^2 and x^2 in the last step, and 0 before."""
         x, correction = self.x[blocks], self._correction[blocks]
         np.maximum(correction, np.float32(0), out=correction)
         correction *= self._gain[blocks]
         correction *= x  # Eq. (1)
-        correction[correction < self._dark] = 0
-        sums = _sums(correction - x, correction) if last else (0.0, 0.0)
+        correction[correction < self.dark] = 0
+        squares = [np.square(correction - x), np.square(correction)] if last else []
         x[...] = correction
-        return sums
-
-
-def _sums(change: NDArray[np.float32], x: NDArray[np.float32]) -> tuple[float, float]:
-    return float(np.square(change).sum(dtype=np.float64)), float(np.square(x).sum(dtype=np.float64))
+        return [float(plane.sum(dtype=np.float64)) for plane in squares] or [0.0, 0.0]

@@ -27,19 +27,13 @@ import numpy as np
 
 from psfcore.compiled import compiled
 from psfcore.deconvolve.conditions import Conditions, Deconvolved
-from psfcore.deconvolve.edges import Edges
-from psfcore.deconvolve.lucy_ratio import DARK_OF_FLOOR, Ratio, light_above_floor
-from psfcore.deconvolve.methods.richardson_lucy import agreed
-from psfcore.deconvolve.problem import Problem, pose
-from psfcore.deconvolve.stopping import Iteration, Stop
+from psfcore.deconvolve.methods.richardson_lucy import LucyIteration, agreed, light_above_floor
+from psfcore.deconvolve.problem import Method, Problem, Stop, pose, relative_change
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.psf import Psf
 
-METHOD = "richardson-lucy-total-variation"
-EDGES: Edges = "symmetric"
-MARGIN_SHARE = 0.05
-KEEPS_FLUX = True
+METHOD = Method("richardson-lucy-total-variation", edges="symmetric", margin_share=0.05, keeps_flux=True)
 SOFTENING = 0.1
 # One step multiplies a small difference by 1 - 8 k / SOFTENING. The steps converge if 8 k / SOFTENING is below 2.
 MOST_SMOOTHING = 0.02
@@ -61,48 +55,41 @@ def deconvolve(
     """
     if not 0 <= smoothing <= MOST_SMOOTHING:
         raise DataError("bad-smoothing", f"expected smoothing of 0 to {MOST_SMOOTHING}; got {smoothing}")
-    problem = pose(image, psf, conditions, edges=EDGES, margin_share=MARGIN_SHARE, steps=steps, stop=stop)
-    return problem.solve(_TotalVariation(problem, smoothing), method=METHOD, steps=steps, stop=stop)
+    problem = pose(METHOD, image, psf, conditions, steps=steps, stop=stop)
+    return problem.solve(_TotalVariation(problem, smoothing))
 
 
-class _TotalVariation(Iteration):
+class _TotalVariation(LucyIteration):
     """The iteration of Eq. (1). x is a plane [y, x], because the differences connect pixels of different blocks of the
     engine."""
-
-    change = 0.0
 
     def __init__(self, problem: Problem, smoothing: float) -> None:
         self.x = light_above_floor(problem)
         self._new = np.empty_like(self.x)
-        self._engine = problem.engine
-        self._ratio = Ratio(problem, agreed(problem), float(self.x.max()))
-        self._dark = self._ratio.floor * np.float32(DARK_OF_FLOOR)
+        super().__init__(problem, agreed(problem), float(self.x.max()))
         self._smoothing = np.float32(smoothing)
         self._softening = np.float32(SOFTENING)
         self._lanes = problem.engine.to_lanes(self.x)
-        self._engine.rows_forward(self._lanes)
-
-    def measure(self) -> None:
-        self._ratio.measure()
+        self.engine.rows_forward(self._lanes)
 
     def update(self, *, last: bool) -> None:
-        self._engine.columns(adjoint=True)
-        self._engine.rows_inverse(self._lanes)
-        correction = self._engine.from_lanes(self._lanes)
+        self.engine.columns(adjoint=True)
+        self.engine.rows_inverse(self._lanes)
+        correction = self.engine.from_lanes(self._lanes)
         sums = np.zeros((self.x.shape[0], 2))
 
         def work(start: int, stop: int, _: object) -> None:
             _smooth_rows(
-                self.x, correction, self._new, self._smoothing, self._softening, self._dark, sums, start, stop
+                self.x, correction, self._new, self._smoothing, self._softening, self.dark, sums, start, stop
             )
 
-        self._engine.run(work, self.x.shape[0])
+        self.engine.run(work, self.x.shape[0])
         self.x, self._new = self._new, self.x
         moved, total = sums.sum(axis=0)
-        self.change = float(np.sqrt(moved / total)) if total > 0 else 0.0
+        self.change = relative_change(moved, total)
         if not last:
-            self._lanes = self._engine.to_lanes(self.x)
-            self._engine.rows_forward(self._lanes)
+            self._lanes = self.engine.to_lanes(self.x)
+            self.engine.rows_forward(self._lanes)
 
 
 @compiled()

@@ -25,15 +25,13 @@ from weakref import WeakValueDictionary
 
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
-from psfcore.fits.cards import optional_text
+from psfcore.fits.cards import LONGEST_TEXT, optional_text
 from psfcore.fits.header import all_hdus, is_plane, read_summary
 from psfcore.limited import run_limited
 
 IMAGE = "image"
 PIXEL_BYTES = 4
 MOST_BYTES, MOST_PLANES = 2**27, 8
-
-_LONGEST_UNIT = 68  # characters of a card's value
 
 Key = tuple[str, str]  # SHA-256 of the file, and name of the plane
 
@@ -134,7 +132,7 @@ def write_pixels(target: BinaryIO, *, path: str, hdu: int | None, limits: dict[s
     stored = read_pixels(path, FitsLimits(**limits), hdu=hdu)
     target.write(stored.pixels.astype("<f4").data)
     unit = optional_text(stored.header, "BUNIT")
-    return {"unit": None if unit is None else ascii_text(unit)[:_LONGEST_UNIT]}
+    return {"unit": None if unit is None else ascii_text(unit)[:LONGEST_TEXT]}
 
 
 def _number_of_plane(path: str | Path, name: str, limits: FitsLimits) -> int:

@@ -104,19 +104,19 @@ def _window(region: Region, header: fits.Header, shape: tuple[int, int]) -> tupl
     """The columns and rows that contain the region, inside the image."""
     ny, nx = shape
     points = region.edge if region.frame == "pixel" else _pixels_of(region.edge, header)
-    found = []
+    parts = []
     for axis, size in ((0, nx), (1, ny)):
         # Pixel i extends from i - 0.5 to i + 0.5.
         first = max(0, math.floor(float(points[:, axis].min()) + 0.5))
         last = min(size - 1, math.ceil(float(points[:, axis].max()) - 0.5))
-        found.append(slice(first, last + 1))
-    if any(part.start >= part.stop for part in found):
+        parts.append(slice(first, last + 1))
+    if any(part.start >= part.stop for part in parts):
         box = ", ".join(f"{points[:, axis].min():.1f} to {points[:, axis].max():.1f}" for axis in (0, 1))
         raise DataError(
             "region-outside",
             f"expected a region with pixels of the image, {nx} x {ny} px; got a region at x and y {box} px: move the region",
         )
-    return found[0], found[1]
+    return parts[0], parts[1]
 
 
 def _pixels_of(points: Points, header: fits.Header) -> Points:
@@ -134,13 +134,13 @@ def _pixels_of(points: Points, header: fits.Header) -> Points:
             f"expected an image with helioprojective coordinates (CTYPE1 HPLN-..., CTYPE2 HPLT-...); got {got}: give the "
             "region in pixels, FRAME=pixel",
         )
-    found: Points = wcs.wcs_world2pix(points / _ARCSEC_PER_DEG, 0)
-    if not np.isfinite(found).all():
+    pixels: Points = wcs.wcs_world2pix(points / _ARCSEC_PER_DEG, 0)
+    if not np.isfinite(pixels).all():
         raise DataError(
             "region-outside",
             "expected a region that the image's coordinates can show; got one partly beyond them: move it, or make it smaller",
         )
-    return found
+    return pixels
 
 
 def moved_header(whole: fits.Header, columns: slice, rows: slice) -> fits.Header:

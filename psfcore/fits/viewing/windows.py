@@ -108,10 +108,10 @@ def _mean(pieces: Iterator[NDArray[np.float32]], step: int) -> NDArray[np.float6
 
 
 def _union(pieces: Iterator[NDArray[np.float32]], step: int) -> NDArray[np.int64]:
-    found = np.zeros((), dtype=np.int64)
+    union = np.zeros((), dtype=np.int64)
     for piece in pieces:
-        found = found | _summed(piece.astype(np.int64), np.bitwise_or, step)
-    return found
+        union = union | _summed(piece.astype(np.int64), np.bitwise_or, step)
+    return union
 
 
 def _summed(piece: NDArray[Any], sum_of: np.ufunc, step: int) -> NDArray[Any]:

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.fits.observation import read_observation
 from psfcore.image import Image, MaskBit
 from psfcore.simulate.observe import observe
 from psfcore.simulate.scene import solar_scene
 from tests.psfcore.conftest import LIMITS, gaussian, make_image, make_psf
-from tests.psfcore.deconvolve.scattering import scattering_psf
+from tests.psfcore.deconvolve.scattering import richardson_lucy, scattering_psf
 
 PSF = scattering_psf(core_px=0.4)
 

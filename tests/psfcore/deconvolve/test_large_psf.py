@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from psfcore.deconvolve.run import Options, deconvolve, input_warnings
+from psfcore.deconvolve.doubts import input_warnings
+from psfcore.deconvolve.run import deconvolve
+from psfcore.deconvolve.whole import Options
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf
 from psfcore.image import Image

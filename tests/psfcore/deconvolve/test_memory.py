@@ -7,7 +7,7 @@ import pytest
 
 from psfcore.convolution.engine import Engine
 from psfcore.deconvolve.conditions import Conditions
-from psfcore.deconvolve.memory import MIB, Asked, check_memory, deconvolution_bytes
+from psfcore.deconvolve.memory import MIB, Demand, check_memory, deconvolution_bytes
 from psfcore.deconvolve.methods.registry import method_named, method_names
 from psfcore.errors import DataError
 from psfcore.psf import Psf
@@ -29,18 +29,18 @@ def test_the_transforms_are_those_of_the_engine() -> None:
         for edges, shape in (("zero", (96, 130)), ("symmetric", (96, 96)), (None, (64, 200))):
             conditions = Conditions(edges=edges, margin_px=16, engine_for=engine_for)  # type: ignore[arg-type]
             method_named(method)(make_image(np.full(shape, 5.0)), psf, conditions, steps=1)
-            sizes = Asked(method, shape, (80, 80), edges=edges, margin_px=16)
+            sizes = Demand(method, shape, (80, 80), edges=edges, margin_px=16)
             engine = engines.pop()
             assert not engines and sizes.plane == engine.field_shape, (method, edges)
             assert sizes.transform == (engine.column_plan.length, engine.row_plan.length), (method, edges)
 
 
 def test_more_pixels_need_more_memory() -> None:
-    base = deconvolution_bytes(Asked("richardson-lucy", (1024, 1024), (2048, 2048)))
-    assert deconvolution_bytes(Asked("richardson-lucy", (2048, 1024), (2048, 2048))) > base + 20e6
-    assert deconvolution_bytes(Asked("richardson-lucy", (1024, 1024), (2048, 2048), draws=4)) > base + 20e6
-    assert deconvolution_bytes(Asked("richardson-lucy", (1024, 1024), (2048, 2048), edges="zero")) < base
-    assert deconvolution_bytes(Asked("richardson-lucy", (1024, 1024), (64, 64))) < base - 32e6
+    base = deconvolution_bytes(Demand("richardson-lucy", (1024, 1024), (2048, 2048)))
+    assert deconvolution_bytes(Demand("richardson-lucy", (2048, 1024), (2048, 2048))) > base + 20e6
+    assert deconvolution_bytes(Demand("richardson-lucy", (1024, 1024), (2048, 2048), draws=4)) > base + 20e6
+    assert deconvolution_bytes(Demand("richardson-lucy", (1024, 1024), (2048, 2048), edges="zero")) < base
+    assert deconvolution_bytes(Demand("richardson-lucy", (1024, 1024), (64, 64))) < base - 32e6
 
 
 def test_what_does_not_fit_is_refused_with_both_figures() -> None:

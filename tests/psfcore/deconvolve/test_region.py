@@ -13,11 +13,9 @@ from scipy.ndimage import gaussian_filter
 from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.assess.quality import QualityBit
 from psfcore.deconvolve.box import Box
-from psfcore.deconvolve.conditions import Conditions
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.deconvolve.region import BoxWork, box_work
-from psfcore.deconvolve.run import Options
-from psfcore.deconvolve.whole import Work
+from psfcore.deconvolve.whole import Options, Work
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
 from psfcore.psf import Psf, squared_radii
@@ -61,8 +59,9 @@ def both(
     image: Image, psf: Psf, method: str, box: Box, *, largest_error: float = 0.1, steps: int = 0, **more: Any
 ) -> tuple[Any, ...]:
     """The box alone, the same box of the whole image, and the work on the box. steps: 0 for the method's default."""
-    work = Work(image, psf, method, Conditions(**more), {"steps": steps} if steps else {})
-    alone = box_work(work, box, largest_error=largest_error)
+    parameters = {"steps": steps} if steps else {}
+    work = Work(image, psf, Options(method=method, parameters=parameters, region_error=largest_error, **more))
+    alone = box_work(work, box)
     return alone.run(), work.run().pixels[box.slices], alone
 
 
@@ -70,9 +69,10 @@ def both(
 def test_a_box_alone_differs_from_the_whole_image_by_at_most_its_bound(
     image: Image, psf: Psf, method: str
 ) -> None:
-    whole = Work(image, psf, method, Conditions()).run().pixels
+    work = Work(image, psf, Options(method=method, region_error=0.1))
+    whole = work.run().pixels
     for box in (BRIGHT, HOLE):
-        alone = box_work(Work(image, psf, method, Conditions()), box, largest_error=0.1)
+        alone = box_work(work, box)
         result, expected = alone.run(), whole[box.slices]
         assert result.pixels.shape == box.shape and result.of_box is not None
         assert 0 < result.of_box.error <= 0.1 * image.pixels[box.slices].mean()
@@ -133,7 +133,7 @@ def test_if_no_rim_is_wide_enough_the_whole_image_is_deconvolved(image: Image, p
 
 
 def test_the_header_of_the_box_has_its_coordinates(image: Image, psf: Psf) -> None:
-    alone = box_work(Work(image, psf, "linear", Conditions()), BRIGHT)
+    alone = box_work(Work(image, psf, Options(method="linear")), BRIGHT)
     header = alone.image.header
     assert (header["CRPIX1"], header["CRPIX2"], header["CRPIX1A"]) == (100.5 - 150, 90.5 - 60, 7 - 150)
     assert "PXBEG1" not in header and header["CDELT1"] == 0.5
@@ -145,10 +145,10 @@ def test_the_quality_of_a_box_is_that_of_its_place_in_the_image(image: Image, ps
     pixels[100, 20], mask[100, 20] = np.nan, MaskBit.NONFINITE
     mask[49, 30] = MaskBit.SATURATED  # one row below the box
     masked = replace(image, pixels=pixels, mask=mask)
-    work = Work(masked, psf, "linear", Conditions(), {"steps": 2})
+    work = Work(masked, psf, Options(method="linear", parameters={"steps": 2}, region_error=0.3))
     whole = work.run()
     box = Box(0, 80, 50, 130)
-    alone = box_work(work, box, largest_error=0.3)
+    alone = box_work(work, box)
     result = alone.run()
     quality = alone.assess(result).quality
     np.testing.assert_array_equal(np.isnan(result.pixels), np.isnan(whole.pixels[box.slices]))
@@ -161,17 +161,16 @@ def test_the_quality_of_a_box_is_that_of_its_place_in_the_image(image: Image, ps
 def test_a_box_that_is_no_part_of_the_image_is_refused(image: Image, psf: Psf) -> None:
     for box in (Box(0, 257, 0, 20), Box(30, 20, 0, 20)):
         with pytest.raises(DataError, match=f"region-outside: .*{box}"):
-            box_work(Work(image, psf, "linear", Conditions()), box)
+            box_work(Work(image, psf, Options(method="linear")), box)
     with pytest.raises(DataError, match="region-too-small"):
-        box_work(Work(image, psf, "linear", Conditions()), Box(0, 20, 0, 15))
+        box_work(Work(image, psf, Options(method="linear")), Box(0, 20, 0, 15))
 
 
 def test_what_depends_on_the_whole_image_is_refused(image: Image, psf: Psf) -> None:
     def refused(largest_error: float = 0.05, changed: Image = image, **parameters: Any) -> str:
         with pytest.raises(DataError) as error:
-            box_work(
-                Work(changed, psf, "linear", Conditions(), parameters), BRIGHT, largest_error=largest_error
-            )
+            options = Options(method="linear", parameters=parameters, region_error=largest_error)
+            box_work(Work(changed, psf, options), BRIGHT)
         return error.value.code
 
     assert refused(stop="discrepancy") == "region-discrepancy"
@@ -179,7 +178,7 @@ def test_what_depends_on_the_whole_image_is_refused(image: Image, psf: Psf) -> N
     masked = image.mask.copy()
     masked[BRIGHT.slices] = MaskBit.SATURATED
     assert refused(changed=replace(image, mask=masked)) == "all-masked"
-    alone: BoxWork = box_work(Work(image, psf, "linear", Conditions()), BRIGHT)
+    alone: BoxWork = box_work(Work(image, psf, Options(method="linear")), BRIGHT)
     with pytest.raises(DataError, match="region-errors"):
         Options(region=alone.box, error_draws=4)
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tracemalloc
 from collections.abc import Callable
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 
 import numpy as np
@@ -217,10 +217,10 @@ def test_a_stream_of_rice_that_ends_too_early_is_refused(tmp_path: Path) -> None
         "short": RNG.integers(0, 120, 5),
     }
     cuts: list[Callable[[int], int]] = [lambda n: 1, lambda n: n // 2, lambda n: n - 5, lambda n: n - 1]
-    for name, dtype, cut in product(rows, ("u1", "i2", "i4"), cuts):
+    for number, (name, dtype) in enumerate(product(rows, ("u1", "i2", "i4"))):
         pixels = np.tile(rows[name], (20, 1)).astype(dtype)
         path = written(tmp_path / "t.fits", pixels, compression_type="RICE_1")
-        with_first_length(path, lambda length, cut=cut: max(cut(length), 1))
+        with_first_length(path, lambda length, cut=cuts[number % 4]: max(cut(length), 1))
         with pytest.raises(DataError, match=r"unreadable-pixels"):
             read_observation(path, LIMITS)
 
@@ -251,13 +251,13 @@ EXACT = [(codec, dtype) for codec in ("GZIP_1", "GZIP_2", "NOCOMPRESS") for dtyp
 
 
 def test_correct_tiles_pass(tmp_path: Path) -> None:
-    for codec, dtype in (*EXACT, *(("RICE_1", dtype) for dtype in WHOLE)):
+    stored = [*EXACT, *(("RICE_1", dtype) for dtype in WHOLE)]
+    for (codec, dtype), tile in zip(stored, cycle([(7, 9), (1, 50), (40, 50), (7, 9)]), strict=False):
         pixels = RNG.integers(1, 200, (40, 50)).astype(dtype)
-        for tile in ((7, 9), (1, 50), (40, 50)):
-            options = {"compression_type": codec, "tile_shape": tile, "quantize_level": 0}
-            path = written(tmp_path / "tiles.fits", pixels, **options)
-            assert read_summary(path, LIMITS).codec == codec
-            assert np.array_equal(read_observation(path, LIMITS).pixels, pixels), (codec, dtype, tile)
+        options = {"compression_type": codec, "tile_shape": tile, "quantize_level": 0}
+        path = written(tmp_path / "tiles.fits", pixels, **options)
+        assert read_summary(path, LIMITS).codec == codec
+        assert np.array_equal(read_observation(path, LIMITS).pixels, pixels), (codec, dtype, tile)
 
 
 def test_quantised_floats_pass_with_tiles_that_could_not_be_quantised(tmp_path: Path) -> None:

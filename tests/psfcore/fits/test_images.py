@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,7 +60,9 @@ def test_any_storage_becomes_native_float64(tmp_path: Path, limits: FitsLimits) 
     np.testing.assert_array_equal(read_observation(path, limits).pixels, ramp() % 200)
 
 
-def test_blank_is_masked_in_plain_and_compressed_integers(tmp_path: Path, limits: FitsLimits) -> None:
+def test_blank_is_masked_in_plain_unsigned_and_compressed_integers(
+    tmp_path: Path, limits: FitsLimits
+) -> None:
     data = ramp().astype(np.int16)
     data[3, 4] = -32768
     save(tmp_path / "plain.fits", data, BLANK=-32768)
@@ -73,16 +74,10 @@ def test_blank_is_masked_in_plain_and_compressed_integers(tmp_path: Path, limits
         assert np.argwhere(~image.valid).tolist() == [[3, 4]], name
         assert image.mask[3, 4] == MaskBit.NONFINITE
         np.testing.assert_array_equal(image.pixels[image.valid], ramp()[image.valid])
-
-
-def test_blank_is_masked_in_unsigned_images_too(tmp_path: Path, limits: FitsLimits) -> None:
-    stored = np.arange(32 * 32, dtype=">i2").reshape(32, 32)
-    stored[3, 4] = -32768
-    cards = image_cards(32, 32, 16, "BZERO   = 32768", "BSCALE  = 1", "BLANK   = -32768")
-    (tmp_path / "unsigned.fits").write_bytes(block(*cards, data=stored.tobytes()))
+    cards = image_cards(24, 20, 16, "BZERO   = 32768", "BSCALE  = 1", "BLANK   = -32768")
+    (tmp_path / "unsigned.fits").write_bytes(block(*cards, data=data.astype(">i2").tobytes()))
     image = read_observation(tmp_path / "unsigned.fits", limits)
-    assert image.mask[3, 4] == MaskBit.NONFINITE and np.isnan(image.pixels[3, 4])
-    assert image.pixels[0, 5] == 32773 and np.count_nonzero(image.mask) == 1
+    assert np.argwhere(image.mask).tolist() == [[3, 4]] and image.pixels[0, 4] == 32773
 
 
 def test_nan_is_masked_and_negative_is_data(tmp_path: Path, limits: FitsLimits) -> None:
@@ -163,18 +158,6 @@ def test_a_product_without_planes_keeps_header_and_wcs_and_opens_as_one_map(
     assert "Richardson-Lucy, 20 steps" in kept
 
 
-def test_equal_products_are_equal_bytes_with_true_checksums(tmp_path: Path, limits: FitsLimits) -> None:
-    image = read_observation(save(tmp_path / "in.fits", ramp(), BUNIT="DN"), limits)
-    for name in ("one.fits", "two.fits"):
-        write_image(tmp_path / name, image, cards=CARDS, history=["x"])
-    assert (tmp_path / "one.fits").read_bytes() == (tmp_path / "two.fits").read_bytes()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        with fits.open(tmp_path / "one.fits", checksum=True) as hdus:
-            for hdu in hdus:
-                assert (hdu.verify_checksum(), hdu.verify_datasum()) == (1, 1)
-
-
 def test_odd_cards_survive(tmp_path: Path, limits: FitsLimits) -> None:
     long = "word " * 40
     image = read_observation(save(tmp_path / "in.fits", ramp(), LONGTEXT=long.strip(), BUNIT="DN"), limits)
@@ -203,6 +186,7 @@ def test_statistics_in_the_header_are_those_of_the_finite_pixels(tmp_path: Path)
     mask = np.where(np.isfinite(pixels), 0, 1).astype(np.uint8)
     image = Image(pixels, mask, fits.Header({"DATAMAX": 9e9, "DATAP50": 4.0}), "DN", 1.0)
     write_image(tmp_path / "p.fits", image, cards={}, history=[])
+    assert read_planes(tmp_path / "p.fits") == {}
     header = fits.getheader(tmp_path / "p.fits")
     assert (header["DATAMIN"], header["DATAMAX"]) == (1.0, np.nanmax(pixels))
     assert "DATAP50" not in header
@@ -322,12 +306,6 @@ def test_sunpy_shows_the_image_first_and_every_plane_at_the_same_place(
     assert all(np.array_equal(place, corner[0]) for place in corner)
 
 
-def test_a_product_without_planes_has_none(tmp_path: Path, limits: FitsLimits) -> None:
-    image = read_observation(save(tmp_path / "in.fits", ramp()), limits)
-    write_image(tmp_path / "out.fits", image, cards=CARDS)
-    assert read_planes(tmp_path / "out.fits") == {}
-
-
 def test_a_wrong_plane_is_refused(tmp_path: Path, limits: FitsLimits) -> None:
     image = read_observation(save(tmp_path / "in.fits", ramp()), limits)
     for name, plane in (
@@ -364,10 +342,7 @@ def test_a_product_describes_itself_and_points_to_its_input() -> None:
     assert header["TELESCOP"] == "SOLO/EUI/FSI" and header["LVL_NUM"] == 1.5
     assert SHA in history
     assert {f"input {key}: {value}" for key, value in source.items()} <= set(history)
-
-
-def test_what_the_input_does_not_say_is_not_invented() -> None:
-    header, cards, history = made(PARENT="earlier.fits", TELESCOP="X")
+    header, cards, history = made(PARENT="earlier.fits", TELESCOP="X")  # the rest is not invented
     assert set(cards) == {"FILENAME", "CREATOR", "DCNVPASS"} and "PARENT" not in header
     assert history == ["SHA-256 of the input file:", SHA, "input PARENT: earlier.fits"]
 

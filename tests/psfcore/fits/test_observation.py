@@ -13,10 +13,10 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 import heliopsf
+from psfcore.deconvolve.doubts import pixel_warnings
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.channel import check_channel
-from psfcore.fits.doubts import doubts
 from psfcore.fits.frame import UNIT, frame_of
 from psfcore.fits.header import instant, observed_at, read_summary
 from psfcore.fits.observation import check_exposure_of_sun, observation_of, read_observation
@@ -26,14 +26,8 @@ from psfcore.psf import Psf
 from psfcore.psf_sampling import frame_warnings, psf_for_image, with_scale
 
 LIMITS = FitsLimits(max_pixels=10**6)
-AIA = {
-    "TELESCOP": "SDO/AIA",
-    "INSTRUME": "AIA_3",
-    "WAVELNTH": 171,
-    "EXPTIME": 2.0,
-    "BUNIT": "DN",
-    "LVL_NUM": 1.0,
-}
+AIA = {"TELESCOP": "SDO/AIA", "INSTRUME": "AIA_3", "WAVELNTH": 171, "WAVEUNIT": "angstrom"}
+AIA |= {"EXPTIME": 2.0, "BUNIT": "DN", "LVL_NUM": 1.0}
 SCALE = {"CDELT1": 0.599489, "CDELT2": 0.599489, "CUNIT1": "arcsec", "CUNIT2": "arcsec"}
 
 
@@ -41,9 +35,6 @@ def scene(size: int = 64) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Light without two equal values, far from saturation."""
     y, x = np.indices((size, size))
     return 200 + 100 * np.sin(x / 5) * np.cos(y / 7) + 0.001 * (x + size * y)
-
-
-AIA["WAVEUNIT"] = "angstrom"
 
 
 def header(**cards: Any) -> fits.Header:
@@ -57,42 +48,16 @@ def gaussian(offset_px: float = 0.0, size: int = 33, **fields: Any) -> Psf:
     return Psf(kernel=kernel / kernel.sum(), **known | {"plate_scale_arcsec": 0.599489} | fields)
 
 
-def test_counts_of_saturated_pixels_are_no_levels() -> None:
-    pixels = scene()
-    pixels[:3, :5] = 15000.0
-    pixels[10:12, :20] = 14000.0  # many equal values, but the card gives a higher level
-    for cards, level, source, count in (
-        ({"DSATVAL": 15000.0, "DATASAT": 1379.0}, 15000.0, "DSATVAL", 15),
-        ({"SATURATE": 15000.0, "DATASAT": 5}, 15000.0, "SATURATE", 15),
-        ({"SAT_THR": 14000.0}, 14000.0, "SAT_THR", 55),
-        ({"DSATVAL": 15000.0, "SATURATE": 14000.0}, 14000.0, "SATURATE", 55),
-    ):
-        image = observation_of(pixels, header(**cards))
-        assert image.saturation is not None
-        assert (image.saturation.level, image.saturation.found) == (level, source), cards
-        assert np.count_nonzero(image.mask & MaskBit.SATURATED) == count, cards
-
-
 def test_a_level_in_dn_masks_the_same_pixels_in_every_unit() -> None:
     pixels = scene()
     pixels[:2, :9] = 15000.0 + np.arange(18).reshape(2, 9)
-    rates = (
-        "DN/s",
-        "DN / (pix s)",
-        "DN s-1",
-        "dn/sec",
-        "DN pix-1 s-1",
-        "counts/second",
-        "ct/s",
-        "adu / s",
-        "DN/s/pixel",
-    )
-    for unit, in_unit in (
-        *((name, 2.0) for name in rates),
-        ("DN/ms", 2000.0),
-        ("counts / pixel", 1.0),
-        ("ADU", 1.0),
-    ):
+    rates = ["DN/s", "DN / (pix s)", "DN s-1", "dn/sec", "DN pix-1 s-1", "counts/second", "ct/s", "adu / s"]
+    in_units = dict.fromkeys([*rates, "DN/s/pixel"], 2.0) | {
+        "DN/ms": 2000.0,
+        "counts / pixel": 1.0,
+        "ADU": 1.0,
+    }
+    for unit, in_unit in in_units.items():
         image = observation_of(pixels / in_unit, header(BUNIT=unit), saturation_dn=15000.0)
         assert np.count_nonzero(image.mask) == 18, unit
     of_aia = observation_of(pixels, header(BUNIT=None, PIXLUNIT="DN"), saturation_dn=15000.0)
@@ -117,12 +82,8 @@ def test_units_that_are_no_counts() -> None:
 def test_the_plate_scale_is_that_of_the_world_coordinates() -> None:
     """For every way to write a matrix, beside astropy."""
     angle = math.radians(20)
-    pc = {
-        "PC1_1": math.cos(angle),
-        "PC1_2": -math.sin(angle),
-        "PC2_1": math.sin(angle),
-        "PC2_2": math.cos(angle),
-    }
+    cosine, sine = math.cos(angle), math.sin(angle)
+    pc = {"PC1_1": cosine, "PC1_2": -sine, "PC2_1": sine, "PC2_2": cosine}
     in_degrees = {"CUNIT1": "deg", "CUNIT2": "deg", "CDELT1": 1.0, "CDELT2": 1.0}
     none = {"CDELT1": None, "CDELT2": None}
     cd = {key.replace("PC", "CD"): 0.6 * value for key, value in pc.items()}
@@ -146,12 +107,8 @@ def test_turns_and_flips_against_the_detector() -> None:
     for cards, turn_deg, flipped, exact in (
         ({"CROTA2": 0.02}, 0.02, False, True),
         (half, 180.0, False, True),
-        (
-            half | {"SAT_ROT": 179.9, "INST_ROT": 0.1},
-            0.0,
-            False,
-            True,
-        ),  # the spacecraft was rolled, not the image
+        # The spacecraft was rolled, not the image.
+        (half | {"SAT_ROT": 179.9, "INST_ROT": 0.1}, 0.0, False, True),
         ({"SAT_ROT": 90.0, "INST_ROT": 0.0}, -90.0, False, True),  # turned to north by a quarter turn
         ({"CROTA2": 30.0}, 30.0, False, False),
         ({"CDELT2": -0.599489}, 0.0, True, True),
@@ -264,12 +221,8 @@ def test_which_image_of_a_file_is_read(tmp_path: Path) -> None:
         read_summary(cube, LIMITS)
     assert caught.value.code == "three-axes" and "hdus[0]" in caught.value.message
     assert read_observation(cube, LIMITS, hdu=1).pixels.shape == (64, 64)
-    two = write(
-        tmp_path / "two.fits",
-        fits.PrimaryHDU(),
-        fits.ImageHDU(scene(), name="A"),
-        fits.ImageHDU(2 * scene(), name="B"),
-    )
+    images = fits.ImageHDU(scene(), name="A"), fits.ImageHDU(2 * scene(), name="B")
+    two = write(tmp_path / "two.fits", fits.PrimaryHDU(), *images)
     first, second = read_observation(two, LIMITS), read_observation(two, LIMITS, hdu=2)
     assert "HDU 1" in first.warnings["several-images"] and "2 (B)" in first.warnings["several-images"]
     assert np.array_equal(second.pixels, 2 * first.pixels) and second.warnings == {}
@@ -283,13 +236,8 @@ def test_the_mask_of_a_ccddata_file_is_used(tmp_path: Path) -> None:
 
     mask = np.zeros((64, 64), bool)
     mask[5, 6:9] = True
-    data = CCDData(
-        scene(),
-        unit="adu",
-        mask=mask,
-        uncertainty=StdDevUncertainty(np.ones((64, 64))),
-        meta={"EXPTIME": 2.0},
-    )
+    sigma = StdDevUncertainty(np.ones((64, 64)))
+    data = CCDData(scene(), unit="adu", mask=mask, uncertainty=sigma, meta={"EXPTIME": 2.0})
     data.write(tmp_path / "ccd.fits")
     image = read_observation(tmp_path / "ccd.fits", LIMITS)
     assert np.array_equal(image.mask != 0, mask) and "several-images" not in image.warnings
@@ -360,23 +308,22 @@ def test_doubts_about_pixels() -> None:
         (np.clip(np.rint(rng.normal(120, 60, (128, 128))), 0, 255), {}, ["picture"]),
         (np.log10(rng.uniform(30, 3000, (128, 128))), {}, ["scaled"]),
     ):
-        assert list(doubts(observation_of(pixels, header(**cards)), kernel)) == codes
+        assert list(pixel_warnings(observation_of(pixels, header(**cards)), kernel)) == codes
 
 
 def test_by_file_by_object_and_by_map_give_one_answer(tmp_path: Path) -> None:
     sunpy = pytest.importorskip("sunpy.map")
     pixels = scene()
     pixels[2, 2:5], pixels[9, 9] = -32768, 16000.5
-    cards = header(
-        CROTA2=180.0,
-        NSATPIX=1,
-        CTYPE1="HPLN-TAN",
-        CTYPE2="HPLT-TAN",
-        CRPIX1=32.5,
-        CRPIX2=32.5,
-        CRVAL1=0.0,
-        CRVAL2=0.0,
-    )
+    place = {
+        "CTYPE1": "HPLN-TAN",
+        "CTYPE2": "HPLT-TAN",
+        "CRPIX1": 32.5,
+        "CRPIX2": 32.5,
+        "CRVAL1": 0.0,
+        "CRVAL2": 0.0,
+    }
+    cards = header(CROTA2=180.0, NSATPIX=1, **place)
     cards["DATE-OBS"] = "2013-03-10T06:00:00.34"
     fits.PrimaryHDU(pixels, cards).writeto(tmp_path / "image.fits")
     psf = gaussian()

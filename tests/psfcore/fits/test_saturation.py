@@ -113,7 +113,10 @@ def test_what_is_doubtful_is_told() -> None:
     few = np.arange(128 * 128, dtype=float).reshape(128, 128)
     few[10, 10:16] = few.max()
     clipped = exposure(3, clip_dn=1000.0)
+    # Many equal values below the level of a card are no saturation if brighter pixels reach the level.
+    confirmed = np.where(exposure(3) > 2000, 4000.0, clipped)
     for image, options, marked, words in (
+        (image_of(confirmed, SATURATE=4000.0), {}, 4000.0, ("may be saturated",)),
         (image_of(few), {}, np.inf, ("7 pixels", "--saturation")),
         (image_of(clipped, SATURATE=4000.0), {}, 1000.0, ("SATURATE",)),
         (image_of(exposure(4), TELESCOP="SDO/AIA", NSATPIX=12), {}, np.inf, ("NSATPIX counts 12 saturated",)),

@@ -40,7 +40,7 @@ class Made:
     @property
     def found(self) -> Changes:
         """The measured changes."""
-        return self.product.assessed.found
+        return self.product.assessed.changes
 
 
 def used_psf(row: PsfRow) -> UsedPsf:

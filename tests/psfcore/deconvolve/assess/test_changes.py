@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from astropy.io.fits import Header
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, maximum_filter, median_filter, minimum_filter
 
@@ -22,9 +21,7 @@ from psfcore.deconvolve.assess.artefacts import (
     ringing_pct,
 )
 from psfcore.deconvolve.assess.changes import BLOCKS_PX, block_means, measure_changes
-from psfcore.deconvolve.assess.contact_sheet import changes_from_json
 from psfcore.deconvolve.assess.plots import changes_png
-from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.errors import DataError
 from psfcore.image import Image
 from psfcore.noise import Noise
@@ -32,7 +29,7 @@ from psfcore.psf import Psf, crop_centred
 from psfcore.simulate.observe import observe
 from psfcore.simulate.scene import solar_scene
 from tests.psfcore.conftest import delta, make_image, make_psf
-from tests.psfcore.deconvolve.scattering import scattering_psf
+from tests.psfcore.deconvolve.scattering import richardson_lucy, scattering_psf
 
 Plane = NDArray[np.float64]
 SIZE_PX, EDGE_PX = 384, 24
@@ -226,18 +223,3 @@ def test_pages_are_drawn(seen: Image, psf: Psf, result: Plane, tmp_path: Path) -
     for name in ("a.png", "b.png"):
         changes_png(dark, dark, report, tmp_path / name, title="Dark", unit="DN/s")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-
-
-def test_figures_come_back_from_json() -> None:
-    rng = np.random.default_rng(1)
-    before = rng.poisson(50, (96, 128)) + 400.0 * (rng.random((96, 128)) > 0.99)
-    image = Image(before, np.zeros(before.shape, np.uint8), Header(), "DN", 1.0)
-    kernel = np.zeros((17, 17))
-    kernel[8, 8] = 1.0
-    after = before * 1.1
-    after[40:60:5, 30:90:9] = -100
-    found = measure_changes(image, after, Psf(kernel, "point", "1", None, "draft"))
-    again = changes_from_json(json.loads(json.dumps(found.as_json())), found.artefacts.suspected)
-    assert again.as_json() == found.as_json()
-    assert again.structures == found.structures and again.ranges == found.ranges
-    np.testing.assert_array_equal(again.artefacts.suspected, found.artefacts.suspected)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +15,10 @@ from psfcore.deconvolve.assess.error_planes import (
     error_planes,
     expected_image,
     mean_of_root,
-    psf_error_plane,
     sigma_points,
-    with_psf_error,
+    spread_of_results,
 )
-from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
+from psfcore.deconvolve.whole import Options, Work
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
 from psfcore.noise import Noise
@@ -26,7 +26,7 @@ from psfcore.psf import Psf
 from psfcore.simulate.observe import observe
 from psfcore.simulate.scene import solar_scene
 from tests.psfcore.conftest import delta, make_image, make_psf
-from tests.psfcore.deconvolve.scattering import scattering_psf
+from tests.psfcore.deconvolve.scattering import richardson_lucy, scattering_psf
 
 SIZE_PX, EDGE_PX = 112, 12
 EXPOSURE_S = 1.4
@@ -62,6 +62,10 @@ def twenty_steps(psf: Psf) -> Callable[[Image], Plane]:
     return lambda image: richardson_lucy(image, psf, steps=20).pixels
 
 
+def planes_of(image: Image, psf: Psf, run: Callable[[Image], Plane], **more: Any) -> ErrorPlanes:
+    return error_planes(image, psf, run, NOISE, **{"estimate": run(image), "draws": 8} | more)
+
+
 def pulls(scene: Plane, psf: Psf, images: int, draws: int) -> tuple[Plane, Plane]:
     """(result - result without noise) / error, [image, y, x] away from edges; and the error."""
     run = twenty_steps(psf)
@@ -71,7 +75,7 @@ def pulls(scene: Plane, psf: Psf, images: int, draws: int) -> tuple[Plane, Plane
     for seed in range(1, images + 1):
         image = see(scene, psf, seed)
         pixels = run(image)
-        planes = error_planes(image, psf, run, NOISE, estimate=pixels, draws=draws, seed=seed)
+        planes = planes_of(image, psf, run, estimate=pixels, draws=draws, seed=seed)
         found.append(((pixels - truth) / planes.error)[inner])
     return np.array(found), truth[inner]
 
@@ -94,7 +98,7 @@ def test_pulls_have_width_one(psf: Psf, light: float, images: int) -> None:
 def test_a_delta_gives_back_the_noise_of_the_camera() -> None:
     psf = make_psf(delta(32))
     image = see(np.full((128, 128), 300.0), psf, 4)
-    planes = error_planes(image, psf, lambda seen: seen.pixels, NOISE, draws=12)
+    planes = planes_of(image, psf, lambda seen: seen.pixels, draws=12)
     expected = np.sqrt(6.0 * 300 * EXPOSURE_S + 4.0) / EXPOSURE_S
     assert planes.amplification == pytest.approx(1.0, abs=0.03)
     assert np.median(planes.error) == pytest.approx(expected, rel=0.03)
@@ -109,10 +113,10 @@ def test_the_same_seed_gives_the_same_plane_and_masked_pixels_have_none(psf: Psf
     mask[60, 60] = MaskBit.SATURATED
     damaged = Image(pixels, mask, image.header, image.unit, image.exposure_s)
     run = twenty_steps(psf)
-    first, second = (error_planes(damaged, psf, run, NOISE, draws=3, seed=7, threads=t) for t in (1, 2))
+    first, second = (planes_of(damaged, psf, run, draws=3, threads=t) for t in (1, 2))
     np.testing.assert_array_equal(first.error, second.error)
     np.testing.assert_array_equal(np.isnan(first.error), mask != 0)
-    whole = error_planes(image, psf, run, NOISE, draws=3, seed=7)
+    whole = planes_of(image, psf, run, draws=3)
     far = np.hypot(*(np.indices(mask.shape) - np.array([50, 55])[:, None, None])) > 25
     assert np.median(first.error[far] / whole.error[far]) == pytest.approx(1.0, abs=0.01)
 
@@ -128,24 +132,24 @@ def test_the_model_is_as_bright_as_the_observation_near_the_edges(psf: Psf) -> N
 def test_progress_is_reported_and_may_stop_the_work(psf: Psf) -> None:
     image = see(cut(0.5), psf, 1)
     told: list[tuple[int, int]] = []
-    error_planes(image, psf, lambda seen: seen.pixels, NOISE, draws=2, progress=lambda *at: told.append(at))
+    planes_of(image, psf, lambda seen: seen.pixels, draws=2, progress=lambda *at: told.append(at))
     assert told == [(1, 3), (2, 3), (3, 3)]
 
     def stop(done: int, of: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        error_planes(image, psf, lambda seen: seen.pixels, NOISE, progress=stop)
+        planes_of(image, psf, lambda seen: seen.pixels, progress=stop)
 
 
 def test_what_has_no_error_plane_is_refused() -> None:
     psf = make_psf(delta(16))
     pixels = np.ones((32, 32))
     with pytest.raises(DataError, match="bad-draws"):
-        error_planes(make_image(pixels), psf, lambda seen: seen.pixels, NOISE, draws=1)
+        planes_of(make_image(pixels), psf, lambda seen: seen.pixels, draws=1)
     image = Image(pixels, np.zeros((32, 32), np.uint8), make_image(pixels).header, "DN/s", None)
     with pytest.raises(DataError, match="no-exposure"):
-        error_planes(image, psf, lambda seen: seen.pixels, NOISE)
+        planes_of(image, psf, lambda seen: seen.pixels)
     for pair in ((0.0, 0.0), (-1.0, 2.0), (np.nan, 1.0), (1.0, np.inf)):
         with pytest.raises(DataError, match="bad-noise"):
             Noise(*pair)
@@ -174,25 +178,22 @@ def test_sigma_points_have_the_given_mean_and_covariance() -> None:
     np.testing.assert_allclose(np.cov(points.T, bias=True), covariance, rtol=1e-12)
 
 
-def test_the_error_of_the_psf_is_the_spread_of_its_results(psf: Psf) -> None:
-    """Of random samples without bias, and of sigma points exactly. It has no value where the other error has none."""
+def test_the_scatter_of_sigma_is_corrected_by_the_mean_of_its_root() -> None:
     drawn = np.random.default_rng(3).chisquare(3, 400_000)
     assert mean_of_root(3) == pytest.approx(np.sqrt(drawn / 3).mean(), rel=2e-3)
     assert mean_of_root(1e6) == pytest.approx(1.0, abs=1e-6)
-    rng = np.random.default_rng(1)
-    planes = {total: rng.normal(0, 2.0, (16, 16)) for total in np.linspace(0.9, 1, 200)}
-    psfs = [make_psf(total * delta(16)) for total in planes]
 
-    def run(sample: Psf) -> Plane:
-        return planes[min(planes, key=lambda total: abs(total - sample.total))]
 
-    stack = np.array(list(planes.values()))
-    by_points = psf_error_plane(psfs, run, chance=False)
-    np.testing.assert_allclose(by_points, stack.std(axis=0), rtol=1e-9)
-    by_chance = psf_error_plane(psfs, run)
-    np.testing.assert_allclose(by_chance, stack.std(axis=0, ddof=1) / mean_of_root(199), rtol=1e-9)
+def test_the_error_of_the_psf_is_the_spread_of_its_results(psf: Psf) -> None:
+    """It has no value where the other error has none."""
+    pixels = np.where(np.eye(32) > 0, np.nan, 100.0 + np.arange(32.0))
+    psfs = [make_psf(total * delta(16)) for total in (0.9, 0.95, 1.0)]
+    options = Options(method="linear", error_draws=2, noise=NOISE, parameters={"steps": 2})
+    work = Work(make_image(pixels), psfs[-1], options)
+    planes = work.errors(work.run(), possible_psfs=lambda: psfs)
+    stack = [work.run(psf=one).pixels for one in psfs]
+    np.testing.assert_allclose(planes.psf_error, np.std(stack, axis=0), rtol=1e-9)
+    np.testing.assert_array_equal(np.isnan(planes.psf_error), np.isnan(pixels))
+    assert work.errors(work.run()).psf_error is None
     with pytest.raises(DataError, match="bad-draws"):
-        psf_error_plane(psfs[:1], run)
-    error = np.where(np.eye(16) > 0, np.nan, 1.0)
-    both = with_psf_error(ErrorPlanes(error, None, None, 1.0, 2, 0), by_points)
-    np.testing.assert_array_equal(both.psf_error, np.where(np.eye(16) > 0, np.nan, by_points))
+        spread_of_results(psfs[:1], lambda psf: pixels)

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from psfcore.deconvolve.assess.quality import NEAR_MASKED_PX, QualityBit, quality_plane
-from psfcore.deconvolve.methods.richardson_lucy import richardson_lucy
 from psfcore.image import MaskBit
 from psfcore.psf import Psf
 from psfcore.simulate.observe import observe
 from tests.psfcore.conftest import make_image
-from tests.psfcore.deconvolve.scattering import scattering_psf
+from tests.psfcore.deconvolve.scattering import richardson_lucy, scattering_psf
 
 Plane = NDArray[np.float64]
 SIZE_PX = 128

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from psfcore.deconvolve import memory
-from psfcore.deconvolve.additive import Additive
 from psfcore.deconvolve.conditions import Conditions, Deconvolved
+from psfcore.deconvolve.methods.linear import METHOD, Additive
 from psfcore.deconvolve.methods.registry import method_names
 from psfcore.deconvolve.problem import pose
 from psfcore.image import Image
@@ -22,23 +22,13 @@ from tests.psfcore.conftest import gaussian, make_image, make_psf
 from workers.contract.requests import Method
 from workers.intake.costs import COSTS
 
-# What the file of a method must define, and what each constant means.
-CONSTANTS = {
-    "METHOD": "its name, the name of the file with hyphens",
-    "EDGES": "the default assumption about the scene beyond the edges",
-    "MARGIN_SHARE": "the largest share of the light of an edge pixel that may come from beyond the margin",
-}
 STEPS = 3
 LEAST_GAIN = 0.95  # a few steps must bring the estimate nearer to the scene by 5 %
 
 
 def faults(name: str, module: Any) -> list[str]:
     """A sentence for each thing that a method lacks."""
-    told = [
-        f"{name}: add the constant {constant} to its file: {meaning}"
-        for constant, meaning in CONSTANTS.items()
-        if not hasattr(module, constant)
-    ]
+    told = []
     for figures in ("MARGIN_SHARE", "WORKING_BYTES"):
         if name not in getattr(memory, figures):
             told.append(f"{name}: add its entry to {figures} of psfcore/deconvolve/memory.py")
@@ -51,7 +41,7 @@ def faults(name: str, module: Any) -> list[str]:
     if not told and not _approaches(module):
         told.append(
             f"{name}: {STEPS} steps do not bring the estimate nearer to the scene: divide a filter in the layout of "
-            "engine.transfer by engine.transfer_scale (psfcore/deconvolve/additive.py)"
+            "engine.transfer by engine.transfer_scale (psfcore/deconvolve/methods/linear.py)"
         )
     return told
 
@@ -75,14 +65,14 @@ def unscaled(
     image: Image, psf: Psf, conditions: Conditions, *, steps: int = 5, stop: str = "fixed"
 ) -> Deconvolved:
     """The step x + (y - H x), with a filter that its author forgot to divide by the scale of the transform."""
-    problem = pose(image, psf, conditions, edges="zero", margin_share=0.015, steps=steps, stop="fixed")
+    problem = pose(METHOD, image, psf, conditions, steps=steps, stop="fixed")
     step_filter = np.ones_like(problem.engine.transfer[:, :, :1])
-    return problem.solve(Additive(problem, step_filter), method="linear", steps=steps, stop="fixed")
+    return problem.solve(Additive(problem, step_filter))
 
 
 def test_each_thing_that_is_missing_is_told_by_its_name() -> None:
     empty = faults("my-method", SimpleNamespace())
-    for thing in (*CONSTANTS, "WORKING_BYTES", "benchmarks.estimates", "requests.py"):
+    for thing in ("MARGIN_SHARE", "WORKING_BYTES", "benchmarks.estimates", "requests.py"):
         assert any(thing in sentence for sentence in empty), thing
-    whole = SimpleNamespace(**dict.fromkeys(CONSTANTS, "x"), deconvolve=unscaled)
+    whole = SimpleNamespace(deconvolve=unscaled)
     assert ["transfer_scale" in sentence for sentence in faults("linear", whole)] == [True]

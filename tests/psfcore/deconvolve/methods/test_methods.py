@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.deconvolve.conditions import Conditions, PreparedPsfs
-from psfcore.deconvolve.edges import edge_band_px, share_from_beyond
+from psfcore.deconvolve.edges import band_px, share_from_beyond
 from psfcore.deconvolve.methods import registry
-from psfcore.deconvolve.methods.registry import may_be_negative, method_named, method_names
+from psfcore.deconvolve.methods.registry import method_named, method_names, properties_of
 from psfcore.deconvolve.methods.richardson_lucy_total_variation import SOFTENING
 from psfcore.errors import DataError
 from psfcore.image import MaskBit
@@ -29,7 +29,7 @@ from tests.psfcore.deconvolve.scattering import scattering_psf
 
 Plane = NDArray[np.float64]
 METHODS = method_names()
-LINEAR = tuple(name for name in METHODS if may_be_negative(name))
+LINEAR = tuple(name for name in METHODS if properties_of(name).may_be_negative)
 POSITIVE = tuple(name for name in METHODS if name not in LINEAR)
 ZERO = Conditions(edges="zero")
 TINY = 2.0**-23
@@ -301,8 +301,9 @@ def test_the_edge_band_follows_from_the_psf() -> None:
     kernel[4, 4], kernel[4, 8], kernel[1, 4] = 0.6, 0.2, 0.2
     psf = make_psf(kernel)
     # Mean over the four directions: light from 4 px and from 3 px beyond, 0.2 / 4 each.
-    np.testing.assert_allclose(share_from_beyond(psf), [0.1, 0.1, 0.1, 0.05, 0.0])
-    assert (edge_band_px(psf, 0.07), edge_band_px(psf, 0.04), edge_band_px(psf, 0.2)) == (3, 4, 0)
+    shares = share_from_beyond(psf)
+    np.testing.assert_allclose(shares, [0.1, 0.1, 0.1, 0.05, 0.0])
+    assert [band_px(shares, fraction) for fraction in (0.07, 0.04, 0.2)] == [3, 4, 0]
 
 
 # --- what is refused ---

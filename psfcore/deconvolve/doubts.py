@@ -1,8 +1,9 @@
-"""Signs in the pixels that an image is not what a deconvolution expects: spikes, a bias that is still in, a scaled picture.
+"""Warnings about the inputs of a deconvolution: the PSF, its channel and mesh, and pixels that are not what they should be.
 
-A spike (a cosmic ray, a hot pixel) is brighter than the PSF allows. The PSF puts the share k of a point's light into the
-brightest of the four nearest pixels; a pixel with the excess e over its surroundings is a spike if its neighbours have less
-than half of the excess that its light alone must give them:
+Signs in the pixels are spikes, a bias that is still in, and a scaled picture. A spike (a cosmic ray, a hot pixel) is brighter
+than the PSF allows. The PSF puts the share k of a point's light into the brightest of the four nearest pixels; a pixel with the
+excess e over its surroundings is a spike if its neighbours have less than half of the excess that its light alone must give
+them:
 
     excess of the brightest neighbour < k e / 2,   e > SPIKE_SIGMA sigma        Eq. (1)
 
@@ -15,9 +16,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from psfcore.convolution.offsets import needed_kernel
+from psfcore.deconvolve.methods.registry import method_names, properties_of
+from psfcore.fits.channel import check_channel
 from psfcore.fits.units import parse_unit
 from psfcore.image import Image
+from psfcore.instruments.files import instrument_names
+from psfcore.instruments.model import load_instrument
+from psfcore.psf import REACH_GRID_PX, Psf
+from psfcore.psf_sampling import frame_warnings
 
+LARGEST_CLIPPED = 0.01  # share of the light of an image; a product's total is accurate to about this share
+LARGEST_CUT = 0.001  # share of the light of a PSF; a PSF sums to 1 with about this tolerance
 BLOCK_PX = 16
 SPIKE_SIGMA = 20.0
 FEWEST_SPIKES = 5
@@ -27,7 +37,69 @@ _SAMPLE = 65_536
 _BESIDE = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
-def doubts(image: Image, psf_kernel: NDArray[np.float64]) -> dict[str, str]:
+def input_warnings(psf: Psf, image: Image, method: str | None, *, other_channel: bool) -> dict[str, str]:
+    """Warnings about the inputs: sentences by their codes, the most harmful first.
+
+    method: the method of the deconvolution; None: none was chosen yet. other_channel: whether the PSF may be of another
+    channel than the image. If it is of another channel and this is not allowed, raises DataError "channel-mismatch".
+    """
+    channel = check_channel(psf, image.header, other_channel=other_channel)
+    warnings = frame_warnings(psf, image.header)
+    warnings |= {} if channel is None else {"channel": channel}
+    if _mesh_is_assumed(psf):
+        warnings["assumed-mesh"] = (
+            "the instrument file of the PSF assumes a part of its filter meshes: compare the arms of a bright point with it "
+            "(heliopsf arms), or use a published PSF"
+        )
+    warnings |= image.warnings
+    if image.saturation is not None and image.saturation.warning is not None:
+        warnings["saturation"] = image.saturation.warning
+    if method is not None:
+        warnings |= _cut_warning(psf, image)
+        warnings |= {} if properties_of(method).may_be_negative else _negative_warning(image)
+        warnings |= pixel_warnings(image, psf.kernel)
+    return warnings
+
+
+def _cut_warning(psf: Psf, image: Image) -> dict[str, str]:
+    """The warning if a PSF that is larger than the usual reach is cut, and more than LARGEST_CUT of its light is cut off."""
+    if max(psf.kernel.shape) <= REACH_GRID_PX:
+        return {}
+    needed, _ = needed_kernel(psf.kernel, image.pixels.shape)
+    off = 1 - float(needed.sum()) / psf.total
+    if off <= LARGEST_CUT:
+        return {}
+    (ny, nx), (rows, columns) = psf.kernel.shape, needed.shape
+    return {
+        "psf-cut": f"of the PSF of {nx} x {ny} px, the image needs {columns} x {rows} px: {100 * off:.3g} % of its light falls "
+        "farther, and such light from sources beyond the image is not removed: use a larger image if it matters"
+    }
+
+
+def _mesh_is_assumed(psf: Psf) -> bool:
+    """Whether a PSF was built from an instrument file that assumes a part of its meshes.
+
+    A file of a PSF has no provenance, but the name of its instrument file.
+    """
+    if psf.name == psf.instrument and psf.name in instrument_names():
+        return any(mesh.basis == "assumed" for mesh in load_instrument(psf.name).meshes)
+    return psf.provenance.get("mesh_basis") == "assumed"
+
+
+def _negative_warning(image: Image) -> dict[str, str]:
+    """The warning if a method that counts negative pixels as 0 adds more than LARGEST_CLIPPED to the light of the image."""
+    light = float(image.pixels.sum(where=image.valid))
+    clipped = -float(image.pixels.sum(where=image.valid & (image.pixels < 0)))
+    if clipped <= LARGEST_CLIPPED * abs(light):
+        return {}
+    share = f"{100 * clipped / abs(light):.3g} % of the light" if light else "all of the light"
+    kept = ", ".join(name for name in method_names() if properties_of(name).may_be_negative)
+    return {
+        "negative-pixels": f"negative pixels count as 0, which adds {share}: use a method that keeps them ({kept})"
+    }
+
+
+def pixel_warnings(image: Image, psf_kernel: NDArray[np.float64]) -> dict[str, str]:
     """Warnings about the pixels of an image: sentences by their codes.
 
     psf_kernel: weights [y, x] on the pixels of the image, centre at [ny // 2, nx // 2].

@@ -1,9 +1,10 @@
-"""Parameters as users of astropy give them: numbers in the documented unit, or quantities in any unit that fits."""
+"""Parameters as users give them: numbers in the documented unit, quantities of astropy in any unit that fits, and progress."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias
+import sys
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from astropy import units
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
 
 Number: TypeAlias = "float | units.Quantity"
 NoiseFigures: TypeAlias = "tuple[Number, Number] | Noise"
+Steps = Callable[[int, int], None]
+# True: show a line on standard error; a function: call it with (step, steps); None, False: show nothing.
+Progress = Steps | bool | None
+Stages = Callable[[str, int, int], None]
 # Three names of the number of the A/D converter.
 COUNTS = (units.DN, units.adu, units.ct)
 
@@ -37,18 +42,18 @@ def plain(name: str, value: Any, *allowed: Any) -> NDArray[np.float64]:
 
 def number(name: str, value: Any, *allowed: Any) -> float:
     """As `plain`, for one number."""
-    found = plain(name, value, *allowed)
-    if found.ndim or isinstance(value, str | bool):
+    values = plain(name, value, *allowed)
+    if values.ndim or isinstance(value, str | bool):
         raise DataError("bad-quantity", f"{name}: expected one number; got {value!r:.80}")
-    return float(found)
+    return float(values)
 
 
 def whole(name: str, value: Any, code: str, *allowed: Any) -> int:
     """A whole number. Raises DataError with this code."""
-    found = value.to_value(allowed[0]) if isinstance(value, units.Quantity) and allowed else value
-    if not isinstance(found, int | float | np.integer) or isinstance(found, bool) or int(found) != found:
+    count = value.to_value(allowed[0]) if isinstance(value, units.Quantity) and allowed else value
+    if not isinstance(count, int | float | np.integer) or isinstance(count, bool) or int(count) != count:
         raise DataError(code, f"{name}: expected a whole number; got {value!r:.80}")
-    return int(found)
+    return int(count)
 
 
 def noise_of(noise: Any) -> Noise | None:
@@ -65,7 +70,7 @@ def noise_of(noise: Any) -> Noise | None:
     return Noise(gain, number("read noise", noise[1], *COUNTS))
 
 
-def saturation_dn(level: Any, header: Mapping[str, Any]) -> float | None:
+def level_dn(level: Any, header: Mapping[str, Any]) -> float | None:
     """The saturation level in DN of one exposure. A level per second is multiplied by the exposure time in the header.
 
     Raises DataError "bad-quantity", and "no-exposure" for a level per second of an image without an exposure time.
@@ -87,3 +92,25 @@ def radii_px(radii: ArrayLike | units.Quantity, plate_scale_arcsec: float | None
     if isinstance(radii, units.Quantity) and radii.unit.is_equivalent(units.arcsec) and plate_scale_arcsec:
         return plain("radii", radii, units.arcsec) / plate_scale_arcsec
     return plain("radii", radii, units.pix)
+
+
+def reporter(progress: Progress, stage: str) -> Steps | None:
+    """The function that a computation calls with (step, steps); it shows the stage if ``progress`` is True."""
+    if progress is None or progress is False:
+        return None
+    return _line(stage) if progress is True else progress
+
+
+def stage_reporter(progress: Stages | bool | None) -> Stages:
+    """The function that a computation of several stages calls with (stage, step, steps)."""
+    if progress is True:
+        return lambda stage, step, steps: _line(stage)(step, steps)
+    return progress or (lambda stage, step, steps: None)
+
+
+def _line(stage: str) -> Steps:
+    def show(step: int, steps: int) -> None:
+        end: Literal["\n", ""] = "\n" if step >= steps else ""
+        print(f"\r{stage}: step {step} of {steps}", end=end, file=sys.stderr, flush=True)
+
+    return show
