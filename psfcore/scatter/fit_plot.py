@@ -17,7 +17,7 @@ from psfcore.drawing.plots import INK, points, tidy, write_png
 from psfcore.psf import REACH_GRID_PX, cumulative_curve, radial_profile
 from psfcore.scatter.fit import Curve, ShellWeightFits, TransitFit
 from psfcore.scatter.inversion import CONVERGED_POINTS
-from psfcore.scatter.published import Published
+from psfcore.scatter.as_published import Published
 from psfcore.scatter.report import fit_sentence
 from psfcore.scatter.validation.cross_validation import ONE_SIGMA, TWO_SIGMA
 from psfcore.transit.first_guess import ESTIMATORS

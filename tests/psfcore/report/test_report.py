@@ -23,7 +23,7 @@ from psfcore.report.page import report_page
 from psfcore.report.plot import beyond_of
 from psfcore.report.report import PsfReport, make_report, report_json
 from psfcore.scatter import fit
-from psfcore.scatter.published_equations import free_fit
+from psfcore.scatter.as_published import free_fit
 from psfcore.scatter.total_psf import SCATTER
 from psfcore.scatter.validation.cross_validation import FoldSample, bootstrap_samples, shared_step
 from psfcore.simulate.scatter_truth import total_kernel

@@ -20,7 +20,7 @@ from psfcore.scatter import fit as fit_module
 from psfcore.scatter.fit import ALONE_SUBSETS, RADII_PX, TransitFit, fit_transit, fitted_psf, overdispersion
 from psfcore.scatter.fit_plot import fit_png
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.published import AS_PUBLISHED, CORRECTED_ALONE, Choices, Published
+from psfcore.scatter.as_published import AS_PUBLISHED, CORRECTED_ALONE, Choices, Published
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.report import fit_json, fit_sentence
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW
