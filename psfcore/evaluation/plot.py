@@ -13,8 +13,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
 from psfcore.drawing.plots import CHANGE, INK, points, tidy, write_png
-from psfcore.evaluation.evaluation import Evaluation
-from psfcore.evaluation.frame import FrameEvaluation, Slice, Superposed
+from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Slice, Superposed
 from psfcore.evaluation.report import sentence
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 

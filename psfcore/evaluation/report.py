@@ -25,8 +25,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.evaluation.evaluation import Evaluation
-from psfcore.evaluation.frame import FrameEvaluation, Slice, Superposed
+from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Slice, Superposed
 from psfcore.json_values import json_attributes, json_values
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 

@@ -12,8 +12,13 @@ from typing import Any
 import numpy as np
 
 from psfcore.drawing.page import DASH, render, with_error
-from psfcore.evaluation.evaluation import INVERSION_STEPS, NOISE_REALISATIONS, Evaluation
-from psfcore.evaluation.frame import CENTRE_PX, FrameEvaluation
+from psfcore.evaluation.evaluation import (
+    CENTRE_PX,
+    INVERSION_STEPS,
+    NOISE_REALISATIONS,
+    Evaluation,
+    FrameEvaluation,
+)
 from psfcore.evaluation.report import TREND_PX, Summary, summaries, trends
 from psfcore.psf import REACH_GRID_PX
 from psfcore.report import plot

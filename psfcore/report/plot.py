@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from psfcore.drawing.page import PLOT_DPI
 from psfcore.drawing.plots import png_of, points, tidy
-from psfcore.evaluation.evaluation import Evaluation
-from psfcore.evaluation.frame import Superposed
+from psfcore.evaluation.evaluation import Evaluation, Superposed
 from psfcore.evaluation.plot import (
     draw_absolute,
     draw_centres,

@@ -9,8 +9,7 @@ import pytest
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
-from psfcore.evaluation.evaluation import evaluate
-from psfcore.evaluation.frame import Superposed, half_width_px, superposed, superposed_maps
+from psfcore.evaluation.evaluation import Superposed, evaluate, half_width_px, superposed, superposed_maps
 from psfcore.evaluation.report import report, summaries
 from psfcore.evaluation.summary_lines import summary_lines
 from psfcore.noise import Noise
