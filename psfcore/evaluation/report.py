@@ -228,15 +228,15 @@ def _slice_json(along: Slice) -> dict[str, Any]:
 
 
 def _study_json(study: DarkOffsetStudy) -> dict[str, Any]:
-    largest = ("weight_change_pct", "curve_change_points", "total_curve_change_points")
+    changes = ("weight_change_pct", "curve_change_points", "total_curve_change_points")
     return {
         **json_attributes(study, "radii_px", "curve_radii_px", "nominal"),
-        **json_attributes(study, *(f"largest_{name}" for name in largest)),
+        **{f"largest_{name}": study.largest(name) for name in changes},
         "offsets": [
             {
                 "offset_dn": offset.offset_dn,
                 "parameters": offset.values,
-                **json_attributes(offset, "images", "converged", *largest),
+                **json_attributes(offset, "images", "converged", *changes),
             }
             for offset in study.offsets
         ],

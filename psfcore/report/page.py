@@ -21,8 +21,8 @@ from psfcore.evaluation.evaluation import (
 )
 from psfcore.evaluation.report import TREND_PX, Summary, summaries, trends
 from psfcore.psf import REACH_GRID_PX
-from psfcore.report import plot
-from psfcore.report.plot import beyond_of
+from psfcore.report import plots
+from psfcore.report.plots import beyond_of
 from psfcore.report.report import CrossValidated, PsfReport, inputs_of
 from psfcore.scatter.fit import RADII_PX, TransitFit
 from psfcore.scatter.inversion import CONVERGED_POINTS
@@ -61,7 +61,7 @@ def report_page(report: PsfReport, provenance: dict[str, Any]) -> str:
         "for the Extreme Ultraviolet High-Resolution Imager on board Solar Orbiter.",
         report=report,
         provenance=provenance,
-        plot=plot,
+        plots=plots,
         constants=_CONSTANTS,
         blocks=len(folds(len(report.transit.frames))),
         inputs=inputs,

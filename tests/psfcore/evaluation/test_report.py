@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from psfcore.evaluation.plot import evaluation_png
 
 from psfcore.convolution.convolver import Convolver
 from psfcore.evaluation.evaluation import FrameEvaluation, evaluate
+from psfcore.evaluation.plots import evaluation_png
 from psfcore.evaluation.report import report, slope_of, summary_of, trends
 from psfcore.evaluation.shapes import FIGURES, ShapeErrors, ShapesByErrors
 from psfcore.evaluation.summary_lines import summary_lines

@@ -20,7 +20,7 @@ from psfcore.evaluation.evaluation import evaluate
 from psfcore.psf import Psf, crop_or_pad, cumulative_curve
 from psfcore.report import report as report_module
 from psfcore.report.page import report_page
-from psfcore.report.plot import beyond_of
+from psfcore.report.plots import beyond_of
 from psfcore.report.report import PsfReport, make_report, report_json
 from psfcore.scatter import fit
 from psfcore.scatter.as_published import free_fit
