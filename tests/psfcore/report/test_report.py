@@ -130,7 +130,8 @@ def test_a_given_psf_fitted_to_these_images_is_not_tested_independently() -> Non
     few = dataclasses.replace(transit, frames=transit.frames[:4])
     # Broken into lines, as in a FITS header.
     history = ["psf_id: 1", f"inputs_sha256: {{'000.fits': '{'ab' * 16}", f"{'ab' * 16}'}}"]
-    psf = make_psf(DIFFRACTION, provenance={"history": history})
+    kernel = total_kernel(small_transits.SCATTER, DIFFRACTION, 256)
+    psf = make_psf(kernel, provenance={"history": history})
     report = make_report(few, untouched(few), psf=psf, seed=2)
     assert report.fitted_to_these and "not an independent test" in report.sentence
 

@@ -245,8 +245,8 @@ def test_a_positive_offset_is_fitted_as_more_scatter() -> None:
         change = offset.values["total"] - study.nominal["total"]
         assert offset.curve_change_points[0] == pytest.approx(100 * change, rel=1e-6)
     changes = [np.abs(o.weight_change_pct).max() for o in study.offsets]
-    assert study.largest_weight_change_pct == max(changes) > 2
-    assert 0.5 < study.largest_curve_change_points < 4
+    assert study.largest("weight_change_pct") == max(changes) > 2
+    assert 0.5 < study.largest("curve_change_points") < 4
 
 
 def test_weights_change_as_the_fitted_formulas_do() -> None:
@@ -263,5 +263,5 @@ def test_dark_offsets_of_a_transit_of_the_usual_size() -> None:
     for brightness in (1.0, 3.0):
         plan = default_plan(30, 512, brightness=brightness)
         study = dark_offset_study(simulate(plan, drawn_truth(0), diffraction(1024), 0).transit)
-        assert study.largest_weight_change_pct < 60 / brightness
-        assert study.largest_curve_change_points < 5 / brightness
+        assert study.largest("weight_change_pct") < 60 / brightness
+        assert study.largest("curve_change_points") < 5 / brightness
