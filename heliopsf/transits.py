@@ -50,7 +50,7 @@ class ScatterFit(TransitFit):
 
     def quicklook(self) -> Figure:
         """A figure with curves, residuals and convergence. Needs the extra "plot"."""
-        figure: Figure = module_of_extra("psfcore.scatter.fit_plot").fit_figure(self)
+        figure: Figure = module_of_extra("psfcore.scatter.plots").fit_figure(self)
         return figure
 
 

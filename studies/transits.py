@@ -33,8 +33,8 @@ from psfcore.evaluation.shapes import compare_shapes_by_errors
 from psfcore.evaluation.summary_lines import shape_lines
 from psfcore.instruments.model import load_instrument
 from psfcore.psf import REACH_GRID_PX, cumulative_curve
+from psfcore.scatter.as_published import AS_PUBLISHED, invert_as_published
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.published import AS_PUBLISHED, invert_as_published
 from psfcore.scatter.reconstruction import Solution
 from psfcore.scatter.shapes import SHAPES, stretch_of
 from psfcore.scatter.validation.cross_validation import bands, bootstrap_samples, shared_fits

@@ -14,14 +14,14 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import Colormap, FuncNorm, LinearSegmentedColormap, LogNorm, Normalize
+from matplotlib.colors import Colormap, LinearSegmentedColormap, LogNorm, Normalize, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
 from matplotlib.ticker import FixedFormatter, FuncFormatter
 from numpy.typing import NDArray
 
-from psfcore.drawing.thumbnail import EUV_POINTS, NO_DATA
+from psfcore.drawing.thumbnail import EUV_POINTS, NO_DATA, block_means
 from psfcore.psf import Psf, crop_centred, cumulative_curve, radial_profile
 
 PANEL_PX = 640
@@ -152,9 +152,9 @@ def psf_figure(psf: Psf) -> Figure:
     _draw_centre(figure, image_axes, psf)
     kernels = {"TOTAL": psf.kernel, **psf.components}
     lowest = []
-    for name in sorted(kernels, key=lambda name: _curve(name)[1]):
+    looks = {name: _CURVES.get(name, _OTHER_CURVE) for name in kernels}
+    for name, (colour, width, dashes) in sorted(looks.items(), key=lambda look: look[1][1]):
         kernel = kernels[name]
-        colour, width, dashes = _curve(name)
         style: dict[str, Any] = {"color": colour, "linewidth": width, "linestyle": dashes}
         radius, weight = _smoothed_profile(kernel)
         profile_axes.loglog(radius, weight, **style)
@@ -192,10 +192,6 @@ def _smoothed_profile(kernel: Plane) -> tuple[NDArray[np.float64], NDArray[np.fl
     return radius[shown] / count[shown], light[shown] / count[shown]
 
 
-def _curve(name: str) -> tuple[str, float, Any]:
-    return _CURVES.get(name, _OTHER_CURVE)
-
-
 def _draw_centre(figure: Figure, axes: Any, psf: Psf) -> None:
     size = min(129, *psf.kernel.shape)
     centre = crop_centred(psf.kernel, (size, size))
@@ -215,38 +211,16 @@ def binned(plane: Plane, step: int) -> NDArray[np.float64]:
 
     Incomplete last blocks are left out.
     """
-    ny, nx = plane.shape[0] // step, plane.shape[1] // step
-    data = np.asarray(plane[: ny * step, : nx * step], dtype=np.float32)
-    finite = np.isfinite(data)
-    if finite.all():
-        return _block_sum(data, step) / step**2
-    count = _block_sum(finite.astype(np.float32), step)
-    total = _block_sum(np.where(finite, data, np.float32(0)), step)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    rows, columns = (step * np.arange(side // step) for side in plane.shape)
+    return block_means(plane[: step * rows.size, : step * columns.size], rows, columns)
 
 
-def _block_sum(data: NDArray[np.float32], step: int) -> NDArray[np.float64]:
-    total = np.zeros((data.shape[0] // step, data.shape[1] // step))
-    for row in range(step):
-        for column in range(step):
-            total += data[row::step, column::step]
-    return total
-
-
-def square_root_stretch(before: Plane, after: Plane) -> FuncNorm:
+def square_root_stretch(before: Plane, after: Plane) -> PowerNorm:
     """One square-root stretch for both images: from 0 to the larger of their 99.7th percentiles."""
     finite = [plane[np.isfinite(plane)] for plane in (before, after)]
     top = max((float(np.percentile(values, 99.7)) for values in finite if values.size), default=1.0)
     top = top if top > 0 else 1.0
-    return FuncNorm((_root, _square), vmin=0.0, vmax=top, clip=True)
-
-
-def _root(value: Any) -> Any:
-    return np.sqrt(np.maximum(value, 0))
-
-
-def _square(value: Any) -> Any:
-    return np.square(value)
+    return PowerNorm(0.5, vmin=0.0, vmax=top, clip=True)
 
 
 def change_pct(before: Plane, after: Plane) -> NDArray[np.float64]:

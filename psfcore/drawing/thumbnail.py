@@ -109,20 +109,23 @@ def reduced(pixels: Plane) -> NDArray[np.float64]:
     rows, columns = (
         np.arange(count) * side // count for count, side in zip(sides, pixels.shape, strict=True)
     )
+    return block_means(pixels, rows, columns)
+
+
+def block_means(pixels: Plane, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Means of the finite pixels of the blocks that begin at these rows and columns; NaN for a block without any."""
+
+    def sums(plane: NDArray[Any]) -> NDArray[np.float64]:
+        # The first sum is along the rows, because the pixels of a row lie one after the other in memory.
+        narrow = np.add.reduceat(plane, columns, axis=1, dtype=np.float64)
+        return np.asarray(np.add.reduceat(narrow, rows, axis=0))
+
     finite = np.isfinite(pixels)
     if finite.all():
         heights, widths = np.diff(rows, append=pixels.shape[0]), np.diff(columns, append=pixels.shape[1])
-        return _sums(pixels, rows, columns) / np.outer(heights, widths)
-    total = _sums(np.where(finite, pixels, 0), rows, columns)
-    count = _sums(finite, rows, columns)
+        return sums(pixels) / np.outer(heights, widths)
+    total, count = sums(np.where(finite, pixels, 0)), sums(finite)
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
-
-
-def _sums(plane: NDArray[Any], rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Sums of the blocks that begin at these rows and columns."""
-    # The first sum is along the rows, because the pixels of a row lie one after the other in memory.
-    narrow = np.add.reduceat(plane, columns, axis=1, dtype=np.float64)
-    return np.asarray(np.add.reduceat(narrow, rows, axis=0))
 
 
 def levels_of(pixels: Plane) -> NDArray[np.uint8]:

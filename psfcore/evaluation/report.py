@@ -25,8 +25,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from psfcore.evaluation.evaluation import Evaluation
-from psfcore.evaluation.frame import FrameEvaluation, Slice, Superposed
+from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, Slice, Superposed
 from psfcore.json_values import json_attributes, json_values
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 
@@ -229,15 +228,15 @@ def _slice_json(along: Slice) -> dict[str, Any]:
 
 
 def _study_json(study: DarkOffsetStudy) -> dict[str, Any]:
-    largest = ("weight_change_pct", "curve_change_points", "total_curve_change_points")
+    changes = ("weight_change_pct", "curve_change_points", "total_curve_change_points")
     return {
         **json_attributes(study, "radii_px", "curve_radii_px", "nominal"),
-        **json_attributes(study, *(f"largest_{name}" for name in largest)),
+        **{f"largest_{name}": study.largest(name) for name in changes},
         "offsets": [
             {
                 "offset_dn": offset.offset_dn,
                 "parameters": offset.values,
-                **json_attributes(offset, "images", "converged", *largest),
+                **json_attributes(offset, "images", "converged", *changes),
             }
             for offset in study.offsets
         ],

@@ -28,8 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.errors import DataError
-from psfcore.evaluation.evaluation import evaluate
-from psfcore.evaluation.frame import LEAST_SHARE, FrameEvaluation, half_width_px, superposed_maps
+from psfcore.evaluation.evaluation import (
+    LEAST_SHARE,
+    FrameEvaluation,
+    evaluate,
+    half_width_px,
+    superposed_maps,
+)
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.reconstruction import Inversion, Progress, Solution, labelled
 from psfcore.scatter.shapes import SHAPES, SOFTENED_POWER_LAW, Vector

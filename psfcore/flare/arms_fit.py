@@ -9,11 +9,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from psfcore.errors import DataError
-from psfcore.flare.arms_search import NEEDED_ORDERS_AN_ARM, Flags, Indices, Plane, Vector
 
+Vector = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Plane = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+NEEDED_ORDERS_AN_ARM = 3
 KNOT_PX = 1.0  # distance between the knots of the spline
 ORDER_SIGMA = 5.0
 _USABLE_SHARE = 0.7  # an order is fitted if at least this fraction of the pixels around it is usable
@@ -178,15 +184,14 @@ class FitState:
 class FitResult:
     """The result of a fit, apart from its state.
 
-    error: the standard errors of pattern and amplitudes. freedom: degrees of freedom. light: the fitted light of each
-    pixel, DN. done: the number of Gauss-Newton steps. why: the reason why the fit stopped.
+    error: the standard errors of pattern and amplitudes. reduced_chi2: chi^2 divided by the degrees of freedom, which
+    are the number of fitted pixels minus the number of fitted quantities. light: the fitted light of each pixel, DN.
+    why: the reason why the fit stopped.
     """
 
     error: Vector
-    chi2: float
-    freedom: int
+    reduced_chi2: float
     light: Vector
-    done: int
     why: str
 
 
@@ -220,9 +225,8 @@ def iterate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitSta
     """Fit all quantities together by Gauss-Newton steps. The values in `state` must be close to the solution."""
     weight = 1 / orders.sigma
     of_pattern = state.pattern.size
-    done, why = 0, f"the limit of {_STEPS} steps was reached"
-    while done < _STEPS:
-        done += 1
+    why = f"the limit of {_STEPS} steps was reached"
+    for _ in range(_STEPS):
         bases = _bases(orders, geometry, state.pattern)
         columns = np.hstack(
             (
@@ -243,9 +247,8 @@ def iterate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitSta
     light = _light(orders, _bases(orders, geometry, state.pattern), state)
     left = _without_planes(orders, (orders.value - light) * weight)
     freedom = max(orders.value.size - rank - 3 * state.amplitude.size, 1)
-    chi2 = float(left @ left)
-    scale = np.sqrt(chi2 / freedom)
-    return state, FitResult(error * scale, chi2, freedom, orders.value - left / weight, done, why)
+    reduced_chi2 = float(left @ left) / freedom
+    return state, FitResult(error * np.sqrt(reduced_chi2), reduced_chi2, orders.value - left / weight, why)
 
 
 def _alternate(orders: Orders, geometry: Geometry, state: FitState) -> tuple[FitState, Vector]:

@@ -12,12 +12,17 @@ from typing import Any
 import numpy as np
 
 from psfcore.drawing.page import DASH, render, with_error
-from psfcore.evaluation.evaluation import INVERSION_STEPS, NOISE_REALISATIONS, Evaluation
-from psfcore.evaluation.frame import CENTRE_PX, FrameEvaluation
+from psfcore.evaluation.evaluation import (
+    CENTRE_PX,
+    INVERSION_STEPS,
+    NOISE_REALISATIONS,
+    Evaluation,
+    FrameEvaluation,
+)
 from psfcore.evaluation.report import TREND_PX, Summary, summaries, trends
 from psfcore.psf import REACH_GRID_PX
-from psfcore.report import plot
-from psfcore.report.plot import beyond_of
+from psfcore.report import plots
+from psfcore.report.plots import beyond_of
 from psfcore.report.report import CrossValidated, PsfReport, inputs_of
 from psfcore.scatter.fit import RADII_PX, TransitFit
 from psfcore.scatter.inversion import CONVERGED_POINTS
@@ -56,7 +61,7 @@ def report_page(report: PsfReport, provenance: dict[str, Any]) -> str:
         "for the Extreme Ultraviolet High-Resolution Imager on board Solar Orbiter.",
         report=report,
         provenance=provenance,
-        plot=plot,
+        plots=plots,
         constants=_CONSTANTS,
         blocks=len(folds(len(report.transit.frames))),
         inputs=inputs,

@@ -19,7 +19,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from itertools import count
+from typing import Any, TypeVar
 
 from psfcore.errors import DataError
 from psfcore.evaluation.evaluation import Evaluation, evaluate
@@ -44,13 +45,17 @@ from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
 
 SCHEMA = "psf-report/1"
-STAGES = {
-    "fit": 24.0,
-    "folds": 14.0,
-    "evaluating": 9.0,
-    "dark offsets": 63.0,
-    "tables": 6.0,
-}  # relative costs
+# The relative costs of the stages.
+STAGES = {"fit": 24.0, "folds": 14.0, "evaluating": 9.0, "dark offsets": 63.0, "tables": 6.0}
+Part = TypeVar("Part")
+# Parts that a report may lack.
+DARK_LEVELS = "the effect of wrong dark levels"
+NEED_A_FIT = (
+    "the parameters and their cross-validation",
+    "scatter without a formula (free shells)",
+    "other shapes of scatter",
+    f"{DARK_LEVELS} on a fit",
+)
 OFFSET_VISITS = 8.5  # in a fit with a dark offset, each image is typically processed this number of times
 
 
@@ -84,14 +89,14 @@ class PsfReport:
     prepared: Prepared
     psf: Psf
     tables: dict[str, Any]
-    fit: TransitFit | None
-    cross: CrossValidated | None
     evaluation: Evaluation
-    held_out: bool
-    study: DarkOffsetStudy | None
     fitted_to_these: bool
     missing: tuple[Missing, ...]
     seed: int
+    held_out: bool = False
+    fit: TransitFit | None = None
+    cross: CrossValidated | None = None
+    study: DarkOffsetStudy | None = None
 
     @property
     def given(self) -> bool:
@@ -138,79 +143,82 @@ def make_report(
     (bootstrap, subsets of equations, noise realisations). solution: as in `fit_transit`; not used if the PSF is given.
     Raises DataError "plate-scale-mismatch", and the errors of `fit_transit` and `evaluate`.
     """
-    wanted = [s for s in STAGES if psf is None or s in ("evaluating", "tables")]
-    if not dark_offsets and psf is None:
-        wanted.remove("dark offsets")
-    stages = _ReportProgress(progress, {name: STAGES[name] for name in wanted})
+    missing = _MissingParts()
+    fit: TransitFit | None = None
+    cross: CrossValidated | None = None
+    kernels: Callable[[int], Kernel] | None = None
     if psf is not None:
+        stages = _ReportProgress(progress, "evaluating", "tables")
+        tested = psf
         _check_scale(transit, psf)
-        return _on_a_given(transit, prepared, psf, seed, threads, stages)
-    missing: list[Missing] = []
-    fit = fit_transit(transit, seed=seed, threads=threads, progress=stages.of("fit"), solution=solution)
-    made = fitted_psf(
-        fit, name=f"{transit.instrument or 'transit'}-fitted", version="this report", provenance={}
-    )
-    cross = _cross_validated(fit, seed, missing, stages.of("folds"))
-    kernels = _held_out_kernels(fit.solution, missing)
+        for what in NEED_A_FIT:
+            missing.add(what, "the PSF was given, and no fit was made")
+        if psf.fitted is None:
+            missing.add("errors of the PSF's curve and profile", "the PSF file contains no errors")
+    else:
+        stages = _ReportProgress(progress, *(s for s in STAGES if dark_offsets or s != "dark offsets"))
+        fit = fit_transit(transit, seed=seed, threads=threads, progress=stages.of("fit"), solution=solution)
+        name, fitted = f"{transit.instrument or 'transit'}-fitted", fit.solution
+        tested = fitted_psf(fit, name=name, version="this report", provenance={})
+        cross = missing.unless_made(
+            "the cross-validation, and its comparison with scatter without a formula",
+            lambda: _cross_validated(fitted, seed, stages.of("folds")),
+        )
+        kernels = missing.unless_made("a test on held-out images", lambda: held_out_kernels(fitted))
     evaluation = evaluate(
         transit,
-        kernels or (lambda _index: fit.kernel),
+        kernels or (lambda _index: tested.kernel),
         seed=seed,
         threads=threads,
         progress=stages.of("evaluating"),
     )
-    study = None
-    if dark_offsets:
-        study = _offsets(fit, threads, missing, stages)
-    else:
-        missing.append(Missing("the effect of wrong dark levels", "it was not requested"))
+    study: DarkOffsetStudy | None = None
+    if fit is not None and dark_offsets:
+        visits = len(transit.frames) * len(OFFSETS_DN) * OFFSET_VISITS
+        told = stages.counted("dark offsets", visits)
+        study = missing.unless_made(
+            DARK_LEVELS,
+            lambda: dark_offset_study(transit, nominal=fitted.inversion, threads=threads, progress=told),
+        )
+    elif fit is not None:
+        missing.add(DARK_LEVELS, "it was not requested")
+    stages.of("tables")("tables of the PSF", 0, 1)
     return PsfReport(
         transit=transit,
         prepared=prepared,
-        psf=made,
-        tables=_tables(made, threads, stages),
+        psf=tested,
+        tables=tables_of(tested, threads=threads),
         fit=fit,
         cross=cross,
         evaluation=evaluation,
         held_out=kernels is not None,
         study=study,
-        fitted_to_these=kernels is None,
+        fitted_to_these=kernels is None if psf is None else _names_images(psf, transit),
         missing=tuple(missing),
         seed=seed,
     )
 
 
-def _on_a_given(
-    transit: Transit, prepared: Prepared, psf: Psf, seed: int, threads: int, stages: _ReportProgress
-) -> PsfReport:
-    """The report on a given PSF. No fit is made."""
-    evaluation = evaluate(
-        transit, lambda _index: psf.kernel, seed=seed, threads=threads, progress=stages.of("evaluating")
-    )
-    why = "the PSF was given, and no fit was made"
-    lacking = (
-        "the parameters and their cross-validation",
-        "scatter without a formula (free shells)",
-        "other shapes of scatter",
-        "the effect of wrong dark levels on a fit",
-    )
-    missing = [Missing(what, why) for what in lacking]
-    if psf.fitted is None:
-        missing.append(Missing("errors of the PSF's curve and profile", "the PSF file contains no errors"))
-    return PsfReport(
-        transit=transit,
-        prepared=prepared,
-        psf=psf,
-        tables=_tables(psf, threads, stages),
-        fit=None,
-        cross=None,
-        evaluation=evaluation,
-        held_out=False,
-        study=None,
-        fitted_to_these=_names_images(psf, transit),
-        missing=tuple(missing),
-        seed=seed,
-    )
+class _MissingParts(list[Missing]):
+    """The parts that the report does not show, with the reasons."""
+
+    def add(self, what: str, why: str) -> None:
+        self.append(Missing(what, why))
+
+    def unless_made(self, what: str, make: Callable[[], Part]) -> Part | None:
+        """The part that `make` makes. If the images do not suffice, None; the reason of its DataError is added."""
+        try:
+            return make()
+        except DataError as error:
+            self.add(what, error.message)
+            return None
+
+
+def _cross_validated(solution: Solution, seed: int, progress: Progress) -> CrossValidated:
+    """The cross-validation by the shared scheme."""
+    samples = bootstrap_samples(len(solution.transit.frames), seed=seed)
+    fits = shared_fits(solution, samples, progress=progress)
+    return CrossValidated(fits, bands(fits, solution.total.radii_px))
 
 
 def _check_scale(transit: Transit, psf: Psf) -> None:
@@ -233,94 +241,30 @@ def _names_images(psf: Psf, transit: Transit) -> bool:
     return any(transit.sha256.get(frame.file, "-") in history for frame in transit.frames)
 
 
-def _tables(psf: Psf, threads: int, stages: _ReportProgress) -> dict[str, Any]:
-    stages.of("tables")("tables of the PSF", 0, 1)
-    return tables_of(psf, threads=threads)
-
-
-def _cross_validated(
-    fit: TransitFit, seed: int, missing: list[Missing], progress: Progress
-) -> CrossValidated | None:
-    """The cross-validation by the shared scheme.
-
-    If the images do not suffice, the result is None, and the reason is appended to `missing`.
-    """
-    try:
-        fits = shared_fits(
-            fit.solution, bootstrap_samples(len(fit.transit.frames), seed=seed), progress=progress
-        )
-    except DataError as error:
-        what = "the cross-validation, and its comparison with scatter without a formula"
-        missing.append(Missing(what, error.message))
-        return None
-    return CrossValidated(fits, bands(fits, fit.solution.total.radii_px))
-
-
-def _held_out_kernels(solution: Solution, missing: list[Missing]) -> Callable[[int], Kernel] | None:
-    """For each image, the total PSF of the fold that holds it out. The fold's guard also excludes its neighbours.
-
-    If the images do not suffice, the result is None, and the reason is appended to `missing`.
-    """
-    try:
-        return held_out_kernels(solution)
-    except DataError as error:
-        missing.append(Missing("a test on held-out images", error.message))
-        return None
-
-
-def _offsets(
-    fit: TransitFit, threads: int, missing: list[Missing], stages: _ReportProgress
-) -> DarkOffsetStudy | None:
-    visits = len(fit.transit.frames) * len(OFFSETS_DN) * OFFSET_VISITS
-    try:
-        return dark_offset_study(
-            fit.transit,
-            nominal=fit.inversion,
-            threads=threads,
-            progress=stages.counted("dark offsets", visits),
-        )
-    except DataError as error:
-        missing.append(Missing("the effect of wrong dark levels", error.message))
-        return None
-
-
 class _ReportProgress:
     """Progress of the whole report, computed from the progress of its stages. It never decreases."""
 
     SCALE = 1000
 
-    def __init__(self, progress: Progress, costs: dict[str, float]) -> None:
-        self._progress, self._costs = progress, costs
+    def __init__(self, progress: Progress, *stages: str) -> None:
+        self._progress, self._costs = progress, {name: STAGES[name] for name in stages}
         self._furthest = 0
 
     def of(self, name: str) -> Progress:
         """The progress function of a stage that reports its step and its number of steps."""
-
-        def report(stage: str, step: int, steps: int) -> None:
-            self._say(name, stage, step / max(steps, 1))
-
-        return report
+        return lambda stage, step, steps: self._tell(name, stage, step / max(steps, 1))
 
     def counted(self, name: str, visits: float) -> Progress:
         """The progress function of a stage with several fits.
 
         The steps of each fit begin at 0 again. Therefore the calls are counted instead. visits: expected number of calls.
         """
-        calls = 0
+        calls = count(1)
+        return lambda stage, _step, _steps: self._tell(name, stage, next(calls) / visits)
 
-        def report(stage: str, _step: int, _steps: int) -> None:
-            nonlocal calls
-            calls += 1
-            self._say(name, stage, calls / visits)
-
-        return report
-
-    def _say(self, name: str, stage: str, share: float) -> None:
-        before = 0.0
-        for other, cost in self._costs.items():
-            if other == name:
-                break
-            before += cost
+    def _tell(self, name: str, stage: str, share: float) -> None:
+        names = list(self._costs)
+        before = sum(self._costs[other] for other in names[: names.index(name)])
         done = (before + min(share, 1.0) * self._costs[name]) / sum(self._costs.values())
         self._furthest = max(self._furthest, round(self.SCALE * done))
         self._progress(stage, self._furthest, self.SCALE)

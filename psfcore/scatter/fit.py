@@ -5,7 +5,7 @@ The default is `psfcore.scatter.inversion`, which corrects the four biases of th
 - a free fit of shells without a formula,
 - other shapes, tested on held-out images,
 - the first guess,
-- on request, the unchanged published recipe, and four variants that each correct one of its biases (`published`).
+- on request, the unchanged published recipe, and four variants that each correct one of its biases (`as_published`).
 
 The errors follow from the photon and read noise of every pixel, propagated through the fit. A disc mean is the mean of the
 fully dark pixels of one image. The disc means can vary from image to image by more than this noise. Then chi2 divided by
@@ -36,10 +36,16 @@ from psfcore.psf import (
     crop_or_pad,
     cumulative_curve,
 )
+from psfcore.scatter.as_published import (
+    AS_PUBLISHED,
+    CORRECTED_ALONE,
+    Equations,
+    Published,
+    free_fit,
+    invert_as_published,
+)
 from psfcore.scatter.inversion import Inverter, solution_of
 from psfcore.scatter.optics import Blur, pick
-from psfcore.scatter.published import AS_PUBLISHED, CORRECTED_ALONE, Published, invert_as_published
-from psfcore.scatter.published_equations import Equations, free_fit
 from psfcore.scatter.reconstruction import Inversion, Progress, Solution
 from psfcore.scatter.segments import Segments, beyond_pct, segment_sums, shells_as_published
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Vector, shape_named

@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.psf import cumulative_curve
-from psfcore.scatter.optics import Blur, Optics, noise_covariance, pick, put
+from psfcore.scatter.optics import Blur, Optics, noise_covariance
 from psfcore.scatter.reconstruction import (
     FrameFit,
     Inversion,
@@ -53,11 +53,9 @@ from psfcore.scatter.reconstruction import (
     Round,
     Solution,
     TransitScenes,
-    jacobian_row,
-    pixel_weight,
 )
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW, Shape, Vector
-from psfcore.scatter.total_psf import TotalPsf
+from psfcore.scatter.total_psf import Kernel, TotalPsf
 from psfcore.transit.transit import Transit
 
 ALGORITHM_VERSION = 1  # of `invert`: a change of its results needs a new number, because solutions are kept
@@ -102,11 +100,8 @@ def invert(
     """
     total = TotalPsf(transit.diffraction, shape, transit.shape, threads=threads)
     at = shape.start if start is None else np.asarray(start, dtype=np.float64)
-    kernel = total.kernel(at)
-    optics = Optics(kernel, transit.shape, threads=threads)
-    sky = TransitScenes.reconstructed(transit, optics, progress)
-    sky.find(optics, kernel)
-    solver = Solver(sky, total, counts or [1] * len(transit.frames), threads, progress)
+    sky = _scenes(transit, total, at, threads, progress)
+    solver = _Solver(sky, total, counts or [1] * len(transit.frames), threads, progress)
     frames = solver.taking_part()
     if near:
         at = solver.solve(at, frames, CONVERGED_POINTS)
@@ -135,11 +130,17 @@ def solution_at(
 
     total: of the shape of scatter. Raises the errors of `invert`.
     """
+    sky = _scenes(transit, total, at, threads, progress)
+    return _Solver(sky, total, [1] * len(transit.frames), threads, progress).solution(at)
+
+
+def _scenes(transit: Transit, total: TotalPsf, at: Vector, threads: int, progress: Progress) -> TransitScenes:
+    """The scenes and occulters of all images, for the PSF at these coordinates."""
     kernel = total.kernel(at)
     optics = Optics(kernel, transit.shape, threads=threads)
     sky = TransitScenes.reconstructed(transit, optics, progress)
     sky.find(optics, kernel)
-    return Solver(sky, total, [1] * len(transit.frames), threads, progress).solution(at)
+    return sky
 
 
 def solution_of(
@@ -187,11 +188,10 @@ def refit(
     total, threads, shape = solution.total, solution.threads, solution.transit.shape
     sky, kernel = solution.sky.copy(), total.kernel(start)
     sky.find(Optics(kernel, shape, threads=threads), kernel, progress)
-    solver = Solver(sky, total, counts, threads, progress)
+    solver = _Solver(sky, total, counts, threads, progress)
     frames = solver.taking_part()
     at = solver.solve(start, frames, CONVERGED_POINTS)
-    optics = Optics(total.kernel(at), shape, threads=threads)
-    return Reconstruction(solution.transit, total, optics, sky, tuple(frames), threads), at
+    return solver.reconstruction(total.kernel(at), frames), at
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,15 +219,15 @@ class _Measured:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """The PSF at given coordinates, prepared for convolution, and the derivatives of this PSF."""
+    """The images with the PSF at given coordinates, and the derivatives of this PSF."""
 
-    optics: Optics
+    images: Reconstruction
     slope_blurs: list[Blur]
     curve: Vector
     curve_slopes: NDArray[np.float64]
 
 
-class Solver:
+class _Solver:
     """Gauss-Newton steps on Eq. (2)."""
 
     def __init__(
@@ -270,7 +270,7 @@ class Solver:
         for _ in range(ROUNDS):
             if moved > SLOPES_KEPT_BELOW_POINTS or not kept:
                 kept = {}
-            model = self._model(at, with_slopes=not kept)
+            model = self._model(at, frames, with_slopes=not kept)
             measured = kept = self._measure(model, frames, kept)
             chi2 = sum(self._counts[n] * m.chi2 for n, m in measured.items())
             if before is not None and chi2 > 1.2 * before[1]:
@@ -307,12 +307,18 @@ class Solver:
         _check_determined(normal, self._total.shape)
         return np.asarray(normal)
 
-    def _model(self, at: Vector, *, with_slopes: bool) -> _Model:
+    def reconstruction(self, kernel: Kernel, frames: list[int]) -> Reconstruction:
+        """The scenes with this total PSF. frames: the images of the fit."""
+        transit, threads = self._sky.transit, self._threads
+        optics = Optics(kernel, transit.shape, threads=threads)
+        return Reconstruction(transit, self._total, optics, self._sky, tuple(frames), threads)
+
+    def _model(self, at: Vector, frames: list[int], *, with_slopes: bool) -> _Model:
         kernel = self._total.kernel(at)
         shape, threads = self._sky.transit.shape, self._threads
         slopes = self._total.slopes(at)
         return _Model(
-            optics=Optics(kernel, shape, threads=threads),
+            images=self.reconstruction(kernel, frames),
             slope_blurs=[Blur(s, shape, threads=threads) for s in slopes] if with_slopes else [],
             curve=cumulative_curve(kernel, self._total.radii_px),
             curve_slopes=self._total.curve_slopes(slopes),
@@ -327,25 +333,20 @@ class Solver:
 
     def _measure_one(self, model: _Model, n: int, kept: _Measured | None) -> _Measured:
         """Compute Eq. (1) for one image. If `kept` is given, reuse its weights and Jacobian; otherwise compute Eq. (3) and (4)."""
-        sky, optics = self._sky, model.optics
-        dark, observed = sky.dark[n], sky.observed[n]
-        scene = optics.invert(observed, sky.scenes[n], steps=WARM_STEPS)  # step (d)
-        sky.scenes[n] = scene
-        blanked = scene.copy()
-        put(blanked, dark, 0.0)  # step (f)
-        expected = pick(optics.convolve(blanked), dark)
-        residual = pick(observed, dark) - expected  # Eq. (1)
+        images, sky = model.images, self._sky
+        sky.scenes[n] = images.optics.invert(sky.observed[n], sky.scenes[n], steps=WARM_STEPS)  # step (d)
+        residual, expected = images.residual(n)  # step (f)
         if kept is not None:
             return replace(kept, residual=residual, expected=expected)
-        weight = pixel_weight(sky.transit, n, expected)
-        jacobian = np.array([jacobian_row(optics, blur, blanked, dark) for blur in model.slope_blurs])
+        weight = images.weight(n, expected)
+        jacobian = np.array([images.jacobian(n, blur) for blur in model.slope_blurs])
         weighted = jacobian * weight
         return _Measured(residual, expected, weight, weighted, weighted @ jacobian.T)
 
     def solution(self, at: Vector) -> Solution:
         """The results at these coordinates. Every image is measured once more to obtain residuals and errors."""
-        model = self._model(at, with_slopes=True)
         frames = self.taking_part()
+        model = self._model(at, frames, with_slopes=True)
         measured = self._measure(model, frames, {})
         normal = self._normal(measured)
         spread = np.zeros_like(normal)
@@ -355,7 +356,7 @@ class Solver:
             frame, dark, noise = self._sky.transit.frames[n], self._sky.dark[n], self._sky.transit.noise
             templates = [*m.weighted, np.full(dark[0].size, 1 / dark[0].size)]
             # The covariance of the score, and in the last row that of the mean residual, from the noise of all pixels.
-            of_noise = noise_covariance(model.optics, frame, dark, templates, noise)
+            of_noise = noise_covariance(model.images.optics, frame, dark, templates, noise)
             spread += self._counts[n] ** 2 * of_noise[:-1, :-1]
             fits.append(
                 FrameFit(
@@ -386,9 +387,7 @@ class Solver:
             frames=tuple(fits),
             left_out=self._sky.left_out(),
         )
-        return Solution(
-            self._sky.transit, self._total, model.optics, self._sky, tuple(frames), self._threads, inversion
-        )
+        return Solution(**vars(model.images), inversion=inversion)
 
 
 def _check_determined(normal: NDArray[np.float64], shape: Shape) -> None:

@@ -1,13 +1,14 @@
 """Write the solution of a transit to a file, and read it back without any change of its numbers.
 
-The file is a zip archive without compression: one .npy file per array, and solution.json with everything else. It
-contains only what `invert` computed. Images, noise and diffraction PSF come from the transit. A solution can therefore
-be read only together with the transit from which it was made. The PSF at the solution is computed from the coordinates.
+The file is a NumPy archive (.npz, not compressed). It contains only what `invert` computed. Images, noise and
+diffraction PSF come from the transit. A solution can therefore be read only together with the transit from which it was
+made. The PSF at the solution is computed from the coordinates.
 
 | array | content |
 |---|---|
+| contents | everything that is no array, as JSON |
 | coordinates, covariance, curve_pct, curve_sigma | fields of Inversion |
-| normal, score, mean_jacobian | fields of FrameFit, first axis: the frames of the fit |
+| observed, expected, noise, chi2, normal, score, mean_jacobian | fields of FrameFit, first axis: the frames of the fit |
 | scene-0000, ... | the scene of each frame of the transit, in the engine's order |
 | dark-0000, ... | rows and columns of the dark pixels of each frame of the transit, (2, pixels) |
 """
@@ -16,12 +17,12 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
@@ -35,23 +36,14 @@ from psfcore.transit.transit import Transit
 from psfcore.whole_files import whole_file
 
 MOST_BYTES = 4 * 2**30  # of a file; S3 takes up to 5 GiB in one request
-MOST_JSON_BYTES = 2**24
-_JSON = "solution.json"
-
-
-@dataclass(frozen=True)
-class _FrameLight:
-    """The scalar values of a FrameFit. Arrays of the file and the transit contain its other fields."""
-
-    observed: float
-    expected: float
-    noise: float
-    chi2: float
+_CONTENTS = "contents"
+_NUMBERS_OF_FRAMES = ("observed", "expected", "noise", "chi2")
+_ARRAYS_OF_FRAMES = ("normal", "score", "mean_jacobian")
 
 
 @dataclass(frozen=True)
 class _Contents:
-    """The content of solution.json. found: one entry for each frame of the transit. lights: one for each fitted frame."""
+    """What is no array. found: one entry for each frame of the transit. part: the indices of the fitted frames."""
 
     version: Literal[1]
     shape: str
@@ -59,13 +51,9 @@ class _Contents:
     files: tuple[str, ...]
     part: tuple[int, ...]
     found: tuple[FoundPlace, ...]
-    lights: tuple[_FrameLight, ...]
     rounds: tuple[Round, ...]
     converged: bool
     left_out: dict[str, str]
-
-
-_CONTENTS = TypeAdapter(_Contents)
 
 
 def write_solution(path: Path, solution: Solution) -> None:
@@ -73,43 +61,33 @@ def write_solution(path: Path, solution: Solution) -> None:
 
     Raises DataError "solution-too-large" above MOST_BYTES, and OSError.
     """
-    size = sum(array.nbytes for _, array in _arrays(solution)) + MOST_JSON_BYTES
-    if size > MOST_BYTES:
-        raise DataError(
-            "solution-too-large", f"expected a solution of at most {MOST_BYTES} bytes; got up to {size} bytes"
-        )
-    inversion, transit = solution.inversion, solution.transit
+    inversion, transit, sky = solution.inversion, solution.transit, solution.sky
     contents = _Contents(
         version=1,
         shape=inversion.shape.name,
         field=transit.shape,
         files=tuple(frame.file for frame in transit.frames),
         part=solution.part,
-        found=tuple(solution.sky.found),
-        lights=tuple(_FrameLight(f.observed, f.expected, f.noise, f.chi2) for f in inversion.frames),
+        found=tuple(sky.found),
         rounds=inversion.rounds,
         converged=inversion.converged,
         left_out=inversion.left_out,
     )
     text = json.dumps(asdict(contents), default=lambda scalar: scalar.item())  # NumPy's scalars
-    with whole_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr(zipfile.ZipInfo(_JSON), text)
-        for name, array in _arrays(solution):
-            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.ascontiguousarray(array), (1, 0), allow_pickle=False)
-
-
-def _arrays(solution: Solution) -> Iterator[tuple[str, NDArray[Any]]]:
-    """All arrays of the file by name. Scenes come one by one, because they are large."""
-    inversion, sky = solution.inversion, solution.sky
+    arrays: dict[str, NDArray[Any]] = {_CONTENTS: np.frombuffer(text.encode(), np.uint8)}
     for name in ("coordinates", "covariance", "curve_pct", "curve_sigma"):
-        yield name, getattr(inversion, name)
-    for name in ("normal", "score", "mean_jacobian"):
-        yield name, np.stack([getattr(frame, name) for frame in inversion.frames])
-    for n, scene in enumerate(sky.scenes):
-        yield f"scene-{n:04d}", scene
-    for n, dark in enumerate(sky.dark):
-        yield f"dark-{n:04d}", np.stack(dark).astype(np.int64)
+        arrays[name] = getattr(inversion, name)
+    for name in (*_NUMBERS_OF_FRAMES, *_ARRAYS_OF_FRAMES):
+        arrays[name] = np.stack([np.asarray(getattr(frame, name)) for frame in inversion.frames])
+    for n, (scene, dark) in enumerate(zip(sky.scenes, sky.dark, strict=True)):
+        arrays |= {f"scene-{n:04d}": scene, f"dark-{n:04d}": np.stack(dark).astype(np.int64)}
+    size = sum(array.nbytes for array in arrays.values())
+    if size > MOST_BYTES:
+        raise DataError(
+            "solution-too-large", f"expected a solution of at most {MOST_BYTES} bytes; got {size} bytes"
+        )
+    with whole_file(path) as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def read_solution(path: Path, transit: Transit, *, threads: int = 1) -> Solution:
@@ -119,15 +97,11 @@ def read_solution(path: Path, transit: Transit, *, threads: int = 1) -> Solution
     transit.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise ValueError(f"got a file of more than {MOST_BYTES} bytes")
-        with zipfile.ZipFile(path) as archive:
-            if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
-                raise ValueError("got a compressed member")
+        with path.open("rb") as file, NpzFile(file, allow_pickle=False) as archive:
             return _solution(archive, transit, threads)
     except ValidationError as error:
         first = error.errors()[0]
-        why = f"{_JSON}, {'.'.join(map(str, first['loc']))}: {first['msg']}"
+        why = f"{_CONTENTS}, {'.'.join(map(str, first['loc']))}: {first['msg']}"
     except DataError as error:  # an unknown shape
         why = error.message
     except (zipfile.BadZipFile, EOFError, KeyError, MemoryError, ValueError, NotImplementedError) as error:
@@ -135,27 +109,27 @@ def read_solution(path: Path, transit: Transit, *, threads: int = 1) -> Solution
     raise DataError("bad-solution", f"expected a kept solution of this transit, of file version 1: {why}")
 
 
-def _array(archive: zipfile.ZipFile, name: str, kind: type, *shape: int | None) -> NDArray[Any]:
+def _array(archive: NpzFile, name: str, kind: type, *shape: int | None) -> NDArray[Any]:
     """An array of the archive. None in `shape` allows any length. Raises ValueError if type or shape are others."""
-    with archive.open(f"{name}.npy") as member:
-        array = np.lib.format.read_array(member, allow_pickle=False)
+    array = archive[name]
     fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
     if not fits or array.dtype != kind:
         raise ValueError(f"{name}: expected {shape} of {np.dtype(kind)}; got {array.shape} of {array.dtype}")
     return np.ascontiguousarray(array)
 
 
-def _dark(archive: zipfile.ZipFile, n: int, field: tuple[int, int]) -> Pixels:
+def _dark(archive: NpzFile, n: int, field: tuple[int, int]) -> Pixels:
     """The dark pixels of a frame, all inside the field."""
-    rows, columns = _array(archive, f"dark-{n:04d}", np.int64, 2, None)
-    for pixels, length in ((rows, field[0]), (columns, field[1])):
-        if pixels.size and not (pixels.min() >= 0 and pixels.max() < length):
-            raise ValueError(f"dark-{n:04d}: got pixels outside the images")
-    return rows.astype(np.intp), columns.astype(np.intp)
+    pixels = _array(archive, f"dark-{n:04d}", np.int64, 2, None)
+    if not ((pixels >= 0) & (pixels < np.array(field)[:, None])).all():
+        raise ValueError(f"dark-{n:04d}: got pixels outside the images")
+    rows, columns = pixels.astype(np.intp)
+    return rows, columns
 
 
-def _solution(archive: zipfile.ZipFile, transit: Transit, threads: int) -> Solution:
-    contents = _CONTENTS.validate_python(json.loads(archive.read(_JSON)))
+def _solution(archive: NpzFile, transit: Transit, threads: int) -> Solution:
+    text = _array(archive, _CONTENTS, np.uint8, None).tobytes()
+    contents = TypeAdapter(_Contents).validate_python(json.loads(text))
     _check_transit(contents, transit)
     shape = shape_named(contents.shape)
     size, images = len(shape.parameters), len(contents.part)
@@ -171,6 +145,13 @@ def _solution(archive: zipfile.ZipFile, transit: Transit, threads: int) -> Solut
         found=list(contents.found),
         dark=[_dark(archive, n, transit.shape) for n in every],
     )
+    numbers = [_array(archive, name, np.float64, images).tolist() for name in _NUMBERS_OF_FRAMES]
+    lengths = ((size, size), (size,), (size,))
+    arrays = [
+        _array(archive, name, np.float64, images, *of_one)
+        for name, of_one in zip(_ARRAYS_OF_FRAMES, lengths, strict=True)
+    ]
+    names = (*_NUMBERS_OF_FRAMES, *_ARRAYS_OF_FRAMES)
     inversion = Inversion(
         shape=shape,
         coordinates=coordinates,
@@ -186,19 +167,9 @@ def _solution(archive: zipfile.ZipFile, transit: Transit, threads: int) -> Solut
                 pointing=transit.frames[n].pointing,
                 found=sky.found[n],
                 dark=sky.dark[n],
-                normal=normal,
-                score=score,
-                mean_jacobian=mean_jacobian,
-                **vars(light),
+                **dict(zip(names, values, strict=True)),
             )
-            for n, light, normal, score, mean_jacobian in zip(
-                contents.part,
-                contents.lights,
-                _array(archive, "normal", np.float64, images, size, size),
-                _array(archive, "score", np.float64, images, size),
-                _array(archive, "mean_jacobian", np.float64, images, size),
-                strict=True,
-            )
+            for n, *values in zip(contents.part, *numbers, *arrays, strict=True)
         ),
         left_out=contents.left_out,
     )

@@ -142,12 +142,17 @@ class Reconstruction:
         return pick(self.sky.observed[n], self.sky.dark[n]) - expected, expected
 
     def weight(self, n: int, expected: Vector) -> Vector:
-        """The inverse of the variance of Eq. (3) for pixels of image n with the intensities `expected` (DN/s)."""
-        return pixel_weight(self.transit, n, expected)
+        """The inverse of the variance of Eq. (3) for the dark pixels of image n with the intensities `expected` (DN/s)."""
+        level = np.maximum(expected, LEAST_LEVEL * expected.mean())
+        return np.asarray(1 / self.transit.noise.variance(level, self.transit.frames[n].exposure_s))
 
     def jacobian(self, n: int, slope: Blur) -> Vector:
         """The derivative of the expected light in the dark pixels of image n, from Eq. (4). slope: derivative of the total PSF."""
-        return jacobian_row(self.optics, slope, self.blanked_scene(n), self.sky.dark[n])
+        dark = self.sky.dark[n]
+        changed = slope.convolve(self.blanked_scene(n))
+        scene = self.optics.invert_once(changed)
+        put(scene, dark, 0.0)
+        return pick(changed, dark) - pick(self.optics.convolve(scene), dark)
 
 
 @dataclass(frozen=True)
@@ -234,18 +239,3 @@ class Solution(Reconstruction):
     """An inversion together with its scenes and optics, for later analyses. part: ordered like inversion.frames."""
 
     inversion: Inversion
-
-
-def pixel_weight(transit: Transit, n: int, expected: Vector) -> Vector:
-    """1 / variance (Eq. (3)) of each dark pixel of image n. expected: the expected intensities of these pixels,
-    DN/s."""
-    level = np.maximum(expected, LEAST_LEVEL * expected.mean())
-    return np.asarray(1 / transit.noise.variance(level, transit.frames[n].exposure_s))
-
-
-def jacobian_row(optics: Optics, slope: Blur, blanked: Lanes, dark: Pixels) -> Vector:
-    """The derivative of the expected light in the dark pixels with respect to one coordinate: minus Eq. (4)."""
-    changed = slope.convolve(blanked)
-    scene = optics.invert_once(changed)
-    put(scene, dark, 0.0)
-    return pick(changed, dark) - pick(optics.convolve(scene), dark)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from psfcore.json_values import json_attributes
+from psfcore.scatter.as_published import Published
 from psfcore.scatter.fit import Curve, ShellWeightFits, TransitFit
-from psfcore.scatter.published import Published
 from psfcore.scatter.shapes import stretch_of
 from psfcore.scatter.validation.cross_validation import LIMITS, limits_json
 

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from psfcore.psf import crop_or_pad, cumulative_curve
 from psfcore.scatter import fit
+from psfcore.scatter.as_published import Choices, Published, free_fit, invert_as_published
 from psfcore.scatter.fit import TransitFit, fit_transit
 from psfcore.scatter.inversion import invert
-from psfcore.scatter.published import Choices, Published, invert_as_published
-from psfcore.scatter.published_equations import free_fit
 from psfcore.scatter.reconstruction import Solution
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel

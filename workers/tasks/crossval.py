@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from workers.catalogue.parts import Part
     from workers.tasks.context import Context
 
-_PLOT = "psfcore.scatter.validation.cross_validation_plot"
+_PLOT = "psfcore.scatter.plots"
 WAIT_S = 0.5
 MOST_HELPERS = 16
 

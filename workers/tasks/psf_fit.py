@@ -42,7 +42,7 @@ class Fitted:
 
     def draw(self, path: Path) -> None:
         """Draw the fit into a PNG file."""
-        module_of_extra("psfcore.scatter.fit_plot").fit_png(self.fit, path)
+        module_of_extra("psfcore.scatter.plots").fit_png(self.fit, path)
 
 
 def psf_fit(context: Context, parameters: Mapping[str, Any]) -> str:

@@ -100,7 +100,7 @@ def make(
             "not_shown": said["not_shown"],
             "limits": said["fit"]["limits"] if report.fit is not None else [],
         },
-        draw=lambda path: module_of_extra("psfcore.evaluation.plot").evaluation_png(
+        draw=lambda path: module_of_extra("psfcore.evaluation.plots").evaluation_png(
             report.evaluation, path, title=report.how_judged, study=report.study
         ),
         page=lambda: module_of_extra("psfcore.report.page").report_page(report, provenance),

@@ -59,10 +59,9 @@ from psfcore.transit.transit import folds
 RUNS = 10
 RESOLVE_STEPS = 5
 SETTLE_STEPS = 1
-# The percentiles of a Gaussian at one and two standard deviations below and above its mean.
-ONE_SIGMA: tuple[float, float] = (100 * float(ndtr(-1)), 100 * float(ndtr(1)))
-TWO_SIGMA: tuple[float, float] = (100 * float(ndtr(-2)), 100 * float(ndtr(2)))
-LIMITS = (TWO_SIGMA[0], ONE_SIGMA[0], 50.0, ONE_SIGMA[1], TWO_SIGMA[1])
+# The percentiles of a Gaussian at two and one standard deviations below its mean, at its mean, and above it.
+LIMITS = tuple(100 * float(ndtr(deviations)) for deviations in (-2, -1, 0, 1, 2))
+ONE_SIGMA = (LIMITS[1], LIMITS[3])
 LIMIT_NAMES = ("minus_2_sigma", "minus_1_sigma", "median", "plus_1_sigma", "plus_2_sigma")
 # Within this distance, the free fit of the paper differs from the power law of the paper.
 NEAR_CENTRE_PX = 3.0

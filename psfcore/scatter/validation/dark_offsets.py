@@ -53,33 +53,16 @@ class DarkOffset:
 
 @dataclass(frozen=True, eq=False)
 class DarkOffsetStudy:
-    """Effects of dark offsets on the PSF of a transit. nominal: the parameters of the fit without an offset.
-
-    largest_...: the largest absolute change at any distance and for any offset.
-    """
+    """Effects of dark offsets on the PSF of a transit. nominal: the parameters of the fit without an offset."""
 
     radii_px: Vector
     curve_radii_px: Vector
     nominal: dict[str, float]
     offsets: tuple[DarkOffset, ...]
 
-    @property
-    def largest_weight_change_pct(self) -> float:
-        """Largest relative change of the diffuse weight per pixel, percent."""
-        return self._largest("weight_change_pct")
-
-    @property
-    def largest_curve_change_points(self) -> float:
-        """Largest change of C(R) of the scatter kernel, percentage points."""
-        return self._largest("curve_change_points")
-
-    @property
-    def largest_total_curve_change_points(self) -> float:
-        """Largest change of C(R) of the total PSF, percentage points."""
-        return self._largest("total_curve_change_points")
-
-    def _largest(self, name: str) -> float:
-        return max(float(np.abs(getattr(offset, name)).max()) for offset in self.offsets)
+    def largest(self, change: str) -> float:
+        """The largest absolute value of a change, such as "weight_change_pct", at any distance and for any offset."""
+        return max(float(np.abs(getattr(offset, change)).max()) for offset in self.offsets)
 
 
 def dark_offset_study(

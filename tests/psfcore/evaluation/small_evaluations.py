@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from psfcore.convolution.convolver import Convolver
-from psfcore.evaluation.evaluation import Evaluation, evaluate
-from psfcore.evaluation.frame import FrameEvaluation
+from psfcore.evaluation.evaluation import Evaluation, FrameEvaluation, evaluate
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy, dark_offset_study
 from psfcore.simulate.scatter_truth import total_kernel
 from psfcore.transit.transit import Kernel

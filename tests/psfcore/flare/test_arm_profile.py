@@ -49,14 +49,14 @@ def compared(seed: int, arm_deg: float = 0.0, c: float = 2.53) -> FlareCompariso
     )
 
 
-@pytest.mark.parametrize("arm_deg", [0.0, 90.0])
-def test_the_total_psf_fits_within_noise_and_diffraction_alone_does_not(arm_deg: float) -> None:
-    found = [compared(seed, arm_deg) for seed in range(5)]
+def test_the_total_psf_fits_within_noise_and_diffraction_alone_does_not() -> None:
+    """Along both arms."""
+    found = [compared(seed, 90.0 * (seed % 2)) for seed in range(6)]
     # About ten of the seventy degrees of freedom go into the box.
     assert 0.6 < np.mean([one.total.chi2_per_distance for one in found]) < 1.15
     assert 0.8 < np.mean([one.total.reduced_chi2 for one in found]) < 1.25
     # Over 90 flares this share is 0.965 +- 0.024; one in thirty is below 0.9. Another processor may round a
-    # logarithm differently, which changes the Poisson noise and hence these five flares.
+    # logarithm differently, which changes the Poisson noise and hence these six flares.
     assert np.mean([one.explained for one in found]) > 0.92
     for one in found:
         assert one.diffraction is not None and one.chi2_factor is not None and one.rms_factor is not None

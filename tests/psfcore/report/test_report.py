@@ -20,10 +20,10 @@ from psfcore.evaluation.evaluation import evaluate
 from psfcore.psf import Psf, crop_or_pad, cumulative_curve
 from psfcore.report import report as report_module
 from psfcore.report.page import report_page
-from psfcore.report.plot import beyond_of
+from psfcore.report.plots import beyond_of
 from psfcore.report.report import PsfReport, make_report, report_json
-from psfcore.scatter import fit
-from psfcore.scatter.published_equations import free_fit
+from psfcore.scatter.fit import TransitFit
+from psfcore.scatter.reconstruction import Progress
 from psfcore.scatter.total_psf import SCATTER
 from psfcore.scatter.validation.cross_validation import FoldSample, bootstrap_samples, shared_step
 from psfcore.simulate.scatter_truth import total_kernel
@@ -34,14 +34,14 @@ from tests.blank_figures import blank_figures
 from tests.html_page import check_stands_alone, read_page
 from tests.psfcore import small_transits
 from tests.psfcore.conftest import make_psf
-from tests.psfcore.small_transits import DIFFRACTION, observed, sky
+from tests.psfcore.small_transits import DIFFRACTION, fitted, observed, sky
 
 PROVENANCE = {"software_version": "1.2.3", "libraries": {"numpy": "9.9"}, "algorithm_version": 1}
 
 
 @contextmanager
 def quick() -> Iterator[None]:
-    """Free shells from 20 draws instead of 100, a cross-validation of 3 runs instead of 10, and tables of 512 px."""
+    """A cross-validation of 3 runs instead of 10, and tables of 512 px."""
 
     def small_tables(psf: Psf, **options: Any) -> dict[str, Any]:
         kernel, *parts = (crop_or_pad(part, 512) for part in (psf.kernel, *psf.components.values()))
@@ -49,7 +49,6 @@ def quick() -> Iterator[None]:
         return tables_of(dataclasses.replace(psf, kernel=kernel, components=components), **options)
 
     with (
-        patch.object(fit, "free_fit", partial(free_fit, subsets=20)),
         patch.object(report_module, "tables_of", small_tables),
         patch.object(report_module, "bootstrap_samples", partial(bootstrap_samples, runs=3)),
     ):
@@ -62,10 +61,15 @@ def untouched(transit: Transit) -> Prepared:
 
 @cache
 def progress_of_whole() -> tuple[PsfReport, list[tuple[str, int, int]]]:
-    """The report on twelve small images, and its progress."""
+    """The report on twelve small images with the fit that many tests use, and its progress."""
     steps: list[tuple[str, int, int]] = []
     transit = observed(sky()).transit
-    with quick():
+
+    def fit(*_: Any, progress: Progress, **__: Any) -> TransitFit:
+        progress("fit", 0, 2)
+        return fitted()
+
+    with quick(), patch.object(report_module, "fit_transit", fit):
         made = make_report(transit, untouched(transit), seed=5, progress=lambda *step: steps.append(step))
     return made, steps
 
@@ -123,12 +127,12 @@ def test_the_json_holds_the_numbers_of_the_page() -> None:
 
 def test_a_given_psf_fitted_to_these_images_is_not_tested_independently() -> None:
     transit = dataclasses.replace(observed(sky()).transit, sha256={"000.fits": "ab" * 32})
-    kernel = total_kernel(small_transits.SCATTER, DIFFRACTION, 256)
+    few = dataclasses.replace(transit, frames=transit.frames[:4])
     # Broken into lines, as in a FITS header.
     history = ["psf_id: 1", f"inputs_sha256: {{'000.fits': '{'ab' * 16}", f"{'ab' * 16}'}}"]
-    report = make_report(
-        transit, untouched(transit), psf=make_psf(kernel, provenance={"history": history}), seed=2
-    )
+    kernel = total_kernel(small_transits.SCATTER, DIFFRACTION, 256)
+    psf = make_psf(kernel, provenance={"history": history})
+    report = make_report(few, untouched(few), psf=psf, seed=2)
     assert report.fitted_to_these and "not an independent test" in report.sentence
 
 
@@ -202,16 +206,16 @@ def test_the_report_page_a_given_psf_lists_what_it_does_not_show_and_why() -> No
 
 
 def test_a_malicious_file_name_is_text() -> None:
-    report = given()
-    name = "</td><script>alert(1)</script>.fits"
-    frames = (dataclasses.replace(report.transit.frames[0], file=name), *report.transit.frames[1:])
-    judged = tuple(dataclasses.replace(f, file=name) if f.index == 0 else f for f in report.evaluation.frames)
-    changed = dataclasses.replace(
-        report,
-        transit=dataclasses.replace(report.transit, frames=frames, sha256={name: "0" * 64}),
-        evaluation=dataclasses.replace(report.evaluation, frames=judged, left_out={name: name}),
+    report, name = given(), "</td><script>alert(1)</script>.fits"
+    first, *others = report.evaluation.frames
+    evaluation = dataclasses.replace(
+        report.evaluation, frames=(dataclasses.replace(first, file=name), *others), left_out={name: name}
     )
+    frames = (dataclasses.replace(report.transit.frames[0], file=name), *report.transit.frames[1:])
+    transit = dataclasses.replace(report.transit, frames=frames, sha256={name: "0" * 64})
     with blank_figures():
-        html = report_page(changed, {"file": name})
+        html = report_page(
+            dataclasses.replace(report, transit=transit, evaluation=evaluation), {"file": name}
+        )
     check_stands_alone(html)
     assert [t.text for t in read_page(html) if t.name == "td"].count(name) == 4

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import Convolver, linear_convolve
-from psfcore.psf import REACH_GRID_PX, crop_centred, cumulative_curve
+from psfcore.psf import REACH_GRID_PX, cumulative_curve
 from psfcore.scatter.optics import Blur, Optics, pick, put
 from psfcore.scatter.power_law import scatter_kernel
 from psfcore.scatter.shapes import SOFTENED_POWER_LAW
@@ -49,8 +49,6 @@ def test_curve_slopes_are_differences_of_curves() -> None:
     assert total.radii_px.tolist() == [0.5, 2, 5, 10, 20, 50]
     assert set(total.radii_px) < set(CURVE_RADII_PX)
     slopes = total.slopes(AT)
-    for k, slope in enumerate(slopes):
-        np.testing.assert_array_equal(slope, total.slope(AT, k))
     found = total.curve_slopes(slopes)
     assert found.shape == (6, 3)
     for k in range(3):
@@ -59,8 +57,6 @@ def test_curve_slopes_are_differences_of_curves() -> None:
         ahead, behind = (cumulative_curve(total.kernel(AT + side * step), total.radii_px) for side in (1, -1))
         np.testing.assert_allclose(found[:, k], (ahead - behind) / 2e-3, rtol=1e-8)
     assert (found[:, 2] > 0).all()  # more scatter, more light beyond every distance
-    crop = crop_centred(total.kernel(AT), (64, 64))
-    assert cumulative_curve(crop, [20.0]) == pytest.approx(cumulative_curve(total.kernel(AT), [20.0]))
 
 
 # --- convolution in the order of the engine --------------------------------------------------------------
@@ -78,12 +74,13 @@ def scene(shape: tuple[int, int], seed: int = 1) -> NDArray[np.float64]:
     return np.asarray(rng.uniform(50, 150, shape) + 2000 * (rng.random(shape) > 0.98))
 
 
-def test_it_is_the_convolution() -> None:
-    for kernel, shape in itertools.product((total_kernel(SCATTER, DIFFRACTION, 200), LOPSIDED), FIELDS):
+def test_it_is_the_convolution_with_a_kernel_of_any_sign() -> None:
+    more = scatter_kernel(6.2, 2.5, 0.42, 128) - scatter_kernel(6.1, 2.5, 0.41, 128)
+    for kernel, shape in itertools.product((LOPSIDED, more), FIELDS):
         blur, plain, x = Blur(kernel, shape), Convolver(kernel, shape, dtype=np.float64), scene(shape)
         seen, back = blur.convolve(blur.lanes(x)), blur.correlate(blur.lanes(x))
-        np.testing.assert_allclose(blur.field(seen), plain.apply(x), rtol=1e-5)
-        np.testing.assert_allclose(blur.field(back), plain.adjoint(x), rtol=1e-5)
+        for lanes, expected in ((seen, plain.apply(x)), (back, plain.adjoint(x))):
+            np.testing.assert_allclose(blur.field(lanes), expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_nothing_is_left_beyond_the_fields_last_row() -> None:
@@ -126,13 +123,6 @@ def test_inversion_recovers_the_scene() -> None:
         assert off[5] < 0.5
         nearly = optics.invert(observed, optics.lanes(x + 1.0), steps=3)
         np.testing.assert_allclose(optics.field(nearly), x, atol=0.1)
-
-
-def test_a_kernel_may_have_any_sign() -> None:
-    kernel = scatter_kernel(6.2, 2.5, 0.42, 128) - scatter_kernel(6.1, 2.5, 0.41, 128)
-    blur, plain, x = Blur(kernel, (50, 60)), Convolver(kernel, (50, 60), dtype=np.float64), scene((50, 60))
-    seen, expected = blur.field(blur.convolve(blur.lanes(x))), plain.apply(x)
-    np.testing.assert_allclose(seen, expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_single_pixels_are_the_right_ones() -> None:

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from psfcore.convolution.convolver import Convolver
 from psfcore.errors import DataError
 from psfcore.psf import squared_radii
 from psfcore.scatter.power_law import scatter_kernel
@@ -48,23 +47,17 @@ def test_equals_the_plain_sum_for_any_shape_and_reach(ny: int, nx: int, grid_px:
     np.testing.assert_allclose(segment_sums(image, targets, segments), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_segments_of_any_kind_of_image_equal_the_plain_sum() -> None:
+def test_sums_of_any_kind_of_image_are_the_plain_sums() -> None:
+    """Also over the published shells of a large image."""
     targets = some_targets((101, 140), 30)
-    for edges in (PUBLISHED, PIXEL_WIDE):
-        segments = Segments(edges, 128)
-        for dtype in (np.float32, np.float64, ">f4", np.uint16):
-            image = scene((101, 140)).astype(dtype)
-            expected = segment_sums_plain(image, targets, segments)
-            sums = segment_sums(image, targets, segments)
-            np.testing.assert_allclose(sums, expected, rtol=1e-9, atol=1e-9, err_msg=f"{dtype}")
-
-
-def test_published_shells_of_a_large_image_equal_the_plain_sum() -> None:
-    image = scene((1024, 1024)).astype(np.float32)
-    targets = np.array([[0, 0], [500, 700], [500, 701], [1023, 1023]])
-    segments = Segments(shells_as_published())
-    expected = segment_sums_plain(image, targets, segments)
-    np.testing.assert_allclose(segment_sums(image, targets, segments), expected, rtol=1e-9, atol=1e-6)
+    corners = np.array([[0, 0], [500, 700], [500, 701], [1023, 1023]])
+    cases = [(scene((101, 140)).astype(t), targets, PUBLISHED, 128) for t in (np.float32, ">f4", np.uint16)]
+    cases.append((scene((1024, 1024)).astype(np.float32), corners, shells_as_published(), 2048))
+    for image, where, edges, grid_px in cases:
+        segments = Segments(edges, grid_px)
+        expected = segment_sums_plain(image, where, segments)
+        sums = segment_sums(image, where, segments)
+        np.testing.assert_allclose(sums, expected, rtol=1e-9, atol=1e-6, err_msg=f"{image.dtype}")
 
 
 def test_light_lands_at_source_plus_offset() -> None:
@@ -74,18 +67,6 @@ def test_light_lands_at_source_plus_offset() -> None:
     targets = np.array([[20, 22], [16, 20], [23, 16], [20, 20]])
     expected = np.vstack((7.0 * np.eye(3), np.zeros(3)))
     np.testing.assert_array_equal(segment_sums(image, targets, segments), expected)
-
-
-def test_sums_weighted_by_segment_are_the_convolution() -> None:
-    """sum over S of psf_S A_S is the image convolved with the kernel that is psf_S on S."""
-    image, targets = scene((64, 80)), some_targets((64, 80), 30)
-    segments = Segments(PIXEL_WIDE, 128)
-    weights = np.random.default_rng(1).random(segments.size)
-    kernel = np.append(weights, 0.0)[segments.label_map(128)]
-    convolved = Convolver(kernel, image.shape, dtype=np.float64).apply(image)
-    np.testing.assert_allclose(
-        segment_sums(image, targets, segments) @ weights, convolved[tuple(targets.T)], rtol=1e-9
-    )
 
 
 def test_dark_segments_of_a_bright_image_are_exactly_dark() -> None:

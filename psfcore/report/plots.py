@@ -6,36 +6,43 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
+from psfcore.drawing.charts import (
+    FARTHEST_PX,
+    NEAREST_PX,
+    along_distance,
+    boxed_legend,
+    draw_band,
+    draw_errors,
+    draw_totals,
+    draw_weights_of_shells,
+    legend,
+)
 from psfcore.drawing.page import PLOT_DPI
 from psfcore.drawing.plots import png_of, points, tidy
-from psfcore.evaluation.evaluation import Evaluation
-from psfcore.evaluation.frame import Superposed
-from psfcore.evaluation.plot import (
+from psfcore.evaluation.evaluation import Evaluation, Superposed
+from psfcore.evaluation.plots import (
     draw_absolute,
     draw_centres,
-    draw_errors,
     draw_maps,
     draw_offsets,
     draw_slices,
-    minutes_of,
+    each,
+    pointings,
+    positions,
     shown_slices,
 )
-from psfcore.psf import REACH_GRID_PX
 from psfcore.report.report import CrossValidated, PsfReport
 from psfcore.scatter.fit import RADII_PX, TransitFit
+from psfcore.scatter.shapes import Vector
 from psfcore.scatter.total_psf import DIFFRACTION, SCATTER
 from psfcore.scatter.validation.cross_validation import ShellBands
 from psfcore.scatter.validation.dark_offsets import DarkOffsetStudy
 from psfcore.tables.make import TOTAL
 
-Vector = NDArray[np.float64]
-
 WIDTH_IN = 9.9
 MOST_SLICES = 6
-_NEAREST_PX, _FARTHEST_PX = 0.5, REACH_GRID_PX / 2
 _COLOURS = {TOTAL: "#111111", DIFFRACTION: "#7b3fa0", SCATTER: "#c77f00"}
 _NAMES = {TOTAL: "total", DIFFRACTION: "diffraction", SCATTER: "diffuse scatter"}
 _FREE, _BAND = "#1f6fb4", "#4f8cc4"
@@ -45,36 +52,37 @@ def curves_png(report: PsfReport) -> bytes:
     """1 - encircled energy of the total PSF. For a fit, also of its diffuse scatter, with the uncertainties below."""
     if report.fit is None:
         figure, (total,) = _figure(5.6, 3.9, 1)
-        _draw_curve(total, report, TOTAL)
+        _draw_curve(total, report, TOTAL, "Total PSF")
+        legend(total, 8)
         charts = [total]
     else:
         figure, charts = _figure(WIDTH_IN, 7.0, 2, 2, heights=(1.3, 1.0))
-        for column, name in enumerate((TOTAL, SCATTER)):
-            _draw_curve(charts[column], report, name)
-            _draw_spread(charts[2 + column], report, name)
+        for axes, name, title in zip(
+            charts, (TOTAL, SCATTER), ("Total PSF", "Diffuse scatter alone"), strict=False
+        ):
+            _draw_curve(axes, report, name, title)
+        for axes, name in zip(charts[2:], (TOTAL, SCATTER), strict=True):
+            _draw_spread(axes, report, name)
         if report.cross is not None and report.cross.bands.shells is not None:
             _draw_free(charts[1], charts[3], report, report.cross.bands.shells)
-    for axes in charts:
-        _mark_field(axes, report)
-        axes.legend(fontsize=8, loc="upper right", frameon=False)
-    for axes in charts[:2]:
-        axes.set_ylim(0, None)
-    for axes in charts[2:]:
-        low, high = axes.get_ylim()
-        axes.set_ylim(low, high + 0.45 * (high - low))  # room for the legend
-        axes.legend(fontsize=7.5, loc="upper right", frameon=False, ncols=2)
+        for axes in charts[:2]:
+            axes.set_ylim(0, None)
+            legend(axes, 8)
+        for axes in charts[2:]:
+            low, high = axes.get_ylim()
+            axes.set_ylim(low, high + 0.45 * (high - low))  # room for the legend
+            legend(axes, 7.5, ncols=2)
     tidy(charts)
     return png_of(figure)
 
 
-def _draw_curve(axes: Any, report: PsfReport, name: str) -> None:
+def _draw_curve(axes: Any, report: PsfReport, name: str, title: str) -> None:
     """Draw 1 - encircled energy of a component, with its error."""
     radii, beyond, sigma = beyond_of(report.tables, name)
     axes.fill_between(radii, beyond - sigma, beyond + sigma, color=_COLOURS[name], alpha=0.3, linewidth=0)
     axes.plot(radii, beyond, color=_COLOURS[name], linewidth=1.5, label=_NAMES[name])
-    axes.set(xscale="log", xlim=(_NEAREST_PX, _FARTHEST_PX), ylim=(0, None))
-    axes.set(xlabel="Distance R (px)", ylabel="1 - encircled energy (%)", title=_title(name))
-    _plain_ticks(axes)
+    axes.set(ylim=(0, None), ylabel="1 - encircled energy (%)", title=title)
+    along_distance(axes, max(report.transit.shape), "Distance R (px)")
 
 
 def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
@@ -82,23 +90,13 @@ def _draw_spread(axes: Any, report: PsfReport, name: str) -> None:
     radii, _, sigma = beyond_of(report.tables, name)
     found = _folds_of(report, name)
     if found is not None:
-        at, limits = found
-        low_2, low_1, median, high_1, high_2 = limits
-        axes.fill_between(at, low_2, high_2, color=_BAND, alpha=0.25, linewidth=0, label="folds, 2 sigma")
-        axes.fill_between(at, low_1, high_1, color=_BAND, alpha=0.5, linewidth=0, label="folds, 1 sigma")
-        axes.plot(at, median, color="#12407a", linewidth=1.2, label="folds, median")
+        draw_band(axes, *found, _BAND, "folds: median, 1 and 2 sigma")
     axes.axhline(0, color="#555555", linewidth=1.0)
     shown = np.searchsorted(radii, [r for r in RADII_PX if r < radii[-1]])
-    axes.errorbar(
-        radii[shown],
-        np.zeros(shown.size),
-        sigma[shown],
-        label="fit to all images, ±1 σ",
-        **points(_COLOURS[name], 3.0),
-    )
-    axes.set(xscale="log", xlim=(_NEAREST_PX, _FARTHEST_PX))
-    axes.set(xlabel="Distance R (px)", ylabel="Difference from the fit (points)")
-    _plain_ticks(axes)
+    style = {"label": "fit to all images, ±1 σ", **points(_COLOURS[name], 3.0)}
+    axes.errorbar(radii[shown], np.zeros(shown.size), sigma[shown], **style)
+    axes.set(ylabel="Difference from the fit (points)")
+    along_distance(axes, max(report.transit.shape), "Distance R (px)")
 
 
 def _folds_of(report: PsfReport, name: str) -> tuple[Vector, NDArray[np.float64]] | None:
@@ -115,13 +113,13 @@ def _folds_of(report: PsfReport, name: str) -> tuple[Vector, NDArray[np.float64]
     if bands.shells is None:
         return None
     edges = bands.shells.edges_px[:-1]
-    shown = edges >= _NEAREST_PX
-    return edges[shown], bands.shells.law_beyond_pct[:, shown] - _from(report, name, edges[shown])
+    shown = edges >= NEAREST_PX
+    return edges[shown], bands.shells.law_beyond_pct[:, shown] - _scatter_from(report, edges[shown])
 
 
-def _from(report: PsfReport, name: str, edges: Vector) -> Vector:
-    """The percentage of light beyond each distance. Pixels exactly at the distance are included."""
-    radii, beyond, _ = beyond_of(report.tables, name)
+def _scatter_from(report: PsfReport, edges: Vector) -> Vector:
+    """The percentage of scattered light beyond each distance. Pixels exactly at the distance are included."""
+    radii, beyond, _ = beyond_of(report.tables, SCATTER)
     just_below = edges * (1 - 1e-9)
     within = np.maximum(np.searchsorted(radii, just_below) - 1, 0)
     exact = just_below <= report.tables["exact_to_px"]  # up to this radius, the curve is a step function
@@ -133,7 +131,7 @@ def _draw_free(curve: Any, spread: Any, report: PsfReport, shells: ShellBands) -
     edges = shells.edges_px[:-1]
     shown = (edges >= 1) & (edges < max(report.transit.shape))
     low_2, low_1, median, high_1, high_2 = shells.free_beyond_pct[:, shown]
-    fitted = _from(report, SCATTER, edges[shown])
+    fitted = _scatter_from(report, edges[shown])
     for axes, middle in ((curve, median), (spread, median - fitted)):
         for low, high, width, label in (
             (low_2, high_2, 0.7, None),
@@ -144,28 +142,17 @@ def _draw_free(curve: Any, spread: Any, report: PsfReport, shells: ShellBands) -
             axes.errorbar(edges[shown], middle, span, label=label, zorder=3, **style)
 
 
-def _title(name: str) -> str:
-    return {TOTAL: "Total PSF", SCATTER: "Diffuse scatter alone"}.get(name, name.lower())
-
-
 def beyond_of(tables: dict[str, Any], name: str) -> tuple[Vector, Vector, Vector]:
     """Radii (px), 100 (1 - encircled energy) of a component at these radii, and its standard error (0: not known)."""
     radii = np.array(tables["radii_px"])
     encircled = np.array(tables["encircled"][name])
     changes = np.array(tables["encircled_changes"].get(name, np.zeros((1, radii.size))))
-    near = radii < _NEAREST_PX
+    near = radii < NEAREST_PX
     # The curve begins at half a pixel. This radius encloses only the central pixel.
     shown = np.concatenate(([np.flatnonzero(near)[-1]], np.flatnonzero(~near)))
-    r = np.where(near[shown], _NEAREST_PX, radii[shown])
+    r = np.where(near[shown], NEAREST_PX, radii[shown])
     beyond = 100 * np.maximum(1 - encircled[shown], 0.0)
     return r, beyond, 100 * np.linalg.norm(changes[:, shown], axis=0)
-
-
-def _mark_field(axes: Any, report: PsfReport) -> None:
-    """Shade distances beyond the field, where the PSF is an extrapolation of the fitted shape."""
-    field = max(report.transit.shape)
-    if field < _FARTHEST_PX:
-        axes.axvspan(field, _FARTHEST_PX, color="#efefef", zorder=0, linewidth=0, label="beyond the field")
 
 
 def profile_png(report: PsfReport) -> bytes:
@@ -173,29 +160,20 @@ def profile_png(report: PsfReport) -> bytes:
     figure, (axes,) = _figure(7.2, 4.4, 1)
     profile = report.tables["profile"]
     radius = np.array(profile["radius_px"])
-    at = np.maximum(radius, _NEAREST_PX)
-    for name in (DIFFRACTION, SCATTER, TOTAL):
-        if name not in profile["mean_weight"]:
-            continue
+    lowest = []
+    for name in (name for name in _COLOURS if name in profile["mean_weight"]):
         weight = np.array(profile["mean_weight"][name])
-        there = weight > 0
-        sigma = np.array(profile["sigma"].get(name, np.zeros(weight.size)))
-        axes.fill_between(
-            at[there],
-            np.maximum(weight - sigma, 0.05 * weight)[there],
-            (weight + sigma)[there],
-            color=_COLOURS[name],
-            alpha=0.3,
-            linewidth=0,
-        )
-        axes.plot(at[there], weight[there], color=_COLOURS[name], linewidth=1.5, label=_NAMES[name])
-    lowest = [np.array(w) for n, w in profile["mean_weight"].items() if n in (TOTAL, SCATTER)]
-    floor = min(float(w[(w > 0) & (radius < _FARTHEST_PX)].min()) for w in lowest)
-    axes.set(xscale="log", yscale="log", xlim=(_NEAREST_PX, _FARTHEST_PX), ylim=(floor / 5, 2))
-    _mark_field(axes, report)
-    axes.set(xlabel="Distance from the centre (px)", ylabel="Mean weight (fraction of the light per pixel)")
-    _plain_ticks(axes)
-    axes.legend(fontsize=9, loc="upper right", frameon=False)
+        lit = weight > 0
+        sigma = np.array(profile["sigma"].get(name, np.zeros(weight.size)))[lit]
+        at, mean = np.maximum(radius, NEAREST_PX)[lit], weight[lit]
+        shade: dict[str, Any] = {"color": _COLOURS[name], "alpha": 0.3, "linewidth": 0}
+        axes.fill_between(at, np.maximum(mean - sigma, 0.05 * mean), mean + sigma, **shade)
+        axes.plot(at, mean, color=_COLOURS[name], linewidth=1.5, label=_NAMES[name])
+        if name != DIFFRACTION:
+            lowest.append(float(mean[radius[lit] < FARTHEST_PX].min()))
+    axes.set(yscale="log", ylim=(min(lowest) / 5, 2), ylabel="Mean weight (fraction of the light per pixel)")
+    along_distance(axes, max(report.transit.shape), "Distance from the centre (px)")
+    legend(axes)
     tidy([axes])
     return png_of(figure)
 
@@ -203,24 +181,15 @@ def profile_png(report: PsfReport) -> bytes:
 def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
     """Diffuse weights by distance: the fitted shape, and free shells."""
     figure, (axes,) = _figure(7.2, 4.4, 1)
-    shown = shells.edges_px[:-1] < max(report.transit.shape)
-    edges = shells.edges_px[: np.count_nonzero(shown) + 1]
-    low_2, low_1, median, high_1, high_2 = np.maximum(shells.free_weight[:, shown], 1e-30)
-    for low, high, alpha, label in ((low_2, high_2, 0.14, "2 sigma"), (low_1, high_1, 0.3, "1 sigma")):
-        steps = np.append(low, low[-1]), np.append(high, high[-1])
-        style: dict[str, Any] = {"color": _FREE, "alpha": alpha, "linewidth": 0}
-        axes.fill_between(edges, *steps, step="post", label=f"free shells, {label}", **style)
-    axes.hlines(median, edges[:-1], edges[1:], color=_FREE, linewidth=1.4, label="free shells, median")
-    profile = report.tables["profile"]
+    field_px, profile = max(report.transit.shape), report.tables["profile"]
+    draw_weights_of_shells(axes, shells.edges_px, shells.free_weight, field_px, _FREE)
     radius, weight = np.array(profile["radius_px"]), np.array(profile["mean_weight"][SCATTER])
-    there = (radius >= 1) & (radius <= _FARTHEST_PX)
-    axes.plot(radius[there], weight[there], color=_COLOURS[SCATTER], linewidth=1.8, label="fitted shape")
-    axes.set(xscale="log", xlim=(_NEAREST_PX, _FARTHEST_PX), xlabel="Distance (px)")
-    axes.set(yscale="log", ylim=(0.2 * weight[there].min(), 20 * weight[there].max()))
+    shown = (radius >= 1) & (radius <= FARTHEST_PX)
+    axes.plot(radius[shown], weight[shown], color=_COLOURS[SCATTER], linewidth=1.8, label="fitted shape")
+    axes.set(yscale="log", ylim=(0.2 * weight[shown].min(), 20 * weight[shown].max()))
     axes.set_ylabel("Diffuse weight (fraction of the light per pixel)")
-    _mark_field(axes, report)
-    _plain_ticks(axes)
-    axes.legend(fontsize=9, loc="upper right", frameon=False)
+    along_distance(axes, field_px)
+    legend(axes)
     tidy([axes])
     return png_of(figure)
 
@@ -228,15 +197,12 @@ def weights_png(report: PsfReport, shells: ShellBands) -> bytes:
 def totals_png(cross: CrossValidated, fit: TransitFit) -> bytes:
     """Histogram of the total diffuse scatter over the folds."""
     figure, (axes,) = _figure(6.4, 3.4, 1)
-    totals = 100 * cross.bands.totals
-    found, sigma = 100 * fit.inversion.values["total"], 100 * fit.value_sigma["total"]
-    axes.axvspan(
-        found - sigma, found + sigma, color="#c77f00", alpha=0.2, linewidth=0, label="error of that fit, ±1 σ"
-    )
-    axes.hist(totals, bins=min(25, max(5, totals.size // 4)), color=_BAND, label="folds")
-    axes.axvline(found, color="#c77f00", linewidth=1.6, label="fit to all images")
-    axes.set(xlabel="Diffusely scattered light (% of all light)", ylabel="Number of fits")
-    axes.legend(fontsize=9, frameon=False)
+    total, sigma = 100 * fit.inversion.values["total"], 100 * fit.value_sigma["total"]
+    style: dict[str, Any] = {"color": _COLOURS[SCATTER], "alpha": 0.2, "linewidth": 0}
+    axes.axvspan(total - sigma, total + sigma, label="error of that fit, ±1 σ", **style)
+    draw_totals(axes, cross.bands.totals, _BAND)
+    axes.axvline(total, color=_COLOURS[SCATTER], linewidth=1.6, label="fit to all images")
+    legend(axes, loc="best")
     tidy([axes])
     return png_of(figure)
 
@@ -249,8 +215,7 @@ def slices_png(evaluation: Evaluation) -> bytes:
     figure, charts = _figure(WIDTH_IN * max(across, 2) / 3, 3.3 * rows, across, rows)
     for axes, frame in zip(charts, shown, strict=False):
         draw_slices(axes, frame)
-        axes.legend(fontsize=7, loc="upper center", frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
-        axes.set_title(f"Pointing {frame.pointing}: {frame.file:.20}", fontsize=10)
+        boxed_legend(axes, 7, "upper center")
     for axes in charts[len(shown) :]:
         axes.set_visible(False)
     tidy(charts)
@@ -268,26 +233,16 @@ def residuals_png(evaluation: Evaluation) -> bytes:
     """Residuals of disc means and of centres by time, detector x and detector y, coloured by pointing."""
     frames = evaluation.frames
     figure, charts = _figure(WIDTH_IN, 6.2, 3, 2)
-    where = {
-        "Time from the first image (min)": minutes_of(frames),
-        "Detector x of the occulter (px)": np.array([f.found.place.x_px for f in frames]),
-        "Detector y of the occulter (px)": np.array([f.found.place.y_px for f in frames]),
-    }
-    rows = (("Disc mean", "residual_pct", "noise_pct"), ("Centre", "centre_pct", "centre_noise_pct"))
-    for row, (name, value, noise) in enumerate(rows):
-        values = np.array([getattr(f, value) for f in frames])
-        sigma = np.array([getattr(f, noise) for f in frames])
-        for column, (label, at) in enumerate(where.items()):
-            axes = charts[3 * row + column]
-            draw_errors(axes, frames, at, values, sigma)
-            axes.legend().remove()
+    for row, (name, key) in enumerate((("Disc mean", ""), ("Centre", "centre_"))):
+        values = each(frames, f"{key or 'residual_'}pct")
+        for axes, (label, at) in zip(charts[3 * row :], positions(frames).items(), strict=False):
+            draw_errors(axes, pointings(frames), at, values, each(frames, f"{key}noise_pct"))
+            axes.get_legend().remove()
             axes.set(xlabel=label if row else "")
-            if column == 0:
-                axes.set_ylabel(f"{name}: residual (%)")
-    handles, labels = charts[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, title="pointing", loc="outside upper center", ncols=8, fontsize=9, frameon=False
-    )
+        charts[3 * row].set_ylabel(f"{name}: residual (%)")
+    labelled = charts[0].get_legend_handles_labels()
+    style: dict[str, Any] = {"ncols": 8, "fontsize": 9, "frameon": False}
+    figure.legend(*labelled, title="pointing", loc="outside upper center", **style)
     tidy(charts)
     return png_of(figure)
 
@@ -305,11 +260,9 @@ def offsets_png(study: DarkOffsetStudy) -> bytes:
     """Effect of wrong dark levels on diffuse weights and on 1 - encircled energy."""
     figure, charts = _figure(WIDTH_IN, 4.2, 2)
     draw_offsets(charts, study)
-    charts[0].set_title("Diffuse weights")
-    charts[1].set_title("1 - encircled energy")
-    for axes in charts:
-        axes.legend(fontsize=7.5, frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
-        _plain_ticks(axes)
+    for axes, title in zip(charts, ("Diffuse weights", "1 - encircled energy"), strict=True):
+        axes.set_title(title)
+        boxed_legend(axes, 7.5)
     tidy(charts)
     return png_of(figure)
 
@@ -326,8 +279,3 @@ def _figure(
     figure = Figure(figsize=(width_in, height_in), dpi=PLOT_DPI, facecolor="white", layout="constrained")
     charts = figure.subplots(rows, across, squeeze=False, height_ratios=heights)
     return figure, list(np.ravel(charts))
-
-
-def _plain_ticks(axes: Any) -> None:
-    """Label ticks as 1, 10, 100 instead of powers of ten."""
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
