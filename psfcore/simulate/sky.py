@@ -56,29 +56,13 @@ class TrueSky:
     seed: int
     threads: int = 1
 
-    def true_scene(self, index: int) -> Plane:
-        """The scene of image `index`, cropped to the field, without the light that the occulter hides."""
-        return on_field(self.true_scene_and_beyond(index), self.plan.margin_px)
-
-    def true_scene_and_beyond(self, index: int) -> Plane:
-        """The scene of image `index` without the light that the occulter hides.
-
-        The result is plan.margin_px larger than the field on each side.
-        """
-        scene = self.scenes[self.plan.shots[index].pointing].copy()
-        around = self.behind[index]
-        rows, columns = around.window(self.plan.margin_px)
-        scene[rows, columns] -= around.hidden(self.plan.place(index))
-        return np.asarray(np.maximum(scene, 0.0))  # rounding gives -1e-14 for a hidden pixel
-
     def expected(self, index: int) -> Plane:
         """The noise-free image `index` from Eq. (1), on the pixels of the field."""
         around = self.behind[index]
         hidden = np.zeros((self.plan.size_px, self.plan.size_px))
         hidden[around.window()] = around.hidden(self.plan.place(index))
-        return np.asarray(
-            self.seen_scenes[self.plan.shots[index].pointing] - self._hiding.apply(hidden)
-        )  # Eq. (1)
+        seen = self.seen_scenes[self.plan.shots[index].pointing]
+        return np.asarray(seen - self._hiding.apply(hidden))  # Eq. (1)
 
     @cached_property
     def noise_free(self) -> tuple[Plane, ...]:
