@@ -96,7 +96,7 @@ def true_sky(
     seen: dict[int, Plane] = {}
     around: dict[int, Behind] = {}
     for pointing in plan.pointings:
-        fine = drawn_scene(plan, pointing, seed) if scenes is None else _given(scenes, pointing, plan)
+        fine = drawn_scene(plan, pointing, seed) if scenes is None else _checked_scene(scenes, pointing, plan)
         for index in (n for n, shot in enumerate(plan.shots) if shot.pointing == pointing):
             around[index] = behind(fine, plan.place(index), fine=plan.oversampling, margin_px=plan.margin_px)
         coarse[pointing] = binned(fine, plan.oversampling)
@@ -124,7 +124,7 @@ def on_field(plane: Plane, margin_px: int) -> Plane:
     return plane[margin_px : ny - margin_px, margin_px : nx - margin_px]
 
 
-def _given(scenes: Mapping[int, Plane], pointing: int, plan: Plan) -> Plane:
+def _checked_scene(scenes: Mapping[int, Plane], pointing: int, plan: Plan) -> Plane:
     edge = (plan.size_px + 2 * plan.margin_px) * plan.oversampling
     if pointing not in scenes or scenes[pointing].shape != (edge, edge):
         got = scenes[pointing].shape if pointing in scenes else f"scenes of pointings {sorted(scenes)}"
