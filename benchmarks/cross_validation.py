@@ -28,8 +28,7 @@ from psfcore.fits.blocks import FitsLimits
 from psfcore.scatter.inversion import invert
 from psfcore.scatter.validation.cross_validation import FoldFit, bands, bootstrap_samples, shared_fits
 from psfcore.simulate.plan import default_plan
-from psfcore.simulate.transit import simulate
-from psfcore.simulate.transit_files import write
+from psfcore.simulate.transit import simulate, write
 from psfcore.transit.folder import read_transit
 from studies.transits import diffraction, drawn_truth
 from tests.whole import stack as stacks

@@ -32,8 +32,7 @@ from psfcore.scatter.reconstruction import LEAST_LEVEL, Solution
 from psfcore.scatter.report import fit_sentence
 from psfcore.scatter.total_psf import TotalPsf
 from psfcore.simulate.plan import default_plan
-from psfcore.simulate.transit import simulate
-from psfcore.simulate.transit_files import write
+from psfcore.simulate.transit import simulate, write
 from psfcore.transit.folder import read_transit
 from studies.transits import diffraction, drawn_truth
 

@@ -20,14 +20,7 @@ from psfcore.drawing.plots import preview_png
 from psfcore.instruments.model import load_instrument
 
 REPEATS = 3
-ENTRANCE_MESH = {
-    "wavelength_angstrom": 174.0,
-    "distance_mm": 4187.0,
-    "pitch_um": 1270.0,
-    "wire_um": 40.0,
-    "windows": 37,
-    "pixel_pitch_um": 10.0,
-}
+ORDER_SPACING_PX = 5.7365  # of the entrance mesh of HRI_EUV
 
 
 def calls(folder: Path) -> dict[str, Callable[[], object]]:
@@ -40,9 +33,7 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
             plane, plane * 1.1, folder / "preview.png", title="timed", unit="DN/s"
         ),
         "orders of a rotated mesh, 2048 px": lambda: rotated_mesh_kernel(
-            **ENTRANCE_MESH,  # type: ignore[arg-type]
-            angle_deg=45.0,
-            size=2048,
+            ORDER_SPACING_PX, pitch_um=1270.0, wire_um=40.0, windows=37, angle_deg=45.0, size=2048
         ),
         "design study of 32 meshes": lambda: design_study(hri, pitches_um, [20, 30, 40, 50]),
     }

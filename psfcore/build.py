@@ -59,20 +59,20 @@ def build_psf(
     instrument that needs too large arrays.
     """
     if size % 2 or not SMALLEST_SIZE_PX <= size <= LARGEST_SIZE_PX:
-        wanted = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
-        raise DataError("bad-size", f"expected {wanted}; got {size}")
+        expected = f"an even size of {SMALLEST_SIZE_PX} to {LARGEST_SIZE_PX} px"
+        raise DataError("bad-size", f"expected {expected}; got {size}")
     check_workload(instrument, instrument.name)
-    known = component_names(instrument)
-    if component not in (None, *known):
-        raise DataError("unknown-component", f"expected one of {', '.join(known)}; got {component!r}")
-    names = known if component is None else (component,)
+    available = component_names(instrument)
+    if component not in (None, *available):
+        raise DataError("unknown-component", f"expected one of {', '.join(available)}; got {component!r}")
+    names = available if component is None else (component,)
     if component is None and not parts:
         names = tuple(name for name in names if name in (DIFFRACTION, SCATTER))
     grid = max(size, REACH_GRID_PX)
     patterns = diffraction_patterns(
         instrument,
         size=grid,
-        wanted=names,
+        names=names,
         mount_image=mount_image,
         threads=threads,
         progress=None if progress is None else lambda done, of: progress(900 * done // of, 1000),
@@ -191,17 +191,17 @@ def known_diffraction(instrument: str | None, *, threads: int = 1) -> Kernel:
 
     Raises DataError "no-known-psf" if the instrument is not known.
     """
-    known = load_instrument(check_known(instrument))
-    return build_psf(known, component="DIFFRACTION", threads=threads).kernel
+    description = load_instrument(check_known(instrument))
+    return build_psf(description, component="DIFFRACTION", threads=threads).kernel
 
 
 def check_known(instrument: str | None) -> str:
     """The name of a known instrument. Raises DataError "no-known-psf" if the instrument is not known."""
     if instrument not in instrument_names():
-        known = ", ".join(instrument_names())
+        names = ", ".join(instrument_names())
         raise DataError(
             "no-known-psf",
-            f'expected "known_psf" in transit.json, or an instrument with a known diffraction PSF ({known}); '
+            f'expected "known_psf" in transit.json, or an instrument with a known diffraction PSF ({names}); '
             f"got {instrument or 'neither'}",
         )
     return instrument

@@ -184,10 +184,10 @@ def trusted(path: Path) -> bool:
     shared_group = source.st_gid if source.st_mode & stat.S_IWGRP else None
     try:
         path = path.resolve(strict=True)
-        found = [one.stat() for one in (path, *path.parents)]
+        states = [one.stat() for one in (path, *path.parents)]
     except OSError:  # the path does not exist, or this user may not read it
         return False
-    for place, one in enumerate(found):
+    for place, one in enumerate(states):
         if one.st_uid not in owners:
             return False
         others = one.st_mode & stat.S_IWOTH or (one.st_mode & stat.S_IWGRP and one.st_gid != shared_group)
@@ -251,18 +251,18 @@ class KernelFiles(IndexDataCacheFile):
 
     def _is_good(self, name: str) -> bool:
         try:
-            kept = Path(self._data_path(name)).read_bytes()
+            content = Path(self._data_path(name)).read_bytes()
         except FileNotFoundError:
             return False
-        return kept[-SEAL_BYTES:] == self._seal(kept[:-SEAL_BYTES])
+        return content[-SEAL_BYTES:] == self._seal(content[:-SEAL_BYTES])
 
     def _seal(self, payload: bytes) -> bytes:
         stamp = repr((self._version, self._source_stamp, sources_sha256()))
         return hashlib.sha256(stamp.encode()).digest() + hashlib.sha256(payload).digest()
 
     def _name(self, key: Any) -> str:
-        told = repr((self._version, key))
-        return self._index_name.removesuffix("nbi") + hashlib.sha256(told.encode()).hexdigest()[:24] + ".nbc"
+        text = repr((self._version, key))
+        return self._index_name.removesuffix("nbi") + hashlib.sha256(text.encode()).hexdigest()[:24] + ".nbc"
 
 
 @cache

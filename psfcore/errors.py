@@ -85,7 +85,7 @@ def together(errors: Sequence[DataError]) -> DataError:
     first = errors[0]
     if len(errors) == 1:
         return first
-    told = [error.message for error in errors[:MOST_TOLD]]
+    messages = [error.message for error in errors[:MOST_TOLD]]
     if len(errors) > MOST_TOLD:
-        told.append(f"and {len(errors) - MOST_TOLD} more")
-    return type(first)(first.code, f"{len(errors)} files cannot be used: " + "; ".join(told))
+        messages.append(f"and {len(errors) - MOST_TOLD} more")
+    return type(first)(first.code, f"{len(errors)} files cannot be used: " + "; ".join(messages))

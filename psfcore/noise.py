@@ -12,19 +12,28 @@ too small for a pixel whose noise happens to be negative, and it could be negati
 | g | photon_gain_dn: DN per detected photon | DN |
 | r | read_noise_dn: rms | DN |
 | t | dn_per_unit: exposure time for DN/s, 1 for DN | s, 1 |
+
+This module loads numpy on first use, so that the web process can check the figures of requests.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
-from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
 from psfcore.errors import DataError
 
-Plane = NDArray[np.float64]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Plane = NDArray[np.float64]
+
+# Strict: the text "12.5" and the value true are refused, because they are not numbers.
+Figure = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -47,14 +56,31 @@ class Noise:
 
     def variance(self, expected: Plane, dn_per_unit: float) -> Plane:
         """Variance [y, x] of pixels whose expected values are `expected`; negative expected values count as zero."""
+        import numpy as np
+
         photons = self.photon_gain_dn * np.maximum(expected, 0.0) / dn_per_unit
         return np.asarray(photons + (self.read_noise_dn / dn_per_unit) ** 2)  # Eq. (1), Eq. (2)
 
     def observe(self, expected: Plane, dn_per_unit: float, rng: np.random.Generator) -> Plane:
         """Simulate one exposure [y, x] of a scene whose noise-free image is `expected`."""
+        import numpy as np
+
         exposure_dn: Plane = np.maximum(expected, 0.0) * dn_per_unit
         if self.photon_gain_dn > 0:
             exposure_dn = np.asarray(rng.poisson(exposure_dn / self.photon_gain_dn) * self.photon_gain_dn)
         if self.read_noise_dn > 0:
             exposure_dn = np.asarray(exposure_dn + rng.normal(0.0, self.read_noise_dn, expected.shape))
         return np.asarray(exposure_dn / dn_per_unit)
+
+
+class NoiseFigures(BaseModel):
+    """Variance of a pixel in DN^2 = photon_gain_dn * signal in DN + read_noise_dn^2."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    photon_gain_dn: Figure = Field(description="DN per detected photon")
+    read_noise_dn: Figure = Field(description="read noise, DN rms")
+
+    def noise(self) -> Noise:
+        """The noise model with these figures. Raises DataError "bad-noise" if both are zero."""
+        return Noise(self.photon_gain_dn, self.read_noise_dn)

@@ -109,9 +109,9 @@ def _check_weights(kernel: Kernel) -> None:
     within = (min(kernel.shape[0], REACH_GRID_PX), min(kernel.shape[1], REACH_GRID_PX))
     total = float((kernel if kernel.shape == within else crop_centred(kernel, within)).sum())
     if not SMALLEST_SUM < total <= LARGEST_SUM:
-        wanted = f"weights that sum to 1 over the full reach, or to less if cropped ({SMALLEST_SUM} to {LARGEST_SUM})"
+        expected = f"weights that sum to 1 over the full reach, or to less if cropped ({SMALLEST_SUM} to {LARGEST_SUM})"
         raise DataError(
-            "psf-sum", f"expected {wanted}; got {total:.6g}. Divide the weights by their sum first"
+            "psf-sum", f"expected {expected}; got {total:.6g}. Divide the weights by their sum first"
         )
 
 
@@ -123,11 +123,11 @@ def _check_centre(kernel: Kernel) -> None:
     centre = (kernel.shape[0] // 2, kernel.shape[1] // 2)
     if kernel[centre] < kernel.max() * (1 - CENTRE_TOLERANCE):
         peak = np.unravel_index(int(kernel.argmax()), kernel.shape)
-        found = tuple(int(p) for p in peak)
-        hint = " (the corner origin of a Fourier transform)" if found == (0, 0) else ""
+        place = tuple(int(p) for p in peak)
+        hint = " (the corner origin of a Fourier transform)" if place == (0, 0) else ""
         raise DataError(
             "psf-not-centred",
-            f"expected the peak at [y, x] = {centre}; got {found}{hint}: shift the PSF so that its peak is at {centre}",
+            f"expected the peak at [y, x] = {centre}; got {place}{hint}: shift the PSF so that its peak is at {centre}",
         )
 
 

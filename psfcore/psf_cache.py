@@ -38,16 +38,9 @@ FITS, PROVENANCE = "fits", "provenance.json"  # parts that every builder keeps
 # The same for a PSF that was built for a deconvolution: its kernel is equal, but it has no components.
 TOTAL_FITS, TOTAL_PROVENANCE = "total.fits", "total.provenance.json"
 _NAME = re.compile(r"([0-9a-f]{64})\.([0-9a-f]{64})\.([a-z.]+)")
+_TEMPORARY = re.compile(rf"\..*{re.escape(PARTIAL)}")
 _OTHERS = 0o077  # permissions of the group and of all other users
 _ABANDONED_S = 86_400.0  # a temporary file of this age belongs to no running process
-
-
-@dataclass(frozen=True)
-class CachedFile:
-    """A file of the cache, whose content was checked."""
-
-    path: Path
-    sha256: str
 
 
 @dataclass(frozen=True)
@@ -70,7 +63,7 @@ class PsfCache:
         self.folder = folder
         self.max_bytes = max_bytes
 
-    def find(self, identity: str, part: str) -> CachedFile | None:
+    def find(self, identity: str, part: str) -> Path | None:
         """A file of a PSF, after its content was checked; None if the cache has no such file.
 
         A damaged file is removed.
@@ -84,13 +77,13 @@ class PsfCache:
                     # The access time of the file is set to now: it records the last use. The modification time is not
                     # changed, because other running commands use it to notice that a file was replaced.
                     os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
-                    return CachedFile(path, sha256)
+                    return path
                 path.unlink()
             except FileNotFoundError:  # another process removed it
                 continue
         return None
 
-    def keep(self, identity: str, part: str, write: Callable[[Path], object]) -> CachedFile | None:
+    def keep(self, identity: str, part: str, write: Callable[[Path], object]) -> Path | None:
         """Keep a file. ``write(path)`` writes it. Returns None if the file is larger than the largest size of the
         cache.
 
@@ -108,13 +101,12 @@ class PsfCache:
                 os.fsync(written.fileno())
             if unfinished.stat().st_size > self.max_bytes:
                 return None
-            sha256 = sha256_of(unfinished)
-            kept = self.folder / f"{identity}.{sha256}.{part}"
+            kept = self.folder / f"{identity}.{sha256_of(unfinished)}.{part}"
             unfinished.replace(kept)
         finally:
             unfinished.unlink(missing_ok=True)
         self._shrink(identity)
-        return CachedFile(kept, sha256)
+        return kept
 
     def psfs(self) -> list[CachedPsf]:
         """The PSFs in the cache; the most recently used PSF comes first."""
@@ -122,7 +114,7 @@ class PsfCache:
         for path in self._files():
             with suppress(FileNotFoundError):  # another process removed it
                 files.setdefault(path.name.split(".")[0], []).append((path, path.stat()))
-        found = [
+        psfs = [
             CachedPsf(
                 identity=identity,
                 files=tuple(path for path, _ in of),
@@ -131,27 +123,22 @@ class PsfCache:
             )
             for identity, of in files.items()
         ]
-        return sorted(found, key=lambda psf: psf.used_at, reverse=True)
+        return sorted(psfs, key=lambda psf: psf.used_at, reverse=True)
 
     def clear(self) -> int:
         """Remove all files; returns the size of the PSFs in bytes. Other files in the folder stay."""
         removed = self.psfs()
         for psf in removed:
             _remove(psf)
-        for leftover in self._partials():
+        for leftover in self._files(_TEMPORARY):
             leftover.unlink(missing_ok=True)
         return sum(psf.bytes for psf in removed)
 
-    def _files(self) -> list[Path]:
-        """The files of PSFs; none if the folder does not exist or belongs to another user."""
+    def _files(self, pattern: re.Pattern[str] = _NAME) -> list[Path]:
+        """The files with such names, by default those of PSFs; none if there is no folder or it belongs to another user."""
         if not self.folder.is_dir() or self._of_another_user():
             return []
-        return sorted(path for path in self.folder.iterdir() if _NAME.fullmatch(path.name))
-
-    def _partials(self) -> list[Path]:
-        if not self.folder.is_dir() or self._of_another_user():
-            return []
-        return list(self.folder.glob(f".*{PARTIAL}"))
+        return sorted(path for path in self.folder.iterdir() if pattern.fullmatch(path.name))
 
     def _shrink(self, last: str) -> None:
         """Remove the least recently used PSFs until the others fit.
@@ -166,7 +153,7 @@ class PsfCache:
             if psf.identity != last:
                 _remove(psf)
                 total -= psf.bytes
-        for leftover in self._partials():  # killed processes leave such files
+        for leftover in self._files(_TEMPORARY):  # killed processes leave such files
             with suppress(FileNotFoundError):
                 if time.time() - leftover.stat().st_mtime > _ABANDONED_S:
                     leftover.unlink()
@@ -213,11 +200,8 @@ def built_file(
         names = (TOTAL_FITS, TOTAL_PROVENANCE)
         fits = cache.find(recipe.identity, TOTAL_FITS)
     if fits is not None:
-        kept = cache.find(recipe.identity, names[1])
-        yield (
-            fits.path,
-            {"psf_id": recipe.identity} if kept is None else json.loads(kept.path.read_bytes()),
-        )
+        provenance = cache.find(recipe.identity, names[1])
+        yield fits, {"psf_id": recipe.identity} if provenance is None else json.loads(provenance.read_bytes())
         return
     # A command that finds its PSF does not load the libraries of the diffraction.
     from psfcore.build import build_recipe

@@ -155,9 +155,9 @@ def check_compatible(image: Image, psf: Psf) -> None:
         if scale is None:
             continue
         if abs(scale / psf.plate_scale_arcsec - 1) > PLATE_SCALE_TOLERANCE:
-            wanted = f"{psf.plate_scale_arcsec:g} arcsec/px, the plate scale of PSF {psf.name}"
+            expected = f"{psf.plate_scale_arcsec:g} arcsec/px, the plate scale of PSF {psf.name}"
             raise DataError(
-                "plate-scale-mismatch", f"expected {wanted}; got CDELT{axis} = {scale:g} arcsec/px"
+                "plate-scale-mismatch", f"expected {expected}; got CDELT{axis} = {scale:g} arcsec/px"
             )
 
 

@@ -173,7 +173,7 @@ def get(
         return kept
     folder.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f".{name}-", dir=folder) as temporary:
-        file = _downloaded(one, Path(temporary), progress) if source is None else _found(one, source)
+        file = _downloaded(one, Path(temporary), progress) if source is None else _file_in(one, source)
         sha256 = sha256_of(file)
         first = json.loads(record.read_bytes())["sha256"] if record.is_file() else sha256
         if sha256 != first:
@@ -191,7 +191,7 @@ def get(
     return kept
 
 
-def _found(one: Published, source: Path) -> Path:
+def _file_in(one: Published, source: Path) -> Path:
     if not (source / one.file).is_file():
         raise DataError(
             "no-such-file", f"expected {one.file} in {source}; it is not there: get it from {one.place}"

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from psfcore.noise_figures import NoiseFigures
+from psfcore.noise import NoiseFigures
 from workers.catalogue.tables import JobRow, ProductRow, PsfRow, ReportRow, TransitRow
 from workers.contract.kinds import KINDS
 from workers.contract.phases import JobError, Phase

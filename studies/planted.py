@@ -135,7 +135,7 @@ FAULTS = (
           ("tests/psfcore/transit/test_transit.py",), ("tests/psfcore/scatter/validation",)),
     Fault("simulate-photons-counted-in-dn", "psfcore/noise.py",
           "rng.poisson(exposure_dn / self.photon_gain_dn) * self.photon_gain_dn", "rng.poisson(exposure_dn)",
-          ("tests/psfcore/simulate/test_simulate.py",), ("tests/psfcore/simulate",)),
+          ("tests/psfcore/simulate/test_transit.py",), ("tests/psfcore/simulate",)),
     Fault("flare-error-of-mean-not-of-count", "psfcore/flare/arm_profile.py",
           "np.sqrt(np.bincount(member, variance[rows, columns])) / count",
           "np.sqrt(np.bincount(member, variance[rows, columns]) / count)",

@@ -169,7 +169,7 @@ def _places(simulated: SimulatedTransit, solution: Solution, bound: Any) -> list
     """For each frame: photons per pixel, errors in x and y, stated errors, bounds (px)."""
     rows = []
     for n, frame in zip(solution.part, solution.inversion.frames, strict=True):
-        exact, found = simulated.truth.places[n], frame.found
+        exact, found = simulated.plan.place(n), frame.found
         gain = simulated.plan.noise.photon_gain_dn
         photons = frame.observed * simulated.plan.shots[n].exposure_s / gain
         rows.append(
@@ -188,9 +188,9 @@ def _places(simulated: SimulatedTransit, solution: Solution, bound: Any) -> list
 def _noise_free(simulated: SimulatedTransit, true_curve: NDArray[np.float64]) -> list[float]:
     """The errors of the curve for images without noise and with exact places."""
     frames = tuple(
-        replace(frame, pixels=seen.astype(np.float32), place=place)
-        for frame, seen, place in zip(
-            simulated.transit.frames, simulated.sky.noise_free, simulated.truth.places, strict=True
+        replace(frame, pixels=seen.astype(np.float32), place=simulated.plan.place(n))
+        for n, (frame, seen) in enumerate(
+            zip(simulated.transit.frames, simulated.sky.noise_free, strict=True)
         )
     )
     inversion = invert(replace(simulated.transit, frames=frames)).inversion

@@ -19,8 +19,7 @@ from psfcore.gap.library import registry
 from psfcore.gap.report import plot as gap_plot
 from psfcore.scatter import total_psf
 from psfcore.simulate.plan import default_plan
-from psfcore.simulate.transit import simulate
-from psfcore.simulate.transit_files import write
+from psfcore.simulate.transit import simulate, write
 from tests.psfcore.gap.small_gaps import FEW, changed, few_sign_flips
 from tests.transit_files import TRUTH, diffraction
 from workers.tasks import gap as gap_task

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
-from psfcore.simulate.transit import simulate
-from psfcore.simulate.transit_files import write
+from psfcore.simulate.transit import simulate, write
 
 SHAPE = (64, 80)
 RADIUS_PX = 4.0

@@ -18,8 +18,7 @@ import heliopsf
 from psfcore.psf import crop_centred, cumulative_curve
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth, total_kernel
-from psfcore.simulate.transit import simulate
-from psfcore.simulate.transit_files import write
+from psfcore.simulate.transit import simulate, write
 
 # %%
 # Simulate a transit

@@ -20,8 +20,7 @@ import heliopsf
 from psfcore.psf import crop_centred
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
-from psfcore.simulate.transit import simulate
-from psfcore.simulate.transit_files import write
+from psfcore.simulate.transit import simulate, write
 
 # %%
 # The archive

@@ -22,8 +22,7 @@ from psfcore.blind.effects.effect import Effect
 from psfcore.blind.effects.fine_optics import binned_glass, fine_optics
 from psfcore.blind.leftover import Left, LinearEstimator, refitted, rms
 from psfcore.simulate.plan import HIGH, Plan
-from psfcore.simulate.transit import reported_places
-from psfcore.simulate.transit_files import write_observation
+from psfcore.simulate.transit import reported_places, write_observation
 from psfcore.transit.prepare import Exposure, prepare
 from psfcore.transit.transit import Frame
 

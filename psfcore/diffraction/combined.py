@@ -30,11 +30,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import linear_convolve
-from psfcore.diffraction.airy import airy_kernel
-from psfcore.diffraction.edge_pattern import edge_kernel
 from psfcore.diffraction.fraunhofer import far_field, samples_per_pixel
-from psfcore.diffraction.hexagonal_mesh import hexagonal_mesh_kernel
-from psfcore.diffraction.mesh_series import mesh_line, rotated_mesh_kernel
+from psfcore.diffraction.mesh_series import (
+    hexagonal_mesh_kernel,
+    mesh_line,
+    order_spacing_px,
+    rotated_mesh_kernel,
+)
+from psfcore.diffraction.open_aperture import airy_kernel, edge_kernel
 from psfcore.diffraction.pupil import entrance_pupil
 from psfcore.instruments.model import Instrument, Mesh, Mount
 from psfcore.instruments.workload import MOST_MASK_SAMPLES, PERIOD_PX, windows_of
@@ -112,10 +115,10 @@ def available_parts(instrument: Instrument) -> tuple[str, ...]:
     return tuple(name for name in names if has.get(name, True))
 
 
-def needed_parts(instrument: Instrument, wanted: Iterable[str]) -> set[str]:
-    """The components that must be computed to obtain the wanted ones."""
+def needed_parts(instrument: Instrument, names: Iterable[str]) -> set[str]:
+    """The components that must be computed to obtain those of these names."""
     route, available = route_of(instrument), set(available_parts(instrument))
-    needed = set(wanted)
+    needed = set(names)
     if DIFFRACTION in needed:
         needed |= {ENTRANCE, FILTER_WHEEL} & available
     if ENTRANCE in needed and not (route.meshes_in_mask and {ENTRANCE_MESH, MOUNT} <= available):
@@ -129,17 +132,17 @@ def diffraction_patterns(
     instrument: Instrument,
     *,
     size: int,
-    wanted: Iterable[str],
+    names: Iterable[str],
     mount_image: NDArray[np.floating] | None = None,
     threads: int = 1,
     progress: Progress | None = None,
 ) -> Patterns:
-    """Compute the wanted components, shape (size, size), not normalised.
+    """Compute the components of these names, shape (size, size), not normalised.
 
     The patterns of the spectral lines are multiplied by the weights of the lines and added. mount_image: pixels [y, x] of
     the mount's mask image, if the instrument has one. progress: called with (done, of).
     """
-    route, needed = route_of(instrument), needed_parts(instrument, wanted)
+    route, needed = route_of(instrument), needed_parts(instrument, names)
     patterns = Patterns(notes={"entrance_route": str(route)})
     lines = instrument.spectral_lines
     steps = len(lines) * len(needed) * STEPS_A_PUPIL
@@ -264,21 +267,23 @@ class _OneWavelength:
         return combined
 
     def _mesh(self, mesh: Mesh) -> Kernel:
-        optics: dict[str, Any] = {
-            "wavelength_angstrom": self.wavelength_angstrom,
-            "distance_mm": self.instrument.mesh_distance_mm(mesh),
+        spacing_px = order_spacing_px(
+            wavelength_angstrom=self.wavelength_angstrom,
+            distance_mm=self.instrument.mesh_distance_mm(mesh),
+            pitch_um=mesh.pitch_um,
+            pixel_pitch_um=self.instrument.detector.pixel_pitch_um,
+        )
+        series: dict[str, Any] = {
             "pitch_um": mesh.pitch_um,
             "wire_um": mesh.wire_um,
             "windows": windows_of(mesh),
-            "pixel_pitch_um": self.instrument.detector.pixel_pitch_um,
             "size": self.size,
         }
-        if mesh.openings == "hexagonal":
-            return hexagonal_mesh_kernel(angle_deg=mesh.angle_deg, **optics)
-        if mesh.angle_deg % 90 == 0:
-            line = mesh_line(**optics)
+        if mesh.openings == "square" and mesh.angle_deg % 90 == 0:
+            line = mesh_line(spacing_px, **series)
             return np.outer(line, line)
-        return rotated_mesh_kernel(angle_deg=mesh.angle_deg, **optics)
+        kernel = rotated_mesh_kernel if mesh.openings == "square" else hexagonal_mesh_kernel
+        return kernel(spacing_px, angle_deg=mesh.angle_deg, **series)
 
     def _convolved(self, a: Kernel, b: Kernel) -> Kernel:
         return linear_convolve(a, b, (self.size, self.size), threads=self.threads)

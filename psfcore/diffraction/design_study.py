@@ -37,7 +37,7 @@ from psfcore.scatter.power_law import described_kernel
 
 NEAR_PX = 10.0
 FAR_PX = 100.0
-FLARE_PX = 5
+FLARE_PX = 5  # the flare whose orders are looked at, px per side
 MOST_MESHES = 400
 _COMPARED_PX = (50.0, 150.0)  # orders at these radii are compared with the scatter
 
@@ -46,7 +46,7 @@ _COMPARED_PX = (50.0, 150.0)  # orders at these radii are compared with the scat
 class MeshDesign:
     """One mesh: its geometry, and its effect in percent of all transmitted light.
 
-    peak_visibility: the contrast (high - low) / (high + low) of the orders along the axis, for a flare of `flare_px` px
+    peak_visibility: the contrast (high - low) / (high + low) of the orders along the axis, for a flare of FLARE_PX px
     per side. It is 1 if the orders are separate, and 0 if they merge.
     peak_over_scatter: the light of an order in a pixel, divided by the diffuse scatter of the same flare in this pixel;
     the largest value for the orders on the axis from 50 to 150 px. None if the instrument has no scatter.
@@ -80,56 +80,48 @@ class DesignStudy:
 
 
 def design_study(
-    instrument: Instrument,
-    pitches_um: Iterable[float],
-    wires_um: Iterable[float],
-    *,
-    flare_px: int = FLARE_PX,
+    instrument: Instrument, pitches_um: Iterable[float], wires_um: Iterable[float]
 ) -> DesignStudy:
     """Compute every combination of pitch and wire at the entrance of `instrument`, and also the first square entrance mesh
     of the instrument.
 
-    Raises DataError "bad-design" for no mesh or more than 400 meshes, for a wire that is not narrower than every pitch,
-    and for a flare smaller than 1 px.
+    Raises DataError "bad-design" for no mesh or more than 400 meshes, and for a wire that is not narrower than every pitch.
     """
     pitches, wires = sorted(set(pitches_um)), sorted(set(wires_um))
-    _check(pitches, wires, flare_px)
+    _check(pitches, wires)
     halo = None
     if instrument.scatter is not None:
         kernel = described_kernel(instrument.scatter, REACH_GRID_PX)
         halo = kernel[REACH_GRID_PX // 2, REACH_GRID_PX // 2 :]
-    rows = [_mesh(instrument, pitch, wire, flare_px, halo) for wire in wires for pitch in pitches]
+    rows = [_mesh(instrument, pitch, wire, halo) for wire in wires for pitch in pitches]
     square = [mesh for mesh in instrument.meshes if mesh.openings == "square"]
     own = next((mesh for mesh in square if mesh.place == "entrance"), None)
-    flown = None if own is None else _mesh(instrument, own.pitch_um, own.wire_um, flare_px, halo)
-    return DesignStudy(instrument.name, flare_px, tuple(rows), flown)
+    flown = None if own is None else _mesh(instrument, own.pitch_um, own.wire_um, halo)
+    return DesignStudy(instrument.name, FLARE_PX, tuple(rows), flown)
 
 
-def _check(pitches: Sequence[float], wires: Sequence[float], flare_px: int) -> None:
+def _check(pitches: Sequence[float], wires: Sequence[float]) -> None:
     number = len(pitches) * len(wires)
     if not 1 <= number <= MOST_MESHES:
         raise DataError(
             "bad-design", f"expected 1 to {MOST_MESHES} meshes (pitches times wires); got {number}"
         )
     if not (wires[0] > 0 and np.isfinite(pitches).all() and wires[-1] < pitches[0]):
-        wanted = "finite pitches and wires with 0 < wire < pitch (um)"
-        raise DataError("bad-design", f"expected {wanted}; got wires {wires} and pitches {pitches}")
-    if flare_px < 1:
-        raise DataError("bad-design", f"expected a flare of at least 1 px; got {flare_px}")
+        expected = "finite pitches and wires with 0 < wire < pitch (um)"
+        raise DataError("bad-design", f"expected {expected}; got wires {wires} and pitches {pitches}")
 
 
 def _mesh(
-    instrument: Instrument, pitch_um: float, wire_um: float, flare_px: int, halo: NDArray[np.float64] | None
+    instrument: Instrument, pitch_um: float, wire_um: float, halo: NDArray[np.float64] | None
 ) -> MeshDesign:
     windows = max(1, round(instrument.aperture.diameter_mm * 1e3 / pitch_um))
-    optics = {
-        "wavelength_angstrom": instrument.wavelength_angstrom,
-        "distance_mm": instrument.focal_length_mm,
-        "pitch_um": pitch_um,
-        "pixel_pitch_um": instrument.detector.pixel_pitch_um,
-    }
-    spacing = order_spacing_px(**optics)
-    line = mesh_line(**optics, wire_um=wire_um, windows=windows, size=REACH_GRID_PX)
+    spacing = order_spacing_px(
+        wavelength_angstrom=instrument.wavelength_angstrom,
+        distance_mm=instrument.focal_length_mm,
+        pitch_um=pitch_um,
+        pixel_pitch_um=instrument.detector.pixel_pitch_um,
+    )
+    line = mesh_line(spacing, pitch_um=pitch_um, wire_um=wire_um, windows=windows, size=REACH_GRID_PX)
     beyond = cumulative_curve(np.outer(line, line), [NEAR_PX, FAR_PX])
     open_share = 1 - wire_um / pitch_um
     return MeshDesign(
@@ -141,28 +133,28 @@ def _mesh(
         diffracted_pct=100 * (1 - open_share**2),  # Eq. (2)
         beyond_10_px_pct=float(beyond[0]),
         beyond_100_px_pct=float(beyond[1]),
-        peak_visibility=_contrast(spacing, flare_px),
-        peak_over_scatter=None if halo is None else _over_scatter(open_share, spacing, flare_px, halo),
+        peak_visibility=_contrast(spacing),
+        peak_over_scatter=None if halo is None else _over_scatter(open_share, spacing, halo),
     )
 
 
-def _contrast(spacing_px: float, flare_px: int) -> float:
+def _contrast(spacing_px: float) -> float:
     """`peak_visibility` of MeshDesign: the contrast along the axis of the orders of a flare, as pixels record it.
 
     Each order is the box of the flare convolved with a pixel, a trapezium. All orders are assumed to be equally bright.
     """
     x = np.linspace(0.0, spacing_px, 401)
-    neighbours = int(np.ceil((flare_px + 1) / spacing_px)) + 1
+    neighbours = int(np.ceil((FLARE_PX + 1) / spacing_px)) + 1
     orders = spacing_px * np.arange(-neighbours, neighbours + 2)
     apart = np.abs(x[:, None] - orders)
-    light = np.clip((flare_px + 1) / 2 - apart, 0.0, min(1.0, float(flare_px))).sum(axis=1)
+    light = np.clip((FLARE_PX + 1) / 2 - apart, 0.0, 1.0).sum(axis=1)
     return float((light.max() - light.min()) / (light.max() + light.min()))
 
 
-def _over_scatter(open_share: float, spacing_px: float, flare_px: int, halo: NDArray[np.float64]) -> float:
+def _over_scatter(open_share: float, spacing_px: float, halo: NDArray[np.float64]) -> float:
     """`peak_over_scatter` of MeshDesign; 0 if no order lies at 50 to 150 px."""
     k = np.arange(np.ceil(_COMPARED_PX[0] / spacing_px), np.floor(_COMPARED_PX[1] / spacing_px) + 1)
     share = open_share**2 * np.sinc(k * open_share) ** 2  # Eq. (1)
     under = halo[np.rint(k * spacing_px).astype(int)]
     # The light of an order spreads over as many pixels as the flare has. In these pixels the scatter is nearly constant.
-    return float((share / flare_px**2 / under).max(initial=0.0))
+    return float((share / FLARE_PX**2 / under).max(initial=0.0))

@@ -42,7 +42,7 @@ symmetric in both axes is transformed by `mirrored`, in about a quarter of the t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 
 from psfcore.compiled import compiled
 from psfcore.convolution.convolver import transform_axis
-from psfcore.diffraction.mirrored import MirroredTransforms, Place, can_transform
+from psfcore.diffraction.mirrored import MirroredTransforms, Place, can_transform, passes
 from psfcore.diffraction.pupil import MaskGrid, Pupil
 
 STRIP_ROWS = 16
@@ -117,18 +117,14 @@ def far_field(
     mask = MaskGrid(pupil, cell_mm)
     with ThreadPoolExecutor(max_workers=threads) as pool:
         survey = _survey(MaskGrid(pupil, pupil.width_mm / SURVEY_CELLS), pool)
+        places = _places(samples, survey.symmetry)
+        transforms: MirroredTransforms | _Transforms
         if survey.mirror_x and survey.mirror_y and can_transform(n):
-            mirrored = MirroredTransforms(mask, period=n, size=size, pool=pool, threads=threads)
-            places = [
-                Place(_offset(s, samples), _offset(t, samples), weight)
-                for s, t, weight in _places(samples, survey.symmetry)
-            ]
-            pattern = _completed(
-                mirrored.summed(places, progress or (lambda done, of: None)), survey.symmetry
-            )
+            transforms = MirroredTransforms(mask, period=n, size=size, pool=pool, threads=threads)
         else:
-            transforms = _Transforms(mask, survey, samples, n, size, pool, threads)
-            pattern = transforms.summed(progress or (lambda done, of: None))
+            transforms = _Transforms(mask, survey, samples // 2, n, size, pool, threads)
+        summed = transforms.summed(places, progress or (lambda done, of: None))
+    pattern = _completed(summed, survey.symmetry)
     pattern /= float(n) ** 2 * samples**2 * survey.open_area_mm2 / cell_mm**2
     sinc = np.sinc((np.arange(size) - size // 2) / n)
     pattern /= sinc[:, None] ** 2
@@ -177,47 +173,47 @@ def _survey(mask: MaskGrid, pool: ThreadPoolExecutor) -> _Survey:
 
 
 class _Transforms:
-    """Compute the transforms of Eq. (2), one for each position (s, t) within the pixel.
+    """Computes the sum of |E|^2 over samples, for any mask: a transform of Eq. (2) for each place.
 
-    Positions that follow from others by the symmetry of the mask are left out.
+    offsets: the number of different offsets in x of all places. The result has the shape (size, size).
     """
 
     def __init__(
         self,
         mask: MaskGrid,
         survey: _Survey,
-        samples: int,
+        offsets: int,
         period: int,
         size: int,
         pool: ThreadPoolExecutor,
         threads: int,
     ) -> None:
-        self.mask, self.symmetry, self.samples, self.period = mask, survey.symmetry, samples, period
+        self.mask, self.period = mask, period
         self.kept = slice(period // 2 - size // 2, period // 2 - size // 2 + size)
         self.pool, self.threads = pool, threads
         # If the mask is symmetric in y, half of its rows are enough.
         rows = mask.cells // 2 if survey.mirror_y else mask.cells
-        # One pass over the mask computes the spectra of several s. SPECTRA_BYTES limits their number.
-        together = max(1, min(samples // 2, SPECTRA_BYTES // (8 * rows * size)))
+        # One pass over the mask computes the spectra of several offsets. SPECTRA_BYTES limits their number.
+        together = max(1, min(offsets, SPECTRA_BYTES // (8 * rows * size)))
         self.spectra = np.empty((together, rows, size), dtype=np.complex64)
         self.field = np.empty((period, size), dtype=np.complex64)
         self.total = np.zeros((size, size))
 
-    def summed(self, progress: Progress) -> NDArray[np.float64]:
-        """Sum over all s, t of |E|^2."""
-        half, together = self.samples // 2, len(self.spectra)
-        places = _places(self.samples, self.symmetry)
-        for done, (s, t, weight) in enumerate(places):
-            if t == 0 and s % together == 0:
-                self._transform_along_x(range(s, min(s + together, half)))
-            self._transform_along_y(self.spectra[s % together], t)
-            self._add(weight)
-            progress(done + 1, len(places))
-        return _completed(self.total, self.symmetry)
+    def summed(self, places: Sequence[Place], progress: Progress) -> NDArray[np.float64]:
+        """The sum of |E|^2 over the places, each multiplied by its weight. progress(done, of)."""
+        done = 0
+        for here, of_pass in passes(places, len(self.spectra)):
+            self._transform_along_x(here)
+            for place in of_pass:
+                self._transform_along_y(self.spectra[here.index(place.offset_x)], place.offset_y)
+                self._add(place.weight)
+                done += 1
+                progress(done, len(places))
+        return self.total
 
-    def _transform_along_x(self, columns: range) -> None:
-        """Compute spectra[y, j] of all rows, for several s. The spectra do not depend on t."""
-        phases = [self._phases(s) for s in columns]
+    def _transform_along_x(self, offsets: Sequence[float]) -> None:
+        """Compute spectra[y, j] of all rows, for several offsets in x."""
+        phases = [self._phases(offset) for offset in offsets]
 
         def transform(block: slice) -> None:
             strip = np.empty((STRIP_ROWS, self.mask.cells), dtype=np.float32)
@@ -231,9 +227,9 @@ class _Transforms:
 
         list(self.pool.map(transform, _blocks(self.spectra.shape[1], self.threads)))
 
-    def _transform_along_y(self, spectrum: NDArray[np.complex64], t: int) -> None:
-        """Compute field[j_y, j_x] for one t, for all j_y of the period."""
-        within, of_period = self._phases(t)
+    def _transform_along_y(self, spectrum: NDArray[np.complex64], offset: float) -> None:
+        """Compute field[j_y, j_x] for one offset in y, for all j_y of the period."""
+        within, of_period = self._phases(offset)
 
         def fold(block: slice) -> None:
             _fold_block(spectrum, self.mask.cells, within, of_period, self.field, block.start, block.stop)
@@ -241,12 +237,12 @@ class _Transforms:
         list(self.pool.map(fold, _blocks(self.period, self.threads)))
         self.field = transform_axis(self.field, axis=0, threads=self.threads)
 
-    def _phases(self, place: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+    def _phases(self, offset: float) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
         """exp(-2 pi i turns (m + k n) / n) as a product of two factors: the first for each m, the second for each k.
 
         turns: o_s - n // 2. Because of the term n // 2, the centre of the pattern is at [n // 2], and no shift is needed.
         """
-        turns, n = _offset(place, self.samples) - self.period // 2, self.period
+        turns, n = offset - self.period // 2, self.period
         within = np.exp(-2j * np.pi * turns * np.arange(n) / n)
         of_period = np.exp(-2j * np.pi * turns * np.arange(math.ceil(self.mask.cells / n)))
         return within.astype(np.complex64), of_period.astype(np.complex64)
@@ -257,16 +253,17 @@ class _Transforms:
         list(self.pool.map(lambda block: _add_intensity(field[block], self.total[block], weight), blocks))
 
 
-def _places(samples: int, symmetry: str) -> list[tuple[int, int, float]]:
-    """The positions (s, t) that must be computed, in ascending order, and their weights.
+def _places(samples: int, symmetry: str) -> list[Place]:
+    """The positions (s, t) that must be computed, in ascending order, with their weights.
 
     The symmetry of the mask decides whether t takes all values, the first half, or the values up to s. In the last case
     the transpose of the sum is added at the end. Positions with s = t would then count twice, so they get half the
     weight.
     """
     half, transpose = samples // 2, symmetry == MIRROR_AND_TRANSPOSE
+    offsets = [(place + 0.5) / samples - 0.5 for place in range(samples)]  # o_s of Eq. (2)
     return [
-        (s, t, 0.5 if transpose and s == t else 1.0)
+        Place(offsets[s], offsets[t], 0.5 if transpose and s == t else 1.0)
         for s in range(half)
         for t in range({NO_SYMMETRY: samples, MIRROR: half, MIRROR_AND_TRANSPOSE: s + 1}[symmetry])
     ]
@@ -286,11 +283,6 @@ def _completed(total: NDArray[np.float64], symmetry: str) -> NDArray[np.float64]
         return np.asarray(total + total[np.ix_(mirror, mirror)])
     total = total + total[mirror]
     return np.asarray(total + total[:, mirror])
-
-
-def _offset(place: int, samples: int) -> float:
-    """o_s of Eq. (2)."""
-    return (place + 0.5) / samples - 0.5
 
 
 def _blocks(size: int, threads: int) -> list[slice]:

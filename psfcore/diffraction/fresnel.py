@@ -118,11 +118,6 @@ class FresnelStep:
         return np.asarray(self._after * self._transform.apply(field * self._before))  # Eq. (1)
 
 
-def propagate(field: Wave, source: Grid, target: Grid, distance_mm: float) -> Wave:
-    """Propagate one field through free space, Eq. (1)."""
-    return FresnelStep(source, target, distance_mm).apply(field)
-
-
 def conic_sag_mm(x_mm: ArrayLike, *, radius_mm: float, conic: float) -> Vector:
     """Depth of a conic mirror at x from its vertex, Eq. (3); NaN outside the conic."""
     square = np.square(np.asarray(x_mm, dtype=np.float64))

@@ -45,15 +45,16 @@ from psfcore.diffraction.fresnel import (
     line_light_beyond,
     mesh_openings_mm,
     open_share,
-    propagate,
 )
 from psfcore.diffraction.light_path import (
     REACH_PX,
     SAMPLES_PER_PIXEL,
     BestFocus,
     LightPath,
+    Waves,
     best_focus,
     light_path,
+    waves_to_detector,
 )
 from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
@@ -172,9 +173,10 @@ def fresnel_study(
     report = progress or (lambda done, of: None)
     steps = 1 + len(distances_mm) * phases
     report(0, steps)
-    focus = best_focus(path, nominal_focal_length_mm=instrument.focal_length_mm)
+    waves = waves_to_detector(path)
+    focus = best_focus(waves, nominal_focal_length_mm=instrument.focal_length_mm)
     entrance_line = _entrance_line(path, focus.focal_length_mm)
-    at_primary = path.field_at_primary(path.entrance_mm, *path.entrance_grids())
+    at_primary = waves.at_primary(path.entrance_mm)
     report(1, steps)
     results = []
     for index, distance_mm in enumerate(distances_mm):
@@ -202,13 +204,6 @@ def fresnel_study(
     )
 
 
-def _grids(path: LightPath, distance_mm: float) -> tuple[Grid, Grid]:
-    """The grids of the secondary and of a filter wheel at this distance from the detector."""
-    wheel = path.wheel_grid(distance_mm)
-    behind_mm = path.secondary_to_detector_mm - distance_mm
-    return path.secondary_grid(wheel.width_mm, behind_mm), wheel
-
-
 class _AtWheel:
     """The focused wave in front of the filter wheel, and its propagation through the mesh of the wheel to the
     detector."""
@@ -217,12 +212,17 @@ class _AtWheel:
         self.path, self.distance_mm = path, distance_mm
         self.behind_secondary_mm = path.secondary_to_detector_mm - distance_mm
         self.beam_mm = path.beam_mm(separation_mm, self.behind_secondary_mm)
-        self._secondary, self._grid = _grids(path, distance_mm)
-        self._detector = path.detector_grid
-        self._lights: list[float] = []
-        self._upstream: list[tuple[Grid, float]] = []
-        self._field = self._arriving(at_primary, separation_mm)
+        self._grid, self._detector = path.wheel_grid(distance_mm), path.detector_grid
+        waves = Waves(path, self._grid, self.behind_secondary_mm)
+        at_secondary = waves.at_secondary(at_primary, separation_mm)
+        self._field = waves.at_plane(at_secondary)
         self._step = FresnelStep(self._grid, self._detector, distance_mm)
+        self._lights: list[float] = []
+        self._upstream: list[tuple[Grid, float]] = [
+            (waves.aperture, 1.0),
+            (waves.primary, waves.primary.light(at_primary)),
+            (waves.secondary, waves.secondary.light(at_secondary)),
+        ]
 
     def line(self, phase: float) -> Vector:
         """Light in each pixel, for the mesh shifted by `phase` of its pitch."""
@@ -250,17 +250,6 @@ class _AtWheel:
             for (grid, light), count in zip(planes, [*least, None], strict=True)
         )
 
-    def _arriving(self, at_primary: Wave, separation_mm: float) -> Wave:
-        path, secondary = self.path, self._secondary
-        aperture, primary = path.entrance_grids()
-        at_secondary = path.field_at_secondary(at_primary, primary, secondary, separation_mm)
-        self._upstream = [
-            (aperture, 1.0),
-            (primary, primary.light(at_primary)),
-            (secondary, secondary.light(at_secondary)),
-        ]
-        return propagate(at_secondary, secondary, self._grid, self.behind_secondary_mm)
-
 
 def _entrance_line(path: LightPath, focal_length_mm: float) -> Vector:
     """Fraunhofer image of entrance aperture and mesh in pixels, sum 1."""
@@ -270,16 +259,21 @@ def _entrance_line(path: LightPath, focal_length_mm: float) -> Vector:
     return np.asarray(line / line.sum())
 
 
-def _combined_line(path: LightPath, entrance_line: Vector, distance_mm: float, windows: int) -> Vector:
-    """The image of the entrance, convolved with the series of the filter-wheel mesh, sum 1."""
-    series = mesh_line(
+def _wheel_spacing_px(path: LightPath, distance_mm: float) -> float:
+    """The spacing of the orders of the filter-wheel mesh at a distance from the detector, px."""
+    return order_spacing_px(
         wavelength_angstrom=path.wavelength_mm * _ANGSTROM_PER_MM,
         distance_mm=distance_mm,
         pitch_um=path.wheel_mesh.pitch_um,
-        wire_um=path.wheel_mesh.wire_um,
-        windows=windows,
         pixel_pitch_um=path.pixel_mm * _UM_PER_MM,
-        size=_SIZE_PX,
+    )
+
+
+def _combined_line(path: LightPath, entrance_line: Vector, distance_mm: float, windows: int) -> Vector:
+    """The image of the entrance, convolved with the series of the filter-wheel mesh, sum 1."""
+    mesh, spacing_px = path.wheel_mesh, _wheel_spacing_px(path, distance_mm)
+    series = mesh_line(
+        spacing_px, pitch_um=mesh.pitch_um, wire_um=mesh.wire_um, windows=windows, size=_SIZE_PX
     )
     line = linear_convolve(entrance_line[None, :], series[None, :], (1, _SIZE_PX))[0]
     return np.asarray(line / line.sum())
@@ -300,12 +294,7 @@ def _compared(wheel: _AtWheel, lines: Vector, combined: Vector) -> DistanceResul
         distance_mm=wheel.distance_mm,
         beam_mm=wheel.beam_mm,
         beam_pitches=wheel.beam_mm / pitch_mm,
-        wheel_order_spacing_px=order_spacing_px(
-            wavelength_angstrom=path.wavelength_mm * _ANGSTROM_PER_MM,
-            distance_mm=wheel.distance_mm,
-            pitch_um=path.wheel_mesh.pitch_um,
-            pixel_pitch_um=path.pixel_mm * _UM_PER_MM,
-        ),
+        wheel_order_spacing_px=_wheel_spacing_px(path, wheel.distance_mm),
         sampling=wheel.sampling(float(lines.sum(axis=1).mean())),
         fresnel_line=mean_line,
         combined_line=combined,
@@ -326,8 +315,8 @@ def _check(path: LightPath, distances_mm: Sequence[float], phases: int, windows:
         raise DataError(
             "bad-distance", f"expected distances between 0 and {longest:g} mm (exclusive); got {got}"
         )
-    for distance_mm in distances_mm:
-        _grids(path, distance_mm)
+    for distance_mm in distances_mm:  # raises "too-many-samples"
+        path.secondary_grid(path.wheel_grid(distance_mm).width_mm, longest - distance_mm)
     for code, value, most in (("bad-phases", phases, 1000), ("bad-windows", windows, 100_000)):
         if not 1 <= value <= most:
             raise DataError(code, f"expected 1 to {most} {code.removeprefix('bad-')}; got {value}")

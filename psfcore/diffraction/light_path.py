@@ -45,7 +45,6 @@ from psfcore.diffraction.fresnel import (
     mesh_openings_mm,
     mirror_transmission,
     open_share,
-    propagate,
 )
 from psfcore.errors import DataError
 from psfcore.instruments.model import Aperture, Instrument, Mesh, Mirror
@@ -138,19 +137,39 @@ class LightPath:
     def _grid(self, plane: str, width_mm: float, next_width_mm: float, distance_mm: float) -> Grid:
         return grid_for(plane, self.wavelength_mm, width_mm, next_width_mm, distance_mm)
 
-    def field_at_primary(self, openings_mm: Vector, aperture: Grid, primary: Grid) -> Wave:
-        """The field behind the primary, for a plane wave along the axis. The light that enters through the openings is 1."""
-        field = open_share(aperture, openings_mm).astype(np.complex128)
-        field /= np.sqrt(aperture.light(field))
-        field = propagate(field, aperture, primary, self.aperture_to_primary_mm)
-        return np.asarray(field * mirror_transmission(self.primary, primary))
 
-    def field_at_secondary(
-        self, at_primary: Wave, primary: Grid, secondary: Grid, separation_mm: float
-    ) -> Wave:
-        """The field behind the secondary, from the field behind the primary."""
-        field = propagate(at_primary, primary, secondary, separation_mm)
-        return np.asarray(field * mirror_transmission(self.secondary, secondary))
+class Waves:
+    """Waves from the aperture over both mirrors to a plane behind them, each computed from the wave before.
+
+    plane: the grid of the plane, at distance_mm from the secondary.
+    """
+
+    def __init__(self, path: LightPath, plane: Grid, distance_mm: float) -> None:
+        self.path, self.plane = path, plane
+        self.aperture, self.primary = path.entrance_grids()
+        self.secondary = path.secondary_grid(plane.width_mm, distance_mm)
+        self._behind = FresnelStep(self.secondary, plane, distance_mm)
+
+    def at_primary(self, openings_mm: Vector) -> Wave:
+        """The field behind the primary, for a plane wave along the axis. The light that enters through the openings is 1."""
+        field = open_share(self.aperture, openings_mm).astype(np.complex128)
+        field /= np.sqrt(self.aperture.light(field))
+        field = FresnelStep(self.aperture, self.primary, self.path.aperture_to_primary_mm).apply(field)
+        return np.asarray(field * mirror_transmission(self.path.primary, self.primary))
+
+    def at_secondary(self, at_primary: Wave, separation_mm: float) -> Wave:
+        """The field behind the secondary, at this separation of the mirrors."""
+        field = FresnelStep(self.primary, self.secondary, separation_mm).apply(at_primary)
+        return np.asarray(field * mirror_transmission(self.path.secondary, self.secondary))
+
+    def at_plane(self, at_secondary: Wave) -> Wave:
+        """The field that arrives at the plane."""
+        return self._behind.apply(at_secondary)
+
+
+def waves_to_detector(path: LightPath) -> Waves:
+    """Waves from the aperture to the detector without the mesh of the filter wheel."""
+    return Waves(path, path.detector_grid, path.secondary_to_detector_mm)
 
 
 def focal_mm(mirror: Mirror) -> float:
@@ -182,9 +201,9 @@ def light_path(instrument: Instrument) -> LightPath:
             instrument, "meshes.openings", "square meshes, for propagation in one dimension", "hexagonal"
         )
     if (entrance.angle_deg - wheel.angle_deg) % 90:
-        wanted = "meshes with the same axes, for propagation in one dimension"
+        expected = "meshes with the same axes, for propagation in one dimension"
         got = f"{entrance.angle_deg:g} and {wheel.angle_deg:g} degrees"
-        raise _lacking(instrument, "meshes.angle_deg", wanted, got)
+        raise _lacking(instrument, "meshes.angle_deg", expected, got)
     return LightPath(
         wavelength_mm=instrument.wavelength_angstrom * _MM_PER_ANGSTROM,
         aperture=instrument.aperture,
@@ -233,33 +252,6 @@ class BestFocus:
     message: str
 
 
-class _WithoutWheel:
-    """Waves from the aperture to the detector without the mesh of the filter wheel."""
-
-    def __init__(self, path: LightPath) -> None:
-        self.path = path
-        self.detector = path.detector_grid
-        length_mm = path.secondary_to_detector_mm
-        self._secondary = path.secondary_grid(self.detector.width_mm, length_mm)
-        self._aperture, self._primary = path.entrance_grids()
-        self._step = FresnelStep(self._secondary, self.detector, length_mm)
-        # At x2 = 0, the integral in Eq. (1) of fresnel is the sum of E1 times this phase factor.
-        self._to_axis = np.exp(1j * np.pi / path.wavelength_mm / length_mm * self._secondary.x_mm**2)
-
-    def at_primary(self, openings_mm: Vector) -> Wave:
-        return self.path.field_at_primary(openings_mm, self._aperture, self._primary)
-
-    def on_axis(self, at_primary: Wave, separation_mm: float) -> float:
-        """Intensity on the axis, in arbitrary units."""
-        return float(np.abs(np.dot(self._at_secondary(at_primary, separation_mm), self._to_axis)) ** 2)
-
-    def at_detector(self, at_primary: Wave, separation_mm: float) -> Wave:
-        return self._step.apply(self._at_secondary(at_primary, separation_mm))
-
-    def _at_secondary(self, at_primary: Wave, separation_mm: float) -> Wave:
-        return self.path.field_at_secondary(at_primary, self._primary, self._secondary, separation_mm)
-
-
 def paraxial_separation_mm(path: LightPath) -> float:
     """The separation at which rays near the axis meet on the detector, Eq. (2).
 
@@ -268,22 +260,22 @@ def paraxial_separation_mm(path: LightPath) -> float:
     f1, f2, length = focal_mm(path.primary), focal_mm(path.secondary), path.secondary_to_detector_mm
     separation_mm = f1 - length * f2 / (f2 - length) if f2 != length else 0.0  # Eq. (2)
     if separation_mm <= 0:
-        found = f"{separation_mm:g} mm" if f2 != length else "no finite separation"
+        got = f"{separation_mm:g} mm" if f2 != length else "no finite separation"
         raise DataError(
             "no-focus",
-            f"expected mirrors that can focus on the detector at a positive separation; got {found}: "
+            f"expected mirrors that can focus on the detector at a positive separation; got {got}: "
             "correct their radii or distances in the instrument file",
         )
     return separation_mm
 
 
-def best_focus(path: LightPath, *, nominal_focal_length_mm: float) -> BestFocus:
+def best_focus(waves: Waves, *, nominal_focal_length_mm: float) -> BestFocus:
     """Solve for the separation of best focus.
 
-    nominal_focal_length_mm: the focal length of the instrument file, for comparison. Raises DataError "no-focus" if there
-    is no maximum within SEARCH_MM of the paraxial separation.
+    waves: those of `waves_to_detector`. nominal_focal_length_mm: the focal length of the instrument file, for comparison.
+    Raises DataError "no-focus" if there is no maximum within SEARCH_MM of the paraxial separation.
     """
-    waves = _WithoutWheel(path)
+    path = waves.path
     at_primary = waves.at_primary(path.aperture_mm)
     paraxial_mm = paraxial_separation_mm(path)
     separation_mm = _sharpest(waves, at_primary, paraxial_mm)
@@ -310,14 +302,24 @@ def best_focus(path: LightPath, *, nominal_focal_length_mm: float) -> BestFocus:
     )
 
 
-def _sharpest(waves: _WithoutWheel, at_primary: Wave, paraxial_mm: float) -> float:
-    found = minimize_scalar(
-        lambda separation_mm: -waves.on_axis(at_primary, separation_mm),
+def _sharpest(waves: Waves, at_primary: Wave, paraxial_mm: float) -> float:
+    path = waves.path
+    # At x2 = 0, the integral in Eq. (1) of fresnel is the sum of E1 times this phase factor.
+    to_axis = np.exp(
+        1j * np.pi / path.wavelength_mm / path.secondary_to_detector_mm * waves.secondary.x_mm**2
+    )
+
+    def on_axis(separation_mm: float) -> float:
+        """Intensity on the axis, in arbitrary units."""
+        return float(np.abs(np.dot(waves.at_secondary(at_primary, separation_mm), to_axis)) ** 2)
+
+    search = minimize_scalar(
+        lambda separation_mm: -on_axis(separation_mm),
         bounds=(paraxial_mm - SEARCH_MM, paraxial_mm + SEARCH_MM),
         method="bounded",
         options={"xatol": TOLERANCE_MM},
     )
-    separation_mm = float(found.x)
+    separation_mm = float(search.x)
     if abs(separation_mm - paraxial_mm) > 0.95 * SEARCH_MM:
         raise DataError(
             "no-focus",
@@ -327,15 +329,15 @@ def _sharpest(waves: _WithoutWheel, at_primary: Wave, paraxial_mm: float) -> flo
     return separation_mm
 
 
-def _order_spacing_px(waves: _WithoutWheel, separation_mm: float) -> tuple[float, int]:
+def _order_spacing_px(waves: Waves, separation_mm: float) -> tuple[float, int]:
     """Mean spacing (px) of the orders of the entrance mesh, measured between the orders -n and +n; and n."""
     path = waves.path
-    field = waves.at_detector(waves.at_primary(path.entrance_mm), separation_mm)
+    field = waves.at_plane(waves.at_secondary(waves.at_primary(path.entrance_mm), separation_mm))
     pitch_mm = path.entrance_mesh.pitch_um * MM_PER_UM
     expected_px = path.wavelength_mm * path.focal_length_mm(separation_mm) / pitch_mm / path.pixel_mm
     orders = max(1, min(HIGHEST_ORDER, int(REACH_PX / expected_px - 1)))
     low, high = (
-        _peak_px(np.abs(field) ** 2, waves.detector, path.pixel_mm, side * orders * expected_px)
+        _peak_px(np.abs(field) ** 2, waves.plane, path.pixel_mm, side * orders * expected_px)
         for side in (-1, 1)
     )
     return (high - low) / (2 * orders), orders
@@ -351,6 +353,7 @@ def _peak_px(intensity: Vector, grid: Grid, pixel_mm: float, near_px: float) -> 
     return float(x_px[top] + shift * grid.step_mm / pixel_mm)
 
 
-def _beyond_central_pixel(waves: _WithoutWheel, at_primary: Wave, separation_mm: float) -> float:
-    line = binned_light(waves.at_detector(at_primary, separation_mm), waves.detector, SAMPLES_PER_PIXEL)
+def _beyond_central_pixel(waves: Waves, at_primary: Wave, separation_mm: float) -> float:
+    field = waves.at_plane(waves.at_secondary(at_primary, separation_mm))
+    line = binned_light(field, waves.plane, SAMPLES_PER_PIXEL)
     return 1 - float(line[REACH_PX] / line.sum())

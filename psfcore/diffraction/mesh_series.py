@@ -1,4 +1,4 @@
-"""Diffraction by a regular mesh in the far field.
+"""Diffraction by a regular mesh in the far field: a mesh with square openings, and one with hexagonal openings.
 
 Hofmeister et al., The point-spread function of HRI_EUV, section "Analytical solution for mesh diffraction",
 here Eq. (1). The pattern is separable in x and y. Eq. (1) is the factor of one axis, with sinc(u) = sin(u) / u:
@@ -21,18 +21,38 @@ of every pair of cells is distributed over the pixels that the pair covers. The 
 (The transform of the envelope is a triangle. Only the term m = 0 of the cosine series lies within its support.) The
 weights are fractions of the light on the whole plane, so light outside the array is missing from the sum.
 
+A mesh with hexagonal openings (a honeycomb): Goodman, Introduction to Fourier Optics, section "Gratings": the pattern of a
+periodic mask consists of orders at the vectors g of the reciprocal lattice. With openings at distances d from their six
+neighbours and F the transform of one opening, the share of the transmitted light in an order is
+
+    light(g) = |F(g)|^2 / (A B),   A = sqrt(3) w^2 / 2,   B = sqrt(3) d^2 / 2                          Eq. (6)
+    g = (h (1, -1 / sqrt(3)) + k (0, 2 / sqrt(3))) / d                                              Eq. (7)
+
+in the frame of the mesh, whose x axis points from an opening to the next; h and k are whole numbers. The six nearest orders
+are 2 / (sqrt(3) d) from the centre, at angles of 60 degrees, beginning at 30 degrees. The opening consists of three
+rhombi that meet in its centre, with sides v and u, two corners of the hexagon that are 120 degrees apart:
+
+    F(g) = sum over the rhombi of |v x u| sinc(pi g.v) sinc(pi g.u) cos(pi g.(v + u))                  Eq. (8)
+
+By Parseval's theorem the shares sum to 1, and order 0 has the open share A / B = (w / d)^2. On the detector, the order g is at
+lambda z g. Its light is spread over a small square as wide as an order of so many windows; the pattern of the aperture
+widens it further.
+
 | symbol | name | unit |
 |---|---|---|
 | lambda | wavelength_angstrom | Angstrom |
 | z | distance_mm: from the mesh to the detector; for a mesh in the entrance pupil, the focal length | mm |
 | d | pitch_um | um |
-| w | pitch_um - wire_um, the width of a window | um |
+| w | pitch_um - wire_um, the width of a window; the distance between opposite sides of a hexagon | um |
 | N | windows | - |
+| A, B | areas of a hexagonal opening and of a cell of its mesh | - |
 | x | offset on the detector | px |
 | lambda z / d | order_spacing_px | px |
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,25 +82,12 @@ def order_spacing_px(
 
 
 def mesh_line(
-    *,
-    wavelength_angstrom: float,
-    distance_mm: float,
-    pitch_um: float,
-    wire_um: float,
-    windows: int,
-    pixel_pitch_um: float,
-    size: int,
+    spacing_px: float, *, pitch_um: float, wire_um: float, windows: int, size: int
 ) -> NDArray[np.float64]:
     """Integrate Eq. (1) over each of `size` pixels, centre at [size // 2].
 
-    Returns shape (size,), normalised to sum 1.
+    spacing_px: see `order_spacing_px`. Returns shape (size,), normalised to sum 1.
     """
-    spacing_px = order_spacing_px(
-        wavelength_angstrom=wavelength_angstrom,
-        distance_mm=distance_mm,
-        pitch_um=pitch_um,
-        pixel_pitch_um=pixel_pitch_um,
-    )
     alpha = np.pi * (pitch_um - wire_um) / pitch_um / spacing_px
     edges_px = np.arange(size + 1, dtype=np.float64) - size // 2 - 0.5
     light = np.diff(_integral(edges_px, alpha=alpha, spacing_px=spacing_px, windows=windows))
@@ -89,15 +96,7 @@ def mesh_line(
 
 
 def rotated_mesh_kernel(
-    *,
-    wavelength_angstrom: float,
-    distance_mm: float,
-    pitch_um: float,
-    wire_um: float,
-    windows: int,
-    pixel_pitch_um: float,
-    angle_deg: float,
-    size: int,
+    spacing_px: float, *, pitch_um: float, wire_um: float, windows: int, angle_deg: float, size: int
 ) -> NDArray[np.float64]:
     """The pattern of a mesh, rotated by `angle_deg` (from +x towards +y) and integrated over pixels.
 
@@ -105,12 +104,6 @@ def rotated_mesh_kernel(
     plane, Eq. (5). At angle 0, the weight of each pixel differs by at most 1e-4 from the product of the exact lines.
     The sum of all absolute differences is at most 5e-4. Misplaced light falls into a pixel next to the correct one.
     """
-    spacing_px = order_spacing_px(
-        wavelength_angstrom=wavelength_angstrom,
-        distance_mm=distance_mm,
-        pitch_um=pitch_um,
-        pixel_pitch_um=pixel_pitch_um,
-    )
     # A rotation by 90 degrees does not change a square mesh.
     turn = np.deg2rad((angle_deg + 45.0) % 90.0 - 45.0)
     reach_px = (size // 2 + 1.5) * float(np.cos(turn) + abs(np.sin(turn)))
@@ -165,8 +158,8 @@ def _first_of_each_cell(
     near = np.interp(middle + half, edges, below) - np.interp(middle - half, edges, below)
     crowding = np.sqrt(light * np.diff(edges))
     local = crowding / np.sqrt(2 * half * (near + _FAINT_SHARE))
-    wanted = np.diff(edges) / _LARGEST_CELL_PX + _CELLS_AN_ORDER * local + _CELLS_IN_ALL * crowding
-    number = np.floor(np.cumsum(np.minimum(wanted, 1.0)) - np.minimum(wanted[0], 1.0))
+    density = np.diff(edges) / _LARGEST_CELL_PX + _CELLS_AN_ORDER * local + _CELLS_IN_ALL * crowding
+    number = np.floor(np.cumsum(np.minimum(density, 1.0)) - np.minimum(density[0], 1.0))
     return np.concatenate(([0], np.flatnonzero(np.diff(number)) + 1)).astype(np.intp)
 
 
@@ -233,3 +226,59 @@ def _integral(
 def _primitive(k: float, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Eq. (4); x is never 0, because pixel edges are at half pixels."""
     return np.asarray(k * sici(k * x)[0] - (1 - np.cos(k * x)) / x)
+
+
+def hexagonal_mesh_kernel(
+    spacing_px: float, *, pitch_um: float, wire_um: float, windows: int, angle_deg: float, size: int
+) -> NDArray[np.float64]:
+    """The pattern of a hexagonal mesh, shape (size, size), centre at [size // 2, size // 2].
+
+    angle_deg: the direction from an opening to the next. The weights are fractions of the light on the whole plane.
+    """
+    kernel = np.zeros((size, size))
+    turn = math.radians(angle_deg)
+    open_share = 1 - wire_um / pitch_um
+    _add_orders(kernel, spacing_px, open_share, spacing_px / windows, math.cos(turn), math.sin(turn))
+    return kernel
+
+
+@compiled()
+def _add_orders(kernel, reach_px, open_share, width_px, cosine, sine):  # type: ignore[no-untyped-def]
+    """Add all orders of Eq. (7) to their pixels. reach_px: lambda z / d; open_share: w / d."""
+    size = kernel.shape[0]
+    origin = size // 2 + 0.5  # pixel i extends from i to i + 1
+    corner_px = (size // 2 + 1) * math.sqrt(2.0)
+    root = math.sqrt(3.0)
+    rho = open_share / root  # from the centre of an opening to a corner, in units of the pitch
+    angles = np.array([30.0, 150.0, 270.0]) * math.pi / 180
+    vx, vy = rho * np.cos(angles), rho * np.sin(angles)
+    rhombus = root / 2 * rho * rho
+    areas = 3 * rhombus * root / 2  # A B, in units of the pitch
+    most = int(corner_px / reach_px) + 1
+    for h in range(-most, most + 1):
+        middle, extent = h / 2, root / 2 * math.sqrt(max(0.0, (corner_px / reach_px) ** 2 - h * h))
+        for k in range(math.ceil(middle - extent), math.floor(middle + extent) + 1):
+            gx, gy = float(h), (2 * k - h) / root  # Eq. (7)
+            f = 0.0
+            for n in range(3):
+                m = (n + 1) % 3
+                one, other = math.pi * (gx * vx[n] + gy * vy[n]), math.pi * (gx * vx[m] + gy * vy[m])
+                part = rhombus * math.cos(one + other)
+                if abs(one) > 1e-9:
+                    part *= math.sin(one) / one
+                if abs(other) > 1e-9:
+                    part *= math.sin(other) / other
+                f += part  # Eq. (8)
+            light = f * f / areas  # Eq. (6)
+            x = reach_px * (cosine * gx - sine * gy) + origin
+            y = reach_px * (sine * gx + cosine * gy) + origin
+            left, right = math.floor(x - width_px / 2), math.floor(x + width_px / 2)
+            low, high = math.floor(y - width_px / 2), math.floor(y + width_px / 2)
+            for row in range(low, high + 1):
+                part_y = (min(row + 1.0, y + width_px / 2) - max(float(row), y - width_px / 2)) / width_px
+                for column in range(left, right + 1):
+                    part_x = (
+                        min(column + 1.0, x + width_px / 2) - max(float(column), x - width_px / 2)
+                    ) / width_px
+                    if 0 <= row < size and 0 <= column < size:
+                        kernel[row, column] += light * part_x * part_y

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 import queue
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -56,6 +56,14 @@ class Place:
     offset_x: float
     offset_y: float
     weight: float
+
+
+def passes(places: Sequence[Place], together: int) -> Iterator[tuple[list[float], list[Place]]]:
+    """Divide places into passes over the mask: the offsets in x of each pass, at most `together`, and its places."""
+    offsets = sorted({place.offset_x for place in places})
+    for first in range(0, len(offsets), together):
+        here = offsets[first : first + together]
+        yield here, [place for place in places if place.offset_x in here]
 
 
 def can_transform(period: int) -> bool:
@@ -88,17 +96,15 @@ class MirroredTransforms:
 
     def summed(self, places: Sequence[Place], progress: Progress) -> NDArray[np.float64]:
         """The sum of |E|^2 over the places, each multiplied by its weight; shape (size, size). progress(done, of)."""
-        offsets = sorted({place.offset_x for place in places})
+        offsets = len({place.offset_x for place in places})
         bytes_each = self.column_blocks * self.row_blocks * BLOCK**2 * 4
-        passes = math.ceil(len(offsets) * bytes_each / FIELD_BYTES)
-        together = math.ceil(len(offsets) / passes)
+        together = math.ceil(offsets / math.ceil(offsets * bytes_each / FIELD_BYTES))
         fields = np.empty((together, self.column_blocks, self.row_blocks * BLOCK, 2, LANES), np.float32)
         total = np.zeros((self.column_blocks, self.size, 2, LANES))
         done = 0
-        for first in range(0, len(offsets), together):
-            here = offsets[first : first + together]
+        for here, of_pass in passes(places, together):
             self._along_x(here, fields)
-            for place in (place for place in places if place.offset_x in here):
+            for place in of_pass:
                 self._along_y(fields[here.index(place.offset_x)], place, total)
                 done += 1
                 progress(done, len(places))

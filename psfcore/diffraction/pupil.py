@@ -59,7 +59,7 @@ class Pupil:
     picture.
 
     An outline consists of one or more closed polygons with corners (x, y) in mm. A polygon may be a hole in another
-    one.
+    one. meshes: with square openings, parallel to the axes.
     """
 
     opening: Outline
@@ -126,48 +126,41 @@ def circle(radius_mm: float) -> Corners:
     return reach_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def bar(start_mm: float, end_mm: float, width_mm: float, angle_deg: float, across_mm: float = 0.0) -> Corners:
-    """Corners (4, 2) in mm of a bar from start_mm to end_mm along the direction `angle_deg`.
-
-    across_mm: distance of the centre line of the bar from the optical axis, to the left of the direction.
-    """
-    left, right = across_mm + width_mm / 2, across_mm - width_mm / 2
-    corners = np.array([(start_mm, right), (end_mm, right), (end_mm, left), (start_mm, left)])
-    return corners @ _rotation(angle_deg).T
-
-
-def _rotation(angle_deg: float) -> NDArray[np.float64]:
+def bar(start_mm: float, end_mm: float, width_mm: float, angle_deg: float) -> Corners:
+    """Corners (4, 2) in mm of a bar from start_mm to end_mm along the direction `angle_deg` through the optical axis."""
+    half_mm = width_mm / 2
+    corners = np.array([(start_mm, -half_mm), (end_mm, -half_mm), (end_mm, half_mm), (start_mm, half_mm)])
     cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    return np.array([[cos, -sin], [sin, cos]])
+    return corners @ np.array([[cos, -sin], [sin, cos]]).T
 
 
 def _mount_outlines(mount: Mount, rim_mm: float) -> list[Outline]:
     outlines: list[Outline] = []
     hub_mm = mount.hub_diameter_mm / 2
     if hub_mm >= rim_mm:
-        wanted = f"mount.hub_diameter_mm: expected less than the aperture's {2 * rim_mm:g} mm"
-        raise DataError("bad-mount", f"{wanted}; got {mount.hub_diameter_mm:g}")
+        expected = f"mount.hub_diameter_mm: expected less than the aperture's {2 * rim_mm:g} mm"
+        raise DataError("bad-mount", f"{expected}; got {mount.hub_diameter_mm:g}")
     if hub_mm > 0:
         outlines.append((circle(hub_mm),))
     for index, rays in enumerate(mount.rays):
         if rays.width_mm >= 2 * rim_mm:
-            wanted = f"mount.rays.{index}.width_mm: expected less than the aperture's {2 * rim_mm:g} mm"
-            raise DataError("bad-mount", f"{wanted}; got {rays.width_mm:g}")
+            expected = f"mount.rays.{index}.width_mm: expected less than the aperture's {2 * rim_mm:g} mm"
+            raise DataError("bad-mount", f"{expected}; got {rays.width_mm:g}")
         for ray in range(rays.count):
             angle_deg = rays.first_angle_deg + 360 * ray / rays.count
             outlines.append((bar(0.0, 2 * rim_mm, rays.width_mm, angle_deg),))
     for index, ring in enumerate(mount.rings):
         inner_mm, outer_mm = ring.radius_mm - ring.width_mm / 2, ring.radius_mm + ring.width_mm / 2
         if inner_mm < 0 or outer_mm > rim_mm + _RIM_TOLERANCE_MM:
-            wanted = f"mount.rings.{index}: expected a ring within the aperture's radius {rim_mm:g} mm"
-            raise DataError("bad-mount", f"{wanted}; got {inner_mm:g} to {outer_mm:g} mm")
+            expected = f"mount.rings.{index}: expected a ring within the aperture's radius {rim_mm:g} mm"
+            raise DataError("bad-mount", f"{expected}; got {inner_mm:g} to {outer_mm:g} mm")
         hole = (circle(inner_mm)[::-1],) if inner_mm > 0 else ()
         outlines.append((circle(outer_mm), *hole))
     for index, polygon in enumerate(mount.polygons):
         corners = np.array(polygon.corners_mm, dtype=np.float64)
         if np.abs(corners).max() > _FARTHEST_CORNER * 2 * rim_mm:
-            wanted = f"mount.polygons.{index}: expected corners within {_FARTHEST_CORNER} diameters of the aperture"
-            raise DataError("bad-mount", f"{wanted}; got a corner at {np.abs(corners).max():g} mm")
+            expected = f"mount.polygons.{index}: expected corners within {_FARTHEST_CORNER} diameters of the aperture"
+            raise DataError("bad-mount", f"{expected}; got a corner at {np.abs(corners).max():g} mm")
         outlines.append((corners,))
     return outlines
 
@@ -183,11 +176,11 @@ def _mask_picture(
             "bad-mount", f"{key}: expected a square image with two axes; got shape {pixels.shape}"
         )
     if not np.isfinite(pixels).all() or pixels.min() < 0 or pixels.max() <= 0:
-        wanted = "expected finite values of at least 0 (0 is opaque), some of them above 0 (open)"
-        raise DataError("bad-mount", f"{key}: {wanted}; got {pixels.min():g} to {pixels.max():g}")
+        expected = "expected finite values of at least 0 (0 is opaque), some of them above 0 (open)"
+        raise DataError("bad-mount", f"{key}: {expected}; got {pixels.min():g} to {pixels.max():g}")
     if described.width_mm < aperture.diameter_mm:
-        wanted = f"{key}.width_mm: expected at least the aperture's {aperture.diameter_mm:g} mm"
-        raise DataError("bad-mount", f"{wanted}; got {described.width_mm:g}")
+        expected = f"{key}.width_mm: expected at least the aperture's {aperture.diameter_mm:g} mm"
+        raise DataError("bad-mount", f"{expected}; got {described.width_mm:g}")
     return MaskPicture(np.asarray(pixels, dtype=np.float64) / float(pixels.max()), described.width_mm)
 
 
@@ -197,13 +190,9 @@ class MaskGrid:
     def __init__(self, pupil: Pupil, cell_mm: float) -> None:
         self.cell_mm = cell_mm
         self.cells = 2 * math.ceil(pupil.width_mm / cell_mm / 2) + 2
-        straight = [mesh for mesh in pupil.meshes if mesh.angle_deg % 90 == 0]
-        lines = [self._mesh_line(mesh) for mesh in straight]
+        lines = [self._mesh_line(mesh) for mesh in pupil.meshes]
         self._line = (np.prod(lines, axis=0) if lines else np.ones(self.cells)).astype(np.float32)
-        tilted = [mesh for mesh in pupil.meshes if mesh.angle_deg % 90 != 0]
-        wires = [wire for mesh in tilted for wire in _wires(mesh, pupil.width_mm)]
-        outlines = (pupil.opening, *pupil.opaque, *wires)
-        self._edges, self._outline_of_edge = self._in_cells(outlines)
+        self._edges, self._outline_of_edge = self._in_cells((pupil.opening, *pupil.opaque))
         self._first_entry, self._entries = _edges_by_row(self._edges, self.cells)
         self._picture = pupil.picture
 
@@ -249,18 +238,6 @@ def _open_length_um(x_um: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float6
     from_window_um = x_um + window_um / 2 - (0 if mesh.windows % 2 else mesh.pitch_um / 2)
     whole, part_um = np.divmod(from_window_um, mesh.pitch_um)
     return np.asarray(whole * window_um + np.minimum(part_um, window_um))
-
-
-def _wires(mesh: Mesh, width_mm: float) -> list[Outline]:
-    """The wires of a tilted mesh, as bars that extend beyond the pupil. All wires of one direction form one outline."""
-    reach_mm = width_mm  # longer than half the diagonal, width / sqrt(2)
-    pitch_mm, wire_mm = mesh.pitch_um / _UM_PER_MM, mesh.wire_um / _UM_PER_MM
-    count = math.ceil(reach_mm / pitch_mm)
-    across_mm = (np.arange(-count, count + 1) + (0.5 if mesh.windows % 2 else 0.0)) * pitch_mm
-    return [
-        tuple(bar(-reach_mm, reach_mm, wire_mm, mesh.angle_deg + turn, float(a)) for a in across_mm)
-        for turn in (0.0, 90.0)
-    ]
 
 
 def _edges_by_row(edges: NDArray[np.float64], rows: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

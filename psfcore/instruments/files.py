@@ -32,9 +32,9 @@ def instrument_names() -> tuple[str, ...]:
 def instrument_path(name: str) -> Path:
     """Path of the file of instrument `name`; raises DataError "unknown-instrument"."""
     if name not in instrument_names():
-        known = ", ".join(instrument_names())
-        meant = did_you_mean(name, instrument_names())
-        raise DataError("unknown-instrument", f"expected one of: {known}; got {name!r}{meant}")
+        names = ", ".join(instrument_names())
+        hint = did_you_mean(name, instrument_names())
+        raise DataError("unknown-instrument", f"expected one of: {names}; got {name!r}{hint}")
     return _FOLDER / f"{name}.toml"
 
 
@@ -53,11 +53,11 @@ def telescope_of(name: str) -> str:
 @cache
 def telescopes() -> dict[str, str]:
     """The telescopes that the shipped files describe, with their channels in angstrom, such as "94 to 335"."""
-    found: dict[str, list[float]] = {}
+    by_telescope: dict[str, list[float]] = {}
     for name in instrument_names():
         angstrom = tomllib.loads(instrument_path(name).read_text("utf-8"))["wavelength_angstrom"]
-        found.setdefault(telescope_of(name), []).append(angstrom)
-    ends = {name: dict.fromkeys((min(channels), max(channels))) for name, channels in found.items()}
+        by_telescope.setdefault(telescope_of(name), []).append(angstrom)
+    ends = {name: dict.fromkeys((min(channels), max(channels))) for name, channels in by_telescope.items()}
     return {name: " to ".join(f"{channel:g}" for channel in channels) for name, channels in ends.items()}
 
 
@@ -65,8 +65,8 @@ def assumed_in(name: str | None) -> str | None:
     """What the file of instrument `name` assumes: the comment after its status. None: there is no such draft."""
     if name not in instrument_names():
         return None
-    told = _STATUS.search(instrument_path(name).read_text("utf-8"))
-    return None if told is None else told[1].replace(" below", "")
+    status = _STATUS.search(instrument_path(name).read_text("utf-8"))
+    return None if status is None else status[1].replace(" below", "")
 
 
 def match_instrument(cards: Mapping[str, object]) -> str | None:
@@ -79,10 +79,10 @@ def match_instrument(cards: Mapping[str, object]) -> str | None:
     """
     best, most = None, 0
     for name in instrument_names():
-        wanted = match_table(name)
-        matches = (_same(cards.get(key), value, _TOLERANCES.get(key, 0.0)) for key, value in wanted.items())
-        if len(wanted) > most and all(matches):
-            best, most = name, len(wanted)
+        table = match_table(name)
+        matches = (_same(cards.get(key), value, _TOLERANCES.get(key, 0.0)) for key, value in table.items())
+        if len(table) > most and all(matches):
+            best, most = name, len(table)
     return best
 
 
@@ -92,9 +92,9 @@ def match_table(name: str) -> dict[str, str | float]:
     return dict(tomllib.loads(instrument_path(name).read_text("utf-8")).get("match", {}))
 
 
-def _same(found: object, wanted: str | float, tolerance: float) -> bool:
-    if isinstance(wanted, str):
-        return isinstance(found, str) and found.strip().upper() == wanted.upper()
-    if not isinstance(found, (int, float)) or isinstance(found, bool):
+def _same(card: object, value: str | float, tolerance: float) -> bool:
+    if isinstance(value, str):
+        return isinstance(card, str) and card.strip().upper() == value.upper()
+    if not isinstance(card, (int, float)) or isinstance(card, bool):
         return False
-    return abs(found / wanted - 1) <= tolerance
+    return abs(card / value - 1) <= tolerance

@@ -303,9 +303,9 @@ class Scatter:
     def _one_shape(self) -> Self:
         law = (self.b_px is not None) + (self.c is not None)
         if law == 1 or bool(law) + bool(self.laws) + bool(self.table) != 1:
-            given = [key for key in ("b_px", "c", "laws", "table") if getattr(self, key)]
+            keys = [key for key in ("b_px", "c", "laws", "table") if getattr(self, key)]
             raise ValueError(
-                f"expected one shape: b_px and c, or laws, or table; got {' and '.join(given) or 'none of them'}"
+                f"expected one shape: b_px and c, or laws, or table; got {' and '.join(keys) or 'none of them'}"
             )
         radii = [radius for radius, _ in self.table]
         if radii and (len(radii) < 2 or any(b <= a for a, b in pairwise(radii))):
@@ -384,7 +384,7 @@ class Instrument:
 
     def gain_mode(self, name: str | None) -> GainMode | None:
         """The readout mode that the card GAINCOMB names, in upper or lower case; None if the file does not have it."""
-        modes = {known.lower(): mode for known, mode in self.detector.gain_modes.items()}
+        modes = {key.lower(): mode for key, mode in self.detector.gain_modes.items()}
         return modes.get((name or "").lower())
 
     @property
@@ -457,7 +457,7 @@ def parse_instrument(text: str, label: str) -> Instrument:
     try:
         instrument: Instrument = _FILE.validate_python(_parse_toml(text))
     except ValidationError as error:
-        raise DataError("bad-instrument-file", f"{label}: {_said(error)}") from None
+        raise DataError("bad-instrument-file", f"{label}: {_fault_lines(error)}") from None
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
         # An integer of thousands of digits raises ValueError; deeply nested lists raise RecursionError.
         deep = isinstance(error, RecursionError)
@@ -492,30 +492,32 @@ _EXPECTED = {
 }
 
 
-def _said(error: ValidationError) -> str:
+def _fault_lines(error: ValidationError) -> str:
     """All faults, each in a line. A key that is missing because it is misspelt is one fault, not two."""
     faults = sorted(error.errors(include_url=False), key=lambda one: one["type"] not in _UNKNOWN)
-    meant = [(*one["loc"][:-1], _meant(one["loc"])) for one in faults if one["type"] in _UNKNOWN]
-    told = [_fault(one) for one in faults if one["type"] != "missing" or tuple(one["loc"]) not in meant]
-    if len(told) > MOST_TOLD:
-        told = [*told[:MOST_TOLD], f"and {len(told) - MOST_TOLD} more"]
+    misspelt = [(*one["loc"][:-1], _closest_key(one["loc"])) for one in faults if one["type"] in _UNKNOWN]
+    lines = [_fault(one) for one in faults if one["type"] != "missing" or tuple(one["loc"]) not in misspelt]
+    if len(lines) > MOST_TOLD:
+        lines = [*lines[:MOST_TOLD], f"and {len(lines) - MOST_TOLD} more"]
     return (
-        told[0] if len(told) == 1 else "\n".join(["several keys are wrong:", *(f"  {one}" for one in told)])
+        lines[0]
+        if len(lines) == 1
+        else "\n".join(["several keys are wrong:", *(f"  {one}" for one in lines)])
     )
 
 
 def _fault(fault: ErrorDetails) -> str:
     # pydantic marks the name of a gain mode itself, unlike its table, by one more step.
     key = ".".join(str(step) for step in fault["loc"] if step != "[key]")
-    if fault["type"] in _UNKNOWN and (meant := _meant(fault["loc"])):
-        return f"{key}: unknown key; did you mean {meant!r}?"
+    if fault["type"] in _UNKNOWN and (closest := _closest_key(fault["loc"])):
+        return f"{key}: unknown key; did you mean {closest!r}?"
     expected = _expected(fault)
     if "; got " not in expected:  # a fault of several values says itself what was given
         expected += "; got none" if fault["type"] == "missing" else f"; got {fault['input']!r:.80}"
     return f"{key}: {expected}" if key else expected
 
 
-def _meant(location: Sequence[str | int]) -> str:
+def _closest_key(location: Sequence[str | int]) -> str:
     """The known key that is like an unknown one; an empty text if there is none."""
     return next(iter(get_close_matches(str(location[-1]), _keys(location[:-1]), n=1)), "")
 

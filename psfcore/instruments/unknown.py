@@ -218,25 +218,26 @@ def _why(telescope: Telescope | None) -> str:
 
 def _ways(telescope: Telescope | None) -> list[dict[str, str]]:
     """The steps that the user can take next, each with what is known about this telescope."""
-    known = {} if telescope is None else {str(way): sentence for way, sentence in telescope.ways.items()}
+    sentences = {} if telescope is None else {str(way): sentence for way, sentence in telescope.ways.items()}
     return [
-        one | {"text": f"{one['text']}. {known[one['way']]}", "known": known[one["way"]]}
-        if one["way"] in known
+        one | {"text": f"{one['text']}. {sentences[one['way']]}", "known": sentences[one["way"]]}
+        if one["way"] in sentences
         else dict(one)
         for one in WAYS
     ]
 
 
 def _instrument(name: str, header: Mapping[str, Any]) -> dict[str, Any]:
-    known = load_instrument(name)
-    scale = known.detector.plate_scale_arcsec
-    same, told = agreement(name, channel_of(name, None), scale, header)
+    instrument = load_instrument(name)
+    scale = instrument.detector.plate_scale_arcsec
+    channel = channel_of(None, instrument.wavelength_angstrom)
+    same, comparison = agreement(name, channel, scale, header)
     return {
         "name": name,
-        "wavelength_angstrom": known.wavelength_angstrom,
+        "wavelength_angstrom": instrument.wavelength_angstrom,
         "plate_scale_arcsec": scale,
         "same": same,
-        "told": told,
+        "told": comparison,
     }
 
 

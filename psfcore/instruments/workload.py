@@ -56,8 +56,8 @@ def workload(instrument: Instrument, size: int) -> Workload:
     samples = 2 * instrument.aperture.diameter_mm * pixel_mm / (shortest_mm * instrument.focal_length_mm)
     corner_px = (size // 2 + 1.5) * math.sqrt(2)
     # The error of a missing table of distances is raised when the PSF is built.
-    known = ("entrance",) if instrument.distances is None else ("entrance", "filter_wheel")
-    meshes = [mesh for mesh in instrument.meshes if mesh.place in known]
+    places = ("entrance",) if instrument.distances is None else ("entrance", "filter_wheel")
+    meshes = [mesh for mesh in instrument.meshes if mesh.place in places]
     drawn = instrument.mount is not None or bool(instrument.meshes) or not instrument.aperture.round
     mask = samples <= MOST_MASK_SAMPLES and drawn
     mask_cells = 2 * math.ceil(max(size, PERIOD_PX) * samples / 4) + 2 if mask else 0
@@ -97,19 +97,21 @@ def check_workload(instrument: Instrument, label: str) -> None:
     arrays."""
     largest = workload(instrument, LARGEST_SIZE_PX)
     if largest.samples > MOST_SAMPLES:
-        wanted = (
+        expected = (
             f"aperture.diameter_mm: expected a pattern that needs at most {MOST_SAMPLES} samples per pixel"
         )
         needs = "2 x diameter x pixel pitch / (wavelength x focal length)"
-        raise DataError("bad-instrument-file", f"{label}: {wanted}; got {needs} = {largest.samples:.3g}")
+        raise DataError("bad-instrument-file", f"{label}: {expected}; got {needs} = {largest.samples:.3g}")
     if max(largest.cells, default=0) > MOST_CELLS:
-        wanted = f"meshes: expected at most {MOST_CELLS} cells along an axis of a rotated mesh"
+        expected = f"meshes: expected at most {MOST_CELLS} cells along an axis of a rotated mesh"
         advice = "use fewer windows, a smaller pitch_um or a longer distance"
-        raise DataError("bad-instrument-file", f"{label}: {wanted}; got {max(largest.cells):.3g}: {advice}")
+        raise DataError("bad-instrument-file", f"{label}: {expected}; got {max(largest.cells):.3g}: {advice}")
     if max(largest.orders, default=0) > MOST_ORDERS:
-        wanted = f"meshes: expected at most {MOST_ORDERS} orders of a hexagonal mesh up to the corner"
+        expected = f"meshes: expected at most {MOST_ORDERS} orders of a hexagonal mesh up to the corner"
         advice = "use a smaller pitch_um or a longer distance"
-        raise DataError("bad-instrument-file", f"{label}: {wanted}; got {max(largest.orders):.3g}: {advice}")
+        raise DataError(
+            "bad-instrument-file", f"{label}: {expected}; got {max(largest.orders):.3g}: {advice}"
+        )
 
 
 def _cells(instrument: Instrument, mesh: Mesh, wavelength_mm: float, corner_px: float) -> int:

@@ -32,7 +32,6 @@ radius; the PSF is given. In high-only images, pixels that clip are left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,7 +50,6 @@ from psfcore.simulate.scatter_truth import (
     kernel_slopes,
 )
 from psfcore.simulate.sky import TrueSky, on_field
-from psfcore.simulate.transit_files import read_sky
 
 Plane = NDArray[np.float64]
 Kernel = NDArray[np.float64]
@@ -108,14 +106,6 @@ class PhotonBound:
             "stretch": {"sigma": self.stretch, "angle_deg": self.stretch_angle_deg},
             "places": [{"x": x, "y": y} for x, y in self.places_px],
         }
-
-
-def bound_of_folder(folder: str | Path, *, threads: int = 1) -> PhotonBound:
-    """The bound of a folder that psfcore.simulate.transit_files.write wrote.
-
-    Raises the errors of bound_of_sky and of read_sky.
-    """
-    return bound_of_sky(read_sky(folder, threads=threads), threads=threads)
 
 
 def bound_of_sky(sky: TrueSky, *, threads: int = 1) -> PhotonBound:

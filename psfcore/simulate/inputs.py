@@ -83,8 +83,10 @@ def read_plan(path: str | Path, limits: FitsLimits) -> PlanFile:
     if "images" in content or str(content.get("schema", "")).startswith("transit/"):
         manifest = parse_manifest(text)
         plan = _checked(_of_transit(manifest, content, file.parent, limits), file.name)
-        known = None if manifest.known_psf is None else file.parent / manifest.known_psf
-        return PlanFile(plan, known if known is not None and known.is_file() else None, manifest.instrument)
+        known_psf = None if manifest.known_psf is None else file.parent / manifest.known_psf
+        return PlanFile(
+            plan, known_psf if known_psf is not None and known_psf.is_file() else None, manifest.instrument
+        )
     if isinstance(content.get("plan"), dict):
         content = content["plan"]
     if "shots" not in content:
@@ -135,13 +137,13 @@ def _of_transit(
         )
     if all(there):
         headers = [read_summary(folder / image.file, limits) for image in manifest.images]
-        size_px, taken = _size_of(headers), _taken(headers, manifest)
+        size_px, exposures = _size_of_headers(headers), _exposures_of_headers(headers, manifest)
     else:
-        size_px, taken = _stated_size(content), _stated(content["images"])
+        size_px, exposures = _size_of_manifest(content), _exposures_of_manifest(content["images"])
     numbers = {pointing: k for k, pointing in enumerate(manifest.pointings, start=1)}
     shots = [
         Shot(numbers[image.pointing], image.x, image.y, exposure_s, gain_mode, time_s)
-        for image, (exposure_s, gain_mode, time_s) in zip(manifest.images, taken, strict=True)
+        for image, (exposure_s, gain_mode, time_s) in zip(manifest.images, exposures, strict=True)
     ]
     radii = sorted(image.r for image in manifest.images)
     return Plan(
@@ -154,7 +156,7 @@ def _of_transit(
     )
 
 
-def _size_of(headers: Sequence[HeaderSummary]) -> int:
+def _size_of_headers(headers: Sequence[HeaderSummary]) -> int:
     shapes = {header.shape for header in headers}
     ny, nx = headers[0].shape
     if len(shapes) > 1 or ny != nx:
@@ -163,17 +165,19 @@ def _size_of(headers: Sequence[HeaderSummary]) -> int:
     return ny
 
 
-def _taken(headers: Sequence[HeaderSummary], manifest: TransitManifest) -> list[tuple[float, str, float]]:
+def _exposures_of_headers(
+    headers: Sequence[HeaderSummary], manifest: TransitManifest
+) -> list[tuple[float, str, float]]:
     """Exposure time, gain mode and time of each image, from its header."""
-    found = []
+    rows = []
     for header, image, time_s in zip(headers, manifest.images, times_s(headers), strict=True):
         if header.exposure_s is None:
             raise _bad(f"{image.file}: expected XPOSURE or EXPTIME in the header; got neither of them")
-        found.append((header.exposure_s, (header.gain_mode or HIGH).lower(), time_s))
-    return found
+        rows.append((header.exposure_s, (header.gain_mode or HIGH).lower(), time_s))
+    return rows
 
 
-def _stated_size(content: Mapping[str, Any]) -> int:
+def _size_of_manifest(content: Mapping[str, Any]) -> int:
     size = content.get("size_px")
     if not isinstance(size, int) or isinstance(size, bool):
         raise _bad(
@@ -183,9 +187,9 @@ def _stated_size(content: Mapping[str, Any]) -> int:
     return size
 
 
-def _stated(images: Sequence[Mapping[str, Any]]) -> list[tuple[float, str, float]]:
+def _exposures_of_manifest(images: Sequence[Mapping[str, Any]]) -> list[tuple[float, str, float]]:
     """Exposure time, gain mode and time of each image, from transit.json."""
-    found = []
+    rows = []
     for number, image in enumerate(images):
         exposure_s: Any = image.get("exposure_s")
         gain_mode: Any = image.get("gain_mode", HIGH)
@@ -199,8 +203,8 @@ def _stated(images: Sequence[Mapping[str, Any]]) -> list[tuple[float, str, float
             raise _bad(
                 f"{label}: expected a number as `time_s` and a text as `gain_mode`; got {time_s!r:.60} and {gain_mode!r:.60}"
             )
-        found.append((float(exposure_s), gain_mode.lower(), float(time_s)))
-    return found
+        rows.append((float(exposure_s), gain_mode.lower(), float(time_s)))
+    return rows
 
 
 def _is_number(value: Any) -> bool:

@@ -127,12 +127,12 @@ def plan_from_json(content: dict[str, Any]) -> Plan:
         shots = tuple(
             Shot(**{names.get(key, key): value for key, value in shot.items()}) for shot in content["shots"]
         )
-        known = content | {
+        fields = content | {
             "shots": shots,
             "noise": Noise(**content["noise"]),
             "views": tuple(content["views"]),
         }
-        return Plan(**known)
+        return Plan(**fields)
     except (KeyError, TypeError, AttributeError) as error:
         raise DataError(
             "bad-plan", f"expected a plan written by `heliopsf simulate transit`; got: {error}"

@@ -97,13 +97,13 @@ def kernel_slopes(scatter: ScatterTruth) -> dict[str, Kernel]:
     falloff = _falloff(scatter)
     norm = falloff.sum()
     # The central pixel is 1 - total for all b, c and stretches. The falloff and its slopes are 0 in this pixel.
-    found = {
+    slopes = {
         name: (scatter.total / norm) * (slope - falloff * (slope.sum() / norm))
         for name, slope in _falloff_slopes(scatter, falloff).items()
     }
-    found["total"] = falloff / norm
-    found["total"][REACH_GRID_PX // 2, REACH_GRID_PX // 2] = -1.0
-    return {name: found[name] for name in PARAMETERS}
+    slopes["total"] = falloff / norm
+    slopes["total"][REACH_GRID_PX // 2, REACH_GRID_PX // 2] = -1.0
+    return {name: slopes[name] for name in PARAMETERS}
 
 
 def amplitude_slopes(scatter: ScatterTruth) -> dict[str, float]:
@@ -111,8 +111,8 @@ def amplitude_slopes(scatter: ScatterTruth) -> dict[str, float]:
     falloff = _falloff(scatter)
     norm = float(falloff.sum())
     sums = {name: float(slope.sum()) for name, slope in _falloff_slopes(scatter, falloff).items()}
-    found = {name: -scatter.total * total / norm**2 for name, total in sums.items()}
-    return {name: found.get(name, 1 / norm) for name in PARAMETERS}
+    slopes = {name: -scatter.total * total / norm**2 for name, total in sums.items()}
+    return {name: slopes.get(name, 1 / norm) for name in PARAMETERS}
 
 
 def _falloff_slopes(scatter: ScatterTruth, falloff: Kernel) -> dict[str, Kernel]:

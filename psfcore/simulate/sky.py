@@ -56,29 +56,13 @@ class TrueSky:
     seed: int
     threads: int = 1
 
-    def true_scene(self, index: int) -> Plane:
-        """The scene of image `index`, cropped to the field, without the light that the occulter hides."""
-        return on_field(self.true_scene_and_beyond(index), self.plan.margin_px)
-
-    def true_scene_and_beyond(self, index: int) -> Plane:
-        """The scene of image `index` without the light that the occulter hides.
-
-        The result is plan.margin_px larger than the field on each side.
-        """
-        scene = self.scenes[self.plan.shots[index].pointing].copy()
-        around = self.behind[index]
-        rows, columns = around.window(self.plan.margin_px)
-        scene[rows, columns] -= around.hidden(self.plan.place(index))
-        return np.asarray(np.maximum(scene, 0.0))  # rounding gives -1e-14 for a hidden pixel
-
     def expected(self, index: int) -> Plane:
         """The noise-free image `index` from Eq. (1), on the pixels of the field."""
         around = self.behind[index]
         hidden = np.zeros((self.plan.size_px, self.plan.size_px))
         hidden[around.window()] = around.hidden(self.plan.place(index))
-        return np.asarray(
-            self.seen_scenes[self.plan.shots[index].pointing] - self._hiding.apply(hidden)
-        )  # Eq. (1)
+        seen = self.seen_scenes[self.plan.shots[index].pointing]
+        return np.asarray(seen - self._hiding.apply(hidden))  # Eq. (1)
 
     @cached_property
     def noise_free(self) -> tuple[Plane, ...]:
@@ -112,7 +96,7 @@ def true_sky(
     seen: dict[int, Plane] = {}
     around: dict[int, Behind] = {}
     for pointing in plan.pointings:
-        fine = drawn_scene(plan, pointing, seed) if scenes is None else _given(scenes, pointing, plan)
+        fine = drawn_scene(plan, pointing, seed) if scenes is None else _checked_scene(scenes, pointing, plan)
         for index in (n for n, shot in enumerate(plan.shots) if shot.pointing == pointing):
             around[index] = behind(fine, plan.place(index), fine=plan.oversampling, margin_px=plan.margin_px)
         coarse[pointing] = binned(fine, plan.oversampling)
@@ -140,7 +124,7 @@ def on_field(plane: Plane, margin_px: int) -> Plane:
     return plane[margin_px : ny - margin_px, margin_px : nx - margin_px]
 
 
-def _given(scenes: Mapping[int, Plane], pointing: int, plan: Plan) -> Plane:
+def _checked_scene(scenes: Mapping[int, Plane], pointing: int, plan: Plan) -> Plane:
     edge = (plan.size_px + 2 * plan.margin_px) * plan.oversampling
     if pointing not in scenes or scenes[pointing].shape != (edge, edge):
         got = scenes[pointing].shape if pointing in scenes else f"scenes of pointings {sorted(scenes)}"

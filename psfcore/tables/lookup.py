@@ -55,13 +55,13 @@ def curve(tables: Tables, radii: Sequence[float] | None = None) -> dict[str, Any
 
     Raises DataError "bad-radius", "radius-beyond-reach".
     """
-    wanted: Sequence[float] = tables["radii_px"] if radii is None else radii
+    at: Sequence[float] = tables["radii_px"] if radii is None else radii
     if radii is not None and not 0 < len(radii) <= LARGEST_COUNT:
-        raise DataError("bad-radius", f"expected 1 to {LARGEST_COUNT} radii; got {len(wanted)}")
-    find = _reader_at(tables, wanted)
+        raise DataError("bad-radius", f"expected 1 to {LARGEST_COUNT} radii; got {len(at)}")
+    find = _reader_at(tables, at)
     return {
         **_about(tables),
-        "radii_px": list(wanted),
+        "radii_px": list(at),
         "light_beyond_pct": {
             name: [_one_minus(e) for e in find(row)] for name, row in tables["encircled"].items()
         },
@@ -151,7 +151,7 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
         for name in names
     }
     sigmas = [_sigma(tables, f) for tables, f in zip((one, other), find, strict=True)]
-    known = [name for name in names if name in sigmas[0] or name in sigmas[1]]
+    fitted = [name for name in names if name in sigmas[0] or name in sigmas[1]]
     none = [0.0] * len(radii)
     return {
         "one": _about(one),
@@ -163,7 +163,7 @@ def compare(one: Tables, other: Tables) -> dict[str, Any]:
                 100 * math.hypot(a, b)
                 for a, b in zip(sigmas[0].get(name, none), sigmas[1].get(name, none), strict=True)
             ]
-            for name in known
+            for name in fitted
         },
         "largest_points": {name: max(row, key=abs, default=0.0) for name, row in points.items()},
         "difference_of_sums": other["sum"] - one["sum"],

@@ -70,11 +70,11 @@ def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
     sizes: dict[str, dict[str, int]] = {}  # by folder of the archive
     starts: dict[str, dict[str, bytes]] = {}
     with opened(Path(path), limits) as archive:
-        for member in archive.members():
+        for member in archive.members:
             count = MAX_MANIFEST_BYTES + 1 if member.name == MANIFEST_NAME else len(_FITS_STARTS[0])
             sizes.setdefault(member.folder, {})[member.name] = member.size_bytes
             starts.setdefault(member.folder, {})[member.name] = member.read(count)
-        main, kind = archive.main_folder(), archive.kind
+        main, kind = archive.gate.main_folder(), archive.kind
     files, first = sizes.get(main, {}), starts.get(main, {})
     content = first.pop(MANIFEST_NAME, None)
     if content is None:
@@ -107,7 +107,7 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
             folder.mkdir(parents=True)
             undo.callback(folder.rmdir)
         with opened(Path(path), limits) as archive:
-            for member in archive.members():
+            for member in archive.members:
                 if member.folder not in staged:
                     staged[member.folder] = folder / f".{len(staged)}"
                     staged[member.folder].mkdir()
@@ -118,7 +118,7 @@ def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple
                     while chunk := member.read(_CHUNK):
                         file.write(chunk)
                 written.append((member.folder, target))
-            main = archive.main_folder()
+            main = archive.gate.main_folder()
         kept = [target for beside, target in written if beside == main]
         for target in kept:
             if target.parent != folder:

@@ -167,14 +167,14 @@ def _frame_guess(frame: Frame) -> FrameGuess:
     quadrant = (dx[in_shell] > 0).astype(np.int8) + 2 * (dy[in_shell] > 0)
     quadrants = [_mean(shell[quadrant == q]) for q in range(4)]
     apart = [_range_over_mean(list(levels.values())), _range_over_mean(quadrants)]
-    shown = centre.size > 0 and all(level > 0 for level in levels.values())
+    visible = centre.size > 0 and all(level > 0 for level in levels.values())
     return FrameGuess(
         file=frame.file,
         pointing=frame.pointing,
         time_s=frame.time_s,
         centre_dn_s=_mean(centre),
         characteristic_dn_s=levels,
-        inhomogeneity=max(apart) if shown else math.inf,
+        inhomogeneity=max(apart) if visible else math.inf,
     )
 
 
@@ -189,9 +189,9 @@ def _surroundings(frame: Frame, place: Place) -> tuple[Flat, Flat, Flat]:
     left, right = (min(max(int(place.x_px + side * reach), 0), nx) for side in (-1, 1))
     here = (slice(top, bottom), slice(left, right))
     y, x = np.mgrid[here]
-    seen = np.ones(x.shape, dtype=bool) if frame.filled is None else ~frame.filled[here]
-    pixels = frame.pixels[here][seen].astype(np.float64)
-    return pixels, x[seen] - place.x_px, y[seen] - place.y_px
+    valid = np.ones(x.shape, dtype=bool) if frame.filled is None else ~frame.filled[here]
+    pixels = frame.pixels[here][valid].astype(np.float64)
+    return pixels, x[valid] - place.x_px, y[valid] - place.y_px
 
 
 def _pointing_guess(pointing: int, guesses: Sequence[FrameGuess]) -> PointingGuess:
@@ -208,10 +208,10 @@ def _pointing_guess(pointing: int, guesses: Sequence[FrameGuess]) -> PointingGue
 
 def _range_over_mean(values: list[float]) -> float:
     """The range (largest minus smallest) of the finite values divided by their mean; infinite if the mean is not above 0."""
-    known = _finite(values)
-    if known.size == 0 or known.mean() <= 0:
+    finite = _finite(values)
+    if finite.size == 0 or finite.mean() <= 0:
         return math.inf
-    return float((known.max() - known.min()) / known.mean())
+    return float((finite.max() - finite.min()) / finite.mean())
 
 
 def _mean(values: Flat) -> float:

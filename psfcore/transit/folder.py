@@ -21,7 +21,8 @@ from psfcore.fits.images import read_plane
 from psfcore.fits.observation import read_observation
 from psfcore.noise import Noise
 from psfcore.psf import CENTRE_TOLERANCE
-from psfcore.transit.manifest import MANIFEST_NAME, ImageEntry, TransitManifest, read_manifest
+from psfcore.transit.archive import checked_folder
+from psfcore.transit.manifest import MANIFEST_NAME, ImageEntry, TransitManifest
 from psfcore.transit.prepare import Exposure, Prepared, exposure_of, prepare
 from psfcore.transit.transit import Kernel, Place, Transit, check_reaches_in
 from psfcore.whole_files import sha256_of
@@ -59,15 +60,14 @@ def read_prepared(
     `psfcore.fits.observation.read_observation`. Times come from DATE-BEG or
     DATE-OBS. If one image has neither, all images keep the order of transit.json, with one second between them.
 
-    Raises DataError: "no-manifest", "bad-manifest", "missing-file", "transit-shapes", "occulter-outside",
-    "occulter-too-large", "no-noise-figures", "no-known-psf", "known-psf-..." (see ``checked_kernel``), the errors of
-    ``read_observation`` with the name of the file, and the errors of ``prepare``. Raises HeaderError for faults of a header. If
-    several images have faults, one error names all of them.
+    Raises DataError: "transit-shapes", "occulter-outside", "occulter-too-large", "no-noise-figures", "no-known-psf",
+    "known-psf-..." (see ``checked_kernel``), the errors of ``checked_folder``, the errors of ``read_observation`` with the
+    name of the file, and the errors of ``prepare``. Raises HeaderError for faults of a header. If several images have
+    faults, one error names all of them.
     """
     folder = Path(folder)
-    manifest = read_manifest(folder)
+    manifest, _ = checked_folder(folder)
     noise = noise or _noise(manifest)
-    _check_present(folder, manifest)
 
     def summary(image: ImageEntry) -> HeaderSummary:
         with _naming(image.file):
@@ -76,7 +76,7 @@ def read_prepared(
     headers = _each(summary, manifest.images)
     _each(lambda n: _check_frame(n, manifest.images, headers), range(len(headers)))
     instrument = manifest.instrument or next((h.instrument for h in headers if h.instrument), None)
-    known = _known_psf(folder, manifest, limits, diffraction, instrument, headers[0].shape)
+    kernel = _known_psf(folder, manifest, limits, diffraction, instrument, headers[0].shape)
     starts_s = times_s(headers)
     order = sorted(
         range(len(headers)), key=lambda n: starts_s[n]
@@ -106,7 +106,7 @@ def read_prepared(
     frames, prepared = prepare([each for each, _ in exposures])
     transit = Transit(
         frames=frames,
-        diffraction=known,
+        diffraction=kernel,
         noise=noise,
         instrument=instrument,
         plate_scale_arcsec=next((scale for _, scale in exposures if scale is not None), None),
@@ -141,16 +141,6 @@ def _naming(file: str) -> Iterator[None]:
         raise type(error)(error.code, f"{file}: {error.message}") from None
 
 
-def _check_present(folder: Path, manifest: TransitManifest) -> None:
-    missing = [name for name in manifest.files if not (folder / name).is_file()]
-    if missing:
-        named = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
-        raise DataError(
-            "missing-file",
-            f"expected all files that {MANIFEST_NAME} names in the folder; these files are missing: {named}",
-        )
-
-
 def _check_frame(n: int, images: Sequence[ImageEntry], headers: Sequence[HeaderSummary]) -> None:
     """Raise DataError if the shape or the occulter of an image is wrong."""
     image, (ny, nx), first = images[n], headers[n].shape, headers[0].shape
@@ -172,11 +162,11 @@ def _check_frame(n: int, images: Sequence[ImageEntry], headers: Sequence[HeaderS
 def times_s(headers: Sequence[HeaderSummary]) -> list[float]:
     """Start of each image in seconds after the first image; if one image has no readable date, the index of each image."""
     starts = [None if header.date_obs is None else instant(header.date_obs) for header in headers]
-    known = [start for start in starts if start is not None]
-    if len(known) < len(starts):
+    dates = [start for start in starts if start is not None]
+    if len(dates) < len(starts):
         return [float(index) for index in range(len(headers))]
-    first = min(known)
-    return [(start - first).total_seconds() for start in known]
+    first = min(dates)
+    return [(start - first).total_seconds() for start in dates]
 
 
 # --- noise and the known PSF ------------------------------------------------------------------------------
@@ -205,10 +195,10 @@ def _known_psf(
             kernel = read_plane(folder / manifest.known_psf, limits)
         return checked_kernel(kernel, manifest.known_psf)
     if fallback is None:
-        wanted = (
+        expected = (
             f'expected "known_psf" in {MANIFEST_NAME}, or an instrument whose diffraction can be computed'
         )
-        raise DataError("no-known-psf", f"{wanted}; got neither")
+        raise DataError("no-known-psf", f"{expected}; got neither")
     return checked_kernel(fallback(instrument, shape) if callable(fallback) else fallback, "diffraction")
 
 

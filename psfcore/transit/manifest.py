@@ -21,7 +21,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import ErrorDetails
 
 from psfcore.errors import DataError
-from psfcore.noise_figures import NoiseFigures
+from psfcore.noise import NoiseFigures
 
 MANIFEST_NAME = "transit.json"
 MAX_IMAGES = 2000
@@ -98,8 +98,8 @@ class TransitManifest(_Frozen):
     @property
     def files(self) -> tuple[str, ...]:
         """All named files: the images in their order, then the known PSF."""
-        known = () if self.known_psf is None else (self.known_psf,)
-        return (*(image.file for image in self.images), *known)
+        psf = () if self.known_psf is None else (self.known_psf,)
+        return (*(image.file for image in self.images), *psf)
 
     @property
     def pointings(self) -> dict[int, int]:

@@ -19,6 +19,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, BinaryIO, Literal, Self, cast
 
@@ -43,10 +44,9 @@ _PAX_RECORD = re.compile(rb"([1-9]\d{0,5}) [^=\n]+=")
 _MANY_DIGITS = re.compile(rb"\d{65}")
 _ZIP_ENTRY = b"PK\1\2"
 _DIRECTORY_BYTES_PER_MEMBER = (
-    512  # upper estimate of the mean size of an entry in the central directory of a zip file
+    512  # upper estimate of the mean size of an entry in a zip file's table of contents
 )
 _ZIP_ENCRYPTED = 0x1 | 0x40 | 0x2000
-_ZIP_METHODS = {zipfile.ZIP_STORED: "stored", zipfile.ZIP_DEFLATED: "deflated"}
 # The exceptions that a damaged archive raises, depending on where the damage is.
 _DAMAGE = (
     zipfile.BadZipFile,
@@ -95,22 +95,17 @@ class Member:
         return got
 
 
+@dataclass(frozen=True)
 class OpenArchive:
-    """An archive that is open for reading, once, from its start to its end."""
+    """An archive that is open for reading, once, from its start to its end.
+
+    members: the accepted members, which may include files that are not in the main folder of the gate. Each member must be
+    read before the next member is requested.
+    """
 
     kind: Kind
-
-    def __init__(self, gate: Gate) -> None:
-        self._gate = gate
-
-    def members(self) -> Iterator[Member]:
-        """The accepted members, which may include files that are not in ``main_folder``. Each member must be read before the next
-        member is requested."""
-        raise NotImplementedError
-
-    def main_folder(self) -> str:
-        """The folder of the transit's files, after all members were read. Files elsewhere are ignored. Raises DataError."""
-        return self._gate.main_folder()
+    gate: Gate
+    members: Iterator[Member]
 
 
 @contextmanager
@@ -128,16 +123,16 @@ def opened(path: Path, limits: ArchiveLimits) -> Iterator[OpenArchive]:
         try:
             if kind == "zip":
                 with zipfile.ZipFile(cast(IO[bytes], _BoundedFile(file, gate))) as archive:
-                    yield _Zip(archive, gate)
+                    yield OpenArchive("zip", gate, _zip_members(archive, gate))
             elif kind == "tar":
-                yield _Tar("tar", _TarInput(file, gate, size), gate)
+                yield OpenArchive("tar", gate, _tar_members(_TarInput(file, gate, size), gate))
             elif kind == "gzip":
                 stream = GzipStream(file)
                 if archive_kind(stream.read(START_BYTES)) != "tar":
                     message = "expected a .zip, .tar or .tar.gz; got a gzip file that contains no tar"
                     raise DataError("not-an-archive", message)
                 stream.rewind()
-                yield _Tar("tar.gz", _TarInput(cast(BinaryIO, stream), gate), gate)
+                yield OpenArchive("tar.gz", gate, _tar_members(_TarInput(cast(BinaryIO, stream), gate), gate))
             else:
                 raise DataError("not-an-archive", "expected a .zip, .tar or .tar.gz; got another format")
         except DataError:
@@ -191,47 +186,40 @@ class _BoundedFile:
         return True
 
 
-class _Zip(OpenArchive):
-    kind: Kind = "zip"
+def _zip_members(archive: zipfile.ZipFile, gate: Gate) -> Iterator[Member]:
+    """Yield the accepted members; all entries are checked before the first member is read."""
+    entries = archive.infolist()
+    gate.count_members(len(entries))
+    admitted = [(info, file) for info in entries if (file := _admit_entry(info, gate)) is not None]
+    main = gate.main_folder()
+    for info, file in admitted:
+        if file.folder == main:
+            with archive.open(info) as stream:
+                yield Member(file, info.file_size, stream, gate)
 
-    def __init__(self, archive: zipfile.ZipFile, gate: Gate) -> None:
-        super().__init__(gate)
-        self._archive = archive
 
-    def members(self) -> Iterator[Member]:
-        """Yield the accepted members; all entries are checked before the first member is read."""
-        entries = self._archive.infolist()
-        self._gate.count_members(len(entries))
-        admitted = [(info, file) for info in entries if (file := self._admit(info)) is not None]
-        main = self._gate.main_folder()
-        for info, file in admitted:
-            if file.folder == main:
-                with self._archive.open(info) as stream:
-                    yield Member(file, info.file_size, stream, self._gate)
-
-    def _admit(self, info: zipfile.ZipInfo) -> Admitted | None:
-        kind = stat.S_IFMT(info.external_attr >> 16) if info.create_system != 0 else 0
-        if info.orig_filename.endswith("/") and kind in (0, stat.S_IFDIR):
-            self._gate.check_folder(info.orig_filename)
-            return None
-        file = self._gate.admit(info.orig_filename, info.file_size)
-        if file is None:
-            return None
-        if kind not in (0, stat.S_IFREG):
-            raise not_plain(info.orig_filename, "expected only plain files, no links or devices")
-        if info.flag_bits & _ZIP_ENCRYPTED:
-            raise not_plain(info.orig_filename, "expected files that are not encrypted")
-        if info.compress_type not in _ZIP_METHODS:
-            wanted = " or ".join(_ZIP_METHODS.values())
-            raise not_plain(
-                info.orig_filename, f"expected {wanted} files, not compression method {info.compress_type}"
-            )
-        # Deflate adds at most five bytes per block. If the compressed size is far larger, the declared size is wrong.
-        if info.compress_size > 2 * info.file_size + 1024:
-            got = f"{info.compress_size} compressed bytes for a declared size of {info.file_size} bytes"
-            message = f"{shown(info.orig_filename)}: expected sizes that agree; got {got}"
-            raise DataError("archive-broken", message)
-        return file
+def _admit_entry(info: zipfile.ZipInfo, gate: Gate) -> Admitted | None:
+    """The file of an entry; None for a folder and for a file that must be skipped."""
+    kind = stat.S_IFMT(info.external_attr >> 16) if info.create_system != 0 else 0
+    if info.orig_filename.endswith("/") and kind in (0, stat.S_IFDIR):
+        gate.check_folder(info.orig_filename)
+        return None
+    file = gate.admit(info.orig_filename, info.file_size)
+    if file is None:
+        return None
+    if kind not in (0, stat.S_IFREG):
+        raise not_plain(info.orig_filename, "expected only plain files, no links or devices")
+    if info.flag_bits & _ZIP_ENCRYPTED:
+        raise not_plain(info.orig_filename, "expected files that are not encrypted")
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        message = f"expected stored or deflated files, not compression method {info.compress_type}"
+        raise not_plain(info.orig_filename, message)
+    # Deflate adds at most five bytes per block. If the compressed size is far larger, the declared size is wrong.
+    if info.compress_size > 2 * info.file_size + 1024:
+        got = f"{info.compress_size} compressed bytes for a declared size of {info.file_size} bytes"
+        message = f"{shown(info.orig_filename)}: expected sizes that agree; got {got}"
+        raise DataError("archive-broken", message)
+    return file
 
 
 # --- tar --------------------------------------------------------------------------------------------------
@@ -340,41 +328,39 @@ def _checked_headers(source: _TarInput, gate: Gate) -> type[tarfile.TarInfo]:
     return Header
 
 
-class _Tar(OpenArchive):
-    def __init__(self, kind: Kind, source: _TarInput, gate: Gate) -> None:
-        super().__init__(gate)
-        self.kind, self._source = kind, source
+def _tar_members(source: _TarInput, gate: Gate) -> Iterator[Member]:
+    """Yield the accepted members, each after its header was checked."""
+    with tarfile.TarFile(  # the constructor reads the first header
+        fileobj=cast(IO[bytes], source),
+        tarinfo=_checked_headers(source, gate),
+        encoding="utf-8",
+        errors="surrogateescape",
+    ) as archive:
+        while True:
+            source.expect_headers()
+            info = archive.next()
+            source.expect_data()
+            if info is None:
+                return
+            # Each member gets a copy of the global records.
+            if len(archive.pax_headers) > _MAX_GLOBAL_RECORDS:
+                message = f"expected at most {_MAX_GLOBAL_RECORDS} global pax records; got more"
+                raise DataError("archive-broken", message)
+            file = _admit_header(info, gate)
+            info.pax_headers = {}  # to save memory, because tarfile keeps each TarInfo
+            stream = None if file is None else archive.extractfile(info)
+            if file is not None and stream is not None:
+                with stream:
+                    yield Member(file, info.size, stream)
 
-    def members(self) -> Iterator[Member]:
-        with tarfile.TarFile(  # the constructor reads the first header
-            fileobj=cast(IO[bytes], self._source),
-            tarinfo=_checked_headers(self._source, self._gate),
-            encoding="utf-8",
-            errors="surrogateescape",
-        ) as archive:
-            while True:
-                self._source.expect_headers()
-                info = archive.next()
-                self._source.expect_data()
-                if info is None:
-                    return
-                # Each member gets a copy of the global records.
-                if len(archive.pax_headers) > _MAX_GLOBAL_RECORDS:
-                    message = f"expected at most {_MAX_GLOBAL_RECORDS} global pax records; got more"
-                    raise DataError("archive-broken", message)
-                file = self._admit(info)
-                info.pax_headers = {}  # to save memory, because tarfile keeps each TarInfo
-                stream = None if file is None else archive.extractfile(info)
-                if file is not None and stream is not None:
-                    with stream:
-                        yield Member(file, info.size, stream)
 
-    def _admit(self, info: tarfile.TarInfo) -> Admitted | None:
-        if any(key.startswith("GNU.sparse") for key in info.pax_headers):
-            raise not_plain(info.name, "expected only plain files, no sparse ones")
-        if info.isdir():
-            self._gate.check_folder(info.name)
-            return None
-        if not info.isreg() or info.size < 0:
-            raise not_plain(info.name, "expected only plain files, no links or devices")
-        return self._gate.admit(info.name, info.size)
+def _admit_header(info: tarfile.TarInfo, gate: Gate) -> Admitted | None:
+    """The file of a header; None for a folder and for a file that must be skipped."""
+    if any(key.startswith("GNU.sparse") for key in info.pax_headers):
+        raise not_plain(info.name, "expected only plain files, no sparse ones")
+    if info.isdir():
+        gate.check_folder(info.name)
+        return None
+    if not info.isreg() or info.size < 0:
+        raise not_plain(info.name, "expected only plain files, no links or devices")
+    return gate.admit(info.name, info.size)

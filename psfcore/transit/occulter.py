@@ -177,16 +177,16 @@ def find_occulter(
     frame, start = frames[index], frames[index].place
     window = patch_window(frame.pixels.shape, start)
     observed = frame.pixels[window].astype(np.float64)
-    chosen = neighbours_of(index, frames, places, noise)
-    if chosen:
-        share = _shares(chosen, frames, window, noise)
+    neighbours = neighbours_of(index, frames, places, noise)
+    if neighbours:
+        share = _shares(neighbours, frames, window, noise)
         seen, behind = (
             sum(w * p[window].astype(np.float64) for w, p in zip(share, planes, strict=True))
-            for planes in ([frames[k].pixels for k in chosen], [scene_of(k) for k in chosen])
+            for planes in ([frames[k].pixels for k in neighbours], [scene_of(k) for k in neighbours])
         )
         neighbours_noise = sum(
             w**2 * noise.variance(_level(seen), frames[k].exposure_s)
-            for w, k in zip(share, chosen, strict=True)
+            for w, k in zip(share, neighbours, strict=True)
         )
         behind = _quiet(behind, float(np.sqrt(np.mean(neighbours_noise))) * DECONVOLUTION_NOISE)
     else:
@@ -198,9 +198,9 @@ def find_occulter(
     def variance(model: Plane) -> Plane:
         return np.asarray(noise.variance(_level(model), frame.exposure_s) + neighbours_noise)
 
-    found = _solve(simulated, observed, variance, local, len(chosen))
-    x_px, y_px = found.place.x_px + window[1].start, found.place.y_px + window[0].start
-    return replace(found, place=Place(x_px, y_px, start.radius_px))
+    solution = _solve(simulated, observed, variance, local, len(neighbours))
+    x_px, y_px = solution.place.x_px + window[1].start, solution.place.y_px + window[0].start
+    return replace(solution, place=Place(x_px, y_px, start.radius_px))
 
 
 def _shares(
@@ -261,9 +261,11 @@ def _solve(
         normal = weighted @ slopes.T
         # If the Sun changed between the images, the neighbours do not describe the patch. Then the patch gets a smaller
         # weight and the ephemeris a larger one.
-        held = prior.copy()
-        held[:2, :2] *= _excess(weight, misfit)
-        step = np.linalg.lstsq(normal + held, weighted @ misfit.ravel() + held @ (origin - at), rcond=None)[0]
+        scaled_prior = prior.copy()
+        scaled_prior[:2, :2] *= _excess(weight, misfit)
+        step = np.linalg.lstsq(
+            normal + scaled_prior, weighted @ misfit.ravel() + scaled_prior @ (origin - at), rcond=None
+        )[0]
         step[:2] = np.clip(step[:2], -1.0, 1.0) * (0.5 if done >= DAMPED_FROM else 1.0)
         at = at + step
         at[:2] = np.clip(at[:2], origin[:2] - LARGEST_SHIFT_PX, origin[:2] + LARGEST_SHIFT_PX)
@@ -323,8 +325,8 @@ def _quiet(plane: Plane, noise_per_pixel: float) -> Plane:
 
     A Gaussian of width sigma reduces white noise by a factor 2 sqrt(pi) sigma.
     """
-    wanted = LARGEST_TEMPLATE_NOISE * max(float(plane.mean()), 1e-30)
-    sigma = noise_per_pixel / wanted / (2 * np.sqrt(np.pi))
+    largest_noise = LARGEST_TEMPLATE_NOISE * max(float(plane.mean()), 1e-30)
+    sigma = noise_per_pixel / largest_noise / (2 * np.sqrt(np.pi))
     if sigma * 2 * np.sqrt(np.pi) <= 1:
         return plane
     return np.asarray(gaussian_filter(plane, min(sigma, LARGEST_SMOOTHING_PX)))

@@ -87,12 +87,14 @@ class Prepared:
 
     def to_json(self) -> dict[str, Any]:
         """JSON values: the number of frames, and the counts of the frames that have saturated or not finite pixels."""
-        told = [asdict(frame) for frame in self.frames if frame.saturated or frame.nonfinite]
-        return {"images": len(self.frames), "unfilled": self.unfilled, "frames": told}
+        counts = [asdict(frame) for frame in self.frames if frame.saturated or frame.nonfinite]
+        return {"images": len(self.frames), "unfilled": self.unfilled, "frames": counts}
 
 
-def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
-    """The pixels [y, x] in DN/s (float32) of an image in DN or DN/s, and its exposure, s.
+def exposure_of(
+    image: Image, *, file: str, pointing: int, place: Place, time_s: float, gain_mode: str | None
+) -> Exposure:
+    """The exposure of an image in DN or DN/s. Its gaps are the pixels that the mask marks or that are not finite.
 
     Raises DataError "no-exposure", and "unknown-unit" if BUNIT is neither DN nor DN/s.
     """
@@ -109,24 +111,14 @@ def to_rate(image: Image, file: str) -> tuple[Pixels, float]:
         )
     rate = image.pixels * unit.scale / (1.0 if unit.kind == "rate" else image.exposure_s)
     with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite and so a gap
-        return rate.astype(np.float32), image.exposure_s
-
-
-def exposure_of(
-    image: Image, *, file: str, pointing: int, place: Place, time_s: float, gain_mode: str | None
-) -> Exposure:
-    """Make an exposure from an image. Its gaps are the pixels that the mask marks or that are not finite.
-
-    Raises the errors of ``to_rate``.
-    """
-    pixels, exposure_s = to_rate(image, file)
+        pixels = rate.astype(np.float32)
     gaps = (image.mask != 0) | ~np.isfinite(pixels)
     return Exposure(
         file=file,
         pixels=pixels,
         pointing=pointing,
         place=place,
-        exposure_s=exposure_s,
+        exposure_s=image.exposure_s,
         time_s=time_s,
         gain_mode=gain_mode,
         gaps=gaps if gaps.any() else None,
@@ -223,17 +215,17 @@ def _scale(exposure: Exposure, donor: Exposure, here: tuple[Places, Places]) -> 
     The scale is measured near the gaps. If too few pixels near the gaps can be used, the scale is measured in the whole
     image. If too few pixels can be used in the whole image, the scale is 1.
     """
-    wanted = np.zeros(exposure.pixels.shape, dtype=bool)
-    wanted[here] = True
-    known = np.ones_like(wanted)
+    gap = np.zeros(exposure.pixels.shape, dtype=bool)
+    gap[here] = True
+    valid = np.ones_like(gap)
     for gaps in (exposure.gaps, donor.gaps):
         if gaps is not None:
-            known &= ~gaps
-    if not known.any():
+            valid &= ~gaps
+    if not valid.any():
         return 1.0
-    floors = [max(0.0, float(np.median(one.pixels[known]))) for one in (exposure, donor)]
-    bright = known & (exposure.pixels > floors[0]) & (donor.pixels > floors[1])
-    near = bright & ndimage.maximum_filter(wanted, size=2 * NEAR_PX + 1)
+    floors = [max(0.0, float(np.median(one.pixels[valid]))) for one in (exposure, donor)]
+    bright = valid & (exposure.pixels > floors[0]) & (donor.pixels > floors[1])
+    near = bright & ndimage.maximum_filter(gap, size=2 * NEAR_PX + 1)
     for these in (near, bright):
         if np.count_nonzero(these) >= FEWEST_SCALE_PIXELS:
             ratio = exposure.pixels[these].astype(np.float64) / donor.pixels[these]
@@ -241,26 +233,26 @@ def _scale(exposure: Exposure, donor: Exposure, here: tuple[Places, Places]) -> 
     return 1.0
 
 
-def _fill_from_neighbours(pixels: Pixels, wanted: PixelMask, gaps: PixelMask) -> None:
-    """Fill each wanted pixel with the median of the valid pixels near it.
+def _fill_from_neighbours(pixels: Pixels, targets: PixelMask, gaps: PixelMask) -> None:
+    """Fill each pixel of `targets` with the median of the valid pixels near it.
 
     If there are none, the median is taken near the closest valid pixel.
     """
-    if not wanted.any():
+    if not targets.any():
         return
-    rows, columns = np.nonzero(wanted)
-    known = np.where(gaps, np.float32(np.nan), pixels)
-    values = _local_median(known, rows, columns)
+    rows, columns = np.nonzero(targets)
+    valid = np.where(gaps, np.float32(np.nan), pixels)
+    values = _local_median(valid, rows, columns)
     lost = np.isnan(values)
     if lost.any() and not gaps.all():
         nearest = ndimage.distance_transform_edt(gaps, return_distances=False, return_indices=True)
-        values[lost] = _local_median(known, *(axis[rows[lost], columns[lost]] for axis in nearest))
+        values[lost] = _local_median(valid, *(axis[rows[lost], columns[lost]] for axis in nearest))
     pixels[rows, columns] = np.nan_to_num(values, nan=0.0)
 
 
-def _local_median(known: Pixels, rows: Places, columns: Places) -> NDArray[np.float32]:
-    """The median of the known (not NaN) pixels in a window around each given pixel; NaN if there are none."""
-    padded = np.pad(known, NEIGHBOUR_PX, constant_values=np.nan)
+def _local_median(valid: Pixels, rows: Places, columns: Places) -> NDArray[np.float32]:
+    """The median of the valid (not NaN) pixels in a window around each pixel; NaN if there are none."""
+    padded = np.pad(valid, NEIGHBOUR_PX, constant_values=np.nan)
     side = 2 * NEIGHBOUR_PX + 1
     windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
     parts = [np.empty(0, dtype=np.float32)]

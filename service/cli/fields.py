@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from psfcore.errors import DataError
-from psfcore.noise_figures import NoiseFigures
+from psfcore.noise import NoiseFigures
 from workers.contract.requests import METHOD_MODELS, METHODS, Option, RichardsonLucy
 
 Command = TypeVar("Command", bound=Callable[..., Any])

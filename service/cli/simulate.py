@@ -108,12 +108,11 @@ def transit(
 ) -> None:
     """Write a simulated transit, with its true PSF and scenes, to a folder."""
     from psfcore.instruments.model import load_instrument
-    from psfcore.simulate.headers import imitated
     from psfcore.simulate.inputs import LARGEST_DIFFRACTION_PX, diffraction_kernel, scenes_from_files
     from psfcore.simulate.plan import default_plan
     from psfcore.simulate.scatter_truth import ScatterTruth
+    from psfcore.simulate.transit import imitated, write
     from psfcore.simulate.transit import simulate as simulated
-    from psfcore.simulate.transit_files import write
 
     given = [*scene_files, *(Path(one) for one in (diffraction, instrument) if one and Path(one).is_file())]
     check_fresh_folder(output, given, overwrite=overwrite)
@@ -145,10 +144,11 @@ def transit(
 @writes_files
 def bound(folder: Path, json_file: Path | None, overwrite: bool) -> None:
     """Compute the smallest errors that photon and read noise allow for FOLDER, a simulated transit."""
-    from psfcore.simulate.bound import bound_of_folder
+    from psfcore.simulate.bound import bound_of_sky
+    from psfcore.simulate.transit import read_sky
 
     with user_errors():
-        found = bound_of_folder(folder, threads=THREADS)
+        found = bound_of_sky(read_sky(folder, threads=THREADS), threads=THREADS)
     write_json(json_file, found.to_json(), overwrite=overwrite)
     echo("\n".join(_lines(found)))
 

@@ -30,7 +30,7 @@ from psfcore.fits.observation import read_observation
 from psfcore.gap import diagnose
 from psfcore.scatter import fit as fit_module
 from psfcore.scatter.as_published import free_fit
-from psfcore.simulate.transit_files import write
+from psfcore.simulate.transit import write
 from tests.conftest import write_image, write_psf
 from tests.fitted_psfs import EARLY, LATE, fitted_psf, interpolated_on_a_small_grid, write_fitted
 from tests.psfcore.small_transits import SCATTER, observed, sky

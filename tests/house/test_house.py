@@ -96,7 +96,7 @@ LIGHT = (
     "psfcore.instruments.files",
     "psfcore.tables.lookup",
     "psfcore.errors",
-    "psfcore.noise_figures",
+    "psfcore.noise",
     "psfcore.transit.archive",
     "psfcore.transit.manifest",
     "psfcore.whole_files",

@@ -80,6 +80,13 @@ def with_pixels(transit: Transit, pixels: Sequence[NDArray[np.floating]]) -> Tra
     return dataclasses.replace(transit, frames=changed)
 
 
+def true_scene(of: TrueSky, index: int) -> Plane:
+    """The scene of an image with its margins, without the light that the occulter hides."""
+    scene, around = of.scenes[of.plan.shots[index].pointing].copy(), of.behind[index]
+    scene[around.window(of.plan.margin_px)] -= around.hidden(of.plan.place(index))
+    return np.asarray(np.maximum(scene, 0.0))  # rounding gives -1e-14 for a hidden pixel
+
+
 @cache
 def solved() -> Solution:
     """The inversion of the noisy transit."""

@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
-from numpy.typing import NDArray
 
 from psfcore import build
 from psfcore import psf as psf_module
 from psfcore.build import build_psf, component_names
 from psfcore.deconvolve.summary import assumptions
 from psfcore.diffraction import combined
-from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px
 from psfcore.errors import DataError
 from psfcore.fits.blocks import FitsLimits
 from psfcore.fits.psfs import read_psf, write_psf
@@ -25,7 +23,6 @@ from psfcore.instruments.model import (
     Aperture,
     Instrument,
     MaskImage,
-    Mesh,
     Mount,
     PowerLaw,
     Rays,
@@ -48,49 +45,6 @@ PUBLISHED = {  # % of the light outside the central pixel and beyond 11.5 px, an
     "FILTER_WHEEL": (6.4, 0.1, 0.63, 0.05),
     "DIFFRACTION": (26.4, 0.5, 8.0, 1.0),
 }
-
-
-def line(mesh: Mesh, size: int = 2048) -> NDArray[np.float64]:
-    return mesh_line(
-        wavelength_angstrom=174.0,
-        distance_mm=HRI.mesh_distance_mm(mesh),
-        pitch_um=mesh.pitch_um,
-        wire_um=mesh.wire_um,
-        windows=mesh.windows,
-        pixel_pitch_um=10.0,
-        size=size,
-    )
-
-
-def spacing_px(mesh: Mesh) -> float:
-    return order_spacing_px(
-        wavelength_angstrom=174.0,
-        distance_mm=HRI.mesh_distance_mm(mesh),
-        pitch_um=mesh.pitch_um,
-        pixel_pitch_um=10.0,
-    )
-
-
-def test_orders_lie_at_multiples_of_the_spacing() -> None:
-    assert spacing_px(ENTRANCE) == pytest.approx(5.7365, abs=0.001)
-    assert spacing_px(WHEEL) == pytest.approx(0.374, abs=0.001)
-    pattern = line(ENTRANCE)[1024:]
-    for order in range(1, 20):
-        near = round(order * spacing_px(ENTRANCE))
-        assert pattern[near - 2 : near + 3].argmax() == 2
-    assert line(WHEEL)[1024] ** 2 == pytest.approx(0.936, abs=0.001)
-
-
-def test_the_exact_integral_equals_fine_sampling_of_the_published_formula() -> None:
-    size, fine = 64, 2048
-    x = (np.arange(size * fine) + 0.5) / fine - size // 2 - 0.5
-    for mesh in (ENTRANCE, WHEEL):
-        # sinc(u) = sin(u) / u here; numpy's sinc takes u / pi
-        window = np.sinc((mesh.pitch_um - mesh.wire_um) / mesh.pitch_um * x / spacing_px(mesh)) ** 2
-        phase = np.pi * x / spacing_px(mesh)
-        comb = (np.sin(mesh.windows * phase) / np.sin(phase)) ** 2
-        sampled = (window * comb).reshape(size, fine).sum(axis=1)
-        np.testing.assert_allclose(line(mesh, size), sampled / sampled.sum(), rtol=2e-4, atol=1e-9)
 
 
 def test_scatter_amplitude_and_tail() -> None:

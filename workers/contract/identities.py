@@ -8,7 +8,7 @@ from typing import Any
 from psfcore.errors import DataError
 from psfcore.gap.effect_sources import library_sha256
 from psfcore.instruments.files import instrument_names, instrument_path, turned_text
-from psfcore.noise_figures import NoiseFigures
+from psfcore.noise import NoiseFigures
 from psfcore.recipe import Recipe
 from psfcore.recipe import canonical_hash as canonical_hash
 from workers.contract.requests import (

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from psfcore.deconvolve.box import BOX, LARGEST_ERROR, Box, region_without_discrepancy, region_without_errors
 from psfcore.errors import DataError
 from psfcore.instruments.model import MOST_BYTES
-from psfcore.noise_figures import NoiseFigures
+from psfcore.noise import NoiseFigures
 from psfcore.recipe import BUILD_VERSION
 from workers.versions import TIME, iso, seconds
 

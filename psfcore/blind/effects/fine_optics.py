@@ -28,7 +28,7 @@ from scipy.ndimage import convolve1d
 
 from psfcore.build import build_psf
 from psfcore.convolution.convolver import Convolver, linear_convolve
-from psfcore.diffraction.mesh_series import rotated_mesh_kernel
+from psfcore.diffraction.mesh_series import order_spacing_px, rotated_mesh_kernel
 from psfcore.instruments.model import load_instrument
 from psfcore.simulate.scatter_truth import ScatterTruth
 
@@ -100,13 +100,18 @@ def _built(name: str, size: int, turn_deg: float, pitch_factor: float) -> Kernel
     """
     instrument = load_instrument(name)
     entrance = next(mesh for mesh in instrument.meshes if mesh.place == "entrance")
-    orders = rotated_mesh_kernel(
+    pitch_um = entrance.pitch_um / pitch_factor
+    spacing_px = order_spacing_px(
         wavelength_angstrom=instrument.wavelength_angstrom,
         distance_mm=instrument.mesh_distance_mm(entrance),
-        pitch_um=entrance.pitch_um / pitch_factor,
+        pitch_um=pitch_um,
+        pixel_pitch_um=instrument.detector.pixel_pitch_um / FINE,
+    )
+    orders = rotated_mesh_kernel(
+        spacing_px,
+        pitch_um=pitch_um,
         wire_um=entrance.wire_um / pitch_factor,
         windows=entrance.windows,
-        pixel_pitch_um=instrument.detector.pixel_pitch_um / FINE,
         angle_deg=entrance.angle_deg + turn_deg,
         size=size,
     )

@@ -144,7 +144,7 @@ def _named(folder: PsfCache, psf: CachedPsf) -> str:
     file = folder.find(psf.identity, PROVENANCE)
     if file is None:
         return "(incomplete)"
-    parameters: dict[str, Any] = json.loads(file.path.read_bytes())["parameters"]
+    parameters: dict[str, Any] = json.loads(file.read_bytes())["parameters"]
     parts = [parameters.get("instrument", "your instrument file"), f"{parameters['size']} px"]
     return ", ".join([*parts, *filter(None, [parameters.get("component")])])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from scipy.special import fresnel as fresnel_integrals
 
 from psfcore.convolution.convolver import ChirpTransform
-from psfcore.diffraction import fresnel as waves
+from psfcore.diffraction import fresnel
 from psfcore.diffraction.fresnel import (
+    FresnelStep,
     Grid,
     binned_light,
     common_openings_mm,
@@ -26,20 +27,21 @@ from psfcore.diffraction.fresnel import (
     mesh_openings_mm,
     mirror_transmission,
     open_share,
-    propagate,
 )
 from psfcore.diffraction.fresnel_study import FresnelStudy, fresnel_study
 from psfcore.diffraction.light_path import (
     BestFocus,
     LightPath,
+    Waves,
     best_focus,
     focal_mm,
     light_path,
     paraxial_separation_mm,
+    waves_to_detector,
 )
 from psfcore.diffraction.plots import fresnel_png
 from psfcore.errors import DataError
-from psfcore.instruments.model import Aperture, Instrument, Mirror, load_instrument
+from psfcore.instruments.model import Aperture, Mirror, load_instrument
 
 HRI = load_instrument("hri_euv")
 LAMBDA_MM = 1.74e-5
@@ -53,11 +55,19 @@ def path() -> LightPath:
 
 @pytest.fixture(scope="module")
 def focus(path: LightPath) -> BestFocus:
-    return best_focus(path, nominal_focal_length_mm=HRI.focal_length_mm)
+    return best_focus(waves_to_detector(path), nominal_focal_length_mm=HRI.focal_length_mm)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_focus(focus: BestFocus) -> Iterator[None]:
+    """All studies have the same mirrors, so they use one search for the best focus."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("psfcore.diffraction.fresnel_study.best_focus", lambda waves, **_: focus)
+        yield
 
 
 @pytest.fixture(scope="module")
-def study() -> FresnelStudy:
+def study(one_focus: None) -> FresnelStudy:
     return fresnel_study(HRI, distances_mm=(273.0,), phases=4)
 
 
@@ -78,7 +88,7 @@ def slit_field(x_mm: NDArray[np.float64], begin_mm: float, end_mm: float, z_mm: 
 
 
 def through(field: Complex, source: Grid, target: Grid, distance_mm: float) -> Complex:
-    return propagate(field, source, target, distance_mm)
+    return FresnelStep(source, target, distance_mm).apply(field)
 
 
 def test_the_chirp_transform_equals_the_direct_sum() -> None:
@@ -97,12 +107,10 @@ def test_propagation_conserves_the_light_of_any_field() -> None:
     rng = np.random.default_rng(0)
     field = rng.normal(size=2000) + 1j * rng.normal(size=2000)
     for out_samples in (2000, 3001):
-        target = Grid(
-            "b", out_samples, LAMBDA_MM * 300.0 / 0.001 / out_samples, LAMBDA_MM
-        )  # one period of the sum
-        assert target.light(through(field, source, target, 300.0)) == pytest.approx(
-            source.light(field), rel=1e-10
-        )
+        period_mm = LAMBDA_MM * 300.0 / 0.001  # of the sum
+        target = Grid("b", out_samples, period_mm / out_samples, LAMBDA_MM)
+        light = target.light(through(field, source, target, 300.0))
+        assert light == pytest.approx(source.light(field), rel=1e-10)
 
 
 def test_a_gaussian_beam_spreads_by_its_formula() -> None:
@@ -212,11 +220,8 @@ def test_a_telescope_of_parabolas_matches_the_closed_form(path: LightPath) -> No
     separation = paraxial_separation_mm(path)
     behind, distance = path.secondary_to_detector_mm - 273.0, 273.0
     wheel, detector = path.wheel_grid(distance), path.detector_grid
-    aperture, primary = path.entrance_grids()
-    at_mirror = path.secondary_grid(wheel.width_mm, behind)
-    field = path.field_at_primary(path.entrance_mm, aperture, primary)
-    field = path.field_at_secondary(field, primary, at_mirror, separation)
-    field = through(field, at_mirror, wheel, behind)
+    waves = Waves(path, wheel, behind)
+    field = waves.at_plane(waves.at_secondary(waves.at_primary(path.entrance_mm), separation))
     sample = np.flatnonzero(np.abs(wheel.x_mm) < 2.5)[::211]
     exact = collins(path, separation, behind, wheel.x_mm[sample])
     np.testing.assert_allclose(np.abs(field[sample]), np.abs(exact), atol=0.006 * float(np.abs(exact).max()))
@@ -282,7 +287,7 @@ def test_the_sampling_is_reported_and_loses_no_light(study: FresnelStudy) -> Non
 
 
 def test_finer_sampling_changes_nothing(study: FresnelStudy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waves, "SAMPLING_MARGIN", 2.5)
+    monkeypatch.setattr(fresnel, "SAMPLING_MARGIN", 2.5)
     finer = fresnel_study(HRI, distances_mm=(273.0,), phases=1)
     coarse = study.distances[0].phase_largest_points[0]
     assert finer.distances[0].phase_largest_points[0] == pytest.approx(coarse, abs=0.01)
@@ -309,21 +314,17 @@ def test_more_windows_bring_the_series_closer() -> None:
         assert len(result["phase_largest_points"]) == 2
 
 
-def without(**changes: object) -> Instrument:
-    return replace(HRI, **changes)
-
-
 def test_the_error_names_the_key_that_an_instrument_lacks() -> None:
     tilted = (replace(HRI.meshes[0], angle_deg=45.0), HRI.meshes[1])
-    for instrument, key in (
-        (without(mirrors=()), "mirrors: expected a primary and a secondary"),
-        (without(mirrors=HRI.mirrors[:1]), "mirrors"),
-        (without(distances=None), "distances"),
-        (without(meshes=HRI.meshes[:1]), "meshes: expected one mesh at place 'filter_wheel'; got 0"),
-        (without(meshes=tilted), "angle_deg"),
+    for changes, key in (
+        ({"mirrors": ()}, "mirrors: expected a primary and a secondary"),
+        ({"mirrors": HRI.mirrors[:1]}, "mirrors"),
+        ({"distances": None}, "distances"),
+        ({"meshes": HRI.meshes[:1]}, "meshes: expected one mesh at place 'filter_wheel'; got 0"),
+        ({"meshes": tilted}, "angle_deg"),
     ):
         with pytest.raises(DataError, match=f"bad-instrument-file: hri_euv: .*{key}"):
-            fresnel_study(instrument)
+            fresnel_study(replace(HRI, **changes))
 
 
 def test_bad_requests_are_refused_before_the_work() -> None:

@@ -1,4 +1,4 @@
-"""The pattern of a rotated mesh agrees with exact lines, with its symmetries, and with a published PSF."""
+"""The patterns of meshes agree with exact lines, Fourier sums, their symmetries, and a published PSF."""
 
 from __future__ import annotations
 
@@ -10,41 +10,85 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from psfcore.convolution.convolver import linear_convolve
-from psfcore.diffraction.hexagonal_mesh import hexagonal_mesh_kernel
-from psfcore.diffraction.mesh_series import mesh_line, order_spacing_px, rotated_mesh_kernel
-from psfcore.instruments.model import Instrument, Mesh, load_instrument
+from psfcore.diffraction.mesh_series import (
+    hexagonal_mesh_kernel,
+    mesh_line,
+    order_spacing_px,
+    rotated_mesh_kernel,
+)
+from psfcore.instruments.model import Mesh, load_instrument
 from psfcore.psf import cumulative_curve
 
-HRI = {"wavelength_angstrom": 174.0, "distance_mm": 4187.0, "pitch_um": 1270.0, "pixel_pitch_um": 10.0}
-AIA = {"wavelength_angstrom": 171.0, "distance_mm": 4129.0, "pitch_um": 362.857, "pixel_pitch_um": 12.0}
-MESHES: dict[str, dict[str, float]] = {
-    "hri entrance": {**HRI, "wire_um": 40.0, "windows": 37},
-    "hri filter wheel": {**HRI, "wire_um": 40.0, "distance_mm": 273.0, "windows": 16},
-    "hri filter wheel, one beam": {**HRI, "wire_um": 40.0, "distance_mm": 273.0, "windows": 3},
-    "aia": {**AIA, "wire_um": 34.0, "windows": 551},
-    "one window": {**HRI, "wire_um": 40.0, "windows": 1},
+HRI = load_instrument("hri_euv")
+AIA = load_instrument("aia_171")
+
+
+def hri_spacing_px(mesh: Mesh) -> float:
+    return order_spacing_px(
+        wavelength_angstrom=174.0,
+        distance_mm=HRI.mesh_distance_mm(mesh),
+        pitch_um=mesh.pitch_um,
+        pixel_pitch_um=10.0,
+    )
+
+
+ENTRANCE_PX, WHEEL_PX = (hri_spacing_px(mesh) for mesh in HRI.meshes)
+AIA_PX = order_spacing_px(
+    wavelength_angstrom=171.0, distance_mm=4129.0, pitch_um=362.857, pixel_pitch_um=12.0
+)
+OF_HRI = {"pitch_um": 1270.0, "wire_um": 40.0}
+OF_AIA = {"pitch_um": 362.857, "wire_um": 34.0}
+# The spacing of the orders, and the mesh.
+MESHES: dict[str, tuple[float, dict[str, float]]] = {
+    "hri entrance": (ENTRANCE_PX, OF_HRI | {"windows": 37}),
+    "hri filter wheel": (WHEEL_PX, OF_HRI | {"windows": 16}),
+    "hri filter wheel, one beam": (WHEEL_PX, OF_HRI | {"windows": 3}),
+    "aia": (AIA_PX, OF_AIA | {"windows": 551}),
+    "one window": (ENTRANCE_PX, OF_HRI | {"windows": 1}),
 }
 
 
+def line_of(name: str, size: int) -> NDArray[np.float64]:
+    spacing_px, mesh = MESHES[name]
+    return mesh_line(spacing_px, **mesh, size=size)  # type: ignore[arg-type]
+
+
 def rotated(name: str, angle_deg: float, size: int) -> NDArray[np.float64]:
-    return rotated_mesh_kernel(**MESHES[name], angle_deg=angle_deg, size=size)  # type: ignore[arg-type]
+    spacing_px, mesh = MESHES[name]
+    return rotated_mesh_kernel(spacing_px, **mesh, angle_deg=angle_deg, size=size)  # type: ignore[arg-type]
 
 
-def share_on_line(mesh: dict[str, float], line: NDArray[np.float64]) -> float:
-    """Fraction of the light of one axis that falls on the pixels of `line`, from a sum over the central pixel."""
-    optics = ("wavelength_angstrom", "distance_mm", "pitch_um", "pixel_pitch_um")
-    spacing, windows = order_spacing_px(**{key: mesh[key] for key in optics}), mesh["windows"]
-    open_share = 1 - mesh["wire_um"] / mesh["pitch_um"]
-    x = (np.arange(20_000) + 0.5) / 20_000 - 0.5
-    light = np.sinc(open_share * x / spacing) ** 2
-    light *= (np.sin(windows * np.pi * x / spacing) / np.sin(np.pi * x / spacing)) ** 2
-    return float(light.mean() / (windows * spacing / open_share) / line[len(line) // 2])
+def published(name: str, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The published formula at x (px), and its integral over the whole axis."""
+    spacing_px, mesh = MESHES[name]
+    open_share, windows = 1 - mesh["wire_um"] / mesh["pitch_um"], mesh["windows"]
+    phase = np.pi * x / spacing_px  # numpy's sinc takes u / pi
+    light = np.sinc(open_share * x / spacing_px) ** 2 * (np.sin(windows * phase) / np.sin(phase)) ** 2
+    return light, windows * spacing_px / open_share
+
+
+def test_orders_lie_at_multiples_of_the_spacing() -> None:
+    assert [hri_spacing_px(mesh) for mesh in HRI.meshes] == pytest.approx([5.7365, 0.374], abs=0.001)
+    pattern = line_of("hri entrance", 2048)[1024:]
+    for order in range(1, 20):
+        near = round(order * ENTRANCE_PX)
+        assert pattern[near - 2 : near + 3].argmax() == 2
+    assert line_of("hri filter wheel", 2048)[1024] ** 2 == pytest.approx(0.936, abs=0.001)
+
+
+def test_the_exact_integral_equals_fine_sampling_of_the_published_formula() -> None:
+    size, fine = 64, 2048
+    x = (np.arange(size * fine) + 0.5) / fine - size // 2 - 0.5
+    for name in ("hri entrance", "hri filter wheel"):
+        sampled = published(name, x)[0].reshape(size, fine).sum(axis=1)
+        np.testing.assert_allclose(line_of(name, size), sampled / sampled.sum(), rtol=2e-4, atol=1e-9)
 
 
 def test_without_rotation_the_pattern_is_the_product_of_exact_lines() -> None:
-    for name, mesh in MESHES.items():
-        line = mesh_line(**mesh, size=512)  # type: ignore[arg-type]
-        line *= share_on_line(mesh, line)
+    for name in MESHES:
+        line = line_of(name, 512)
+        light, whole = published(name, (np.arange(20_000) + 0.5) / 20_000 - 0.5)
+        line *= float(light.mean() / whole / line[256])  # as fractions of the light on the whole axis
         exact = np.outer(line, line)
         found = rotated(name, 0.0, 512)
         assert np.abs(found - exact).max() < 1e-4, name
@@ -71,18 +115,19 @@ def test_the_pattern_has_the_symmetries_of_a_square() -> None:
 
 def test_the_pattern_rotates_from_x_towards_y() -> None:
     kernel = rotated("aia", 20.0, 129)
-    spacing = order_spacing_px(**AIA)
     for order in (1, 2, 3):
-        along = order * spacing
+        along = order * AIA_PX
         x, y = along * np.cos(np.deg2rad(20)), along * np.sin(np.deg2rad(20))
         assert kernel[64 + round(y), 64 + round(x)] > 100 * kernel[64 - round(y), 64 + round(x)]
 
 
-HEXAGONAL = {**AIA, "pitch_um": 350.0, "wire_um": 35.0, "windows": 400}
+HEXAGONAL_PX = AIA_PX * 362.857 / 350.0
 
 
-def hexagonal(angle_deg: float, size: int = 257) -> NDArray[np.float64]:
-    return hexagonal_mesh_kernel(**HEXAGONAL, angle_deg=angle_deg, size=size)  # type: ignore[arg-type]
+def hexagonal(angle_deg: float) -> NDArray[np.float64]:
+    return hexagonal_mesh_kernel(
+        HEXAGONAL_PX, pitch_um=350.0, wire_um=35.0, windows=400, angle_deg=angle_deg, size=257
+    )
 
 
 def test_the_orders_of_a_hexagonal_mesh_are_the_fourier_sum_of_its_openings() -> None:
@@ -99,7 +144,7 @@ def test_the_orders_of_a_hexagonal_mesh_are_the_fourier_sum_of_its_openings() ->
         ]
         mask |= np.logical_and.reduce(sides)
     light = np.abs(np.fft.fft2(mask) / mask.size) ** 2 / mask.mean()
-    kernel, spacing = hexagonal(0.0), order_spacing_px(**{key: HEXAGONAL[key] for key in AIA})
+    kernel, spacing = hexagonal(0.0), HEXAGONAL_PX
     assert kernel[128, 128] == pytest.approx(0.81, abs=1e-9), "the open share"
     for m, n in ((1, 1), (0, 2), (-1, 1), (2, 0), (3, 1), (0, 4), (1, 2), (4, 2)):
         column, row = round(128 + m * spacing), round(128 + n / np.sqrt(3) * spacing)
@@ -112,7 +157,7 @@ def test_the_nearest_orders_of_a_hexagonal_mesh_are_60_degrees_apart() -> None:
     for angle_deg in (0.0, 13.0, 47.0):
         kernel = hexagonal(angle_deg)
         y, x = np.mgrid[-128:129, -128:129]
-        spacing = 2 / np.sqrt(3) * order_spacing_px(**{key: HEXAGONAL[key] for key in AIA})
+        spacing = 2 / np.sqrt(3) * HEXAGONAL_PX
         near = abs(np.hypot(x, y) - spacing) < 1.5
         angles = np.degrees(np.arctan2(y, x))[near & (kernel > 1e-3)]
         light = kernel[near & (kernel > 1e-3)]
@@ -142,23 +187,17 @@ def aiapy(shared: Path) -> NDArray[np.float64]:
 
 @pytest.fixture(scope="module")
 def ours() -> NDArray[np.float64]:
-    aia = load_instrument("aia_171")
-    entrance = sum(pattern(mesh, aia) for mesh in aia.meshes if mesh.place == "entrance")
-    wheel = sum(pattern(mesh, aia) for mesh in aia.meshes if mesh.place == "filter_wheel")
-    return linear_convolve(np.asarray(entrance), np.asarray(wheel), (SIZE, SIZE), threads=2)
-
-
-def pattern(mesh: Mesh, instrument: Instrument) -> NDArray[np.float64]:
-    return mesh.share * rotated_mesh_kernel(
-        wavelength_angstrom=instrument.wavelength_angstrom,
-        distance_mm=instrument.mesh_distance_mm(mesh),
-        pitch_um=mesh.pitch_um,
-        wire_um=mesh.wire_um,
-        windows=mesh.windows,
-        pixel_pitch_um=instrument.detector.pixel_pitch_um,
-        angle_deg=mesh.angle_deg,
-        size=SIZE,
-    )
+    places = {place: np.zeros((SIZE, SIZE)) for place in ("entrance", "filter_wheel")}
+    for mesh in AIA.meshes:
+        spacing_px = order_spacing_px(
+            wavelength_angstrom=AIA.wavelength_angstrom,
+            distance_mm=AIA.mesh_distance_mm(mesh),
+            pitch_um=mesh.pitch_um,
+            pixel_pitch_um=AIA.detector.pixel_pitch_um,
+        )
+        series = {key: getattr(mesh, key) for key in ("pitch_um", "wire_um", "windows", "angle_deg")}
+        places[mesh.place] += mesh.share * rotated_mesh_kernel(spacing_px, **series, size=SIZE)
+    return linear_convolve(places["entrance"], places["filter_wheel"], (SIZE, SIZE), threads=2)
 
 
 def arms_by_centroid(kernel: NDArray[np.float64], spacing_px: float) -> list[tuple[float, float]]:

@@ -48,14 +48,7 @@ def flare_light() -> NDArray[np.float64]:
     """Expected light [y, x] of a 5 x 5 px flare of one photon per pixel: mesh orders and a wide halo."""
     n = SIZE * FINE
     kernel = rotated_mesh_kernel(
-        wavelength_angstrom=174.0,
-        distance_mm=4187.0,
-        pitch_um=1270.0,
-        wire_um=40.0,
-        windows=37,
-        pixel_pitch_um=10.0 / FINE,
-        angle_deg=ANGLE_DEG,
-        size=n,
+        FINE * SPACING_PX, pitch_um=1270.0, wire_um=40.0, windows=37, angle_deg=ANGLE_DEG, size=n
     )
     fine = (np.arange(n) + 0.5) / FINE - 0.5
     x, y = fine[None, :] - CENTRE[0], fine[:, None] - CENTRE[1]

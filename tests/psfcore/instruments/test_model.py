@@ -59,6 +59,7 @@ FAULTS = [
     (("4.0", "true"), "aperture.diameter_mm: expected a finite number; got True"),
     (("4.0", "nan"), "aperture.diameter_mm: expected a finite number; got nan"),
     (("4.0", "1e-10"), "aperture.diameter_mm: expected a number of at least 0.000000001; got 1e-10"),
+    (("4.0", "1e300"), "aperture.diameter_mm: expected a number of at most 1000000000; got 1e+300"),
     (("4.0", "1979-05-27"), "aperture.diameter_mm: expected a finite number"),
     (("4.0", f"1{'0' * 400}"), "aperture.diameter_mm: expected a "),
     (("diameter_mm = 4.0", ""), "aperture.diameter_mm: expected this key; got none"),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from psfcore.build import build_psf
-from psfcore.diffraction import airy, mesh_series
+from psfcore.diffraction import mesh_series, open_aperture
 from psfcore.diffraction.pupil import MaskGrid, entrance_pupil
 from psfcore.errors import DataError
 from psfcore.instruments.files import instrument_names
@@ -47,7 +47,6 @@ TOO_MANY = {
     "polygons": mount(f"polygons = [{','.join(65 * [POLYGON])}]"),
     "corners": mount(f"polygons = [{{ corners_mm = [{','.join(1025 * ['[0, 1]'])}] }}]"),
     "corners of all polygons": mount(f"polygons = [{','.join(3 * ['{ corners_mm = [' + ','.join(400 * ['[0, 1]']) + '] }'])}]"),
-    "meshes": small(17 * (MESH + "windows = 9\n")),
     "lines": small(65 * "[[bandpass]]\nwavelength_angstrom = 171.0\nweight = 1.0\n"),
     "gain modes": small("[detector.gain_modes]\n" + "\n".join(f"m{n} = {{ basis = 'assumed' }}" for n in range(65))),
     "characters": small("# " + "x" * MOST_BYTES),
@@ -98,9 +97,12 @@ def test_the_sizes_are_those_of_the_arrays(monkeypatch: pytest.MonkeyPatch) -> N
         return np.ones(len(v))
 
     monkeypatch.setattr(mesh_series, "_first_of_each_cell", cells)
-    mesh_series.rotated_mesh_kernel(**optics, **series, distance_mm=aia.focal_length_mm, size=size)
-    monkeypatch.setattr(airy, "airy_light_beyond", light_beyond)
-    airy.airy_kernel(
+    spacing_px = mesh_series.order_spacing_px(
+        **optics, pitch_um=mesh.pitch_um, distance_mm=aia.focal_length_mm
+    )
+    mesh_series.rotated_mesh_kernel(spacing_px, **series, size=size)
+    monkeypatch.setattr(open_aperture, "airy_light_beyond", light_beyond)
+    open_aperture.airy_kernel(
         **optics, focal_length_mm=aia.focal_length_mm, diameter_mm=aia.aperture.diameter_mm, size=size
     )
     for count, expected in zip(seen, (work.cells[0], work.airy_points), strict=True):

@@ -29,7 +29,6 @@ from tests.psfcore.small_transits import (
     IMAGES,
     fitted,
     fitted_with_progress,
-    observed,
     recipe,
     sky,
     solved,
@@ -198,7 +197,7 @@ def test_a_report_is_json_with_the_values_of_the_fit() -> None:
     assert [r["moved_points"] for r in content["rounds"]] == [r.moved_points for r in fit.inversion.rounds]
     assert [f["file"] for f in content["frames"]] == [f"{n:03d}.fits" for n in range(IMAGES)]
     one = content["frames"][5]
-    assert one["x"] == pytest.approx(observed(sky()).truth.places[5].x_px, abs=0.1)
+    assert one["x"] == pytest.approx(sky().plan.place(5).x_px, abs=0.1)
     assert one["residual_pct"] == pytest.approx(100 * (one["expected_dn_s"] / one["observed_dn_s"] - 1))
     assert one["dark_pixels"] == fit.inversion.frames[5].dark[0].size
     assert content["limits"] == list(fit.limits)

@@ -16,7 +16,7 @@ from psfcore.simulate.plan import DISC, VIEWS, default_plan
 from tests.psfcore.conftest import LIMITS
 from tests.transit_files import write_transit
 
-PLAN = default_plan(6, 96)
+PLAN = default_plan(6, 96, saturation_dn=900.0, beyond="on", beyond_px=10)
 
 
 def written(folder: Path, content: Any, name: str = "plan.json") -> Path:

@@ -87,14 +87,13 @@ def refused(
     path: Path, target: Path, code: str, limits: ArchiveLimits = LIMITS, *, listed: bool = True
 ) -> str:
     """Check that unpacking, and listing if `listed`, refuses an archive and leaves nothing. Returns the message."""
-    for look in [lambda: list_archive(path, limits)] if listed else []:
+    for look in (
+        *([lambda: list_archive(path, limits)] if listed else []),
+        lambda: unpack(path, target, limits),
+    ):
         with pytest.raises(DataError) as caught:
             look()
-        assert caught.value.code == code, caught.value
-    with pytest.raises(DataError) as caught:
-        unpack(path, target, limits)
-    assert caught.value.code == code, caught.value
-    assert "expected" in caught.value.message
+        assert caught.value.code == code and "expected" in caught.value.message, caught.value
     assert not target.exists(), "files were left behind"
     return caught.value.message
 
@@ -157,9 +156,6 @@ def test_equal_folders_are_packed_to_equal_bytes_and_can_be_unpacked(folder: Pat
     unpack(tmp_path / "a.tar", tmp_path / "out", LIMITS)
     assert (tmp_path / "out/002.fits").read_bytes() == (folder / "002.fits").read_bytes()
     assert not (tmp_path / "out/notes.txt").exists()
-    (folder / "001.fits").unlink()
-    with pytest.raises(DataError, match=r"001\.fits: .* it is missing"):
-        pack(folder, tmp_path / "c.tar")
 
 
 def test_the_first_bytes_tell_the_kind(folder: Path, tmp_path: Path) -> None:
@@ -221,15 +217,8 @@ def test_too_many_and_too_large_members_are_refused(folder: Path, tmp_path: Path
 
 def test_links_and_devices_in_a_tar_are_refused(folder: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.tar"
-    for kind in (
-        tarfile.SYMTYPE,
-        tarfile.LNKTYPE,
-        tarfile.CHRTYPE,
-        tarfile.BLKTYPE,
-        tarfile.FIFOTYPE,
-        b"S",
-        b"Z",
-    ):
+    links, devices = (tarfile.SYMTYPE, tarfile.LNKTYPE), (tarfile.CHRTYPE, tarfile.BLKTYPE, tarfile.FIFOTYPE)
+    for kind in (*links, *devices, b"S", b"Z"):
         as_tar(path, members_of(folder))
         with tarfile.open(path, "a") as out:
             link = tarfile.TarInfo("x.fits")
@@ -460,9 +449,7 @@ def test_many_entries_for_the_same_bytes_are_refused(tmp_path: Path) -> None:
     entries = b"".join(content[at:end].replace(b"000.fits", b"%03d.fits" % i) for i in range(50))
     tail = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 50, 50, len(entries), at, 0)
     path.write_bytes(content[:at] + entries + tail)
-    with pytest.raises(DataError):
-        unpack(path, tmp_path / "out", LIMITS)
-    refused(path, tmp_path / "out", "archive-too-large", ArchiveLimits(max_bytes=20 * MIB), listed=True)
+    refused(path, tmp_path / "out", "archive-too-large", ArchiveLimits(max_bytes=20 * MIB))
 
 
 # --- damage -----------------------------------------------------------------------------------------------
@@ -549,37 +536,31 @@ def test_missing_and_wrong_files_are_named(folder: Path, tmp_path: Path, kind: s
 # --- in place --------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def whole(tmp_path: Path) -> Path:
-    write_transit(tmp_path / "transit")
-    return tmp_path / "transit"
-
-
-def test_it_is_identified_by_the_archive_that_is_not_written(whole: Path, tmp_path: Path) -> None:
-    before = sorted(path.name for path in whole.iterdir())
-    found = transit_in(whole)
-    assert sorted(path.name for path in whole.iterdir()) == before
-    pack(whole, tmp_path / "transit.tar")
+def test_it_is_identified_by_the_archive_that_is_not_written(folder: Path, tmp_path: Path) -> None:
+    before = sorted(path.name for path in folder.iterdir())
+    found = transit_in(folder)
+    assert sorted(path.name for path in folder.iterdir()) == before
+    pack(folder, tmp_path / "transit.tar")
     assert found.sha256 == sha256_of(tmp_path / "transit.tar")
     assert found.bytes == (tmp_path / "transit.tar").stat().st_size
     assert found.contents == list_archive(tmp_path / "transit.tar", ArchiveLimits())
-    assert found.folder == whole.resolve()
+    assert found.folder == folder.resolve()
 
 
-def test_all_bad_files_are_named_in_one_error_and_nothing_is_written(whole: Path, tmp_path: Path) -> None:
-    (whole / "003.fits").write_text("a letter")
-    checks = (transit_in, lambda whole: pack(whole, tmp_path / "t.tar"))
+def test_all_bad_files_are_named_in_one_error_and_nothing_is_written(folder: Path, tmp_path: Path) -> None:
+    (folder / "002.fits").write_text("a letter")
+    checks = (transit_in, lambda folder: pack(folder, tmp_path / "t.tar"))
     for check in checks:
-        with pytest.raises(DataError, match=r"003\.fits") as caught:
-            check(whole)
+        with pytest.raises(DataError, match=r"002\.fits") as caught:
+            check(folder)
         assert caught.value.code == "not-fits"
-    (whole / "001.fits").unlink()
-    (whole / "diffraction.fits").unlink()
+    (folder / "001.fits").unlink()
+    (folder / "diffraction.fits").unlink()
     for check in checks:
         with pytest.raises(DataError) as caught:
-            check(whole)
+            check(folder)
         assert caught.value.code == "missing-file"
-        for name in ("3 files cannot be used", "001.fits", "003.fits", "diffraction.fits"):
+        for name in ("3 files cannot be used", "001.fits", "002.fits", "diffraction.fits"):
             assert name in caught.value.message
         assert "000.fits" not in caught.value.message
     assert not (tmp_path / "t.tar").exists()

@@ -38,6 +38,7 @@ from tests.psfcore.small_transits import (
     noise_free,
     observed,
     sky,
+    true_scene,
     with_pixels,
 )
 
@@ -89,7 +90,7 @@ def found_in(
     of: TrueSky, transit: Transit, indices: Sequence[int], *, ephemeris_sigma_px: float = 1.0
 ) -> list[FoundPlace]:
     """The places found in some frames, with the true scenes and PSF."""
-    scenes = [of.true_scene(n).astype(np.float32) for n in range(len(transit.frames))]
+    scenes = [true_scene(of, n).astype(np.float32) for n in range(len(transit.frames))]
     known = (transit.frames, scenes.__getitem__, places_of(transit), of.kernel, transit.noise)
     with patch.object(occulter, "EPHEMERIS_SIGMA_PX", ephemeris_sigma_px):
         return [find_occulter(n, *known) for n in indices]
@@ -300,7 +301,7 @@ def test_a_disc_that_touches_the_edge_is_found() -> None:
     found = found_in(of, noise_free(of), range(3), ephemeris_sigma_px=10.0)
     assert np.abs(errors(of, found, range(3))).max() < 0.03
     cut = [crop(frame, 8) for frame in noise_free(of).frames]
-    scenes = [of.true_scene(n)[:, 8:].astype(np.float32) for n in range(3)]
+    scenes = [true_scene(of, n)[:, 8:].astype(np.float32) for n in range(3)]
     one = find_occulter(0, cut, scenes.__getitem__, [f.place for f in cut], of.kernel, of.plan.noise)
     assert (one.place.x_px, one.place.y_px) == pytest.approx((RADIUS_PX - 8, 60.2), abs=0.1)
 

@@ -9,17 +9,12 @@ from numpy.typing import NDArray
 
 from psfcore.errors import DataError
 from psfcore.image import Image, MaskBit
-from psfcore.transit.prepare import Exposure, exposure_of, prepare, to_rate
+from psfcore.transit.prepare import Exposure, exposure_of, prepare
 from psfcore.transit.transit import Place
 from tests.transit_files import SHAPE, SPOT, true_rate
 
 Flat = NDArray[np.float64]
 AWAY = Place(10.0, 10.0, 4.0)
-
-
-def image(pixels: Flat, mask: NDArray[np.uint8] | None = None, unit: str = "DN/s") -> Image:
-    plane = np.zeros(pixels.shape, np.uint8) if mask is None else mask
-    return Image(pixels=pixels, mask=plane, header=Header(), unit=unit, exposure_s=2.0)
 
 
 def exposure(
@@ -30,8 +25,9 @@ def exposure(
     pointing: int = 1,
     time_s: float = 0.0,
     place: Place = AWAY,
+    unit: str = "DN/s",
 ) -> Exposure:
-    """An exposure of ``rate`` with gaps at the given index expressions or masks."""
+    """An exposure of 2 s with the pixels ``rate``, and gaps at the given index expressions or masks."""
     pixels, mask = rate.copy(), np.zeros(rate.shape, np.uint8)
     if saturated is not None:
         mask[saturated] |= int(MaskBit.SATURATED)
@@ -40,7 +36,7 @@ def exposure(
         mask[nonfinite] |= int(MaskBit.NONFINITE)
         pixels[nonfinite] = np.nan
     return exposure_of(
-        image(pixels, mask),
+        Image(pixels=pixels, mask=mask, header=Header(), unit=unit, exposure_s=2.0),
         file=f"{time_s:g}.fits",
         pointing=pointing,
         place=place,
@@ -51,11 +47,10 @@ def exposure(
 
 def test_dn_become_dn_per_second() -> None:
     rate = true_rate(1)
-    pixels, exposure_s = to_rate(image(2 * rate, unit="dn"), "a")
-    assert exposure_s == 2.0 and pixels.dtype == np.float32 and np.allclose(pixels, rate)
-    assert np.allclose(to_rate(image(rate, unit="DN/s"), "a")[0], rate)
-    with pytest.raises(DataError, match="unknown-unit: a: "):
-        to_rate(image(rate, unit="erg"), "a")
+    read = exposure(2 * rate, unit="dn")
+    assert read.exposure_s == 2.0 and read.pixels.dtype == np.float32 and np.allclose(read.pixels, rate)
+    with pytest.raises(DataError, match=r"unknown-unit: 0\.fits: "):
+        exposure(rate, unit="erg")
 
 
 def test_pixels_without_gaps_stay_unchanged() -> None:
