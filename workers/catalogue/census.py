@@ -92,11 +92,10 @@ class Census(Queries):
             func.sum(case((JobRow.attempt > 1, JobRow.attempt - 1), else_=0)),
             func.sum(func.coalesce(JobRow.ended_at - JobRow.started_at, 0.0)),
         ).group_by(JobRow.kind, JobRow.phase)
-        with self._database.reading() as session:
-            return [
-                JobTally(kind, phase, int(jobs), int(attempts), int(retries), float(run_s))
-                for kind, phase, jobs, attempts, retries, run_s in session.execute(query)
-            ]
+        return [
+            JobTally(kind, phase, int(jobs), int(attempts), int(retries), float(run_s))
+            for kind, phase, jobs, attempts, retries, run_s in self._database.lines(query)
+        ]
 
     def tally_files(self) -> list[FileTally]:
         """Numbers and bytes of files, by kind and origin."""

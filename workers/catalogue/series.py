@@ -48,8 +48,7 @@ class Series(Queries):
         )
         query = select(PsfSeriesRow.series, latest).where(PsfSeriesRow.owner == owner)
         query = query.order_by(PsfSeriesRow.series)
-        with self._database.reading() as session:
-            return {series: bool(allowed) for series, allowed in session.execute(query)}
+        return {series: bool(allowed) for series, allowed in self._database.lines(query)}
 
     def variants(
         self, instrument: str, channel: str, kind: str, owner: str, context_id: str | None
