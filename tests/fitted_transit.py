@@ -18,7 +18,7 @@ from tests.once_a_run import once_a_run
 from tests.transit_files import write_simulated
 from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
-from workers.tasks.data import solutions
+from workers.tasks import transits
 
 
 def fitted_transit(folders: pytest.TempPathFactory) -> Path:
@@ -57,7 +57,7 @@ def counted_inversions(images: list[int]) -> Iterator[None]:
         return solution
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(solutions, "invert", counted)
+        patched.setattr(transits, "invert", counted)
         yield
 
 

@@ -17,10 +17,9 @@ from typing import Any
 
 from psfcore.errors import DataError
 from workers.catalogue.bulk_progress import BATCH
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import ImageRow, JobRow, PsfRow
+from workers.catalogue.tables import BulkRow, ImageRow, JobRow, PsfRow
 from workers.contract.bulk import BulkPhase, BulkRequest, BulkWork
 from workers.contract.identities import canonical_hash
 from workers.contract.phases import Fault, JobError, Phase

@@ -9,9 +9,8 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, exists, func, select, tuple_
 
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.database import Queries, newest_first
-from workers.catalogue.tables import ImageRow, ProductRow
+from workers.catalogue.tables import BulkItemRow, BulkRow, ImageRow, ProductRow
 from workers.contract.bulk import OPEN, ItemState
 
 BATCH = 1000

@@ -19,11 +19,10 @@ from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.bulk_progress import BATCH, BulkProgress
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.database import Database, Queries
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import lock_owner
-from workers.catalogue.tables import JobRow
+from workers.catalogue.tables import BulkItemRow, BulkRow, JobRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError, Phase
 

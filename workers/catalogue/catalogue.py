@@ -18,10 +18,9 @@ from sqlalchemy.pool import NullPool
 from psfcore.errors import DataError
 from workers.catalogue.access import Keys, Sessions
 from workers.catalogue.affected import AffectedProducts
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Bulks
-from workers.catalogue.census import Census
-from workers.catalogue.contexts import Contexts
+from workers.catalogue.census import Census, KeptStageTimes
+from workers.catalogue.contexts import Contexts, Series
 from workers.catalogue.database import Database, begins_with, newest_first
 from workers.catalogue.followed import followed_bulks, followed_jobs
 from workers.catalogue.jobs import Jobs
@@ -29,9 +28,8 @@ from workers.catalogue.owners import NamedFiles, Owners, hold_to_quota, lock_own
 from workers.catalogue.parts import Parts
 from workers.catalogue.psfs import Psfs, existing_psf
 from workers.catalogue.schema import Schema
-from workers.catalogue.series import Series
-from workers.catalogue.stage_times import KeptStageTimes
 from workers.catalogue.tables import (
+    BulkRow,
     ImageRow,
     JobRow,
     ProductRow,

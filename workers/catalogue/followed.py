@@ -13,9 +13,8 @@ from typing import Any, Generic, TypeVar
 
 from sqlalchemy import ColumnElement, select, tuple_
 
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.database import Database
-from workers.catalogue.tables import JobRow
+from workers.catalogue.tables import BulkRow, JobRow
 from workers.contract.bulk import OPEN
 from workers.contract.kinds import KINDS
 from workers.contract.phases import Phase

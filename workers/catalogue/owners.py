@@ -41,10 +41,11 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Session
 
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.tables import (
     Base,
+    BulkItemRow,
+    BulkRow,
     DefaultContextRow,
     ImageRow,
     JobRow,
