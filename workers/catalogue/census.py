@@ -108,9 +108,8 @@ class Census(Queries):
                 query = select(literal(origin), *sums).select_from(table)
                 if table is PsfRow:
                     query = select(PsfRow.origin, *sums).group_by(PsfRow.origin)
-                kind = table.__tablename__.removesuffix("s")
                 rows = session.execute(query)
-                tallies += [FileTally(kind, of, int(files), int(size)) for of, files, size in rows]
+                tallies += [FileTally(table.thing(), of, int(files), int(size)) for of, files, size in rows]
         return tallies
 
     def oldest_queued_at(self, queue: Queue | None = None) -> float | None:

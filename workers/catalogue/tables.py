@@ -27,6 +27,11 @@ class Base(DeclarativeBase):
         float: Double,  # without this line, the type depends on the version of SQLAlchemy
     }
 
+    @classmethod
+    def thing(cls) -> str:
+        """The name of what a row describes, for example "image"."""
+        return cls.__tablename__.removesuffix("s")
+
 
 _RELEASED = text("status IN ('certified', 'deprecated')")
 _DEPRECATED = text("status = 'deprecated'")
