@@ -178,8 +178,7 @@ def measure() -> dict[str, Any]:
     from tests.whole.stack import postgres_database
     from tests.workers.databases import database
     from tests.workers.jobs import bulk_row
-    from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
-    from workers.catalogue.tables import DEFAULT_OWNER, ProductRow
+    from workers.catalogue.tables import DEFAULT_OWNER, BulkItemRow, BulkRow, ProductRow
     from workers.run.runner import Runner
 
     counted = {"statements": 0}

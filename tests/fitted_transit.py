@@ -16,9 +16,8 @@ from psfcore.scatter.inversion import invert
 from tests.in_process import InProcess
 from tests.once_a_run import once_a_run
 from tests.transit_files import write_simulated
-from workers.catalogue.catalogue import Catalogue
 from workers.settings import Settings
-from workers.tasks.data import solutions
+from workers.tasks import transits
 
 
 def fitted_transit(folders: pytest.TempPathFactory) -> Path:
@@ -57,7 +56,7 @@ def counted_inversions(images: list[int]) -> Iterator[None]:
         return solution
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(solutions, "invert", counted)
+        patched.setattr(transits, "invert", counted)
         yield
 
 
@@ -66,13 +65,8 @@ def _made(out: Path) -> Path:
     steps: list[tuple[str, int, int]] = []
     inversions: list[int] = []
 
-    settings = _settings(out / "data")
-    settings.data_dir.mkdir()
-    catalogue = Catalogue(settings.catalogue_url)
-    catalogue.upgrade()  # a server opens only a database that has a revision
-    catalogue.close()
     with counted_inversions(inversions):
-        local = InProcess(settings)
+        local = InProcess(_settings(out / "data"))
         psf = local.fit_psf(
             transit,
             out / "psf.fits",

@@ -40,7 +40,7 @@ class InProcess(Operations):
     def __init__(self, settings: Settings) -> None:
         self.settings, self.store = settings, Store(settings.data_dir)
         self.catalogue = Catalogue(settings.catalogue_url)
-        self.catalogue.schema.create()
+        self.catalogue.upgrade()
         self._runner = Runner(settings, self.catalogue, self.store)
         self._limits = FitsLimits(max_pixels=settings.max_pixels)
 

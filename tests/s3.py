@@ -11,12 +11,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import botocore.session
 import pytest
 import s3fs
 from moto.server import ThreadedMotoServer
 
 from workers.files.store import Store, open_store
 from workers.settings import Settings
+
+# Each client reads the description of the interface, a megabyte of JSON: it is read once in this process.
+botocore.session.create_loader = cache(botocore.session.create_loader)
 
 
 def started_server() -> ThreadedMotoServer:

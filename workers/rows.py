@@ -35,7 +35,7 @@ def row_of(catalogue: Catalogue, table: type[Row], identity: str, owner: str) ->
     """The owner's row with this id. Raises ``DataError`` "no-such-image", "no-such-psf", ... if there is none."""
     row = catalogue.get(table, identity, owner)
     if row is None:
-        raise no_such(table.__name__.removesuffix("Row").lower(), identity)
+        raise no_such(table.thing(), identity)
     return row
 
 

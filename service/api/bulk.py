@@ -16,7 +16,7 @@ from service.http.quotas import check_room, check_rows
 from service.http.state import Shared
 from workers.bulk.dry_run import BulkEstimate, dry_run
 from workers.bulk.runs import begin, cancel_turns
-from workers.catalogue.bulk_tables import BulkRow
+from workers.catalogue.tables import BulkRow
 from workers.contract.bulk import STOPPED, BulkPhase, BulkRequest, ItemState
 from workers.contract.phases import JobError
 from workers.rows import no_such

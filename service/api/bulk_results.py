@@ -16,7 +16,7 @@ from service.http.callers import Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
 from workers.catalogue.bulk_progress import BATCH, BulkProgress
-from workers.catalogue.bulk_tables import BulkItemRow
+from workers.catalogue.tables import BulkItemRow
 from workers.contract.bulk import ItemState
 
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES)

@@ -449,7 +449,7 @@ class Local(Operations):
     def _psf_fit(self, request: ResolvedPsfFit, job_id: str, report: _Report) -> str:
         from psfcore.fits.psfs import write_psf
         from workers.tasks import psf_fit
-        from workers.tasks.data.reports import write_json
+        from workers.tasks.results import write_json
 
         fitted = psf_fit.fit(
             request, *self._transit(request, report), job_id=job_id, threads=cores(), progress=report
@@ -545,8 +545,8 @@ class Local(Operations):
         return self._add(f"/v1/psfs/{identity}", described, **files)
 
     def _add_report(self, report: Any) -> str:
-        """Add a finished report (`workers.tasks.data.reports.Finished`)."""
-        from workers.tasks.data.reports import write_json
+        """Add a finished report (`workers.tasks.results.Finished`)."""
+        from workers.tasks.results import write_json
 
         return self._add(
             f"/v1/reports/{uuid.uuid4().hex}",

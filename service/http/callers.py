@@ -38,11 +38,11 @@ from service.http.problems import Problem, problem
 from service.http.rates import Bucket
 from service.http.state import Shared, State, state_of
 from workers.catalogue.access import OWNER, OWNER_RULE, KeyRefused, Scope, SessionRow
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.catalogue import ListedRow
 from workers.catalogue.database import several_ids_fit
 from workers.catalogue.tables import (
     DEFAULT_OWNER,
+    BulkRow,
     ImageRow,
     JobRow,
     KeyRow,

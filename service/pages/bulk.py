@@ -39,11 +39,9 @@ from service.pages.rendering import page, short
 from service.pages.sentences import of_error, of_problem
 from workers.catalogue.access import Scope
 from workers.catalogue.bulk_progress import MOST_EXPLAINED
-from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.psfs import PsfFilter
-from workers.catalogue.tables import ProductRow, PsfContextRow, PsfRow
-from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, BulkRequest, ItemState
-from workers.contract.layout import FIELDS
+from workers.catalogue.tables import BulkItemRow, ProductRow, PsfContextRow, PsfRow
+from workers.contract.bulk import AT_WORK, DELETABLE, FIELDS, OPEN, STOPPED, BulkPhase, BulkRequest, ItemState
 from workers.files import archive
 
 PER_PAGE, PER_SHEET = 20, 24

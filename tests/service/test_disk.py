@@ -22,7 +22,7 @@ from tests.service.conftest import job_after, refusal, result_of, upload, work_t
 from workers import checks
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ProductRow
-from workers.files import beneath
+from workers.files import archive as archive_files
 from workers.files import store as stores
 from workers.files.store import is_disk_full
 from workers.settings import Settings
@@ -136,7 +136,7 @@ def test_a_bulk_run_that_finds_the_disk_full_stops_and_goes_on_with_room(
         "output": {"folder": str(tmp_path / "out")},
     }
     here = f"/v1/bulk/{api.post('/v1/bulk', json=body).json()['id']}"
-    put = beneath.put
+    put = archive_files.put
     written: list[Path] = []
 
     def put_one(source: Path, target: Path, *given: Any, **options: Any) -> None:
@@ -146,7 +146,7 @@ def test_a_bulk_run_that_finds_the_disk_full_stops_and_goes_on_with_room(
         put(source, target, *given, **options)
 
     with monkeypatch.context() as patched:
-        patched.setattr(beneath, "put", put_one)
+        patched.setattr(archive_files, "put", put_one)
         work_through_bulks(settings)
         stopped = api.get(here).json()
     assert (stopped["phase"], stopped["error"]["code"]) == ("ERROR", "storage-full")

@@ -24,7 +24,7 @@ from tests.whole.stack import Missing, Redis, free_port, wait_for
 from workers import logs
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.stage_times import KeptStageTimes
+from workers.catalogue.census import KeptStageTimes
 from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
 from workers.settings import Settings
 

@@ -22,8 +22,8 @@ from sqlalchemy.exc import OperationalError
 
 from service.client.http import Client
 from workers.catalogue.access import Scope
-from workers.catalogue.bulk_tables import BulkItemRow
 from workers.catalogue.catalogue import Catalogue
+from workers.catalogue.tables import BulkItemRow
 from workers.settings import Settings
 
 POSTGRES = os.environ.get("HELIOPSF_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")

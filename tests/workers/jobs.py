@@ -5,11 +5,10 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.tables import JobRow
+from workers.catalogue.tables import BulkRow, JobRow
 from workers.contract.bulk import BulkPhase
 
 

@@ -31,7 +31,6 @@ from workers.contract.identities import product_identity
 from workers.contract.phases import JobError
 from workers.contract.requests import ResolvedDeconvolve
 from workers.files import archive as archive_files
-from workers.files import beneath
 from workers.intake import estimates
 from workers.rows import row_of
 from workers.settings import Settings
@@ -212,9 +211,11 @@ class _DryRun:
             row = row_of(self._catalogue, ImageRow, image.source, self._run.owner)
             return row.id, row.summary | {"filename": row.filename or "image"}
         try:
-            with beneath.opened(Path(image.source), archive_files.roots(self._settings.bulk_roots)) as file:
+            with archive_files.opened(
+                Path(image.source), archive_files.roots(self._settings.bulk_roots)
+            ) as file:
                 limits = FitsLimits(max_pixels=self._settings.max_pixels)
-                return NO_ID, dataclasses.asdict(read_summary(beneath.reopened(file), limits))
+                return NO_ID, dataclasses.asdict(read_summary(archive_files.reopened(file), limits))
         except OSError as error:
             raise archive_files.unreadable(error) from error
 

@@ -19,21 +19,18 @@ from psfcore.image import Image
 from psfcore.whole_files import sha256_of
 from workers.bulk import outputs
 from workers.bulk.runs import resolved_image
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
-from workers.catalogue.tables import ImageRow, ProductRow
+from workers.catalogue.tables import BulkItemRow, BulkRow, ImageRow, ProductRow
 from workers.contract.bulk import BulkWork
 from workers.contract.identities import product_identity
 from workers.contract.requests import ResolvedDeconvolve
 from workers.files import archive as archive_files
-from workers.files import beneath
 from workers.files.store import is_disk_full
 from workers.intake import estimates
 from workers.intake.deprecated import details_now
 from workers.rows import row_of
 from workers.tasks import deconvolve as deconvolve_task
 from workers.tasks.context import Context
-from workers.tasks.data import product
-from workers.tasks.data.product import Made
+from workers.tasks.deconvolve import Made
 from workers.tasks.psf_build import requested_psf
 
 # The changes of an image are summarised for blocks of 4 × 4 px: the brightest and the darkest 1 % of the blocks.
@@ -139,9 +136,9 @@ def write_one(context: Context, ready: Ready, made: Made) -> Outcome:
     """Write a finished deconvolution as a product. Raises DataError "output-not-written", and OSError if the disk is full."""
     output, target = ready.destination.run.output, ready.destination.target
     with context.store.temporary() as path:
-        product.write(made, path)
+        deconvolve_task.write(made, path)
         if ready.destination.run.keeps_products:
-            return _kept(context, product.keep(made, path), ready.destination, reused=False)
+            return _kept(context, deconvolve_task.keep(made, path), ready.destination, reused=False)
         assert output is not None and target is not None
         sha256, size_bytes = sha256_of(path), path.stat().st_size
         outputs.put(output, path, target, sha256, context.settings)
@@ -183,7 +180,7 @@ def _source(context: Context, item: BulkItemRow) -> Iterator[_Source]:
     path = archive_files.check_under(Path(item.source), allowed)
     with context.store.temporary() as copy:
         try:
-            with beneath.opened(path, allowed) as file:
+            with archive_files.opened(path, allowed) as file:
                 sha256 = archive_files.copy_hashed(file, copy, context.settings.max_upload_bytes)
         except OSError as error:
             if is_disk_full(error):  # the copy cannot be written; the same error would occur for every image

@@ -16,12 +16,11 @@ from urllib.parse import quote, unquote_to_bytes
 
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits
-from workers.catalogue.bulk_tables import MOST_LETTERS, BulkRow
 from workers.catalogue.bulks import NOT_UTF_8, TOO_LONG, Listed
+from workers.catalogue.tables import MOST_LETTERS, BulkRow
 from workers.contract.bulk import BulkWork, Condition
 from workers.contract.phases import JobError
 from workers.files import archive as archive_files
-from workers.files import beneath
 from workers.settings import Settings
 
 if TYPE_CHECKING:
@@ -166,8 +165,8 @@ def _listed_one(
     failure = entry.error
     if failure is None and where:
         try:
-            with beneath.opened(entry.path, allowed) as file:
-                if not archive_files.matches(beneath.reopened(file), where, limits):
+            with archive_files.opened(entry.path, allowed) as file:
+                if not archive_files.matches(archive_files.reopened(file), where, limits):
                     return None
         except DataError as unusable:
             failure = unusable

@@ -11,10 +11,8 @@ from typing import Any
 from psfcore.errors import DataError
 from psfcore.fits.header import FitsLimits, first_image_header, optional_text
 from psfcore.whole_files import sha256_of
-from workers.contract.bulk import Output
-from workers.contract.layout import MOST_IN_PATH, Value, laid_out
+from workers.contract.bulk import MOST_IN_PATH, FieldValue, Output, laid_out
 from workers.files import archive as archive_files
-from workers.files import beneath
 from workers.files.store import is_disk_full
 from workers.settings import Settings
 from workers.versions import seconds
@@ -39,7 +37,7 @@ def target_of(
     if output.layout is None:
         return folder / archive_files.safe_name(name, identity)
     taken_at = None if summary["date_obs"] is None else seconds(summary["date_obs"])
-    values: dict[str, Value] = {
+    values: dict[str, FieldValue] = {
         "stem": archive_files.stem_of(name),
         "folder": _folder_below(source, archive_files.roots(settings.bulk_roots)),
         "date": None if taken_at is None else datetime.fromtimestamp(taken_at, UTC),
@@ -73,7 +71,7 @@ def prepare(output: Output, target: Path, identity: str, settings: Settings, lim
         if there != identity:
             raise _taken(target)
     with _write_errors():
-        beneath.make_folder(target.parent, _roots(settings))
+        archive_files.make_folder(target.parent, _roots(settings))
 
 
 def put(output: Output, source: Path, target: Path, sha256: str, settings: Settings) -> None:
@@ -83,7 +81,7 @@ def put(output: Output, source: Path, target: Path, sha256: str, settings: Setti
     """
     with _write_errors():
         try:
-            beneath.put(source, target, _roots(settings), replace=output.layout is None)
+            archive_files.put(source, target, _roots(settings), replace=output.layout is None)
         except FileExistsError:
             if sha256_of(target) != sha256:
                 raise _taken(target) from None
@@ -92,7 +90,7 @@ def put(output: Output, source: Path, target: Path, sha256: str, settings: Setti
 def remove_partials(target: Path, settings: Settings) -> None:
     """Remove the partial copies of a product that a killed worker left."""
     if target.parent.is_dir():
-        beneath.remove_partials(target, _roots(settings))
+        archive_files.remove_partials(target, _roots(settings))
 
 
 def _roots(settings: Settings) -> tuple[Path, ...]:

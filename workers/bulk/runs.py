@@ -11,16 +11,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from psfcore.errors import DataError
-from workers.catalogue.bulk_progress import BATCH
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import ImageRow, JobRow, PsfRow
+from workers.catalogue.tables import BulkRow, ImageRow, JobRow, PsfRow
 from workers.contract.bulk import BulkPhase, BulkRequest, BulkWork
 from workers.contract.identities import canonical_hash
 from workers.contract.phases import Fault, JobError, Phase
@@ -60,7 +57,10 @@ def new_run(
         assert request.context is not None
         context_id = catalogue.contexts.named(request.context, owner).id
     images = list(dict.fromkeys(request.images))
-    _check_uploaded(images, catalogue, owner)
+    there = catalogue.ids_among(ImageRow, images, owner)
+    missing = next((one for one in images if one not in there), None)
+    if missing is not None:
+        raise no_such("image", missing)
     _check_places(request, settings)
     stored = request.model_dump(mode="json", exclude={"images", "context"}) | {"context": context_id}
     now = time.time()
@@ -70,7 +70,8 @@ def new_run(
         name=request.name,
         phase=BulkPhase.LISTING if request.files else BulkPhase.RUNNING,
         request=stored,
-        request_key=_key(stored, images),
+        # Requests that differ only in their names have the same key.
+        request_key=canonical_hash({**stored, "name": None, "images": images}),
         psf_id=request.psf_id,
         context_id=context_id,
         created_at=now,
@@ -89,15 +90,6 @@ def resolved_image(
     return resolved_deconvolution(request, summary, catalogue, bulk.owner)
 
 
-def _check_uploaded(images: Sequence[str], catalogue: Catalogue, owner: str) -> None:
-    for at in range(0, len(images), BATCH):
-        batch = images[at : at + BATCH]
-        there = catalogue.ids_among(ImageRow, batch, owner)
-        missing = next((one for one in batch if one not in there), None)
-        if missing is not None:
-            raise no_such("image", missing)
-
-
 def _check_places(request: BulkRequest, settings: Settings) -> None:
     """Raise DataError "bad-path" or "path-not-allowed" if a pattern or the output folder cannot be used."""
     allowed = archive_files.roots(settings.bulk_roots)
@@ -111,11 +103,6 @@ def _check_places(request: BulkRequest, settings: Settings) -> None:
             "bad-path", f"output: expected an absolute path without '..'; got {ascii(str(folder))[:200]}"
         )
     archive_files.check_under(folder, archive_files.roots(settings.bulk_output_roots), "an output folder")
-
-
-def _key(request: Mapping[str, Any], images: Sequence[str]) -> str:
-    """The key of the request: requests that differ only in their names have the same key."""
-    return canonical_hash({**request, "name": None, "images": list(images)})
 
 
 def keep_turns(catalogue: Catalogue, settings: Settings) -> None:

@@ -23,12 +23,12 @@ from typing import Any, TypeVar
 
 from workers.bulk.image import Destination, Outcome, Ready, compute_one, done_before, read_one, write_one
 from workers.bulk.listing import list_files
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
+from workers.catalogue.tables import BulkItemRow, BulkRow
 from workers.contract.bulk import AT_WORK, BulkPhase, BulkWork
 from workers.contract.phases import Fault, JobError
 from workers.stage_timer import STARTING
 from workers.tasks.context import Context, TurnOver
-from workers.tasks.data.product import Made
+from workers.tasks.deconvolve import Made
 
 TELL_EVERY_S = 1.0  # interval at which a turn reports its progress and checks whether it must stop
 BETWEEN = "between images"  # the stage between two images: the worker checks whether the run continues

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import exists, func, select, tuple_
+from sqlalchemy import ColumnElement, exists, func, select, tuple_
 
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
-from workers.catalogue.database import Database
-from workers.catalogue.tables import ImageRow, ProductRow
+from workers.catalogue.database import Queries, newest_first
+from workers.catalogue.tables import BulkItemRow, BulkRow, ImageRow, ProductRow
 from workers.contract.bulk import OPEN, ItemState
 
 BATCH = 1000
@@ -37,11 +37,8 @@ class Reason:
     example: BulkItemRow
 
 
-class BulkProgress:
-    """Queries of the tables of bulk runs; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class BulkProgress(Queries):
+    """Queries of the tables of bulk runs."""
 
     def pace(self, bulk: BulkRow) -> Pace:
         """The speed of a run: the images that workers process now, and the images that ended per hour.
@@ -71,8 +68,7 @@ class BulkProgress:
         """Number of done images with an artefact score of ``score`` or more."""
         query = select(func.count()).select_from(BulkItemRow)
         query = query.where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.score >= score)
-        with self._database.reading() as session:
-            return session.scalar(query) or 0
+        return self._database.first(query) or 0
 
     def items(
         self, bulk_id: str, state: ItemState, *, after: int = -1, limit: int = BATCH
@@ -81,8 +77,7 @@ class BulkProgress:
         query = select(BulkItemRow).where(
             BulkItemRow.bulk_id == bulk_id, BulkItemRow.state == state, BulkItemRow.position > after
         )
-        with self._database.reading() as session:
-            return session.scalars(query.order_by(BulkItemRow.position).limit(limit)).all()
+        return self._database.all(query.order_by(BulkItemRow.position).limit(limit))
 
     def sources(self, bulk_id: str) -> frozenset[str]:
         """The paths of all files of a run."""
@@ -119,23 +114,19 @@ class BulkProgress:
         query = select(BulkItemRow).where(BulkItemRow.bulk_id == bulk_id, BulkItemRow.score.is_not(None))
         if after is not None:
             query = query.where(key < after)
-        query = query.order_by(BulkItemRow.score.desc(), BulkItemRow.position.desc()).limit(limit)
-        with self._database.reading() as session:
-            return session.scalars(query).all()
+        order = (BulkItemRow.score.desc(), BulkItemRow.position.desc())
+        return self._database.all(query.order_by(*order).limit(limit))
 
     def without_product(self, owner: str, limit: int) -> Sequence[str]:
         """Ids of the owner's newest uploaded images that have no product."""
         made = exists().where(ProductRow.owner == ImageRow.owner, ProductRow.image_id == ImageRow.id)
         query = select(ImageRow.id).where(ImageRow.owner == owner, ~made)
-        query = query.order_by(ImageRow.created_at.desc(), ImageRow.id.desc()).limit(limit)
-        with self._database.reading() as session:
-            return session.scalars(query).all()
+        return self._database.all(newest_first(query, ImageRow, limit))
 
     def names_of_uploads(self, ids: Sequence[str], owner: str) -> dict[str, str]:
         """The file names of these uploaded images, by id. Images without a file name are left out."""
         query = select(ImageRow.id, ImageRow.filename).where(ImageRow.owner == owner, ImageRow.id.in_(ids))
-        with self._database.reading() as session:
-            return {one: name for one, name in session.execute(query) if name}
+        return {one: name for one, name in self._database.lines(query) if name}
 
     def done_before(self, owner: str, product_id: str, output: str) -> BulkItemRow | None:
         """A done image, from any bulk run of the owner, whose product ``product_id`` is in the file ``output``.
@@ -149,25 +140,24 @@ class BulkProgress:
             BulkItemRow.output == output,
             BulkRow.owner == owner,
         )
-        with self._database.reading() as session:
-            return session.scalars(query.limit(1)).first()
+        return self._database.first(query)
 
     def open_images(self) -> dict[str, int]:
         """Numbers of images in all bulk runs that have not ended: images left, done and failed."""
         left = BulkRow.total - BulkRow.done - BulkRow.failed
-        sums = [func.coalesce(func.sum(one), 0) for one in (left, BulkRow.done, BulkRow.failed)]
-        query = select(*sums).where(BulkRow.phase.in_(sorted(OPEN)))
-        with self._database.reading() as session:
-            found = session.execute(query).one()
-        return dict(zip(("left", "done", "failed"), map(int, found), strict=True))
+        counts = {"left": left, "done": BulkRow.done, "failed": BulkRow.failed}
+        return self._sums(counts, BulkRow.phase.in_(sorted(OPEN)))
 
     def ended_images(self) -> dict[str, int]:
         """Numbers of images in all bulk runs: deconvolved, reused (their products existed before), and failed."""
-        sums = (BulkRow.done - BulkRow.reused, BulkRow.reused, BulkRow.failed)
-        query = select(*(func.coalesce(func.sum(one), 0) for one in sums))
-        with self._database.reading() as session:
-            found = session.execute(query).one()
-        return dict(zip(("deconvolved", "reused", "failed"), map(int, found), strict=True))
+        deconvolved = BulkRow.done - BulkRow.reused
+        return self._sums({"deconvolved": deconvolved, "reused": BulkRow.reused, "failed": BulkRow.failed})
+
+    def _sums(self, counts: dict[str, Any], *conditions: ColumnElement[bool]) -> dict[str, int]:
+        """The sum of each count over the runs that meet the conditions."""
+        query = select(*(func.coalesce(func.sum(one), 0) for one in counts.values())).where(*conditions)
+        (sums,) = self._database.lines(query)
+        return dict(zip(counts, map(int, sums), strict=True))
 
     def image_times(self, limit: int) -> list[tuple[float, float]]:
         """Estimated and measured time of the newest images that bulk runs deconvolved, s. Only the newest such run is read."""
@@ -177,6 +167,5 @@ class BulkProgress:
             BulkItemRow.state == ItemState.DONE,
             BulkItemRow.reused.is_(False),
         )
-        with self._database.reading() as session:
-            found = session.scalars(query.order_by(BulkItemRow.ended_at.desc()).limit(limit)).all()
+        found = self._database.all(query.order_by(BulkItemRow.ended_at.desc()).limit(limit))
         return [(one["start_s"], one["seconds"]) for one in found if one and "start_s" in one]

@@ -19,11 +19,10 @@ from sqlalchemy.orm import Session
 
 from psfcore.errors import DataError
 from workers.catalogue.bulk_progress import BATCH, BulkProgress
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
-from workers.catalogue.database import Database
+from workers.catalogue.database import Database, Queries
 from workers.catalogue.jobs import Lease
 from workers.catalogue.owners import lock_owner
-from workers.catalogue.tables import JobRow
+from workers.catalogue.tables import BulkItemRow, BulkRow, JobRow
 from workers.contract.bulk import AT_WORK, DELETABLE, OPEN, STOPPED, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError, Phase
 
@@ -45,7 +44,7 @@ class Listed:
     error: JobError | None = None
 
 
-class Bulks:
+class Bulks(Queries):
     """The tables of bulk runs; each method is one transaction, or one transaction per batch.
 
     The row of an image that ``take`` returns is the right to work on the image, as it was when it was taken. When a
@@ -53,21 +52,20 @@ class Bulks:
     """
 
     def __init__(self, database: Database) -> None:
-        self._database = database
+        super().__init__(database)
         self.progress = BulkProgress(database)
 
     # A bulk run ---------------------------------------------------------------------------------------
 
     def get(self, bulk_id: str) -> BulkRow | None:
         """The run's row, or None."""
-        with self._database.reading() as session:
-            return session.get(BulkRow, bulk_id)
+        return self._database.row(BulkRow, bulk_id)
 
     def at_work(self) -> Sequence[BulkRow]:
         """Runs that list or process images now (LISTING, RUNNING), oldest first."""
         query = select(BulkRow).where(BulkRow.phase.in_(sorted(AT_WORK)))
-        with self._database.reading() as session:
-            return sorted(session.scalars(query), key=lambda bulk: bulk.created_at)
+        # Sorted here: no index of the database has this order.
+        return sorted(self._database.all(query), key=lambda bulk: bulk.created_at)
 
     def create(self, row: BulkRow, uploaded: Sequence[str]) -> tuple[BulkRow, bool]:
         """Create a run whose first images are these uploads, or find the open run of an identical request.

@@ -7,8 +7,8 @@ that are common to all content-addressed rows.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Collection, Sequence
-from typing import TypeVar
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any, TypeVar
 
 from sqlalchemy import Select, String, cast, create_engine, select
 from sqlalchemy.exc import DatabaseError, IntegrityError
@@ -18,10 +18,9 @@ from sqlalchemy.pool import NullPool
 from psfcore.errors import DataError
 from workers.catalogue.access import Keys, Sessions
 from workers.catalogue.affected import AffectedProducts
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Bulks
-from workers.catalogue.census import Census
-from workers.catalogue.contexts import Contexts
+from workers.catalogue.census import Census, KeptStageTimes
+from workers.catalogue.contexts import Contexts, Series
 from workers.catalogue.database import Database, begins_with, newest_first
 from workers.catalogue.followed import followed_bulks, followed_jobs
 from workers.catalogue.jobs import Jobs
@@ -29,9 +28,8 @@ from workers.catalogue.owners import NamedFiles, Owners, hold_to_quota, lock_own
 from workers.catalogue.parts import Parts
 from workers.catalogue.psfs import Psfs, existing_psf
 from workers.catalogue.schema import Schema
-from workers.catalogue.series import Series
-from workers.catalogue.stage_times import KeptStageTimes
 from workers.catalogue.tables import (
+    BulkRow,
     ImageRow,
     JobRow,
     ProductRow,
@@ -157,12 +155,8 @@ class Catalogue:
 
     def rows(self, table: type[Row], identities: Collection[str], owner: str) -> dict[str, Row]:
         """The rows with these identities, by their id. An identity without a row is left out."""
-        rows: dict[str, Row] = {}
-        ids = sorted(identities)
-        for at in range(0, len(ids), _IN_A_QUERY):
-            query = select(table).where(table.owner == owner, table.id.in_(ids[at : at + _IN_A_QUERY]))
-            rows |= {row.id: row for row in self._database.all(query)}
-        return rows
+        queries = (select(table).where(*these) for these in _in_batches(table, identities, owner))
+        return {row.id: row for query in queries for row in self._database.all(query)}
 
     def delete_draft(self, psf_id: str, owner: str) -> PsfRow:
         """Delete a draft PSF that nothing uses; returns the deleted row.
@@ -189,8 +183,8 @@ class Catalogue:
 
     def ids_among(self, table: type[AnyRow], identities: Collection[str], owner: str) -> set[str]:
         """The ids in ``identities`` that the catalogue contains."""
-        query = select(table.id).where(table.owner == owner, table.id.in_(identities))
-        return set(self._database.all(query))
+        queries = (select(table.id).where(*these) for these in _in_batches(table, identities, owner))
+        return {identity for query in queries for identity in self._database.all(query)}
 
     def delete(self, table: type[Row], identity: str, owner: str) -> Row | None:
         """Remove a row with a file from the catalogue; returns the row, or None if it was not there.
@@ -223,6 +217,13 @@ class Catalogue:
             if value is not None:
                 query = query.where(getattr(table, column) == value)
         return self._database.all(newest_first(query, table, limit, after))
+
+
+def _in_batches(table: Any, identities: Collection[str], owner: str) -> Iterator[list[Any]]:
+    """The conditions that select an owner's rows with these ids, for one query after the other."""
+    ids = list(identities)
+    for at in range(0, len(ids), _IN_A_QUERY):
+        yield [table.owner == owner, table.id.in_(ids[at : at + _IN_A_QUERY])]
 
 
 def _unshare_jobs(session: Session, owner: str, result_id: str) -> None:

@@ -1,8 +1,8 @@
-"""Counts for operators: worker processes, jobs by kind and phase, waiting jobs, and files."""
+"""Figures for operators: worker processes, jobs by kind and phase, waiting jobs, files, and the time that jobs took."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, case, delete, func, literal, select
@@ -17,11 +17,13 @@ from workers.catalogue.tables import (
     PsfRow,
     ReportRow,
     SolutionRow,
+    StageTimeRow,
     TransitRow,
     WorkerRow,
 )
 from workers.contract.phases import Phase
 from workers.contract.queues import Queue
+from workers.stage_timer import Spent
 
 
 @dataclass(frozen=True)
@@ -92,11 +94,10 @@ class Census(Queries):
             func.sum(case((JobRow.attempt > 1, JobRow.attempt - 1), else_=0)),
             func.sum(func.coalesce(JobRow.ended_at - JobRow.started_at, 0.0)),
         ).group_by(JobRow.kind, JobRow.phase)
-        with self._database.reading() as session:
-            return [
-                JobTally(kind, phase, int(jobs), int(attempts), int(retries), float(run_s))
-                for kind, phase, jobs, attempts, retries, run_s in session.execute(query)
-            ]
+        return [
+            JobTally(kind, phase, int(jobs), int(attempts), int(retries), float(run_s))
+            for kind, phase, jobs, attempts, retries, run_s in self._database.lines(query)
+        ]
 
     def tally_files(self) -> list[FileTally]:
         """Numbers and bytes of files, by kind and origin."""
@@ -107,9 +108,8 @@ class Census(Queries):
                 query = select(literal(origin), *sums).select_from(table)
                 if table is PsfRow:
                     query = select(PsfRow.origin, *sums).group_by(PsfRow.origin)
-                kind = table.__tablename__.removesuffix("s")
                 rows = session.execute(query)
-                tallies += [FileTally(kind, of, int(files), int(size)) for of, files, size in rows]
+                tallies += [FileTally(table.thing(), of, int(files), int(size)) for of, files, size in rows]
         return tallies
 
     def oldest_queued_at(self, queue: Queue | None = None) -> float | None:
@@ -147,3 +147,42 @@ class Census(Queries):
     def clock(self) -> float:
         """The time of the database's clock, in seconds since 1970."""
         return self._database.clock()
+
+
+class KeptStageTimes(Queries):
+    """The total time of each stage by kind of job, and the durations of the newest jobs."""
+
+    def add(self, kind: str, spent: Mapping[str, Spent]) -> None:
+        """Add the times of one attempt of a job of this kind."""
+        # The rows are sorted, so that two attempts that write at the same moment cannot deadlock.
+        rows = [
+            {"kind": kind, "stage": stage, "seconds": one.seconds, "steps": one.steps}
+            for stage, one in sorted(spent.items())
+        ]
+        if not rows:
+            return
+        with self._database.writing.begin() as session:
+            new = insert_into(session, StageTimeRow).values(rows)
+            sums = {
+                "seconds": StageTimeRow.seconds + new.excluded.seconds,
+                "steps": StageTimeRow.steps + new.excluded.steps,
+            }
+            session.execute(new.on_conflict_do_update(index_elements=["kind", "stage"], set_=sums))
+
+    def all(self) -> dict[tuple[str, str], Spent]:
+        """Total times by kind of job and stage."""
+        query = select(StageTimeRow).order_by(StageTimeRow.kind, StageTimeRow.stage)
+        return {(row.kind, row.stage): Spent(row.seconds, row.steps) for row in self._database.all(query)}
+
+    def run_times(self, kind: str, limit: int) -> list[tuple[float, float]]:
+        """Estimated time (before the measured factor) and duration of the newest completed jobs of a kind, s."""
+        query = (
+            select(JobRow.estimate, JobRow.ended_at - JobRow.started_at)
+            .where(JobRow.kind == kind, JobRow.phase == Phase.COMPLETED)
+            .where(JobRow.estimate.is_not(None), JobRow.started_at.is_not(None))
+            .order_by(JobRow.created_at.desc())
+            .limit(limit)
+        )
+        return [
+            ((one or {}).get("start_s", 0.0), float(took_s)) for one, took_s in self._database.lines(query)
+        ]

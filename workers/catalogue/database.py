@@ -78,6 +78,11 @@ class Database:
         with self.reading() as session:
             return session.scalars(query.limit(1)).first()
 
+    def lines(self, query: Select[*tuple[Any, ...]]) -> Sequence[Any]:
+        """The values of all columns that a query selects, row by row."""
+        with self.reading() as session:
+            return session.execute(query).all()
+
     def any(self, query: Select[Any]) -> bool:
         """Whether a query selects a row."""
         return self.first(query) is not None

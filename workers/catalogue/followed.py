@@ -13,9 +13,8 @@ from typing import Any, Generic, TypeVar
 
 from sqlalchemy import ColumnElement, select, tuple_
 
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.database import Database
-from workers.catalogue.tables import JobRow
+from workers.catalogue.tables import BulkRow, JobRow
 from workers.contract.bulk import OPEN
 from workers.contract.kinds import KINDS
 from workers.contract.phases import Phase
@@ -88,16 +87,13 @@ class Followed(Generic[Followable]):
         table = self._table
         later = tuple_(table.ended_at, table.id) > (after.at, after.id)
         query = select(*self._columns).where(table.owner == owner, later, *self._conditions)
-        with self._database.reading() as session:
-            return _states(session.execute(query.order_by(table.ended_at, table.id).limit(MOST)))
+        return _states(self._database.lines(query.order_by(table.ended_at, table.id).limit(MOST)))
 
     def among(self, owner: str, ids: Collection[str]) -> list[State]:
         """The states of the rows with these ids, in any phase; unknown ids are left out. Pass only a few ids."""
         if not ids:
             return []
-        query = select(*self._columns).where(self._these(owner, ids))
-        with self._database.reading() as session:
-            return _states(session.execute(query))
+        return _states(self._database.lines(select(*self._columns).where(self._these(owner, ids))))
 
     def rows(self, owner: str, ids: Collection[str]) -> dict[str, tuple[State, Followable]]:
         """For each id that the owner has: the state of the row and the complete row. Pass only a few ids."""

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import ColumnElement, and_, case, func, literal, or_, select, update
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
-from workers.catalogue.database import Database
+from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.tables import JobRow, OwnerTurnRow, TermsRow
 from workers.contract.identities import canonical_hash
 from workers.contract.kinds import queue_of
@@ -37,11 +36,8 @@ class Lease:
     token: str
 
 
-class Jobs:
-    """The table of jobs; each method is one transaction."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Jobs(Queries):
+    """The table of jobs."""
 
     def submit(
         self,
@@ -118,8 +114,7 @@ class Jobs:
 
     def get(self, job_id: str) -> JobRow | None:
         """The job's row, or None."""
-        with self._database.reading() as session:
-            return session.get(JobRow, job_id)
+        return self._database.row(JobRow, job_id)
 
     def mark_submitted(self, *job_ids: str) -> None:
         """Record that the broker has received the jobs' ids."""
@@ -167,9 +162,9 @@ class Jobs:
 
         The turns are numbered; times are not used, because clocks may be set back.
         """
-        insert = sqlite.insert if self._database.sqlite else postgresql.insert
         latest = select(func.coalesce(func.max(OwnerTurnRow.number), 0)).where(OwnerTurnRow.queue == queue)
-        turn = insert(OwnerTurnRow).values(owner=owner, queue=queue, number=latest.scalar_subquery() + 1)
+        number = latest.scalar_subquery() + 1
+        turn = insert_into(session, OwnerTurnRow).values(owner=owner, queue=queue, number=number)
         session.execute(
             turn.on_conflict_do_update(
                 index_elements=["owner", "queue"], set_={"number": turn.excluded.number}
@@ -281,9 +276,7 @@ class Jobs:
     def nobody_works(self, for_s: float) -> bool:
         """Whether no job has started, or has sent a heartbeat, in the last ``for_s`` seconds."""
         recent = JobRow.heartbeat_at > self._database.now - for_s
-        query = select(JobRow.id).where(JobRow.phase.in_([*Phase]), recent)
-        with self._database.reading() as session:
-            return session.scalars(query.limit(1)).first() is None
+        return not self._database.any(select(JobRow.id).where(JobRow.phase.in_([*Phase]), recent))
 
     def unsubmitted(
         self, resubmit_s: float, limit: int = 1000, *, idle: bool = False
@@ -314,8 +307,7 @@ class Jobs:
         query = select(JobRow).where(
             JobRow.owner == owner, JobRow.phase == Phase.COMPLETED, JobRow.result_id == result_id
         )
-        with self._database.reading() as session:
-            return session.scalars(query.order_by(JobRow.created_at.desc())).first()
+        return self._database.first(query.order_by(JobRow.created_at.desc()))
 
     def reopen(self, job_id: str) -> bool:
         """COMPLETED -> QUEUED. The job then has the state of a job that has not run. Returns False if the job is not
@@ -334,14 +326,12 @@ class Jobs:
 
     def of_kind(self, kind: str) -> Sequence[JobRow]:
         """All jobs of a kind, in any phase. Use this only for kinds with few jobs."""
-        with self._database.reading() as session:
-            return session.scalars(select(JobRow).where(JobRow.kind == kind)).all()
+        return self._database.all(select(JobRow).where(JobRow.kind == kind))
 
     def others_wait(self, kind: str) -> bool:
         """Whether a job of another kind waits and could start now."""
-        query = select(JobRow.id).where(JobRow.phase == Phase.QUEUED, JobRow.kind != kind, no_equal_at_work())
-        with self._database.reading() as session:
-            return session.scalars(query.limit(1)).first() is not None
+        waits = (JobRow.phase == Phase.QUEUED, JobRow.kind != kind, no_equal_at_work())
+        return self._database.any(select(JobRow.id).where(*waits))
 
     def any_to_do(self, queues: Sequence[Queue], lease_s: float) -> bool:
         """Whether a job of these queues waits and could start now, or has lost its worker: that job will wait soon.
@@ -350,19 +340,13 @@ class Jobs:
         """
         silent = JobRow.heartbeat_at < self._database.now - lease_s
         waits = [JobRow.phase == Phase.QUEUED, no_equal_at_work()], [JobRow.phase == Phase.EXECUTING, silent]
-        with self._database.reading() as session:
-            return any(
-                session.scalars(select(JobRow.id).where(JobRow.queue.in_(queues), *one).limit(1)).first()
-                for one in waits
-            )
+        of_queues = select(JobRow.id).where(JobRow.queue.in_(queues))
+        return any(self._database.any(of_queues.where(*one)) for one in waits)
 
     def at_work_on(self, owner: str, work_key: str) -> bool:
         """Whether a job with this result executes now."""
-        query = select(JobRow.id).where(
-            JobRow.owner == owner, JobRow.work_key == work_key, is_at_work(JobRow.phase)
-        )
-        with self._database.reading() as session:
-            return session.scalars(query.limit(1)).first() is not None
+        this = (JobRow.owner == owner, JobRow.work_key == work_key, is_at_work(JobRow.phase))
+        return self._database.any(select(JobRow.id).where(*this))
 
     def _again(self) -> dict[str, Any]:
         """Values of an UPDATE that queues an executing job again, or aborts it if it was cancelled."""

@@ -21,7 +21,7 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, TypeVar
+from typing import Any
 
 from sqlalchemy import (
     JSON,
@@ -41,10 +41,11 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Session
 
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.database import Queries, insert_into
 from workers.catalogue.tables import (
     Base,
+    BulkItemRow,
+    BulkRow,
     DefaultContextRow,
     ImageRow,
     JobRow,
@@ -63,7 +64,8 @@ from workers.contract.phases import ENDED
 
 MIB = 2**20
 ROWS_PER_MIB = 256
-WITH_FILES = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
+FileRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | SolutionRow
+WITH_FILES: tuple[type[FileRow], ...] = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 # The tables without files, and how many rows each of their rows stands for.
 WITHOUT_FILES: dict[type[Any], ColumnElement[int]] = {
     JobRow: func.count(),
@@ -85,8 +87,6 @@ KEPT: dict[str, type[Any]] = UPLOADED | {
 NOT_KEPT = "the result of this job could not be kept"
 ROWS_NOT_KEPT = "what this request adds to the database could not be kept"
 
-FileRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | SolutionRow
-AnyFileRow = TypeVar("AnyFileRow", ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 BATCH = 1000  # rows that are read at once
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 # This table is very long. The tables of images and products also refer to all of its files.
@@ -246,7 +246,7 @@ class NamedFiles(Queries):
                         named.add(digest)
         return frozenset(named)
 
-    def kept(self, table: type[AnyFileRow]) -> Iterator[AnyFileRow]:
+    def kept(self, table: Any) -> Iterator[FileRow]:
         """All rows of a table that refers to files. The rows are read in batches, so that no transaction stays open
         for long.
         """

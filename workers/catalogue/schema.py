@@ -116,14 +116,6 @@ class Schema:
         elif status.state == "older":
             log.info("database: upgraded from %s to %s", status.revision, status.wanted)
 
-    def create(self) -> None:
-        """Create all tables of an empty database that only this process uses.
-
-        This is quicker than ``upgrade``. The database gets no revision, so no other version can upgrade it.
-        """
-        with self._database.engine.begin() as connection:
-            Base.metadata.create_all(connection)
-
     def check(self) -> None:
         """Raise ``SchemaError`` if the database is not at the revision of this version. The message says what to do."""
         status = self.status()

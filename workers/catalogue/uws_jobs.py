@@ -37,14 +37,7 @@ class UwsJobs:
     def __init__(self, database: Database, jobs: Jobs) -> None:
         self._database, self._jobs = database, jobs
 
-    def draft(
-        self,
-        kind: str,
-        given: dict[str, Any],
-        *,
-        owner: str,
-        **terms: Any,
-    ) -> JobRow:
+    def draft(self, kind: str, given: dict[str, Any], *, owner: str, **terms: Any) -> JobRow:
         """Create a PENDING job with the parameters ``given`` so far. Identical requests do not share it.
 
         terms: the columns of its ``TermsRow``.
@@ -137,12 +130,7 @@ class UwsJobs:
         return [job_id for job_id in due if self.destroy(job_id)]
 
     def lines(
-        self,
-        *,
-        owner: str,
-        last: int,
-        phases: Sequence[str] = (),
-        from_time: float | None = None,
+        self, *, owner: str, last: int, phases: Sequence[str] = (), from_time: float | None = None
     ) -> list[JobLine]:
         """The newest ``last`` jobs of an owner, newest first.
 
@@ -154,8 +142,7 @@ class UwsJobs:
             query = query.where(JobRow.phase.in_(phases))
         if from_time is not None:
             query = query.where(JobRow.created_at >= from_time)
-        with self._database.reading() as session:
-            return [JobLine(*line) for line in session.execute(newest_first(query, JobRow, last))]
+        return [JobLine(*line) for line in self._database.lines(newest_first(query, JobRow, last))]
 
 
 def _locked(session: Session, job_id: str) -> JobRow | None:

@@ -17,7 +17,7 @@ from __future__ import annotations
 from sqlalchemy import ColumnElement, Select, and_, func, or_, select, update
 from sqlalchemy.orm import Session
 
-from workers.catalogue.database import Database
+from workers.catalogue.database import Database, Queries
 from workers.catalogue.jobs import Jobs, Lease, is_at_work, no_equal_at_work
 from workers.catalogue.tables import JobRow, OwnerTurnRow
 from workers.contract.phases import Phase
@@ -68,12 +68,8 @@ class Turns:
             JobRow.estimate["seconds"].as_float() <= seconds,
             JobRow.estimate["memory_mib"].as_integer() <= memory_mib,
         ]
-        with self._database.reading() as session:
-            for owner in session.scalars(_owners(queue).where(*short)).all():
-                found = session.scalars(_oldest(owner, "", queue).where(*short)).first()
-                if found is not None:
-                    return self._jobs.claim(found, worker)
-        return None
+        job_id = self._next("", queue, *short)
+        return None if job_id is None else self._jobs.claim(job_id, worker)
 
     def leave_next(self, told_id: str, queue: Queue) -> str | None:
         """Record that a worker took a message from the broker but starts no job. The job will be submitted again.
@@ -85,13 +81,13 @@ class Turns:
             self._jobs.forget_submission(job_id)
         return job_id
 
-    def _next(self, told_id: str, queue: Queue) -> str | None:
-        """The id of the next job of a queue; None if no job of the queue can start now."""
+    def _next(self, told_id: str, queue: Queue, *conditions: ColumnElement[bool]) -> str | None:
+        """The id of the next job of a queue that meets the conditions; None if none of them can start now."""
         with self._database.reading() as session:
-            for owner in session.scalars(_owners(queue)).all():
-                found = session.scalars(_oldest(owner, told_id, queue)).first()
-                if found is not None:
-                    return found
+            for owner in session.scalars(_owners(queue).where(*conditions)).all():
+                job_id = session.scalars(_oldest(owner, told_id, queue).where(*conditions)).first()
+                if job_id is not None:
+                    return job_id
         return None
 
 
@@ -126,11 +122,8 @@ def _oldest(owner: str, told_id: str, queue: Queue) -> Select[str]:
     return oldest.limit(1)
 
 
-class Places:
-    """Counts waiting jobs; each method is one transaction that reads a bounded number of rows."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class Places(Queries):
+    """Counts waiting jobs. Each method reads a bounded number of rows."""
 
     def before(self, job: JobRow) -> int | None:
         """The number of waiting jobs that are expected to start before a job, at most MOST_COUNTED; None if the job
@@ -165,8 +158,7 @@ def _waiting(*conditions: ColumnElement[bool]) -> Select[str]:
 
 
 def _counted(session: Session, query: Select[str]) -> int:
-    found = session.scalar(select(func.count()).select_from(query.limit(MOST_COUNTED).subquery()))
-    return found or 0
+    return session.scalar(select(func.count()).select_from(query.limit(MOST_COUNTED).subquery())) or 0
 
 
 def _of_others(session: Session, owner: str, queue: Queue, own_before: int) -> int:

@@ -16,11 +16,10 @@ import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 from psfcore.errors import DataError
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import KEPT, UPLOADED, FileRow
+from workers.catalogue.owners import KEPT, UPLOADED, WITH_FILES, FileRow
 from workers.catalogue.tables import ImageRow, ProductRow, PsfRow, ReportRow, SolutionRow, TransitRow
 from workers.files.store import Blob, FileState, Store
 from workers.settings import Settings
@@ -42,14 +41,6 @@ NAMED_IN_DETAILS = (
     "tables_sha256",
     "thumbnail_sha256",
 )
-NAMES: dict[type[Any], str] = {
-    ImageRow: "image",
-    TransitRow: "transit",
-    PsfRow: "psf",
-    ProductRow: "product",
-    ReportRow: "report",
-    SolutionRow: "solution",
-}
 
 
 def files_of(row: ProductRow | PsfRow | ReportRow) -> Iterator[tuple[str, int | None]]:
@@ -84,7 +75,7 @@ class Fault:
     @property
     def what(self) -> str:
         """The kind of the row whose file is lost or damaged, for example "product"."""
-        return NAMES[type(self.row)]
+        return self.row.thing()
 
 
 def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iterator[Fault]:
@@ -94,7 +85,7 @@ def examine(catalogue: Catalogue, store: Store, *, content: bool = True) -> Iter
     size, if any. If several rows refer to a file, the file is read once. Raises ``StoreAway``.
     """
     states: dict[str, FileState] = {}
-    for table in NAMES:
+    for table in WITH_FILES:
         for row in catalogue.named_files.kept(table):
             bad = []
             for digest, size in _files(row):

@@ -156,15 +156,10 @@ def _deconvolution(parameters: Mapping[str, Any], catalogue: Catalogue, owner: s
     runs = 1 + draws + (cost.psf_draws if draws and fitted else 0)
     cpu_s = built_s + cost.base_s + cost.image_ns * 1e-9 * ny * nx
     cpu_s += runs * method["steps"] * of_method(cost.step_ns, method["name"]) * 1e-9 * plane
-    return cpu_s, max(
-        built_mib,
-        product_bytes(asked, whole_px) / MIB,
-    )
+    return cpu_s, max(built_mib, product_bytes(asked, whole_px) / MIB)
 
 
-def _build(
-    parameters: Mapping[str, Any], catalogue: Catalogue | None = None, owner: str = ""
-) -> tuple[float, float]:
+def _build(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> tuple[float, float]:
     cost = COSTS.kinds.psf_build
     size = max(parameters["size"], cost.grid_px)
     grid = size / cost.grid_px
@@ -191,7 +186,7 @@ def _build(
         cost.cell_bytes * max(work.cells, default=0),
         cost.entry_bytes * work.mount_entries + cost.spectrum_bytes * work.mask_cells * size,
     )
-    mask = None if catalogue is None else catalogue.get(ImageRow, parameters.get("mask_id") or "", owner)
+    mask = catalogue.get(ImageRow, parameters.get("mask_id") or "", owner)
     if mask is not None:
         arrays += cost.image_bytes * math.prod(mask.summary["shape"])
     return len(instrument.spectral_lines) * line_s, meshes_mib + cost.grid_mib * grid**2 + arrays / MIB

@@ -19,9 +19,8 @@ from psfcore.instruments.model import load_instrument
 from psfcore.instruments.unknown import agreement, unknown_instrument
 from psfcore.instruments.unknown import channel_of as channel_of_image
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.contexts import NOW
+from workers.catalogue.contexts import NOW, Ends
 from workers.catalogue.psfs import PsfFilter
-from workers.catalogue.series import Ends
 from workers.catalogue.tables import ImageRow, PsfContextRow, PsfRow
 from workers.contract.requests import Deconvolve, PsfInterpolate, ResolvedDeconvolve
 from workers.versions import (

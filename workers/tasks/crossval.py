@@ -31,9 +31,8 @@ from psfcore.scatter.validation.cross_validation import (
 from psfcore.transit.transit import Transit
 from workers.contract.identities import psf_fit_identity
 from workers.contract.requests import ResolvedCrossValidate
-from workers.tasks.data.reports import Finished, keep_report, provenance_of, report_made
-from workers.tasks.data.solutions import solved
-from workers.tasks.transits import load_transit
+from workers.tasks.results import Finished, keep_report, provenance_of, report_made
+from workers.tasks.transits import load_transit, solved
 
 if TYPE_CHECKING:
     from workers.catalogue.parts import Part

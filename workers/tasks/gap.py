@@ -24,10 +24,8 @@ from psfcore.scatter.shapes import SOFTENED_POWER_LAW
 from psfcore.transit.transit import Transit
 from workers.contract.identities import corrected_psf_identity, diffraction_identity, gap_identity
 from workers.contract.requests import ResolvedGapDiagnose
-from workers.tasks.data.psfs import given_psf, keep_psf
-from workers.tasks.data.reports import Finished, keep_report, provenance_of, report_made
-from workers.tasks.data.solutions import solver
-from workers.tasks.transits import load_transit
+from workers.tasks.results import Finished, given_psf, keep_psf, keep_report, provenance_of, report_made
+from workers.tasks.transits import load_transit, solver
 
 if TYPE_CHECKING:
     from workers.tasks.context import Context

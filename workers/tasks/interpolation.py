@@ -19,8 +19,7 @@ from workers.contract.identities import interpolated_psf_identity
 from workers.contract.requests import PsfInterpolate
 from workers.intake.compatibility import of_upload
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import keep_psf, named_psf
-from workers.tasks.data.reports import provenance_of
+from workers.tasks.results import keep_psf, named_psf, provenance_of
 from workers.versions import INTERPOLATED, interpolated_name
 
 STAGE = "interpolating the PSF"

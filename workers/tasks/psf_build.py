@@ -19,7 +19,7 @@ from workers.contract.identities import interpolated_psf_identity, recipe_of
 from workers.contract.requests import PsfBuild, PsfInterpolate, PsfTables, ResolvedDeconvolve
 from workers.settings import library_versions
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import keep_psf, keep_tables, named_psf
+from workers.tasks.results import keep_psf, keep_tables, named_psf
 from workers.versions import TOTAL
 
 

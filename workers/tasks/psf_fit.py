@@ -16,10 +16,8 @@ from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Transit
 from workers.contract.identities import diffraction_identity, psf_fit_identity
 from workers.contract.requests import ResolvedPsfFit
-from workers.tasks.data.psfs import keep_psf
-from workers.tasks.data.reports import provenance_of, write_json
-from workers.tasks.data.solutions import solver
-from workers.tasks.transits import load_transit
+from workers.tasks.results import keep_psf, provenance_of, write_json
+from workers.tasks.transits import load_transit, solver
 
 if TYPE_CHECKING:
     from workers.tasks.context import Context

@@ -16,10 +16,8 @@ from psfcore.transit.prepare import Prepared
 from psfcore.transit.transit import Kernel, Transit
 from workers.contract.identities import report_identity
 from workers.contract.requests import ResolvedReport
-from workers.tasks.data.psfs import given_psf
-from workers.tasks.data.reports import Finished, keep_report, provenance_of, report_made
-from workers.tasks.data.solutions import solver
-from workers.tasks.transits import load_transit
+from workers.tasks.results import Finished, given_psf, keep_report, provenance_of, report_made
+from workers.tasks.transits import load_transit, solver
 
 if TYPE_CHECKING:
     from workers.tasks.context import Context

@@ -25,8 +25,7 @@ from workers.contract.requests import ResolvedRerun
 from workers.lineage import Made, lineage
 from workers.rows import row_of
 from workers.tasks.context import Context
-from workers.tasks.data.psfs import named_psf
-from workers.tasks.data.reports import add_report, write_json
+from workers.tasks.results import add_report, named_psf, write_json
 
 KIND = "rerun"
 SCHEMA = 1

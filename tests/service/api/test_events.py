@@ -27,12 +27,11 @@ from tests.service.conftest import execute, refusal
 from tests.service.keyed import bearer, keyed
 from tests.whole.stack import wait_for
 from workers.catalogue import followed
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.followed import Place
 from workers.catalogue.jobs import Lease
-from workers.catalogue.tables import DEFAULT_OWNER, JobRow, KeyRow
+from workers.catalogue.tables import DEFAULT_OWNER, BulkRow, JobRow, KeyRow
 from workers.contract.bulk import BulkPhase
 from workers.settings import Settings
 

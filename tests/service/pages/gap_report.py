@@ -17,7 +17,7 @@ from workers.catalogue.tables import DEFAULT_OWNER
 from workers.files.store import Store
 from workers.settings import Settings
 from workers.tasks.context import Context
-from workers.tasks.data.reports import add_report, write_json
+from workers.tasks.results import add_report, write_json
 
 GAP_ID = "9a" * 32
 

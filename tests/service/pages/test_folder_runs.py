@@ -17,7 +17,7 @@ from tests.conftest import write_image
 from tests.service.conftest import upload, work_through_bulks
 from tests.service.keyed import keyed
 from workers.catalogue.access import Scope
-from workers.contract.layout import FIELDS
+from workers.contract.bulk import FIELDS
 from workers.settings import Settings
 
 LAYOUT = "{telescop}/{date:%Y/%m/%d}/{stem}_sharp.fits"

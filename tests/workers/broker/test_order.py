@@ -28,13 +28,13 @@ from service.cli.main import main
 from tests.whole.stack import Missing, Redis, wait_for
 from tests.workers.databases import change
 from tests.workers.jobs import claimed, job_row
-from tests.workers.run.processes import started_worker
+from tests.workers.run.processes import started_worker, worker_of
 from workers.broker import app as queue
 from workers.broker.order import FolderTransport, MostUrgentFirst
 from workers.broker.reconciler import AT_ONCE, reconcile
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
-from workers.contract.kinds import queue_of
+from workers.contract.kinds import KINDS
 from workers.contract.phases import Phase
 from workers.contract.queues import Queue, broker_name, by_urgency, queues_named
 from workers.settings import Settings
@@ -59,10 +59,10 @@ def test_queues_that_are_none_are_refused() -> None:
 
 
 def test_a_job_waits_where_its_kind_does_or_where_it_was_told_to(catalogue: Catalogue) -> None:
-    kinds = {"deconvolve": Queue.INTERACTIVE, "cross-validate": Queue.CROSSVAL, "bulk": Queue.BULK}
-    for kind, expected in kinds.items():
+    slow = {"cross-validate": Queue.CROSSVAL, "bulk": Queue.BULK}
+    for kind in KINDS:
         row, _ = catalogue.jobs.submit(kind, {}, kind, "o")
-        assert row.queue == expected == queue_of(kind)
+        assert row.queue == slow.get(kind, Queue.INTERACTIVE)
     assert catalogue.jobs.submit("deconvolve", {}, "later", "o", queue=Queue.BULK)[0].queue == Queue.BULK
     assert catalogue.uws.draft("cross-validate", {}, owner="o").queue == Queue.CROSSVAL
 
@@ -203,12 +203,7 @@ def test_a_process_that_binds_a_queue_waits_for_another_that_does(settings: Sett
 
 # Others write into the broker -----------------------------------------------------------------------
 
-WORKER = """
-import workers.tasks.psf_build
-workers.tasks.psf_build.psf_build = lambda context, _: "result"
-from workers.run.worker import main
-main()
-"""
+WORKER = worker_of('task = lambda context, _: "result"')
 
 
 @dataclass

@@ -26,9 +26,9 @@ from workers.bulk import image as bulk_image
 from workers.bulk import listing, task
 from workers.bulk.listing import Place
 from workers.bulk.runs import keep_turns
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
+from workers.catalogue.tables import BulkItemRow, BulkRow
 from workers.files import archive as archive_files
 from workers.files.store import Store, open_store
 from workers.run.runner import Runner

@@ -22,11 +22,10 @@ from tests.workers.psf_examples import product
 from workers.bulk import listing
 from workers.catalogue import bulk_progress
 from workers.catalogue import bulks as bulk_rows
-from workers.catalogue.bulk_tables import BulkItemRow, BulkRow
 from workers.catalogue.bulks import Listed, new_id
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.jobs import Lease
-from workers.catalogue.tables import ImageRow
+from workers.catalogue.tables import BulkItemRow, BulkRow, ImageRow
 from workers.contract.bulk import DELETABLE, BulkPhase, ItemState
 from workers.contract.phases import Fault, JobError
 from workers.files.store import Store

@@ -70,16 +70,6 @@ def differences(catalogue: Catalogue) -> list[object]:
         return list(compare_metadata(context, Base.metadata))
 
 
-def indexes(catalogue: Catalogue) -> set[str]:
-    """The database's indexes in its own words, with the condition of those that have one."""
-    statement = (
-        "SELECT sql FROM sqlite_master WHERE type = 'index' AND sql IS NOT NULL"
-        if database(catalogue).sqlite
-        else "SELECT indexdef FROM pg_indexes WHERE schemaname = 'public' AND tablename <> 'alembic_version'"
-    )
-    return set(rows(catalogue, text(statement)))
-
-
 def said(caplog: pytest.LogCaptureFixture) -> list[str]:
     """What the schema logged. Alembic logs too, if an earlier test of the process has let it."""
     return [record.message for record in caplog.records if record.name == "workers.catalogue.schema"]
@@ -89,16 +79,14 @@ def test_an_empty_database_gets_the_tables_that_the_code_works_with(
     catalogue: Catalogue, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "workers.catalogue.schema")
-    assert catalogue.schema.status().state == "empty"
+    with pytest.raises(SchemaError, match="it is empty: upgrade it with `heliopsf database upgrade`"):
+        catalogue.schema.check()
+    assert catalogue.schema.status().state == "empty", "it stays so"
     catalogue.upgrade()
+    catalogue.schema.check()
     status = catalogue.schema.status()
     assert status.state == "current" and differences(catalogue) == []
     assert said(caplog) == [f"database: created, revision {status.wanted}"]
-    upgraded = indexes(catalogue)
-    with database(catalogue).engine.begin() as connection:
-        Base.metadata.drop_all(connection)
-    catalogue.schema.create()  # as for the database of one process
-    assert indexes(catalogue) == upgraded and differences(catalogue) == []
 
 
 def test_an_older_database_is_upgraded_with_its_data(
@@ -126,19 +114,21 @@ def test_an_older_database_is_upgraded_with_its_data(
 def test_a_database_that_cannot_be_upgraded_is_refused_and_left_alone(catalogue: Catalogue) -> None:
     change(catalogue, text("CREATE TABLE images (id VARCHAR(64) PRIMARY KEY, pixels TEXT)"))
     assert catalogue.schema.status().state == "unversioned"
-    with pytest.raises(SchemaError, match=r"without a revision: use an empty database"):
-        catalogue.upgrade()
+    for use in (catalogue.upgrade, catalogue.schema.check):
+        with pytest.raises(SchemaError, match=r"without a revision: use an empty database"):
+            use()
     assert inspect(database(catalogue).engine).get_table_names() == ["images"]
     change(catalogue, text("DROP TABLE images"))
     catalogue.upgrade()
     for revision, state, words in (
-        ("9999", "newer", "at revision 9999.*knows revisions up to 0"),
+        ("9999", "newer", "at revision 9999.*knows revisions up to 0.*use the version that made"),
         ("0018", "obsolete", "at revision 0018 of a development version.*upgrade it first"),
     ):
         change(catalogue, text(f"UPDATE alembic_version SET version_num = '{revision}'"))
         assert catalogue.schema.status().state == state
-        with pytest.raises(SchemaError, match=words):
-            catalogue.upgrade()
+        for use in (catalogue.upgrade, catalogue.schema.check):
+            with pytest.raises(SchemaError, match=words):
+                use()
         assert catalogue.schema.status().revision == revision
 
 
@@ -148,6 +138,16 @@ def test_an_upgrade_that_fails_leaves_nothing_behind(catalogue: Catalogue) -> No
     with pytest.raises(DatabaseError, match="already"):
         catalogue.upgrade()
     assert inspect(database(catalogue).engine).get_table_names() == ["jobs_tallied"]
+
+
+@sqlite_alone
+def test_a_database_gets_back_the_indexes_that_it_lacks(catalogue: Catalogue) -> None:
+    catalogue.upgrade()
+    change(catalogue, text("DROP INDEX jobs_tallied"))
+    assert catalogue.schema.faults().indexes == ("jobs_tallied",)
+    catalogue.schema.mend()
+    names = {index["name"] for index in inspect(database(catalogue).engine).get_indexes("jobs")}
+    assert "jobs_tallied" in names and catalogue.schema.faults().indexes == ()
 
 
 STARTS = """

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psfcore.errors import DataError
-from workers.contract.layout import FIELDS, Value, check_layout, laid_out
+from workers.contract.bulk import FIELDS, FieldValue, check_layout, laid_out
 
-VALUES: dict[str, Value] = {
+VALUES: dict[str, FieldValue] = {
     "stem": "image 0",
     "folder": PurePosixPath("2020/03"),
     "telescop": "SOLO/EUI/HRI_EUV",

@@ -9,8 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from psfcore.deconvolve.assess.error_planes import SMALLEST_DRAWS
 from workers.contract.bulk import BulkRequest, BulkWork
-from workers.contract.kinds import KINDS, REQUESTS, JobRequest, kind_of_origin, load, queue_of
-from workers.contract.queues import Queue
+from workers.contract.kinds import KINDS, REQUESTS, JobRequest, kind_of_origin, load
 from workers.contract.requests import Deconvolve, Report
 from workers.contract.suggestions import did_you_mean, explained
 
@@ -36,11 +35,6 @@ def test_a_schema_names_each_request_by_its_kind() -> None:
     schema = TypeAdapter(JobRequest).json_schema()
     assert schema["discriminator"]["mapping"]["psf-build"] == "#/$defs/PsfBuildRequest"
     assert set(schema["discriminator"]["mapping"]) == set(REQUESTS)
-
-
-def test_what_takes_long_does_not_wait_among_the_quick_jobs() -> None:
-    assert queue_of("cross-validate") == Queue.CROSSVAL and queue_of("bulk") == Queue.BULK
-    assert {queue_of(name) for name in set(KINDS) - {"cross-validate", "bulk"}} == {Queue.INTERACTIVE}
 
 
 def test_a_rerun_finds_the_kind_that_made_a_thing() -> None:

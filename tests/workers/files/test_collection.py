@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +19,7 @@ from psfcore.errors import DataError
 from service.cli.main import main
 from tests.in_process import InProcess
 from tests.s3 import client_of, digests, elsewhere, kept, key_of, opened_store, root_of
-from tests.workers.databases import BOTH, change
+from tests.workers.databases import change
 from tests.workers.psf_examples import psf
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, PsfRow, ReportRow, SolutionRow
@@ -187,8 +188,19 @@ def pairs_lost(catalogue: Catalogue, store: Store, pairs: int) -> int:
     return lost
 
 
-@BOTH
-@pytest.mark.parametrize("pairs", [25, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("store", "catalogue", "pairs"),
+    [
+        ("folder", "sqlite", 25),
+        ("folder", "postgresql", 25),
+        ("s3", "sqlite", 10),
+        *(
+            pytest.param(store, catalogue, 1000, marks=pytest.mark.slow)
+            for store, catalogue in product(("folder", "s3"), ("sqlite", "postgresql"))
+        ),
+    ],
+    indirect=["store", "catalogue"],
+)
 def test_no_upload_loses_its_file_to_a_deletion_at_the_same_moment(
     store: Store, catalogue: Catalogue, pairs: int
 ) -> None:

@@ -9,6 +9,25 @@ from pathlib import Path
 
 from workers.settings import Settings
 
+_LIGHT = """
+import contextlib, sys, time, types
+sys.modules["psfcore.compiled"] = types.SimpleNamespace(listening=lambda report: contextlib.nullcontext())
+import workers.run.runner
+workers.run.runner.load_tasks = lambda: None
+{task}
+sys.modules["workers.tasks.psf_build"] = types.SimpleNamespace(psf_build=task)
+from workers.run.worker import main
+main({options})
+"""
+
+
+def worker_of(task: str, options: str = "") -> str:
+    """The code of a worker whose jobs of the kind psf-build call the function ``task`` that this text defines.
+
+    The worker loads no numerical libraries, so that it starts quickly. options: arguments of its main function.
+    """
+    return _LIGHT.format(task=task, options=options)
+
 
 def started_worker(
     code: str, settings: Settings, log: Path, **changes: float | str

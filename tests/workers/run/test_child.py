@@ -17,7 +17,7 @@ from celery import Celery
 
 from tests.whole.stack import wait_for
 from tests.workers.jobs import job_row
-from tests.workers.run.processes import started_worker
+from tests.workers.run.processes import started_worker, worker_of
 from workers.broker import app as queue
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import DEFAULT_OWNER, JobRow
@@ -25,11 +25,9 @@ from workers.run.child import MARGIN, MIB, Child, data_bytes, is_out_of_memory
 from workers.settings import Settings
 
 # A worker of one process, whose jobs do what their parameters say.
-WORKER = """
+WORKER = worker_of("""
 import ctypes
-import time
 import numpy as np
-import workers.tasks.psf_build
 
 def task(context, parameters):
     context.report("at work", 2, 2)  # the last step: the process runs no short job between this report and the work
@@ -46,13 +44,7 @@ def task(context, parameters):
         case "deaf in C":
             ctypes.PyDLL(None).sleep(600)  # with the interpreter's lock: no other thread can run
     return "result"
-
-workers.tasks.psf_build.psf_build = task
-import workers.run.runner
-workers.run.runner.load_tasks = lambda: None  # this process has loaded the only task, before it starts others
-from workers.run.worker import main
-main()
-"""
+""")
 LEASE_S = 2.0
 
 

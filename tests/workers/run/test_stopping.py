@@ -1,4 +1,7 @@
-"""A worker that is told to stop: its job ends in time, or goes back into the queue as if it had not been started."""
+"""A worker that is told to stop: its job ends in time, or goes back into the queue as if it had not been started.
+
+The heartbeat of a job goes on after the database did not answer once.
+"""
 
 from __future__ import annotations
 
@@ -6,27 +9,28 @@ import json
 import logging
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import psutil
 import pytest
-from sqlalchemy import inspect, text
+from sqlalchemy.exc import OperationalError
 
 from tests.whole.stack import wait_for
-from tests.workers.databases import change, database
-from tests.workers.jobs import claimed, job_row
-from tests.workers.psf_examples import psf
-from tests.workers.run.processes import started_worker
+from tests.workers.jobs import job_row
+from tests.workers.run.processes import started_worker, worker_of
 from workers import logs
 from workers.broker import app as queue
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.census import FileTally
-from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
+from workers.catalogue.jobs import Lease
+from workers.catalogue.tables import DEFAULT_OWNER, JobRow
 from workers.contract.phases import Phase
 from workers.files.store import Store
+from workers.run.attempt import Attempt
 from workers.run.child import Stopping
 from workers.run.runner import Runner
 from workers.settings import Settings
@@ -146,56 +150,43 @@ def test_the_lines_of_a_job_carry_its_id_and_owner(bench: Bench, caplog: pytest.
     assert logs.about() == {}
 
 
-# The database, as it is counted and mended ----------------------------------------------------------
+# Heartbeats -----------------------------------------------------------------------------------------
 
 
-def test_the_counts_of_files_and_jobs(catalogue: Catalogue) -> None:
-    for name in "ab":
-        catalogue.add(ImageRow(owner="o", id=name, created_at=1.0, bytes=2**40, filename=None, summary={}))
-    for name, origin in (("a", "built"), ("b", "uploaded"), ("c", "uploaded")):
-        catalogue.add(psf(name, origin=origin, bytes=3))
-    counts = set(catalogue.census.tally_files())
-    assert FileTally("image", "uploaded", 2, 2**41) in counts
-    assert {FileTally("psf", "built", 1, 3), FileTally("psf", "uploaded", 2, 6)} <= counts
-    assert FileTally("transit", "uploaded", 0, 0) in counts
-    assert catalogue.census.tally() == [] and catalogue.census.oldest_queued_at() is None
-    job, _ = catalogue.jobs.submit("psf-build", {}, "a", DEFAULT_OWNER)
-    catalogue.jobs.submit("deconvolve", {}, "b", DEFAULT_OWNER)
-    lease = claimed(catalogue, job.id)
-    assert catalogue.jobs.complete(lease, "r")
-    (waiting, done) = sorted(catalogue.census.tally(), key=lambda tally: tally.kind)
-    assert (waiting.phase, waiting.jobs, waiting.attempts, waiting.run_s) == (Phase.QUEUED, 1, 0, 0.0)
-    assert (done.phase, done.jobs, done.attempts, done.retries) == (Phase.COMPLETED, 1, 1, 0)
-    assert abs(catalogue.census.clock() - time.time()) < 1.0
+def test_a_heartbeat_that_failed_is_followed_by_another() -> None:
+    beats: list[str] = []
+    third = threading.Event()
 
+    def heartbeat(lease: Lease) -> bool:
+        beats.append(lease.job_id)
+        if len(beats) == 1:
+            raise OperationalError("UPDATE", {}, OSError("gone"))
+        if len(beats) == 3:
+            third.set()
+        return True
 
-def test_a_database_gets_back_the_indexes_that_it_lacks(catalogue: Catalogue) -> None:
-    change(catalogue, text("DROP INDEX jobs_tallied"))
-    assert catalogue.schema.faults().indexes == ("jobs_tallied",)
-    catalogue.schema.mend()
-    names = {index["name"] for index in inspect(database(catalogue).engine).get_indexes("jobs")}
-    assert "jobs_tallied" in names and catalogue.schema.faults().indexes == ()
+    catalogue = SimpleNamespace(jobs=SimpleNamespace(heartbeat=heartbeat))
+    attempt = Attempt(catalogue, Lease("job", "token"), 0.01, Stopping(), None, limit_s=60.0)  # type: ignore[arg-type]
+    with attempt.beating():
+        assert third.wait(10.0), beats
+    assert not attempt.stopped.is_set()
 
 
 # Real processes -------------------------------------------------------------------------------------
 
-WORKER = """
-import time
-import workers.tasks.psf_build
-
-def listens(context, _):
+TASKS = {
+    "listens": """
+def task(context, _):
     while True:
         context.report("at work", 1, 2)
         time.sleep(0.02)
-
-def deaf(context, _):
+""",
+    "deaf": """
+def task(context, _):
     context.report("at work", 2, 2)
     time.sleep(60)
-
-workers.tasks.psf_build.psf_build = {task}
-from workers.run.worker import main
-main()
-"""
+""",
+}
 
 
 @pytest.mark.parametrize("task", [pytest.param("listens", marks=pytest.mark.slow), "deaf"])
@@ -209,8 +200,7 @@ def test_a_worker_process_hands_its_job_back_and_is_gone_in_the_time_it_states(
     job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     assert queue.submit(queue.make_app(settings), job.id)
     log = tmp_path / "worker.log"
-    code = WORKER.format(task=task)
-    worker = started_worker(code, settings, log, stop_s=0.5, heartbeat_s=0.2, lease_s=3)
+    worker = started_worker(worker_of(TASKS[task]), settings, log, stop_s=0.5, heartbeat_s=0.2, lease_s=3)
     try:
         wait_for(lambda: job_row(catalogue, job.id).phase == "EXECUTING", "the job is at work")
         wait_for(lambda: len(catalogue.census.workers(3.0)) == 1, "the worker says that it is there")
@@ -238,7 +228,7 @@ def test_a_worker_that_ends_by_an_error_has_no_status_of_success(settings: Setti
     settings.data_dir.mkdir()
     catalogue = Catalogue(settings.catalogue_url)
     catalogue.upgrade()
-    worker = started_worker("from workers.run.worker import main\nmain()", settings, tmp_path / "worker.log")
+    worker = started_worker(worker_of("task = None"), settings, tmp_path / "worker.log")
     try:
         wait_for(lambda: len(catalogue.census.workers(60.0)) == 1, "the worker is there")
         shutil.rmtree(settings.data_dir / "broker" / "queue")

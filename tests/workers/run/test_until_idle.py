@@ -14,7 +14,7 @@ from sqlalchemy import select, update
 from tests.whole.stack import Missing, Redis, postgres_database
 from tests.workers.databases import BOTH, change, rows
 from tests.workers.jobs import claimed
-from tests.workers.run.processes import started_worker
+from tests.workers.run.processes import started_worker, worker_of
 from workers.broker import app as queue
 from workers.broker.reconciler import reconcile
 from workers.catalogue.catalogue import Catalogue
@@ -24,22 +24,13 @@ from workers.contract.queues import Queue
 from workers.settings import Settings
 
 LEASE_S, IDLE_S = 3.0, 6.0
-# The worker loads no numerical libraries, so that many workers start in a few seconds.
-WORKER = f"""
-import contextlib, sys, time, types
-
-def short(context, _):
+SHORT = """
+def task(context, _):
     context.report("at work", 1, 2)
     time.sleep(0.03)
     return "result"
-
-sys.modules["workers.tasks.psf_build"] = types.SimpleNamespace(psf_build=short)
-sys.modules["psfcore.compiled"] = types.SimpleNamespace(listening=lambda report: contextlib.nullcontext())
-import workers.run.runner
-workers.run.runner.load_tasks = lambda: None
-from workers.run.worker import main
-main(idle_s={IDLE_S})
 """
+WORKER = worker_of(SHORT, f"idle_s={IDLE_S}")
 
 
 @BOTH

@@ -23,7 +23,7 @@ from workers.bulk import image as bulk_image
 from workers.bulk.runs import keep_turns
 from workers.catalogue.catalogue import Catalogue
 from workers.contract.queues import Queue
-from workers.files import beneath
+from workers.files import archive as archive_files
 from workers.files.store import Store
 from workers.run.runner import Runner
 from workers.settings import Settings
@@ -157,7 +157,7 @@ def test_an_unwritable_output_folder_fails_before_the_deconvolution(
     out.mkdir()
     (out / "run").write_text("a file where the folder is to be")
     # Root may write to any folder: what the system would answer to another user.
-    monkeypatch.setattr(beneath.os, "access", lambda *_, **__: False)
+    monkeypatch.setattr(archive_files.os, "access", lambda *_, **__: False)
     monkeypatch.delattr(bulk_image.deconvolve_task, "make")
     for folder, reason in (("run", "Not a directory"), ("other", "Permission denied")):
         output = {"folder": str(out / folder)}

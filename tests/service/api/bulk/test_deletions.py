@@ -15,9 +15,8 @@ from tests.service.conftest import refusal, upload, work_through_bulks
 from tests.service.keyed import Keyed
 from workers.bulk.runs import keep_turns
 from workers.catalogue.access import Scope
-from workers.catalogue.bulk_tables import BulkRow
 from workers.catalogue.bulks import Bulks
-from workers.catalogue.tables import ProductRow
+from workers.catalogue.tables import BulkRow, ProductRow
 from workers.contract.phases import Phase
 from workers.settings import Settings
 

@@ -19,9 +19,9 @@ from workers.catalogue.tables import ImageRow, SolutionRow
 from workers.contract.requests import PsfBuild, ResolvedCrossValidate, ResolvedPsfFit, ResolvedReport
 from workers.files.store import Store, StoreAway
 from workers.settings import Settings
+from workers.tasks import transits
 from workers.tasks.context import Context
-from workers.tasks.data import solutions
-from workers.tasks.data.solutions import solution_identity, solved
+from workers.tasks.transits import solution_identity, solved
 
 REQUEST = ResolvedPsfFit(transit_id="1" * 64)
 
@@ -41,7 +41,7 @@ def inverted(monkeypatch: pytest.MonkeyPatch) -> list[Transit]:
         seen.append(transit)
         return small_transits.solved()
 
-    monkeypatch.setattr(solutions, "invert", invert)
+    monkeypatch.setattr(transits, "invert", invert)
     return seen
 
 
@@ -103,7 +103,7 @@ def test_everything_that_determines_a_solution_is_in_its_identity(monkeypatch: p
         ("library_versions", dict),
     ):
         with monkeypatch.context() as patched:
-            patched.setattr(solutions, name, other)
+            patched.setattr(transits, name, other)
             made.append(solution_identity(REQUEST, transit, shape, None))
     assert len(set(made)) == len(made) == 11
     assert solution_identity(REQUEST, transit, shape, None) == made[0]

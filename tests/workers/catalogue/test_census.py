@@ -1,8 +1,9 @@
-"""Stage times in the catalogue: the sums over attempts; a failure to store them changes no job's outcome."""
+"""Counts of files and jobs, and stage times: sums over attempts; a failure to store them changes no job's outcome."""
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,9 +15,11 @@ from sqlalchemy import text
 from psfcore.errors import DataError
 from tests.workers.conftest import Clock
 from tests.workers.databases import BOTH, change
-from tests.workers.jobs import job_row
+from tests.workers.jobs import claimed, job_row
+from tests.workers.psf_examples import psf
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.tables import DEFAULT_OWNER, JobRow
+from workers.catalogue.census import FileTally
+from workers.catalogue.tables import DEFAULT_OWNER, ImageRow, JobRow
 from workers.contract.phases import Phase
 from workers.files.store import Store
 from workers.run.runner import Runner
@@ -25,6 +28,26 @@ from workers.stage_timer import STARTING, Spent
 from workers.tasks.context import Context
 
 Task = Callable[[Context, Mapping[str, Any]], str]
+
+
+def test_the_counts_of_files_and_jobs(catalogue: Catalogue) -> None:
+    for name in "ab":
+        catalogue.add(ImageRow(owner="o", id=name, created_at=1.0, bytes=2**40, filename=None, summary={}))
+    for name, origin in (("a", "built"), ("b", "uploaded"), ("c", "uploaded")):
+        catalogue.add(psf(name, origin=origin, bytes=3))
+    counts = set(catalogue.census.tally_files())
+    assert FileTally("image", "uploaded", 2, 2**41) in counts
+    assert {FileTally("psf", "built", 1, 3), FileTally("psf", "uploaded", 2, 6)} <= counts
+    assert FileTally("transit", "uploaded", 0, 0) in counts
+    assert catalogue.census.tally() == [] and catalogue.census.oldest_queued_at() is None
+    job, _ = catalogue.jobs.submit("psf-build", {}, "a", DEFAULT_OWNER)
+    catalogue.jobs.submit("deconvolve", {}, "b", DEFAULT_OWNER)
+    lease = claimed(catalogue, job.id)
+    assert catalogue.jobs.complete(lease, "r")
+    (waiting, done) = sorted(catalogue.census.tally(), key=lambda tally: tally.kind)
+    assert (waiting.phase, waiting.jobs, waiting.attempts, waiting.run_s) == (Phase.QUEUED, 1, 0, 0.0)
+    assert (done.phase, done.jobs, done.attempts, done.retries) == (Phase.COMPLETED, 1, 1, 0)
+    assert abs(catalogue.census.clock() - time.time()) < 1.0
 
 
 @BOTH
@@ -50,8 +73,7 @@ def run(folder: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch, tas
     monkeypatch.setattr("workers.tasks.psf_build.psf_build", task)
     job, _ = catalogue.jobs.submit("psf-build", {}, "k", DEFAULT_OWNER)
     Runner(settings, catalogue, Store(settings.data_dir)).run(job.id)
-    row = job_row(catalogue, job.id)
-    return row
+    return job_row(catalogue, job.id)
 
 
 def test_an_attempt_stores_its_stages_without_the_time_of_writing(

@@ -1,1 +1,0 @@
-"""Reads and keeps the data of tasks: PSFs, solutions, products and reports."""
