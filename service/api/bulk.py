@@ -14,6 +14,7 @@ from service.http.paging import Cursor, Limit, Page, following, no_cursor, page,
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.quotas import check_room, check_rows
 from service.http.state import Shared
+from service.views import RowView
 from workers.bulk.dry_run import BulkEstimate, dry_run
 from workers.bulk.runs import begin, cancel_turns
 from workers.catalogue.bulk_tables import BulkRow
@@ -44,7 +45,7 @@ class Counts(BaseModel):
     )
 
 
-class BulkView(BaseModel):
+class BulkView(RowView):
     """A bulk run."""
 
     id: str
@@ -86,15 +87,15 @@ class BulkView(BaseModel):
             failed=row.failed,
             to_look_at=progress.to_look_at(row.id, LOOK_FROM),
         )
-        values = {name: getattr(row, name) for name in cls.model_fields if hasattr(row, name)} | {
-            "images": counts,
-            "images_an_hour": rate,
-            "time_left_s": left * 3600.0 / rate if rate and row.phase == BulkPhase.RUNNING else None,
-            "results": f"{here}/results",
-            "failures": f"{here}/failures",
-            "events": f"{here}/events",
-        }
-        return cls.model_validate(values)
+        return cls.of_columns(
+            row,
+            images=counts,
+            images_an_hour=rate,
+            time_left_s=left * 3600.0 / rate if rate and row.phase == BulkPhase.RUNNING else None,
+            results=f"{here}/results",
+            failures=f"{here}/failures",
+            events=f"{here}/events",
+        )
 
 
 class BulkLine(BaseModel):

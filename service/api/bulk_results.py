@@ -15,6 +15,7 @@ from service.api.bulk import BulkId, find
 from service.http.callers import Reading
 from service.http.problems import RESPONSES
 from service.http.state import Shared
+from service.views import RowView
 from workers.catalogue.bulk_progress import BATCH, BulkProgress
 from workers.catalogue.bulk_tables import BulkItemRow
 from workers.contract.bulk import ItemState
@@ -34,7 +35,7 @@ class Change(BaseModel):
     up_to_pct: float
 
 
-class Result(BaseModel):
+class Result(RowView):
     """A done image."""
 
     position: int
@@ -84,15 +85,13 @@ class Result(BaseModel):
     def of(cls, row: BulkItemRow) -> Result:
         """The result of one image of a bulk run, from its row in the catalogue."""
         assert row.statistics is not None
-        told: dict[str, Any] = {"seconds": None, "kernel_seconds": None, **row.statistics}
-        own = {name: getattr(row, name) for name in cls.model_fields if hasattr(row, name)}
-        product = f"/v1/products/{row.product_id}"
-        file = f"{product}/file" if row.kept else None
-        provenance = f"{product}/provenance" if row.kept else None
-        thumbnail = f"{product}/thumbnail" if row.kept and told["has_thumbnail"] else None
-        return cls.model_validate(
-            {**told, **own, "file": file, "thumbnail": thumbnail, "provenance": provenance}
-        )
+        product, statistics = f"/v1/products/{row.product_id}", row.statistics
+        addresses = {
+            "file": f"{product}/file" if row.kept else None,
+            "provenance": f"{product}/provenance" if row.kept else None,
+            "thumbnail": f"{product}/thumbnail" if row.kept and statistics["has_thumbnail"] else None,
+        }
+        return cls.of_columns(row, **{"seconds": None, "kernel_seconds": None, **statistics, **addresses})
 
     def flat(self) -> dict[str, Any]:
         """The values of a CSV row."""

@@ -18,6 +18,7 @@ from service.http.callers import Caller, KeyFirst, Reading, Submitting
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.state import Shared
+from service.views import RowView
 from workers.catalogue.access import LABEL_LENGTH, OWNER, Scope, TooManyKeys
 from workers.catalogue.tables import KeyRow
 from workers.contract.requests import PRINTABLE_OR_EMPTY
@@ -70,7 +71,7 @@ class NewKey(BaseModel):
         return self
 
 
-class KeyView(BaseModel):
+class KeyView(RowView):
     """A key, without its secret."""
 
     id: str
@@ -87,9 +88,7 @@ class KeyView(BaseModel):
     @classmethod
     def of(cls, row: KeyRow) -> KeyView:
         """The description of a key, from its row in the catalogue. It does not contain the secret key."""
-        names = ("id", "owner", "label", "created_at", "expires_at", "revoked_at", "last_used_at", "made_by")
-        shown = {name: getattr(row, name) for name in names}
-        return cls(scopes=list(map(Scope, row.scopes)), state=_state(row), **shown)
+        return cls.of_columns(row, state=_state(row))
 
 
 class MadeKey(KeyView):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
@@ -16,7 +16,7 @@ from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, as_problems
 from service.http.quotas import check_rows
 from service.http.state import Shared, State
-from service.views import PastChange, was_certified
+from service.views import PastChange, RowView, was_certified
 from workers.catalogue.affected import Affected, Place
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import PsfRow
@@ -93,7 +93,7 @@ class Change(PastChange):
     successor: str | None = Field(validation_alias="successor_id")
 
 
-class StatusView(BaseModel):
+class StatusView(RowView):
     """A PSF's status, its allowed changes, and its history."""
 
     id: str
@@ -149,14 +149,9 @@ def _asked(body: StatusChange) -> StatusAsked:
 
 def _view(state: State, caller: Caller, row: PsfRow) -> StatusView:
     psfs = state.catalogue.psfs
-    values: dict[str, Any] = {"valid_from": row.valid_from, "valid_to": row.valid_to}
-    return StatusView(
-        id=row.id,
-        status=PsfStatus(row.status),
-        version=row.version,
-        series=row.series,
+    return StatusView.of_columns(
+        row,
         was_certified=was_certified(row),
-        **values,
         successor=row.successor_id,
         may_become=sorted(MAY_BECOME[PsfStatus(row.status)]),
         next_version=None if row.series is None else next_version(psfs.released(row.series, caller.owner)),
@@ -245,7 +240,7 @@ def _series(state: State, caller: Caller, name: str) -> SeriesView:
     )
 
 
-class AffectedView(BaseModel):
+class AffectedView(RowView):
     """A product, the PSF that made it, and the replacement of this PSF, if there is one."""
 
     product_id: str
@@ -262,12 +257,9 @@ class AffectedView(BaseModel):
     @classmethod
     def of(cls, one: Affected) -> AffectedView:
         """The description of an affected product and its PSF, from their rows in the catalogue."""
-        return cls(
+        return cls.of_columns(
+            one.product,
             product_id=one.product.id,
-            image_id=one.product.image_id,
-            created_at=one.product.created_at,
-            psf_id=one.psf.id,
-            psf_version=one.product.psf_version,
             psf_status=one.psf.status,
             successor=one.psf.successor_id,
             redo_with=None if one.redo_with is None else one.redo_with.id,
