@@ -10,9 +10,8 @@ from fastapi import APIRouter, Path, Query
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from service.api.psfs import TEXT
-from service.http import paging as pages
 from service.http.callers import Caller, Certifying, KeyFirst, Reading
-from service.http.paging import Page, Paging
+from service.http.paging import Page, Paging, number, place
 from service.http.problems import RESPONSES, as_problems
 from service.http.quotas import check_rows
 from service.http.state import Shared, State
@@ -274,12 +273,12 @@ def list_affected(
     superseded: Annotated[bool, Query(description="only products whose PSF has a successor")] = False,
 ) -> Page[AffectedView]:
     """Products whose PSF is deprecated, sorted by PSF; the products of each PSF are listed newest first."""
-    at = pages.place(paging.cursor, 3)
-    after = None if at is None else Place(at[0], pages.number(at[1]), at[2])
+    at = place(paging.cursor, 3)
+    after = None if at is None else Place(at[0], number(at[1]), at[2])
     rows = state.catalogue.affected.page(
         caller.owner, superseded=superseded, limit=paging.limit + 1, after=after
     )
-    return _page(paging, rows, whole=True)
+    return paging.page(rows, AffectedView.of, lambda one: (one.psf.id, *_place(one)))
 
 
 @affected.get("/v1/psfs/{psf_id}/affected", summary="Products made with a PSF")
@@ -288,13 +287,9 @@ def list_affected_by_psf(
 ) -> Page[AffectedView]:
     """Products made with this PSF, which may have any status. The newest product is listed first."""
     psf = state.row(PsfRow, psf_id, caller.owner)
-    return _page(paging, state.catalogue.affected.of_psf(psf, **paging.query), whole=False)
+    return paging.page(state.catalogue.affected.of_psf(psf, **paging.query), AffectedView.of, _place)
 
 
-def _page(paging: Paging, rows: list[Affected], *, whole: bool) -> Page[AffectedView]:
-    following = None
-    if len(rows) > paging.limit:
-        last = rows[paging.limit - 1]
-        place = (repr(last.product.created_at), last.product.id)
-        following = pages.following(paging.request, *((last.psf.id, *place) if whole else place))
-    return Page(items=[AffectedView.of(one) for one in rows[: paging.limit]], next=following)
+def _place(one: Affected) -> tuple[str, ...]:
+    """The place of a product in its cursor."""
+    return repr(one.product.created_at), one.product.id

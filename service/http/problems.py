@@ -45,6 +45,7 @@ STATUS_OF = {
     "changed-meanwhile": 409,
     "channel-mismatch": 409,
     "cutout-not-plain": 409,
+    "equal-bulk-open": 409,
     "line-known": 409,
     "name-taken": 409,
     "no-date": 409,
@@ -74,6 +75,8 @@ STATUS_OF = {
     "archive-too-large": 413,
     "too-much-memory": 413,
     "not-an-archive": 415,
+    "upload-locked": 423,
+    "too-many-uploads": 429,
 }
 # Headers of every answer; a route may set others. The headers forbid browsers to guess media types, to show
 # the answer in a frame, to send a referrer, to load content, and to let windows of other sites reach the answer.
