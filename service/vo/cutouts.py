@@ -79,7 +79,7 @@ async def get_region(request: Request, caller: Reading, state: Shared, fields: F
             f"expected ID, the id of one of your products; got {names[0][:120]!a}: list your products",
         )
     headers = files.headers_of(f"{ANSWERS_VERSION} {row.file_sha256} {shape} {numbers} {frame}")
-    if (same := files.unchanged(request, headers)) is not None:
+    if (same := files.not_modified(request, headers)) is not None:
         return same
     with as_problems():
         file = await anyio.to_thread.run_sync(
@@ -138,7 +138,7 @@ def _written(state: State, row: ProductRow, shape: str, numbers: tuple[float, ..
     from psfcore.fits.viewing.regions import write_cutout  # loads the numerical libraries
 
     check_disk(state)
-    path = files.found(state.store, row.file_sha256, row.bytes)
+    path = files.path_of(state.store, row.file_sha256, row.bytes)
     with state.store.temporary() as target:
         file = target.open("w+b")
         try:
