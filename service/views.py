@@ -283,7 +283,7 @@ class FileView(BaseModel):
     bytes: int = Field(description="unpacked size, as declared in the archive")
 
 
-class TransitView(BaseModel):
+class TransitView(RowView):
     """An uploaded transit: properties of its archive, and the content of its transit.json."""
 
     id: str = Field(description="SHA-256 of the archive")
@@ -303,22 +303,12 @@ class TransitView(BaseModel):
     unpacked_bytes: int
 
     @classmethod
-    def of(cls, row: TransitRow) -> TransitView:
+    def of(cls, row: TransitRow) -> Self:
         """The description of a transit, from its row in the catalogue."""
-        return cls.model_validate(_transit_content(row))
+        return cls.of_columns(row, **row.summary)
 
 
 class TransitDetails(TransitView):
     """An uploaded transit, with the files that its transit.json names."""
 
     files: list[FileView]
-
-    @classmethod
-    def of(cls, row: TransitRow) -> TransitDetails:
-        """The description of a transit and its files, from the row of the transit in the catalogue."""
-        return cls.model_validate(_transit_content(row))
-
-
-def _transit_content(row: TransitRow) -> dict[str, object]:
-    about = {"id": row.id, "created_at": row.created_at, "bytes": row.bytes, "filename": row.filename}
-    return row.summary | about
