@@ -241,14 +241,44 @@ class Client(Connection, Operations):
         """All PSF versions, newest first."""
         return self._all("/v1/psfs", filters)
 
-    def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
+    def psf_curve(self, psf_id: str, radii: Sequence[float] | None = None) -> dict[str, Any]:
+        """Light beyond radii (px) in percent, by component, with errors; without ``radii``, at all radii of the table."""
+        return self.answer([psf_id], "curve", {} if radii is None else {"radii": list(radii)})
+
+    def psf_profile(self, psf_id: str) -> dict[str, Any]:
+        """Mean weight of the pixels at each radius, for each component."""
+        return self.answer([psf_id], "profile", {})
+
+    def psf_encircled(self, psf_id: str, radius: float) -> dict[str, Any]:
+        """Light within a radius (px), as a fraction of all light."""
+        return self.answer([psf_id], "encircled", {"radius": radius})
+
+    def psf_annulus(self, psf_id: str, inner: float, outer: float) -> dict[str, Any]:
+        """Light between two radii (px), as a fraction of all light."""
+        return self.answer([psf_id], "annulus", {"inner": inner, "outer": outer})
+
+    def compare_psfs(self, psf_id: str, other_id: str) -> dict[str, Any]:
+        """Differences of the curves (percentage points) and sums of two PSFs, the second minus the first."""
+        return self.answer([psf_id, other_id], f"compare/{other_id}", {})
+
+    def answer(self, psf_ids: list[str], question: str, query: dict[str, Any]) -> dict[str, Any]:
+        """The answer to a query. If tables are missing, for example of an uploaded PSF, they are made first."""
+        address = f"/v1/psfs/{psf_ids[0]}/{question}"
         parameters = {
             name: ",".join(f"{number!r}" for number in value) if isinstance(value, list) else value
             for name, value in query.items()
         }
-        return self._json("GET", f"/v1/psfs/{psf_id}/{question}", params=parameters)
+        try:
+            return self._json("GET", address, params=parameters)
+        except ServiceError as error:
+            if error.code != "no-tables":
+                raise
+        for psf_id in psf_ids:
+            self.wait(self.submit("psf-tables", psf_id=psf_id))
+        return self._json("GET", address, params=parameters)
 
     def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
+        """Write the central (size, size) px of a PSF as FITS."""
         self.download(f"/v1/psfs/{psf_id}/cutout?size={size}", output, overwrite=overwrite)
 
     def psf_status(self, psf_id: str) -> dict[str, Any]:
