@@ -200,12 +200,12 @@ class Result(RowView):
 
     def flat(self) -> dict[str, Any]:
         """The values of a CSV row."""
-        told = self.model_dump(exclude=NESTED) | {"warnings": " ".join(self.warnings)}
+        row = self.model_dump(exclude=NESTED) | {"warnings": " ".join(self.warnings)}
         for kind in CHANGES:
             change: Change | None = getattr(self, kind)
-            told[f"{kind}_sum_pct"] = None if change is None else change.sum_pct
-            told[f"{kind}_up_to_pct"] = None if change is None else change.up_to_pct
-        return told
+            row[f"{kind}_sum_pct"] = None if change is None else change.sum_pct
+            row[f"{kind}_up_to_pct"] = None if change is None else change.up_to_pct
+        return row
 
 
 CHANGES = ("bright", "dark")

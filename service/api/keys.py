@@ -226,20 +226,20 @@ def _end(state: Shared, caller: Caller, body: NewKey) -> float | None:
     """The end of a new key. Raises ``Problem`` 422 if this end is in the past, and 403 if it is later than the end of
     the caller's key."""
     now = time.time()
-    asked = body.expires_at if body.lasts_days is None else now + body.lasts_days * DAY_S
-    if asked is not None and asked <= now:
+    end = body.expires_at if body.lasts_days is None else now + body.lasts_days * DAY_S
+    if end is not None and end <= now:
         raise Problem(
-            422, "end-in-the-past", f"expected an end in the future; got {asked:.0f}: choose a later one"
+            422, "end-in-the-past", f"expected an end in the future; got {end:.0f}: choose a later one"
         )
     own = state.catalogue.keys.get(caller.name)
     latest = None if own is None or Scope.ADMIN in caller.scopes else own.expires_at
     if latest is None:
-        return asked
-    if asked is not None and asked > latest:
+        return end
+    if end is not None and end > latest:
         raise Problem(
             403,
             "outlives-its-maker",
-            f"expected an end that is not later than that of your own key ({latest:.0f}); got {asked:.0f}: choose an earlier end, "
+            f"expected an end that is not later than that of your own key ({latest:.0f}); got {end:.0f}: choose an earlier end, "
             "or ask the operator for a key",
         )
-    return latest if asked is None else asked
+    return latest if end is None else end

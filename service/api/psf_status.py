@@ -191,8 +191,11 @@ class SeriesView(SeriesSummary):
 @series.get("", summary="List series")
 def list_series(caller: Reading, state: Shared) -> Page[SeriesSummary]:
     """The series of which a PSF was certified, sorted by name, on one page."""
-    known = state.catalogue.series.all(caller.owner)
-    items = [SeriesSummary(series=name, interpolated=interpolated) for name, interpolated in known.items()]
+    series_of_owner = state.catalogue.series.all(caller.owner)
+    items = [
+        SeriesSummary(series=name, interpolated=interpolated)
+        for name, interpolated in series_of_owner.items()
+    ]
     return Page(items=items, next=None)
 
 

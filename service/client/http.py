@@ -16,7 +16,7 @@ from service.client import resumable
 from service.client.address import SHOWN_DIGITS
 from service.client.connection import GOES_ON, Connection
 from service.client.errors import Patience, ServiceError, WaitInterrupted
-from service.client.operations import Operations, Progress, given
+from service.client.operations import Operations, Progress, without_none
 
 if TYPE_CHECKING:
     import numpy as np
@@ -365,7 +365,7 @@ class Client(Connection, Operations):
             "before_time": before_time or self.psf(before)["valid_to"],
             "after_time": after_time or self.psf(after)["valid_from"],
         }
-        parameters = {"before_psf_id": before, "after_psf_id": after, "time": time, **given(times)}
+        parameters = {"before_psf_id": before, "after_psf_id": after, "time": time, **without_none(times)}
         return self.run("psf-interpolate", parameters, progress)
 
     def contexts(self) -> Iterator[dict[str, Any]]:
@@ -451,7 +451,7 @@ class Client(Connection, Operations):
         self, bulk_id: str, *, order: str = "bulk", limit: int | None = None
     ) -> Iterator[dict[str, Any]]:
         """The images that are done, with checksums and changes. ``order="worst"`` puts the highest artefact score first."""
-        query = given({"order": order, "limit": limit})
+        query = without_none({"order": order, "limit": limit})
         with self._streamed(f"/v1/bulk/{bulk_id}/results", params=query) as answer:
             for line in answer.iter_lines():
                 yield json.loads(line)
@@ -519,7 +519,7 @@ def _bulk_request(
     **fields: Any,
 ) -> dict[str, Any]:
     """The body of a request for a bulk run, from the arguments of ``Client.submit_bulk``."""
-    fields = given(fields)
+    fields = without_none(fields)
     own: dict[str, Any] = {name: fields.pop(name) for name in ("name", "psf_id", "context") if name in fields}
     return {
         **own,

@@ -224,7 +224,7 @@ class Operations(ABC):
         """Run a job of this kind on a transit, and download files of its result; returns the description of the result."""
         check_outputs(files.values(), inputs=(transit,), overwrite=overwrite)
         transit_id = self.upload_transit(transit)["id"]
-        request = {"transit_id": transit_id, **given(parameters), **_noise(noise)}
+        request = {"transit_id": transit_id, **without_none(parameters), **_noise(noise)}
         result = self.run(kind, request, progress)
         self._fetch(result, files, overwrite)
         return result
@@ -261,7 +261,7 @@ def treatment(
     *, method: str = "richardson-lucy", noise: tuple[float, float] | None = None, **parameters: Any
 ) -> dict[str, Any]:
     """The fields of a request to deconvolve, from the arguments of ``Operations.deconvolve``."""
-    parameters = given(parameters)
+    parameters = without_none(parameters)
     fields = {name: value for name, value in parameters.items() if name in Deconvolve.model_fields}
     of_method = {name: value for name, value in parameters.items() if name not in fields}
     return {"method": {"name": method, **of_method}, **fields, **_noise(noise)}
@@ -274,7 +274,7 @@ def named_instrument(instrument: str | Path) -> dict[str, str]:
     return {"instrument": instrument}
 
 
-def given(parameters: dict[str, Any]) -> dict[str, Any]:
+def without_none(parameters: dict[str, Any]) -> dict[str, Any]:
     """The parameters that are not None. The service has defaults for the others."""
     return {name: value for name, value in parameters.items() if value is not None}
 

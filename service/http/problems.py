@@ -202,12 +202,12 @@ def install(app: FastAPI, as_page: AsPage) -> None:
     def _ours(request: Request, _error: Exception) -> Response:
         # After this answer Starlette logs the traceback and passes the error on to the server, which closes the
         # connection. No middleware sets the headers of this answer, so they are set here.
-        told = {"Connection": "close", "X-Request-ID": logs.about().get("request", "")}
+        headers = {"Connection": "close", "X-Request-ID": logs.about().get("request", "")}
         detail = (
             "the service failed and logged the error; send the X-Request-ID of this answer to the operator"
         )
         return answer(
-            request, Problem(500, "internal-error", detail, headers=SECURITY_HEADERS | told), as_page
+            request, Problem(500, "internal-error", detail, headers=SECURITY_HEADERS | headers), as_page
         )
 
 

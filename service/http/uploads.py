@@ -139,7 +139,7 @@ class Received:
 
 
 def _could_be_fits(start: bytes, _whole: bool) -> bool:
-    return any(start.startswith(known[: len(start)]) for known in FITS_STARTS)
+    return any(start.startswith(beginning[: len(start)]) for beginning in FITS_STARTS)
 
 
 def _image_content(path: Path, state: State) -> HeaderSummary:

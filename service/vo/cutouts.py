@@ -112,11 +112,11 @@ def described_cutout(identity: str, base: str) -> Service:
 
 def _region_of(fields: Mapping[str, list[str]]) -> tuple[str, tuple[float, ...], Frame]:
     """The shape, its numbers and the frame of a request."""
-    given = [name for name in SHAPES if name in fields]
-    if len(given) != 1:
-        got = " and ".join(name.upper() for name in given) if given else None
+    shapes = [name for name in SHAPES if name in fields]
+    if len(shapes) != 1:
+        got = " and ".join(name.upper() for name in shapes) if shapes else None
         refuse("CIRCLE, BOX or POLYGON", "exactly one of them", got)
-    [shape] = given
+    [shape] = shapes
     text = fields[shape][0]
     try:
         numbers = tuple(map(float, text.split()))
