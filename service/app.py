@@ -14,7 +14,6 @@ from psfcore.fits.viewing.planes import Planes
 from service import api_page, operation
 from service.api import (
     bulk,
-    bulk_results,
     contexts,
     events,
     images,
@@ -131,7 +130,6 @@ def create_app(settings: Settings, bound_to: str = "127.0.0.1") -> FastAPI:
         transits.reports,
         resumable.router,
         bulk.router,
-        bulk_results.router,
         events.router,
         keys.router,
     )

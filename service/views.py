@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -13,6 +13,16 @@ from workers.contract.kinds import KINDS
 from workers.contract.phases import JobError, Phase
 from workers.contract.queues import Queue
 from workers.versions import PsfStatus, iso
+
+
+class RowView(BaseModel):
+    """The description of a row of the catalogue, for its owner."""
+
+    @classmethod
+    def of_columns(cls, row: object, **computed: Any) -> Self:
+        """The description whose fields are the columns of the row with the same names, and ``computed``."""
+        columns = {name: getattr(row, name) for name in cls.model_fields if hasattr(row, name)}
+        return cls.model_validate(columns | computed)
 
 
 class PastChange(BaseModel):
@@ -28,7 +38,7 @@ class PastChange(BaseModel):
 MOST_SHARE = 0.99  # a job that takes longer than estimated is not done yet
 
 
-class Progress(BaseModel):
+class Progress(RowView):
     """Progress of a job."""
 
     stage: str
@@ -52,7 +62,7 @@ class Estimate(BaseModel):
     seconds: float
 
 
-class JobView(BaseModel):
+class JobView(RowView):
     """A job."""
 
     id: str
@@ -90,29 +100,13 @@ class JobView(BaseModel):
 
         waiting_before: number of jobs that wait before this job; None if they were not counted.
         """
-        return cls(
-            id=row.id,
-            kind=row.kind,
-            phase=Phase(row.phase),
-            queue=Queue(row.queue),
-            created_at=row.created_at,
-            started_at=row.started_at,
-            ended_at=row.ended_at,
-            attempt=row.attempt,
-            cancel_requested=row.cancel_requested,
+        return cls.of_columns(
+            row,
             waiting_before=waiting_before,
-            progress=Progress(
-                stage=row.stage,
-                step=row.step,
-                steps=row.steps,
-                time_left_s=time_left_s(row),
-                share=share_of_time(row),
-            ),
-            estimate=Estimate.model_validate(row.estimate) if row.estimate else None,
-            parameters=row.parameters,
+            progress=Progress.of_columns(row, time_left_s=time_left_s(row), share=share_of_time(row)),
+            estimate=row.estimate or None,
             result=f"{KINDS[row.kind].result}/{row.result_id}" if row.result_id else None,
             result_deleted=result_deleted,
-            error=JobError.model_validate(row.error) if row.error else None,
         )
 
 
@@ -146,7 +140,7 @@ def share_of_time(row: JobRow, now: float | None = None) -> float | None:
     return float(min(max(used_s / row.estimate["seconds"], 0.0), MOST_SHARE))
 
 
-class ProductView(BaseModel):
+class ProductView(RowView):
     """A deconvolved image."""
 
     id: str = Field(description="identity: hash of image, PSF, method, parameters and algorithm version")
@@ -176,14 +170,8 @@ class ProductView(BaseModel):
         details: the current details of the product; default: the details in the row.
         """
         here = f"/v1/products/{row.id}"
-        return cls(
-            id=row.id,
-            created_at=row.created_at,
-            kind=row.kind,
-            image_id=row.image_id,
-            psf_id=row.psf_id,
-            psf_version=row.psf_version,
-            bytes=row.bytes,
+        return cls.of_columns(
+            row,
             sha256=row.file_sha256,
             details=row.details if details is None else details,
             file=f"{here}/file",
@@ -199,7 +187,7 @@ def was_certified(row: PsfRow) -> bool:
     return row.status == PsfStatus.CERTIFIED or row.valid_from is not None
 
 
-class PsfView(BaseModel):
+class PsfView(RowView):
     """A PSF. Its content never changes, because the id depends on the content. Its status may change."""
 
     id: str
@@ -235,29 +223,19 @@ class PsfView(BaseModel):
     def of(cls, row: PsfRow) -> PsfView:
         """The description of a PSF, from its row in the catalogue."""
         here = f"/v1/psfs/{row.id}"
-        return cls(
-            id=row.id,
-            created_at=row.created_at,
-            name=row.name,
-            version=row.version,
-            instrument=row.instrument,
-            channel=row.channel,
-            kind=row.kind,
-            status=PsfStatus(row.status),
+        return cls.of_columns(
+            row,
             was_certified=was_certified(row),
             valid_from=None if row.valid_from is None else iso(row.valid_from),
             valid_to=None if row.valid_to is None else iso(row.valid_to),
             successor=row.successor_id,
-            origin=row.origin,
-            bytes=row.bytes,
-            details=row.details,
             file=f"{here}/file",
             preview=f"{here}/preview" if row.preview_sha256 else None,
             report=f"{here}/report" if "report_sha256" in row.details else None,
         )
 
 
-class ReportView(BaseModel):
+class ReportView(RowView):
     """The report of a job, for example on a transit or a rerun."""
 
     id: str
@@ -282,14 +260,8 @@ class ReportView(BaseModel):
     def of(cls, row: ReportRow) -> ReportView:
         """The description of a report, from its row in the catalogue."""
         here = f"/v1/reports/{row.id}"
-        return cls(
-            id=row.id,
-            created_at=row.created_at,
-            kind=row.kind,
-            transit_id=row.transit_id,
-            about_id=row.about_id,
-            bytes=row.bytes,
-            details=row.details,
+        return cls.of_columns(
+            row,
             file=f"{here}/file",
             preview=f"{here}/preview" if row.preview_sha256 else None,
             html=f"{here}/page" if row.details.get("page_sha256") else None,
@@ -311,7 +283,7 @@ class FileView(BaseModel):
     bytes: int = Field(description="unpacked size, as declared in the archive")
 
 
-class TransitView(BaseModel):
+class TransitView(RowView):
     """An uploaded transit: properties of its archive, and the content of its transit.json."""
 
     id: str = Field(description="SHA-256 of the archive")
@@ -331,22 +303,12 @@ class TransitView(BaseModel):
     unpacked_bytes: int
 
     @classmethod
-    def of(cls, row: TransitRow) -> TransitView:
+    def of(cls, row: TransitRow) -> Self:
         """The description of a transit, from its row in the catalogue."""
-        return cls.model_validate(_transit_content(row))
+        return cls.of_columns(row, **row.summary)
 
 
 class TransitDetails(TransitView):
     """An uploaded transit, with the files that its transit.json names."""
 
     files: list[FileView]
-
-    @classmethod
-    def of(cls, row: TransitRow) -> TransitDetails:
-        """The description of a transit and its files, from the row of the transit in the catalogue."""
-        return cls.model_validate(_transit_content(row))
-
-
-def _transit_content(row: TransitRow) -> dict[str, object]:
-    about = {"id": row.id, "created_at": row.created_at, "bytes": row.bytes, "filename": row.filename}
-    return row.summary | about

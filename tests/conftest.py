@@ -37,7 +37,6 @@ LONGEST_FIRST = (
     "service/pages/browser/test_product.py",
     "service/cli/gap/test_diagnose.py",
     "workers/files/test_collection.py",
-    "fuzz/test_fuzz.py",
     "service/pages/browser/test_way_through.py",
     "workers/run/test_stopping.py",
     "service/api/bulk/test_bulk.py",

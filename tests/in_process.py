@@ -15,7 +15,6 @@ from psfcore.fits.stored_psf import check_is_psf
 from psfcore.tables import lookup
 from psfcore.transit.archive import list_archive, pack
 from psfcore.whole_files import sha256_of
-from service.client.errors import ServiceError
 from service.client.operations import Operations, Progress
 from service.client.outputs import written
 from service.views import JobView, ProductView, PsfView, ReportView
@@ -125,10 +124,6 @@ class InProcess(Operations):
             shutil.copyfile(self.store.verified(digest), partial)
 
     def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        digest = self._row(f"/v1/psfs/{psf_id}").details.get("tables_sha256")
-        if digest is None:
-            raise ServiceError("no tables", code="no-tables")
+        """The answer of a PSF's tables to a question."""
+        digest = self._row(f"/v1/psfs/{psf_id}").details["tables_sha256"]
         return lookup.QUESTIONS[question](json.loads(self.store.path(digest).read_bytes()), **query)
-
-    def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
-        raise NotImplementedError

@@ -1,22 +1,27 @@
-"""Bulk runs, many images deconvolved in the same way: ``/v1/bulk``."""
+"""Bulk runs, many images deconvolved in the same way: ``/v1/bulk``; and their results, image by image, as JSON lines or as CSV."""
 
 from __future__ import annotations
 
+import csv
+import io
 import logging
-from typing import Annotated, Any
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
+from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from psfcore.errors import DataError
 from service.http.callers import Bulk, Caller, KeyFirst, Reading
-from service.http.paging import Cursor, Limit, Page, following, no_cursor, page, place, position
-from service.http.problems import RESPONSES, Problem, problem
+from service.http.paging import Page, Paging, no_cursor, place
+from service.http.problems import RESPONSES, Problem, as_problems, problem
 from service.http.quotas import check_room, check_rows
 from service.http.state import Shared
+from service.views import RowView
 from workers.bulk.dry_run import BulkEstimate, dry_run
 from workers.bulk.runs import begin, cancel_turns
-from workers.catalogue.tables import BulkRow
+from workers.catalogue.bulk_progress import BATCH, BulkProgress
+from workers.catalogue.tables import BulkItemRow, BulkRow
 from workers.contract.bulk import STOPPED, BulkPhase, BulkRequest, ItemState
 from workers.contract.phases import JobError
 from workers.rows import no_such
@@ -25,6 +30,7 @@ log = logging.getLogger(__name__)
 router = APIRouter(prefix="/v1/bulk", tags=["bulk"], responses=RESPONSES, route_class=KeyFirst)
 BulkId = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
 SAMPLE, MOST_SAMPLED = 200, 10_000  # images that an estimate examines
+NDJSON, CSV = "application/x-ndjson", "text/csv"
 LOOK_FROM = 1.0  # a person should inspect images with this artefact score or a higher one
 
 
@@ -44,7 +50,7 @@ class Counts(BaseModel):
     )
 
 
-class BulkView(BaseModel):
+class BulkView(RowView):
     """A bulk run."""
 
     id: str
@@ -86,15 +92,15 @@ class BulkView(BaseModel):
             failed=row.failed,
             to_look_at=progress.to_look_at(row.id, LOOK_FROM),
         )
-        values = {name: getattr(row, name) for name in cls.model_fields if hasattr(row, name)} | {
-            "images": counts,
-            "images_an_hour": rate,
-            "time_left_s": left * 3600.0 / rate if rate and row.phase == BulkPhase.RUNNING else None,
-            "results": f"{here}/results",
-            "failures": f"{here}/failures",
-            "events": f"{here}/events",
-        }
-        return cls.model_validate(values)
+        return cls.of_columns(
+            row,
+            images=counts,
+            images_an_hour=rate,
+            time_left_s=left * 3600.0 / rate if rate and row.phase == BulkPhase.RUNNING else None,
+            results=f"{here}/results",
+            failures=f"{here}/failures",
+            events=f"{here}/events",
+        )
 
 
 class BulkLine(BaseModel):
@@ -123,6 +129,92 @@ class Failed(BaseModel):
     error: JobError
 
 
+class Change(BaseModel):
+    """Change of the intensity in the brightest or the darkest 1 % of the blocks of 4 x 4 pixels.
+
+    sum_pct: change of the summed intensity of these blocks. up_to_pct: percentile 99 of the changes of the bright
+    blocks, or percentile 1 of the changes of the dark blocks.
+    """
+
+    sum_pct: float
+    up_to_pct: float
+
+
+class Result(RowView):
+    """A done image."""
+
+    position: int
+    source: str = Field(description="id of the upload, or path of the file")
+    image_sha256: str
+    psf_id: str
+    product_id: str
+    file: str | None = Field(
+        description="address of the product; null: the service does not keep the product"
+    )
+    thumbnail: str | None = Field(
+        None, description="address of a small picture of the product; null: the service keeps none"
+    )
+    provenance: str | None = Field(
+        None,
+        description="address of the product's lineage as W3C PROV; null: the service does not keep the product",
+    )
+    output: str | None = Field(
+        description="path of the product in the output folder; null: the run has no output folder"
+    )
+    sha256: str = Field(description="SHA-256 of the product's file")
+    bytes: int
+    reused: bool = Field(
+        description="whether the product already existed, so that the image was not deconvolved"
+    )
+    score: float = Field(description="artefact score; below 1: no signs of artefacts were found")
+    flux_change_pct: float
+    bright: Change | None
+    dark: Change | None
+    signs: dict[str, float | None] = Field(
+        description="the signs of artefacts, and the measured value of each sign"
+    )
+    steps_done: int
+    stopped_because: str
+    negative_pixels: int
+    warnings: list[str] = Field(
+        default_factory=list,
+        description="codes of the product's warnings; the product's details have their texts",
+    )
+    ended_at: float
+    seconds: float | None = Field(description="time that the worker spent on the image; null: unknown")
+    kernel_seconds: float | None = Field(
+        description="part of `seconds` that was spent on deconvolving and on measuring changes; null: the product already existed"
+    )
+
+    @classmethod
+    def of(cls, row: BulkItemRow) -> Result:
+        """The result of one image of a bulk run, from its row in the catalogue."""
+        assert row.statistics is not None
+        product, statistics = f"/v1/products/{row.product_id}", row.statistics
+        addresses = {
+            "file": f"{product}/file" if row.kept else None,
+            "provenance": f"{product}/provenance" if row.kept else None,
+            "thumbnail": f"{product}/thumbnail" if row.kept and statistics["has_thumbnail"] else None,
+        }
+        return cls.of_columns(row, **{"seconds": None, "kernel_seconds": None, **statistics, **addresses})
+
+    def flat(self) -> dict[str, Any]:
+        """The values of a CSV row."""
+        row = self.model_dump(exclude=NESTED) | {"warnings": " ".join(self.warnings)}
+        for kind in CHANGES:
+            change: Change | None = getattr(self, kind)
+            row[f"{kind}_sum_pct"] = None if change is None else change.sum_pct
+            row[f"{kind}_up_to_pct"] = None if change is None else change.up_to_pct
+        return row
+
+
+CHANGES = ("bright", "dark")
+NESTED = {*CHANGES, "signs"}
+COLUMNS = [name for name in Result.model_fields if name not in NESTED] + [
+    f"{kind}_{what}" for kind in CHANGES for what in Change.model_fields
+]
+
+
 @router.post("/estimate", summary="Estimate a bulk run without starting it")
 def estimate_bulk(
     body: BulkRequest,
@@ -137,10 +229,8 @@ def estimate_bulk(
     The request and its errors are the same as for `POST /v1/bulk`. The pixels are not read. Therefore the run may also
     refuse images whose pixels cannot be used.
     """
-    try:
+    with as_problems():
         return dry_run(body, state.catalogue, caller.owner, state.settings, sample=sample)
-    except DataError as error:
-        raise problem(error) from error
 
 
 @router.post(
@@ -162,10 +252,8 @@ def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shar
     """
     check = check_room if body.keeps_products else check_rows
     check(state, caller.owner, 1 + len(body.images))
-    try:
+    with as_problems():
         row, new = begin(body, state.catalogue, caller.owner, state.settings)
-    except DataError as error:
-        raise problem(error) from error
     if new:
         log.info("bulk run %s: submitted, %d uploads", row.id, row.total, extra={"fields": {"bulk": row.id}})
         state.reconciler.wake()
@@ -176,18 +264,11 @@ def submit_bulk(body: BulkRequest, response: Response, caller: Bulk, state: Shar
 
 @router.get("", summary="List bulk runs")
 def list_bulks(
-    request: Request,
-    caller: Reading,
-    state: Shared,
-    phase: BulkPhase | None = None,
-    limit: Limit = 50,
-    cursor: Cursor = None,
+    paging: Paging, caller: Reading, state: Shared, phase: BulkPhase | None = None
 ) -> Page[BulkLine]:
     """Bulk runs, newest first."""
-    rows = state.catalogue.page(
-        BulkRow, owner=caller.owner, limit=limit + 1, after=position(cursor), phase=phase
-    )
-    return page(request, rows, limit, BulkLine.model_validate)
+    rows = state.catalogue.page(BulkRow, owner=caller.owner, phase=phase, **paging.query)
+    return paging.page(rows, BulkLine.model_validate)
 
 
 @router.get("/{bulk_id}", summary="One bulk run: progress, speed and time left")
@@ -197,20 +278,13 @@ def get_bulk(bulk_id: BulkId, caller: Reading, state: Shared) -> BulkView:
 
 
 @router.get("/{bulk_id}/failures", summary="Failed images, with reasons")
-def list_failures(
-    bulk_id: BulkId,
-    request: Request,
-    caller: Reading,
-    state: Shared,
-    limit: Annotated[int, Query(ge=1, le=200, description="rows per page")] = 50,
-    cursor: Cursor = None,
-) -> Page[Failed]:
+def list_failures(bulk_id: BulkId, paging: Paging, caller: Reading, state: Shared) -> Page[Failed]:
     """The failed images, in the order of the run."""
     row = find(state, caller, bulk_id)
-    after = _after(cursor)
-    items = state.catalogue.bulks.progress.items(row.id, ItemState.FAILED, after=after, limit=limit + 1)
-    next_page = following(request, str(items[limit - 1].position)) if len(items) > limit else None
-    return Page(items=[Failed.model_validate(item) for item in items[:limit]], next=next_page)
+    items = state.catalogue.bulks.progress.items(
+        row.id, ItemState.FAILED, after=_after(paging.cursor), limit=paging.limit + 1
+    )
+    return paging.page(items, Failed.model_validate, lambda item: (str(item.position),))
 
 
 @router.post("/{bulk_id}/pause", summary="Pause a bulk run")
@@ -246,10 +320,8 @@ def retry_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> BulkView:
     The answer is 409 if this run has ended and another bulk run of an identical request is open. The message names that run.
     """
     row = find(state, caller, bulk_id)
-    try:
+    with as_problems():
         changed = state.catalogue.bulks.retry(row.id)
-    except DataError as error:
-        raise Problem(409, error.code, error.message) from error
     _done(changed is not None, row, "other than CANCELLED")
     state.reconciler.wake()
     return get_bulk(bulk_id, caller, state)
@@ -270,6 +342,82 @@ def delete_bulk(bulk_id: BulkId, caller: Bulk, state: Shared) -> Response:
         _done(False, there, "PAUSED, ERROR, COMPLETED or CANCELLED", ": cancel it first")
     cancel_turns(state.catalogue, row.id)
     return Response(status_code=204)
+
+
+@router.get(
+    "/{bulk_id}/results",
+    summary="Manifest of the done images: checksums, changes and artefacts",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "One image per line: position, source, image_sha256, psf_id, product_id, file (address), "
+            "output (path), sha256, bytes, reused, score, flux_change_pct, bright, dark, signs, and more.",
+            "content": {NDJSON: {"schema": {"type": "string"}}, CSV: {"schema": {"type": "string"}}},
+        }
+    },
+)
+def get_results(
+    bulk_id: BulkId,
+    caller: Reading,
+    state: Shared,
+    format: Literal["ndjson", "csv"] = "ndjson",
+    order: Annotated[
+        Literal["bulk", "worst"],
+        Query(description="`bulk`: order of the run; `worst`: highest artefact score first"),
+    ] = "bulk",
+    limit: Annotated[
+        int | None, Query(ge=1, le=1_000_000, description="number of images; default: all")
+    ] = None,
+    warning: Annotated[
+        str | None,
+        Query(max_length=40, description="only images with this warning, by its code, for example `frame`"),
+    ] = None,
+) -> Response:
+    """All images that are done so far, streamed from the database."""
+    row = find(state, caller, bulk_id)
+    rows = _in_order(state.catalogue.bulks.progress, row.id, order, limit, warning)
+    headers = {"Content-Disposition": f'attachment; filename="bulk-{bulk_id[:12]}.{format}"'}
+    lines, media_type = (_table(rows), CSV) if format == "csv" else (_json_lines(rows), NDJSON)
+    return StreamingResponse(lines, media_type=media_type, headers=headers)
+
+
+def _in_order(
+    progress: BulkProgress, bulk_id: str, order: str, limit: int | None, warning: str | None
+) -> Iterator[list[Result]]:
+    """Results in batches; each batch is one query. warning: see `get_results`."""
+    left = limit
+    after, behind = -1, None
+    while left is None or left > 0:
+        size = BATCH if left is None or warning is not None else min(BATCH, left)
+        if order == "worst":
+            batch = progress.worst(bulk_id, after=behind, limit=size)
+        else:
+            batch = progress.items(bulk_id, ItemState.DONE, after=after, limit=size)
+        if not batch:
+            return
+        after = batch[-1].position
+        behind = (float(batch[-1].score or 0.0), after)
+        results = [Result.of(row) for row in batch]
+        results = [one for one in results if warning is None or warning in one.warnings][:left]
+        yield results
+        left = None if left is None else left - len(results)
+
+
+def _json_lines(batches: Iterator[list[Result]]) -> Iterator[str]:
+    for batch in batches:
+        yield "".join(f"{result.model_dump_json()}\n" for result in batch)
+
+
+def _table(batches: Iterator[list[Result]]) -> Iterator[str]:
+    yield _rows([COLUMNS])
+    for batch in batches:
+        yield _rows([list(result.flat().values()) for result in batch])
+
+
+def _rows(rows: Sequence[Sequence[Any]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def find(state: Shared, caller: Caller, bulk_id: str) -> BulkRow:

@@ -13,7 +13,7 @@ from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, as_problems
 from service.http.quotas import check_rows
 from service.http.state import Shared
-from service.views import PastChange
+from service.views import PastChange, RowView
 from workers.catalogue.contexts import NAME, Pin
 from workers.catalogue.tables import PsfContextRow
 from workers.contract.requests import ContextName, Identity
@@ -63,7 +63,7 @@ class PinView(BaseModel):
     )
 
 
-class ContextView(BaseModel):
+class ContextView(RowView):
     """A context. A context never changes; for other pins, create another context."""
 
     id: str = Field(description="SHA-256 of the name and the pins of the context")
@@ -76,14 +76,7 @@ class ContextView(BaseModel):
     @classmethod
     def of(cls, row: PsfContextRow) -> ContextView:
         """The description of a context, from its row in the catalogue."""
-        return cls(
-            id=row.id,
-            name=row.name,
-            created_at=row.created_at,
-            created_by=row.created_by,
-            reason=row.reason,
-            size=row.pins,
-        )
+        return cls.of_columns(row, size=row.pins)
 
 
 class WholeContext(ContextView):

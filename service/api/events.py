@@ -166,10 +166,10 @@ async def _follow(
 def _stream(request: Request, state: Shared, caller: Caller, say: Callable[[], Said]) -> Response:
     """A stream of the texts of ``say``, which counts as a stream of the caller until it ends.
 
-    The stream ends after the last text, or after ``stream_s`` seconds. The stream also ends when the server stops, and
-    when the key is revoked or expires. ``say`` is called every ``LOOK_EVERY_S`` seconds in a thread. If ``say`` raises
-    SQLAlchemyError, it is called again later and must then return the same text: a failed call must not change the
-    state of ``say``.
+    The stream ends after the last text, or after ``stream_s`` seconds, but not before its first look. It also ends when
+    the server stops, and when the key is revoked or expires. ``say`` is called every ``LOOK_EVERY_S`` seconds in a
+    thread. If ``say`` raises SQLAlchemyError, it is called again later and must then return the same text: a failed call
+    must not change the state of ``say``.
     """
     state.streams.open(caller.name)
     ends_at = time.monotonic() + state.settings.stream_s
@@ -177,7 +177,7 @@ def _stream(request: Request, state: Shared, caller: Caller, say: Callable[[], S
     async def texts() -> AsyncIterator[str]:
         yield f"retry: {COME_BACK_MS}\n\n"
         said_at = time.monotonic()
-        while time.monotonic() <= ends_at and not getattr(request.app.state, "stopping", False):
+        while True:
             try:
                 if not await run_in_threadpool(still_let_in, state, caller):
                     return  # a client that connects again gets 401 with the reason
@@ -192,7 +192,7 @@ def _stream(request: Request, state: Shared, caller: Caller, say: Callable[[], S
                 said_at = time.monotonic()
                 # The comment keeps the connection open while nothing changes.
                 yield text or ": still here\n\n"
-            if last:
+            if last or time.monotonic() > ends_at or getattr(request.app.state, "stopping", False):
                 return
             await asyncio.sleep(LOOK_EVERY_S)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from service.http import downloads as files
 from service.http import uploads
@@ -13,7 +13,7 @@ from service.http.callers import Reading, Submitting
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES
 from service.http.state import Shared
-from service.views import ProductView
+from service.views import ProductView, RowView
 from workers.catalogue.tables import ImageRow, ProductRow
 from workers.contract.requests import Identity
 from workers.files.collection import files_of, remove_unnamed
@@ -23,7 +23,7 @@ router = APIRouter(prefix="/v1/images", tags=["images"], responses=RESPONSES)
 products = APIRouter(prefix="/v1/products", tags=["products"], responses=RESPONSES)
 
 
-class ImageView(BaseModel):
+class ImageView(RowView):
     """An uploaded image."""
 
     id: str = Field(description="SHA-256 of the file")
@@ -35,9 +35,7 @@ class ImageView(BaseModel):
     @classmethod
     def of(cls, row: ImageRow) -> ImageView:
         """The description of an image, from its row in the catalogue."""
-        return cls(
-            id=row.id, created_at=row.created_at, bytes=row.bytes, filename=row.filename, header=row.summary
-        )
+        return cls.of_columns(row, header=row.summary)
 
 
 @router.post(

@@ -129,11 +129,11 @@ def estimate_job(body: JobRequest, caller: Submitting, state: Shared) -> Estimat
     if body.kind == "deconvolve":
         wanted, resolved = cast(Deconvolve, body.parameters), ResolvedDeconvolve.model_validate(parameters)
         psf = reasoned_psf(wanted, resolved, state.catalogue, caller.owner)
-    known = there(result, result_id, caller.owner, state.catalogue, state.store)
+    existing = there(result, result_id, caller.owner, state.catalogue, state.store)
     return EstimateView(
         parameters=parameters,
         result_id=result_id,
-        existing=f"{result}/{result_id}" if known else None,
+        existing=f"{result}/{result_id}" if existing else None,
         estimate=Estimate.model_validate(estimate),
         queue=queue,
         waiting_before=state.catalogue.places.before_new(caller.owner, queue),

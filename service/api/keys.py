@@ -18,6 +18,7 @@ from service.http.callers import Caller, KeyFirst, Reading, Submitting
 from service.http.paging import Page, Paging
 from service.http.problems import RESPONSES, Problem, problem
 from service.http.state import Shared
+from service.views import RowView
 from workers.catalogue.access import LABEL_LENGTH, OWNER, Scope, TooManyKeys
 from workers.catalogue.tables import KeyRow
 from workers.contract.requests import PRINTABLE_OR_EMPTY
@@ -70,7 +71,7 @@ class NewKey(BaseModel):
         return self
 
 
-class KeyView(BaseModel):
+class KeyView(RowView):
     """A key, without its secret."""
 
     id: str
@@ -87,9 +88,7 @@ class KeyView(BaseModel):
     @classmethod
     def of(cls, row: KeyRow) -> KeyView:
         """The description of a key, from its row in the catalogue. It does not contain the secret key."""
-        names = ("id", "owner", "label", "created_at", "expires_at", "revoked_at", "last_used_at", "made_by")
-        shown = {name: getattr(row, name) for name in names}
-        return cls(scopes=list(map(Scope, row.scopes)), state=_state(row), **shown)
+        return cls.of_columns(row, state=_state(row))
 
 
 class MadeKey(KeyView):
@@ -227,20 +226,20 @@ def _end(state: Shared, caller: Caller, body: NewKey) -> float | None:
     """The end of a new key. Raises ``Problem`` 422 if this end is in the past, and 403 if it is later than the end of
     the caller's key."""
     now = time.time()
-    asked = body.expires_at if body.lasts_days is None else now + body.lasts_days * DAY_S
-    if asked is not None and asked <= now:
+    end = body.expires_at if body.lasts_days is None else now + body.lasts_days * DAY_S
+    if end is not None and end <= now:
         raise Problem(
-            422, "end-in-the-past", f"expected an end in the future; got {asked:.0f}: choose a later one"
+            422, "end-in-the-past", f"expected an end in the future; got {end:.0f}: choose a later one"
         )
     own = state.catalogue.keys.get(caller.name)
     latest = None if own is None or Scope.ADMIN in caller.scopes else own.expires_at
     if latest is None:
-        return asked
-    if asked is not None and asked > latest:
+        return end
+    if end is not None and end > latest:
         raise Problem(
             403,
             "outlives-its-maker",
-            f"expected an end that is not later than that of your own key ({latest:.0f}); got {asked:.0f}: choose an earlier end, "
+            f"expected an end that is not later than that of your own key ({latest:.0f}); got {end:.0f}: choose an earlier end, "
             "or ask the operator for a key",
         )
-    return latest if asked is None else asked
+    return latest if end is None else end

@@ -78,8 +78,8 @@ def rerun_product(product_id: Identity, response: Response, caller: Submitting, 
 def _rerun(
     of: Literal["product", "psf"], identity: str, response: Response, caller: Submitting, state: Shared
 ) -> JobView:
-    asked = KINDS["rerun"].request(kind="rerun", parameters=Rerun(of=of, id=identity))
-    return submit_job(asked, response, caller, state)
+    request = KINDS["rerun"].request(kind="rerun", parameters=Rerun(of=of, id=identity))
+    return submit_job(request, response, caller, state)
 
 
 def _provenance(state: Shared, row: ProductRow | PsfRow, of: str, form: Format) -> Response:

@@ -131,7 +131,7 @@ async def get_product_pixels(
 async def _pixels(request: Request, state: Shared, digest: str, name: str, part: Part) -> Response:
     """A part of a plane of a stored file, or 304 if the client already has it."""
     sent = files.headers_of(f"{ANSWERS_VERSION} {digest} pixels {name} {part}")
-    if (same := files.unchanged(request, sent)) is not None:
+    if (same := files.not_modified(request, sent)) is not None:
         return same
     with as_problems():
         plane = await _plane(state, digest, name)
@@ -157,7 +157,7 @@ async def picture_of(request: Request, state: State, digest: str, core_px: int |
     """A picture of the image in a stored file as PNG, or 304 if the client already has it. core_px: of the central part of a
     PSF, with this width."""
     sent = files.headers_of(f"{ANSWERS_VERSION} {digest} picture {core_px}")
-    if (same := files.unchanged(request, sent)) is not None:
+    if (same := files.not_modified(request, sent)) is not None:
         return same
 
     def draw(plane: Plane) -> bytes:
@@ -182,7 +182,7 @@ def _decoded(state: State, digest: str, name: str) -> Plane:
     def decode(target: BinaryIO) -> Decoded:
         check_disk(state)
         # The checksum of the whole file is verified, because browsers keep the pixels for a long time.
-        return decode_plane(files.found(state.store, digest), name, state.limits, target)
+        return decode_plane(files.path_of(state.store, digest), name, state.limits, target)
 
     return state.planes.decoded((digest, name), decode)
 
@@ -227,11 +227,11 @@ async def get_product_header(
 
 async def _headers(request: Request, state: Shared, digest: str, size: int) -> Response:
     sent = files.headers_of(f"{ANSWERS_VERSION} {digest} header")
-    if (same := files.unchanged(request, sent)) is not None:
+    if (same := files.not_modified(request, sent)) is not None:
         return same
 
     def read() -> Response:
-        listed = all_cards(files.found(state.store, digest, size), state.limits)
+        listed = all_cards(files.path_of(state.store, digest, size), state.limits)
         content = [{"index": one.index, "name": one.name, "cards": one.cards} for one in listed]
         return JSONResponse(content, headers=sent)
 

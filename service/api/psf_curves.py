@@ -164,11 +164,11 @@ async def get_cutout(
     """The central part of the PSF, not renormalised. Its centre is at [size // 2, size // 2]."""
     row = await run_in_threadpool(state.row, PsfRow, psf_id, caller.owner)
     headers = files.headers_of(f"{ANSWERS_VERSION} {row.file_sha256} cutout {size}")
-    if (same := files.unchanged(request, headers)) is not None:
+    if (same := files.not_modified(request, headers)) is not None:
         return same
 
     def cut() -> Cutout:
-        return cutout(files.found(state.store, row.file_sha256, row.bytes), size, state.settings.psf_limits)
+        return cutout(files.path_of(state.store, row.file_sha256, row.bytes), size, state.settings.psf_limits)
 
     with as_problems():
         part = await anyio.to_thread.run_sync(cut, limiter=state.cutouts)
@@ -192,7 +192,7 @@ def _answer(
     headers = files.headers_of(
         f"{ANSWERS_VERSION} {' '.join(digests)} {request.url.path} {request.url.query}"
     )
-    if (same := files.unchanged(request, headers)) is not None:
+    if (same := files.not_modified(request, headers)) is not None:
         return same
     tables = [_read(state, row, digest) for row, digest in zip(rows, digests, strict=True)]
     with as_problems():
@@ -200,7 +200,7 @@ def _answer(
 
 
 def _read(state: Shared, row: PsfRow, digest: str) -> Mapping[str, Any]:
-    tables: dict[str, Any] = json.loads(files.found(state.store, digest).read_bytes())
+    tables: dict[str, Any] = json.loads(files.path_of(state.store, digest).read_bytes())
     if tables["schema"] != psf_lookup.SCHEMA:
         raise _no_tables(row)
     return tables

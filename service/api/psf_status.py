@@ -4,19 +4,18 @@
 from __future__ import annotations
 
 import logging
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from service.api.psfs import TEXT
-from service.http import paging as pages
 from service.http.callers import Caller, Certifying, KeyFirst, Reading
-from service.http.paging import Page, Paging
+from service.http.paging import Page, Paging, number, place
 from service.http.problems import RESPONSES, as_problems
 from service.http.quotas import check_rows
 from service.http.state import Shared, State
-from service.views import PastChange, was_certified
+from service.views import PastChange, RowView, was_certified
 from workers.catalogue.affected import Affected, Place
 from workers.catalogue.psfs import StatusAsked
 from workers.catalogue.tables import PsfRow
@@ -93,7 +92,7 @@ class Change(PastChange):
     successor: str | None = Field(validation_alias="successor_id")
 
 
-class StatusView(BaseModel):
+class StatusView(RowView):
     """A PSF's status, its allowed changes, and its history."""
 
     id: str
@@ -149,14 +148,9 @@ def _asked(body: StatusChange) -> StatusAsked:
 
 def _view(state: State, caller: Caller, row: PsfRow) -> StatusView:
     psfs = state.catalogue.psfs
-    values: dict[str, Any] = {"valid_from": row.valid_from, "valid_to": row.valid_to}
-    return StatusView(
-        id=row.id,
-        status=PsfStatus(row.status),
-        version=row.version,
-        series=row.series,
+    return StatusView.of_columns(
+        row,
         was_certified=was_certified(row),
-        **values,
         successor=row.successor_id,
         may_become=sorted(MAY_BECOME[PsfStatus(row.status)]),
         next_version=None if row.series is None else next_version(psfs.released(row.series, caller.owner)),
@@ -197,8 +191,11 @@ class SeriesView(SeriesSummary):
 @series.get("", summary="List series")
 def list_series(caller: Reading, state: Shared) -> Page[SeriesSummary]:
     """The series of which a PSF was certified, sorted by name, on one page."""
-    known = state.catalogue.series.all(caller.owner)
-    items = [SeriesSummary(series=name, interpolated=interpolated) for name, interpolated in known.items()]
+    series_of_owner = state.catalogue.series.all(caller.owner)
+    items = [
+        SeriesSummary(series=name, interpolated=interpolated)
+        for name, interpolated in series_of_owner.items()
+    ]
     return Page(items=items, next=None)
 
 
@@ -245,7 +242,7 @@ def _series(state: State, caller: Caller, name: str) -> SeriesView:
     )
 
 
-class AffectedView(BaseModel):
+class AffectedView(RowView):
     """A product, the PSF that made it, and the replacement of this PSF, if there is one."""
 
     product_id: str
@@ -262,12 +259,9 @@ class AffectedView(BaseModel):
     @classmethod
     def of(cls, one: Affected) -> AffectedView:
         """The description of an affected product and its PSF, from their rows in the catalogue."""
-        return cls(
+        return cls.of_columns(
+            one.product,
             product_id=one.product.id,
-            image_id=one.product.image_id,
-            created_at=one.product.created_at,
-            psf_id=one.psf.id,
-            psf_version=one.product.psf_version,
             psf_status=one.psf.status,
             successor=one.psf.successor_id,
             redo_with=None if one.redo_with is None else one.redo_with.id,
@@ -282,12 +276,12 @@ def list_affected(
     superseded: Annotated[bool, Query(description="only products whose PSF has a successor")] = False,
 ) -> Page[AffectedView]:
     """Products whose PSF is deprecated, sorted by PSF; the products of each PSF are listed newest first."""
-    at = pages.place(paging.cursor, 3)
-    after = None if at is None else Place(at[0], pages.number(at[1]), at[2])
+    at = place(paging.cursor, 3)
+    after = None if at is None else Place(at[0], number(at[1]), at[2])
     rows = state.catalogue.affected.page(
         caller.owner, superseded=superseded, limit=paging.limit + 1, after=after
     )
-    return _page(paging, rows, whole=True)
+    return paging.page(rows, AffectedView.of, lambda one: (one.psf.id, *_place(one)))
 
 
 @affected.get("/v1/psfs/{psf_id}/affected", summary="Products made with a PSF")
@@ -296,13 +290,9 @@ def list_affected_by_psf(
 ) -> Page[AffectedView]:
     """Products made with this PSF, which may have any status. The newest product is listed first."""
     psf = state.row(PsfRow, psf_id, caller.owner)
-    return _page(paging, state.catalogue.affected.of_psf(psf, **paging.query), whole=False)
+    return paging.page(state.catalogue.affected.of_psf(psf, **paging.query), AffectedView.of, _place)
 
 
-def _page(paging: Paging, rows: list[Affected], *, whole: bool) -> Page[AffectedView]:
-    following = None
-    if len(rows) > paging.limit:
-        last = rows[paging.limit - 1]
-        place = (repr(last.product.created_at), last.product.id)
-        following = pages.following(paging.request, *((last.psf.id, *place) if whole else place))
-    return Page(items=[AffectedView.of(one) for one in rows[: paging.limit]], next=following)
+def _place(one: Affected) -> tuple[str, ...]:
+    """The place of a product in its cursor."""
+    return repr(one.product.created_at), one.product.id

@@ -20,11 +20,10 @@ from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from psfcore.errors import DataError
 from psfcore.whole_files import sha256_of
 from service.http import uploads
 from service.http.callers import Caller, Submitting
-from service.http.problems import RESPONSES, Problem
+from service.http.problems import RESPONSES, Problem, as_problems
 from service.http.quotas import Allowed, check_length
 from service.http.state import Shared, State
 from workers.files.partial_uploads import PartialUpload, PartialUploads
@@ -123,11 +122,9 @@ def begin_upload(request: Request, caller: Submitting, state: Shared) -> Respons
                 with _while_open(equal.id):
                     return _described(200, open_uploads, equal)
         check_length(state, caller, length)
-        try:
+        with as_problems():
             filename = uploads.label(metadata.get("filename"))
             upload = open_uploads.create(caller.owner, name, length, filename, sha256)
-        except DataError as error:
-            raise Problem(429, error.code, error.message) from error
         return _described(201, open_uploads, upload)
 
 
@@ -158,10 +155,8 @@ async def send_part(upload_id: UploadId, request: Request, caller: Submitting, s
         raise Problem(415, "bad-upload", f"expected Content-Type: {PART}; got another one")
     with _while_open(upload_id), ExitStack() as held:
         open_uploads, upload = await run_in_threadpool(_open_upload, upload_id, request, caller, state)
-        try:
+        with as_problems():
             file = held.enter_context(open_uploads.opened(upload))
-        except DataError as error:
-            raise Problem(423, error.code, error.message) from error
         offset = file.tell()
         if (sent := _number(request, "upload-offset")) != offset:
             raise Problem(409, "wrong-offset", f"expected bytes from {offset} on; got bytes from {sent} on")

@@ -26,7 +26,7 @@ from service.cli.options import (
 )
 from service.cli.progress import echo
 from service.client.errors import WaitInterrupted
-from service.client.operations import Progress, given
+from service.client.operations import Progress, without_none
 from service.client.outputs import check_outputs
 from workers.contract.queues import Queue, queues_named
 
@@ -114,7 +114,7 @@ def worker(
     from workers.files.modes import keep_private
 
     # Celery imports the worker's module, which reads its settings from the environment.
-    options = given({"worker_processes": processes, "worker_queues": queues})
+    options = without_none({"worker_processes": processes, "worker_queues": queues})
     if queues is not None:
         try:
             queues_named(queues)

@@ -18,7 +18,7 @@ import httpx
 
 from service.client.address import DEFAULT_SERVER, how_to_start, service_address
 from service.client.errors import FIRST_WAIT_S, Patience, ServiceError
-from service.client.operations import given
+from service.client.operations import without_none
 from service.client.outputs import written
 
 # Longest silence before a stream counts as broken; a stream sends a line at least every 15 s.
@@ -184,7 +184,7 @@ class Connection:
     ) -> httpx.Response:
         """The answer to a request. A parameter whose value is None is not sent."""
         with self._reached():
-            return self._http.request(method, address, params=given(params or {}) or None, **options)
+            return self._http.request(method, address, params=without_none(params or {}) or None, **options)
 
     @contextmanager
     def _streamed(self, address: str, **options: Any) -> Iterator[httpx.Response]:

@@ -16,7 +16,7 @@ from service.client import resumable
 from service.client.address import SHOWN_DIGITS
 from service.client.connection import GOES_ON, Connection
 from service.client.errors import Patience, ServiceError, WaitInterrupted
-from service.client.operations import Operations, Progress, given
+from service.client.operations import Operations, Progress, without_none
 
 if TYPE_CHECKING:
     import numpy as np
@@ -241,14 +241,44 @@ class Client(Connection, Operations):
         """All PSF versions, newest first."""
         return self._all("/v1/psfs", filters)
 
-    def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
+    def psf_curve(self, psf_id: str, radii: Sequence[float] | None = None) -> dict[str, Any]:
+        """Light beyond radii (px) in percent, by component, with errors; without ``radii``, at all radii of the table."""
+        return self.answer([psf_id], "curve", {} if radii is None else {"radii": list(radii)})
+
+    def psf_profile(self, psf_id: str) -> dict[str, Any]:
+        """Mean weight of the pixels at each radius, for each component."""
+        return self.answer([psf_id], "profile", {})
+
+    def psf_encircled(self, psf_id: str, radius: float) -> dict[str, Any]:
+        """Light within a radius (px), as a fraction of all light."""
+        return self.answer([psf_id], "encircled", {"radius": radius})
+
+    def psf_annulus(self, psf_id: str, inner: float, outer: float) -> dict[str, Any]:
+        """Light between two radii (px), as a fraction of all light."""
+        return self.answer([psf_id], "annulus", {"inner": inner, "outer": outer})
+
+    def compare_psfs(self, psf_id: str, other_id: str) -> dict[str, Any]:
+        """Differences of the curves (percentage points) and sums of two PSFs, the second minus the first."""
+        return self.answer([psf_id, other_id], f"compare/{other_id}", {})
+
+    def answer(self, psf_ids: list[str], question: str, query: dict[str, Any]) -> dict[str, Any]:
+        """The answer to a query. If tables are missing, for example of an uploaded PSF, they are made first."""
+        address = f"/v1/psfs/{psf_ids[0]}/{question}"
         parameters = {
             name: ",".join(f"{number!r}" for number in value) if isinstance(value, list) else value
             for name, value in query.items()
         }
-        return self._json("GET", f"/v1/psfs/{psf_id}/{question}", params=parameters)
+        try:
+            return self._json("GET", address, params=parameters)
+        except ServiceError as error:
+            if error.code != "no-tables":
+                raise
+        for psf_id in psf_ids:
+            self.wait(self.submit("psf-tables", psf_id=psf_id))
+        return self._json("GET", address, params=parameters)
 
     def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
+        """Write the central (size, size) px of a PSF as FITS."""
         self.download(f"/v1/psfs/{psf_id}/cutout?size={size}", output, overwrite=overwrite)
 
     def psf_status(self, psf_id: str) -> dict[str, Any]:
@@ -335,7 +365,7 @@ class Client(Connection, Operations):
             "before_time": before_time or self.psf(before)["valid_to"],
             "after_time": after_time or self.psf(after)["valid_from"],
         }
-        parameters = {"before_psf_id": before, "after_psf_id": after, "time": time, **given(times)}
+        parameters = {"before_psf_id": before, "after_psf_id": after, "time": time, **without_none(times)}
         return self.run("psf-interpolate", parameters, progress)
 
     def contexts(self) -> Iterator[dict[str, Any]]:
@@ -421,7 +451,7 @@ class Client(Connection, Operations):
         self, bulk_id: str, *, order: str = "bulk", limit: int | None = None
     ) -> Iterator[dict[str, Any]]:
         """The images that are done, with checksums and changes. ``order="worst"`` puts the highest artefact score first."""
-        query = given({"order": order, "limit": limit})
+        query = without_none({"order": order, "limit": limit})
         with self._streamed(f"/v1/bulk/{bulk_id}/results", params=query) as answer:
             for line in answer.iter_lines():
                 yield json.loads(line)
@@ -489,7 +519,7 @@ def _bulk_request(
     **fields: Any,
 ) -> dict[str, Any]:
     """The body of a request for a bulk run, from the arguments of ``Client.submit_bulk``."""
-    fields = given(fields)
+    fields = without_none(fields)
     own: dict[str, Any] = {name: fields.pop(name) for name in ("name", "psf_id", "context") if name in fields}
     return {
         **own,

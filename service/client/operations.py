@@ -9,7 +9,7 @@ the new file is complete.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -85,19 +85,6 @@ class Operations(ABC):
     @abstractmethod
     def download(self, address: str, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the file at an address of the service to ``path``; an existing file only if ``overwrite`` is true."""
-
-    # No command with --local asks for these two.
-
-    def ask(self, psf_id: str, question: str, **query: Any) -> dict[str, Any]:
-        """The answer of a PSF's tables to "curve", "profile", "encircled", "annulus" or "compare/ID".
-
-        Raises ``ServiceError`` "no-tables" if the tables have not been made.
-        """
-        raise NotImplementedError
-
-    def psf_cutout(self, psf_id: str, size: int, output: str | Path, *, overwrite: bool = False) -> None:
-        """Write the central (size, size) px of a PSF as FITS."""
-        raise NotImplementedError
 
     def deconvolve(
         self,
@@ -237,7 +224,7 @@ class Operations(ABC):
         """Run a job of this kind on a transit, and download files of its result; returns the description of the result."""
         check_outputs(files.values(), inputs=(transit,), overwrite=overwrite)
         transit_id = self.upload_transit(transit)["id"]
-        request = {"transit_id": transit_id, **given(parameters), **_noise(noise)}
+        request = {"transit_id": transit_id, **without_none(parameters), **_noise(noise)}
         result = self.run(kind, request, progress)
         self._fetch(result, files, overwrite)
         return result
@@ -252,37 +239,6 @@ class Operations(ABC):
         for name, path in files.items():
             if path is not None:
                 self.download(result[name], path, overwrite=overwrite)
-
-    def psf_curve(self, psf_id: str, radii: Sequence[float] | None = None) -> dict[str, Any]:
-        """Light beyond radii (px) in percent, by component, with errors; without ``radii``, at all radii of the table."""
-        return self.answer([psf_id], "curve", {} if radii is None else {"radii": list(radii)})
-
-    def psf_profile(self, psf_id: str) -> dict[str, Any]:
-        """Mean weight of the pixels at each radius, for each component."""
-        return self.answer([psf_id], "profile", {})
-
-    def psf_encircled(self, psf_id: str, radius: float) -> dict[str, Any]:
-        """Light within a radius (px), as a fraction of all light."""
-        return self.answer([psf_id], "encircled", {"radius": radius})
-
-    def psf_annulus(self, psf_id: str, inner: float, outer: float) -> dict[str, Any]:
-        """Light between two radii (px), as a fraction of all light."""
-        return self.answer([psf_id], "annulus", {"inner": inner, "outer": outer})
-
-    def compare_psfs(self, psf_id: str, other_id: str) -> dict[str, Any]:
-        """Differences of the curves (percentage points) and sums of two PSFs, the second minus the first."""
-        return self.answer([psf_id, other_id], f"compare/{other_id}", {})
-
-    def answer(self, psf_ids: list[str], question: str, query: dict[str, Any]) -> dict[str, Any]:
-        """The answer to a query. If tables are missing, for example of an uploaded PSF, they are made first."""
-        try:
-            return self.ask(psf_ids[0], question, **query)
-        except ServiceError as error:
-            if error.code != "no-tables":
-                raise
-        for psf_id in psf_ids:
-            self.wait(self.submit("psf-tables", psf_id=psf_id))
-        return self.ask(psf_ids[0], question, **query)
 
     @staticmethod
     def _ended(job: dict[str, Any]) -> dict[str, Any]:
@@ -305,7 +261,7 @@ def treatment(
     *, method: str = "richardson-lucy", noise: tuple[float, float] | None = None, **parameters: Any
 ) -> dict[str, Any]:
     """The fields of a request to deconvolve, from the arguments of ``Operations.deconvolve``."""
-    parameters = given(parameters)
+    parameters = without_none(parameters)
     fields = {name: value for name, value in parameters.items() if name in Deconvolve.model_fields}
     of_method = {name: value for name, value in parameters.items() if name not in fields}
     return {"method": {"name": method, **of_method}, **fields, **_noise(noise)}
@@ -318,7 +274,7 @@ def named_instrument(instrument: str | Path) -> dict[str, str]:
     return {"instrument": instrument}
 
 
-def given(parameters: dict[str, Any]) -> dict[str, Any]:
+def without_none(parameters: dict[str, Any]) -> dict[str, Any]:
     """The parameters that are not None. The service has defaults for the others."""
     return {name: value for name, value in parameters.items() if value is not None}
 

@@ -24,9 +24,9 @@ def check_outputs(
     symbolic or hard link; "outputs-equal" if two outputs are the same file; "output-exists" if an output exists and
     ``overwrite`` is false; "output-not-writable" if a file cannot be written there now (a small file is written and removed).
     """
-    read = {_file(path): path for given in inputs if given is not None for path in _files_in(Path(given))}
+    read = {_file(path): path for one in inputs if one is not None for path in _files_in(Path(one))}
     taken: dict[_File, Path] = {}
-    for output in (Path(given) for given in outputs if given is not None):
+    for output in (Path(one) for one in outputs if one is not None):
         if _is_device(output):
             continue
         file = _file(output)

@@ -27,11 +27,10 @@ from weakref import WeakValueDictionary
 
 from fastapi import Depends, Request, Response, Security
 from fastapi.concurrency import run_in_threadpool
-from fastapi.openapi.models import HTTPBase, HTTPBearer
 from fastapi.params import Security as SecurityParameter
 from fastapi.routing import APIRoute
-from fastapi.security import SecurityScopes
-from fastapi.security.base import SecurityBase
+from fastapi.security import HTTPBearer, SecurityScopes
+from fastapi.security.http import HTTPBase
 
 from service.http.guard import BULK, SAFE_METHODS, JsonRequest
 from service.http.problems import Problem, problem
@@ -82,26 +81,19 @@ class Caller:
     session: str | None = None  # the id of the browser's session, if a cookie let the request in
 
 
-class _Scheme(SecurityBase):
-    """A way to send a key, for the OpenAPI description."""
-
-    def __init__(self, name: str, model: HTTPBase) -> None:
-        self.scheme_name, self.model = name, model
-
-    async def __call__(self) -> None:
-        """Do nothing: ``_caller`` checks the key of every request."""
-
-
-_AS_BEARER = _Scheme("bearer", HTTPBearer(description="a key, hpsf_ID_SECRET"))
-_AS_PASSWORD = _Scheme("basic", HTTPBase(scheme="basic", description="any user name, a key as the password"))
+# The two ways to send a key, for the OpenAPI description; ``_caller`` checks the key of every request.
+_AS_BEARER = HTTPBearer(scheme_name="bearer", description="a key, hpsf_ID_SECRET", auto_error=False)
+_AS_PASSWORD = HTTPBase(
+    scheme="basic", scheme_name="basic", description="any user name, a key as the password", auto_error=False
+)
 
 
 def _caller(
     request: Request,
     needed: SecurityScopes,
     state: Shared,
-    _bearer: Annotated[None, Depends(_AS_BEARER)],
-    _basic: Annotated[None, Depends(_AS_PASSWORD)],
+    _bearer: Annotated[object, Depends(_AS_BEARER)],
+    _basic: Annotated[object, Depends(_AS_PASSWORD)],
 ) -> Caller:
     """The caller of a request. Raises ``Problem`` if the key lacks a scope that the route needs, or if the caller
     reached a limit."""

@@ -29,7 +29,7 @@ def send(
     size: int | None = None,
     missing: tuple[str, str] | None = None,
 ) -> Response:
-    """The file with this SHA-256 as ETag, or 304 if the client already has it. size: as for ``found``.
+    """The file with this SHA-256 as ETag, or 304 if the client already has it. size: as for ``path_of``.
 
     Clients can check the received file against the SHA-256 in the header Repr-Digest (RFC 9530). Raises ``Problem`` 410
     if the file is lost, and 404 with the code and the message of ``missing`` if digest is None.
@@ -39,9 +39,9 @@ def send(
         raise Problem(404, *missing)
     content = base64.b64encode(bytes.fromhex(digest)).decode()
     headers = {"ETag": f'"{digest}"', "Cache-Control": KEPT, "Repr-Digest": f"sha-256=:{content}:"}
-    if known(request, headers["ETag"]):
+    if _client_has(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    path = found(store, digest, size)
+    path = path_of(store, digest, size)
     return FileResponse(path, media_type=media_type, filename=filename, headers=headers)
 
 
@@ -50,12 +50,12 @@ def headers_of(content: str) -> dict[str, str]:
     return {"ETag": f'"{hashlib.sha256(content.encode()).hexdigest()}"', "Cache-Control": KEPT}
 
 
-def unchanged(request: Request, headers: dict[str, str]) -> Response | None:
+def not_modified(request: Request, headers: dict[str, str]) -> Response | None:
     """The answer 304 if the client already has the content with these headers; otherwise None."""
-    return Response(status_code=304, headers=headers) if known(request, headers["ETag"]) else None
+    return Response(status_code=304, headers=headers) if _client_has(request, headers["ETag"]) else None
 
 
-def found(store: Store, digest: str, size: int | None = None) -> Path:
+def path_of(store: Store, digest: str, size: int | None = None) -> Path:
     """The path of a stored file, after a check. Raises ``Problem`` 410 if the file is lost or damaged.
 
     size: the recorded size of the file, bytes; the check then reads only the size. None: the check reads the whole file,
@@ -78,7 +78,7 @@ def _logged(error: BadFile) -> Problem:
     return problem(error)
 
 
-def known(request: Request, etag: str) -> bool:
+def _client_has(request: Request, etag: str) -> bool:
     """Whether the client already has the content of this ETag (If-None-Match)."""
     tags = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
     return "*" in tags or etag in tags

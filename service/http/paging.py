@@ -7,7 +7,7 @@ import binascii
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Generic, Protocol, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Depends, Query, Request
 from pydantic import BaseModel, Field
@@ -24,20 +24,8 @@ class Page(BaseModel, Generic[Item]):
     next: str | None = Field(description="address of the next page; null: this is the last page")
 
 
-class _Ordered(Protocol):
-    created_at: Any
-    id: Any
-
-
-Row = TypeVar("Row", bound=_Ordered)
-Limit = Annotated[int, Query(ge=1, le=200, description="rows per page")]
+Row = TypeVar("Row")
 Cursor = Annotated[str | None, Query(description="the cursor in `next` of the previous page")]
-
-
-def position(cursor: str | None) -> tuple[float, str] | None:
-    """The (created_at, id) in a cursor. Raises ``Problem`` 422 if this service did not issue it."""
-    parts = place(cursor, 2)
-    return None if parts is None else (number(parts[0]), parts[1])
 
 
 def place(cursor: str | None, count: int) -> list[str] | None:
@@ -81,11 +69,8 @@ def no_cursor() -> Problem:
     )
 
 
-def page(request: Request, rows: Sequence[Row], limit: int, view: Callable[[Row], Item]) -> Page[Item]:
-    """The page of ``limit`` rows. Callers query ``limit + 1`` rows: the last row shows that there is a next page."""
-    after = rows[limit - 1] if len(rows) > limit else None
-    next_page = None if after is None else following(request, repr(after.created_at), after.id)
-    return Page(items=[view(row) for row in rows[:limit]], next=next_page)
+def _place_in_time(row: Any) -> tuple[str, ...]:
+    return repr(row.created_at), row.id
 
 
 @dataclass(frozen=True)
@@ -98,15 +83,36 @@ class Listing:
 
     @property
     def query(self) -> dict[str, Any]:
-        """Arguments of the query for the rows. Raises ``Problem`` 422 if this service did not issue the cursor."""
-        return {"limit": self.limit + 1, "after": position(self.cursor)}
+        """Arguments of the query for the rows: one more than the page has, which shows that there is a next page, after
+        the (created_at, id) in the cursor. Raises ``Problem`` 422 if this service did not issue the cursor."""
+        parts = place(self.cursor, 2)
+        after = None if parts is None else (number(parts[0]), parts[1])
+        return {"limit": self.limit + 1, "after": after}
 
-    def page(self, rows: Sequence[Row], view: Callable[[Row], Item]) -> Page[Item]:
-        """The page of the rows that ``query`` gave."""
-        return page(self.request, rows, self.limit, view)
+    def following(
+        self, rows: Sequence[Row], place_of: Callable[[Row], tuple[str, ...]] = _place_in_time
+    ) -> str | None:
+        """The address of the next page; None if the rows that ``query`` gave are the last.
+
+        place_of: the parts of the cursor that names a row.
+        """
+        return following(self.request, *place_of(rows[self.limit - 1])) if len(rows) > self.limit else None
+
+    def page(
+        self,
+        rows: Sequence[Row],
+        view: Callable[[Row], Item],
+        place_of: Callable[[Row], tuple[str, ...]] = _place_in_time,
+    ) -> Page[Item]:
+        """The page of the rows that ``query`` gave. place_of: as for ``following``."""
+        return Page(items=[view(row) for row in rows[: self.limit]], next=self.following(rows, place_of))
 
 
-async def _listing(request: Request, limit: Limit = 50, cursor: Cursor = None) -> Listing:
+async def _listing(
+    request: Request,
+    limit: Annotated[int, Query(ge=1, le=200, description="rows per page")] = 50,
+    cursor: Cursor = None,
+) -> Listing:
     return Listing(request, limit, cursor)
 
 

@@ -45,6 +45,7 @@ STATUS_OF = {
     "changed-meanwhile": 409,
     "channel-mismatch": 409,
     "cutout-not-plain": 409,
+    "equal-bulk-open": 409,
     "line-known": 409,
     "name-taken": 409,
     "no-date": 409,
@@ -74,6 +75,8 @@ STATUS_OF = {
     "archive-too-large": 413,
     "too-much-memory": 413,
     "not-an-archive": 415,
+    "upload-locked": 423,
+    "too-many-uploads": 429,
 }
 # Headers of every answer; a route may set others. The headers forbid browsers to guess media types, to show
 # the answer in a frame, to send a referrer, to load content, and to let windows of other sites reach the answer.
@@ -199,12 +202,12 @@ def install(app: FastAPI, as_page: AsPage) -> None:
     def _ours(request: Request, _error: Exception) -> Response:
         # After this answer Starlette logs the traceback and passes the error on to the server, which closes the
         # connection. No middleware sets the headers of this answer, so they are set here.
-        told = {"Connection": "close", "X-Request-ID": logs.about().get("request", "")}
+        headers = {"Connection": "close", "X-Request-ID": logs.about().get("request", "")}
         detail = (
             "the service failed and logged the error; send the X-Request-ID of this answer to the operator"
         )
         return answer(
-            request, Problem(500, "internal-error", detail, headers=SECURITY_HEADERS | told), as_page
+            request, Problem(500, "internal-error", detail, headers=SECURITY_HEADERS | headers), as_page
         )
 
 

@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic
+from typing import Any, Generic, Self
 
 import anyio.to_thread
 from fastapi import Request, Response
@@ -109,8 +109,37 @@ class Kind(Generic[Row]):
             return self.content(path, state)
 
 
+class Received:
+    """A file of a request, which is written to a temporary path and hashed while it arrives.
+
+    filename: the name that the client gives to the file. bytes: the number of bytes that have arrived.
+    """
+
+    def __init__(self, path: Path, filename: str | None = None) -> None:
+        self.path, self.filename, self.bytes = path, filename, 0
+        self._file, self._digest = path.open("wb"), hashlib.sha256()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def write(self, piece: bytes) -> None:
+        """Add the next bytes of the file; a reader of the path finds them at once."""
+        self._digest.update(piece)
+        self._file.write(piece)
+        self._file.flush()
+        self.bytes += len(piece)
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the bytes that have arrived."""
+        return self._digest.hexdigest()
+
+
 def _could_be_fits(start: bytes, _whole: bool) -> bool:
-    return any(start.startswith(known[: len(start)]) for known in FITS_STARTS)
+    return any(start.startswith(beginning[: len(start)]) for beginning in FITS_STARTS)
 
 
 def _image_content(path: Path, state: State) -> HeaderSummary:
@@ -164,12 +193,13 @@ async def add_upload(
     """
     allowed = Allowed(state, caller)
     with state.store.temporary() as path:
-        sha256, size, filename = await _receive(request, path, state, kind, allowed)
+        file = await _receive(request, path, state, kind, allowed)
         summary = await anyio.to_thread.run_sync(kind.inspect, path, state, limiter=state.inspecting)
-        there = None if equal is None else await run_in_threadpool(equal, sha256)
+        there = None if equal is None else await run_in_threadpool(equal, file.sha256)
         if there is None:
-            upload = kind.row(caller.owner, sha256, size, filename, summary, **(columns or {}))
-            row, new = await run_in_threadpool(allowed.keep, path, sha256, upload)
+            about = (caller.owner, file.sha256, file.bytes, label(file.filename))
+            upload = kind.row(*about, summary, **(columns or {}))
+            row, new = await run_in_threadpool(allowed.keep, path, file.sha256, upload)
         else:
             row, new = there, False
     response.status_code = 201 if new else 200
@@ -177,10 +207,8 @@ async def add_upload(
     return row
 
 
-async def _receive(
-    request: Request, path: Path, state: State, kind: Kind[Any], take: Allowed
-) -> tuple[str, int, str | None]:
-    """Write the file of a request to a path; returns its SHA-256, size and name."""
+async def _receive(request: Request, path: Path, state: State, kind: Kind[Any], take: Allowed) -> Received:
+    """Write the file of a request to a path."""
     most_bytes = kind.most_bytes(state)
     text = request.headers.get("content-length", "")
     counted = int(text) if text.isdecimal() else 0
@@ -188,23 +216,21 @@ async def _receive(
         raise _too_large(most_bytes)
     if counted:  # if the length is declared, the upload can be refused before it is sent
         await run_in_threadpool(take, counted)
-    digest, size, start, filename = hashlib.sha256(), 0, b"", None
-    with path.open("wb") as file:
+    start = b""
+    with Received(path) as file:
         async for name, chunk in _file_of(request, most_bytes):
-            filename = name
+            file.filename = name
             if len(start) < kind.start_bytes:
                 start += chunk[: kind.start_bytes - len(start)]
                 kind.check_start(start, whole=False)
-            size += len(chunk)
-            if size > most_bytes:
+            if file.bytes + len(chunk) > most_bytes:
                 raise _too_large(most_bytes)
-            if size > counted:
+            if file.bytes + len(chunk) > counted:
                 await run_in_threadpool(take, UNDECLARED_BYTES)
                 counted += UNDECLARED_BYTES
-            digest.update(chunk)
             file.write(chunk)
-    kind.check_size(size, state)
-    return digest.hexdigest(), size, filename
+    kind.check_size(file.bytes, state)
+    return file
 
 
 def _too_large(max_bytes: int) -> Problem:
@@ -216,9 +242,9 @@ def _too_large(max_bytes: int) -> Problem:
 
 
 async def _file_of(request: Request, max_bytes: int) -> AsyncIterator[tuple[str | None, bytes]]:
-    """The pieces of the file in a request, each with the label of the file: the raw body, or the part ``file`` of a form."""
+    """The pieces of the file in a request, each with the name of the file: the raw body, or the part ``file`` of a form."""
     if media_type_of(request) != FORM:
-        filename = label(request.query_params.get("filename"))
+        filename = request.query_params.get("filename")
         async for chunk in chunks_of(request):
             yield filename, chunk
         return
@@ -228,7 +254,7 @@ async def _file_of(request: Request, max_bytes: int) -> AsyncIterator[tuple[str 
             if file is None and part.name == "file":
                 file = part
             if part is file and piece:
-                yield label(file.filename), piece
+                yield file.filename, piece
     if file is None:
         raise Problem(
             400,

@@ -16,6 +16,7 @@ from service.api.bulk import (
     BulkLine,
     BulkView,
     Failed,
+    Result,
     cancel_bulk,
     delete_bulk,
     estimate_bulk,
@@ -28,9 +29,8 @@ from service.api.bulk import (
     retry_bulk,
     submit_bulk,
 )
-from service.api.bulk_results import Result
 from service.http.callers import Caller
-from service.http.paging import Cursor, following, number, place
+from service.http.paging import Cursor, Listing, following, number, place
 from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.pages.forms import Sent, SentForm, checked, chosen_method, text, usual_steps
@@ -72,7 +72,7 @@ router = APIRouter(prefix="/bulk", include_in_schema=False)
 @router.get("")
 def bulk_list(request: Request, caller: PageReading, state: Shared, cursor: Cursor = None) -> Response:
     """The bulk runs, newest first, and the forms that start one."""
-    runs = list_bulks(request, caller, state, limit=PER_PAGE, cursor=cursor)
+    runs = list_bulks(Listing(request, PER_PAGE, cursor), caller, state)
     without = state.catalogue.bulks.progress.without_product(caller.owner, MOST_STARTED + 1)
     return page(
         request,
@@ -242,7 +242,7 @@ def failures(
 ) -> Response:
     """The failed images, in the order of the run."""
     row = find(state, caller, bulk_id)
-    found = list_failures(bulk_id, request, caller, state, PER_PAGE, cursor)
+    found = list_failures(bulk_id, Listing(request, PER_PAGE, cursor), caller, state)
     uploads = state.catalogue.bulks.progress.names_of_uploads(
         [one.source for one in found.items], caller.owner
     )

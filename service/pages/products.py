@@ -88,7 +88,7 @@ def delete(product_id: Identity, caller: PageSubmitting, state: Shared) -> Respo
 def _lost(state: State, digest: str, size: int) -> str | None:
     """Why a file cannot be shown; None if it can."""
     try:
-        downloads.found(state.store, digest, size)
+        downloads.path_of(state.store, digest, size)
     except Problem as problem:
         return of_problem(problem)
     return None

@@ -290,7 +290,7 @@ def _fit(state: State, view: PsfView) -> dict[str, Any] | None:
     digest = view.details.get("report_sha256")
     if digest is None:
         return None
-    said: dict[str, Any] = json.loads(downloads.found(state.store, digest).read_bytes())
+    said: dict[str, Any] = json.loads(downloads.path_of(state.store, digest).read_bytes())
     return said
 
 

@@ -84,8 +84,8 @@ def figure(
         )
     png = figures[number - 1]
     headers = {"ETag": f'"{hashlib.sha256(png).hexdigest()}"', "Cache-Control": downloads.KEPT}
-    if downloads.known(request, headers["ETag"]):
-        return Response(status_code=304, headers=headers)
+    if (same := downloads.not_modified(request, headers)) is not None:
+        return same
     return Response(png, media_type="image/png", headers=headers)
 
 
@@ -94,7 +94,7 @@ def _stored(state: State, row: ReportRow) -> StoredPage | None:
     digest = row.details.get("page_sha256")
     if digest is None:
         return None
-    return read_stored(downloads.found(state.store, digest), f"/reports/{row.id}/figures")
+    return read_stored(downloads.path_of(state.store, digest), f"/reports/{row.id}/figures")
 
 
 @lru_cache(maxsize=MOST_KEPT)
@@ -118,7 +118,7 @@ def read_stored(path: Path, figures_at: str) -> StoredPage:
 
 
 def _said(state: State, row: ReportRow) -> Mapping[str, Any]:
-    said: dict[str, Any] = json.loads(downloads.found(state.store, row.file_sha256, row.bytes).read_bytes())
+    said: dict[str, Any] = json.loads(downloads.path_of(state.store, row.file_sha256, row.bytes).read_bytes())
     return said
 
 

@@ -6,7 +6,6 @@ equatorial coordinates that SODA demands; so the service does not claim to be SO
 
 from __future__ import annotations
 
-import hashlib
 import io
 import math
 from collections.abc import Iterator, Mapping
@@ -17,10 +16,9 @@ from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
-from psfcore.errors import DataError
 from service.http import downloads as files
 from service.http.callers import Reading
-from service.http.problems import Problem, problem
+from service.http.problems import Problem, as_problems
 from service.http.quotas import check_disk
 from service.http.state import Shared, State
 from service.vo.lists import row_named
@@ -80,18 +78,13 @@ async def get_region(request: Request, caller: Reading, state: Shared, fields: F
             "no-such-product",
             f"expected ID, the id of one of your products; got {names[0][:120]!a}: list your products",
         )
-    tag = hashlib.sha256(
-        f"{ANSWERS_VERSION} {row.file_sha256} {shape} {numbers} {frame}".encode()
-    ).hexdigest()
-    headers = {"ETag": f'"{tag}"', "Cache-Control": files.KEPT}
-    if files.known(request, headers["ETag"]):
-        return Response(status_code=304, headers=headers)
-    try:
+    headers = files.headers_of(f"{ANSWERS_VERSION} {row.file_sha256} {shape} {numbers} {frame}")
+    if (same := files.not_modified(request, headers)) is not None:
+        return same
+    with as_problems():
         file = await anyio.to_thread.run_sync(
             _written, state, row, shape, numbers, frame, limiter=state.cutouts
         )
-    except DataError as error:
-        raise problem(error) from error
     headers["Content-Disposition"] = f'attachment; filename="product-{row.id[:12]}-cutout.fits"'
     headers["Content-Length"] = str(file.seek(0, io.SEEK_END))
     return StreamingResponse(_pieces(file), media_type=files.FITS_TYPE, headers=headers)
@@ -119,11 +112,11 @@ def described_cutout(identity: str, base: str) -> Service:
 
 def _region_of(fields: Mapping[str, list[str]]) -> tuple[str, tuple[float, ...], Frame]:
     """The shape, its numbers and the frame of a request."""
-    given = [name for name in SHAPES if name in fields]
-    if len(given) != 1:
-        got = " and ".join(name.upper() for name in given) if given else None
+    shapes = [name for name in SHAPES if name in fields]
+    if len(shapes) != 1:
+        got = " and ".join(name.upper() for name in shapes) if shapes else None
         refuse("CIRCLE, BOX or POLYGON", "exactly one of them", got)
-    [shape] = given
+    [shape] = shapes
     text = fields[shape][0]
     try:
         numbers = tuple(map(float, text.split()))
@@ -145,7 +138,7 @@ def _written(state: State, row: ProductRow, shape: str, numbers: tuple[float, ..
     from psfcore.fits.viewing.regions import write_cutout  # loads the numerical libraries
 
     check_disk(state)
-    path = files.found(state.store, row.file_sha256, row.bytes)
+    path = files.path_of(state.store, row.file_sha256, row.bytes)
     with state.store.temporary() as target:
         file = target.open("w+b")
         try:

@@ -12,13 +12,10 @@ clients could use it to reach machines that they cannot reach themselves.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from functools import partial
-from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 from fastapi import Depends, Request
 from pydantic import BaseModel, ValidationError
@@ -31,6 +28,7 @@ from service.http.forms import FORM, FormPart, Piece, media_type_of
 from service.http.problems import Problem
 from service.http.quotas import Allowed, check_room
 from service.http.state import Shared, State
+from service.http.uploads import Received
 from service.vo.parameters import (
     MAX_FORM_BYTES,
     NO_XML,
@@ -141,28 +139,13 @@ def _model(kind: str) -> type[BaseModel]:
 # Files ----------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Part:
-    """A file in a form, received to a temporary path."""
-
-    filename: str | None
-    path: Path
-    digest: hashlib._Hash = field(default_factory=hashlib.sha256)
-    bytes: int = 0
-
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of the file."""
-        return self.digest.hexdigest()
-
-
 @dataclass(frozen=True)
 class Sent:
     """A form: its fields by their names in lower case, the values of UPLOAD, and the files by the names of their parts."""
 
     fields: dict[str, str]
     uploads: tuple[str, ...] = ()
-    parts: Mapping[str, Part] = field(default_factory=dict)
+    parts: Mapping[str, Received] = field(default_factory=dict)
 
 
 async def _sent(request: Request, caller: Submitting, state: Shared) -> AsyncIterator[Sent]:
@@ -184,7 +167,7 @@ async def _sent(request: Request, caller: Submitting, state: Shared) -> AsyncIte
 SentForm = Annotated[Sent, Depends(_sent)]
 
 
-def files_of(sent: Sent, kind: str) -> dict[str, Part]:
+def files_of(sent: Sent, kind: str) -> dict[str, Received]:
     """The file for each name in UPLOAD.
 
     Raises ``Problem`` if UPLOAD is malformed, names a part that the form does not have, or sets a parameter twice; if
@@ -222,27 +205,25 @@ def files_of(sent: Sent, kind: str) -> dict[str, Part]:
     return {name: sent.parts[part] for name, part in parts.items()}
 
 
-def ids_of(files: Mapping[str, Part]) -> dict[str, str]:
+def ids_of(files: Mapping[str, Received]) -> dict[str, str]:
     """The parameters that the files of a form set: the id of each file, by the name of the parameter."""
     return {NAMES[name]: file.sha256 for name, file in files.items()}
 
 
-def keep(state: State, caller: Caller, files: Mapping[str, Part]) -> None:
-    """Check the files of a form, and add them to the catalogue. If one of them is refused, none is added."""
+def keep(state: State, caller: Caller, files: Mapping[str, Received]) -> None:
+    """Check the files of a form, and add them to the catalogue. If one of them is refused, none is added.
+
+    Raises ``Problem`` 413, 415 or 422 if a file cannot be used.
+    """
+    rows: list[Any] = []
+    for name, file in files.items():
+        kind = KINDS_OF[name]
+        kind.check_size(file.bytes, state)
+        summary = kind.inspect(file.path, state)
+        rows.append(kind.row(caller.owner, file.sha256, file.bytes, uploads.label(file.filename), summary))
     allowed = Allowed(state, caller)  # the bytes were counted against the caller's rate when they arrived
-    additions = [_addition(state, caller.owner, name, file, allowed) for name, file in files.items()]
-    for add in additions:
-        add()
-
-
-def _addition(
-    state: State, owner: str, name: str, part: Part, allowed: Allowed
-) -> Callable[[], tuple[object, bool]]:
-    """A function that stores a file and adds its row to the catalogue. Raises ``Problem`` 413, 415 or 422 if the file cannot be used."""
-    kind = KINDS_OF[name]
-    kind.check_size(part.bytes, state)
-    row = kind.row(owner, part.sha256, part.bytes, part.filename, kind.inspect(part.path, state))
-    return partial(allowed.keep, part.path, part.sha256, row)
+    for file, row in zip(files.values(), rows, strict=True):
+        allowed.keep(file.path, file.sha256, row)
 
 
 class _Files:
@@ -254,8 +235,8 @@ class _Files:
     def __init__(self, store: Store, take: Callable[[int], None], resources: ExitStack) -> None:
         self._store, self._take, self._resources = store, take, resources
         self._uncounted = 0
-        self._open: dict[FormPart, BinaryIO] = {}
-        self.parts: dict[str, Part] = {}
+        self._open: dict[FormPart, Received] = {}
+        self.parts: dict[str, Received] = {}
 
     def write(self, pieces: list[Piece]) -> None:
         """Write the bytes of files that have arrived."""
@@ -266,15 +247,11 @@ class _Files:
             while self._uncounted < 0:
                 self._take(COUNTED_BYTES)
                 self._uncounted += COUNTED_BYTES
-            part, file = self.parts[sent.name], self._open[sent]
-            part.digest.update(data)
-            part.bytes += len(data)
-            file.write(data)
-            file.flush()
+            self._open[sent].write(data)
 
     def _begin(self, sent: FormPart) -> None:
         if sent.name in self.parts or len(self.parts) == MOST_FILES:
             raise bad(f"expected at most {MOST_FILES} files in parts of different names; got more")
         path = self._resources.enter_context(self._store.temporary())
-        self._open[sent] = self._resources.enter_context(path.open("wb"))
-        self.parts[sent.name] = Part(uploads.label(sent.filename), path)
+        file = self._resources.enter_context(Received(path, sent.filename))
+        self._open[sent] = self.parts[sent.name] = file

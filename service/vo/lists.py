@@ -20,7 +20,7 @@ from fastapi.responses import JSONResponse
 from psfcore.errors import DataError
 from psfcore.fits.frame import plate_scale_arcsec
 from service.http.callers import Caller, Reading
-from service.http.paging import following, position
+from service.http.paging import Listing
 from service.http.problems import Problem
 from service.http.state import Shared, State
 from service.vo.columns import PRODUCTS, PSFS, Table
@@ -215,11 +215,11 @@ def _listed(
     """The answer to a request for a list."""
     answer_format = format_of(fields, VOTABLE, JSON)
     limit = min(integer("MAXREC", one(fields, "maxrec") or str(USUAL), 0), MOST)
-    listed = page(limit=limit + 1, after=position(one(fields, "cursor")))
+    listing = Listing(request, limit, one(fields, "cursor"))
+    listed = page(**listing.query)
     rows = listed[:limit]
     status = "OVERFLOW" if len(listed) > limit else "OK"
-    after = rows[-1] if rows and status == "OVERFLOW" else None
-    link = None if after is None else following(request, repr(after.created_at), after.id)
+    link = listing.following(listed) if rows else None
     following_page = None if link is None else base_url(request) + link
     if answer_format == JSON:
         about = ("name", "description", "datatype", "unit", "ucd", "utype", "xtype")

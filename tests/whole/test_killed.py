@@ -15,10 +15,10 @@ from tests.whole.stack import EMBEDDED_FIRST, Stack, items, running, wait_for
 from workers.catalogue.tables import JobRow
 from workers.contract.phases import Phase
 
-IMAGES = 10
+IMAGES = 8
 AT_WORK = 3  # images of a bulk run that one process reads, computes and writes at the same time
 SERVED = "redis and postgresql"
-MANY_STEPS = {"name": "richardson-lucy", "steps": 100}
+SOME_STEPS = {"name": "richardson-lucy", "steps": 40}
 
 
 @pytest.fixture
@@ -45,12 +45,12 @@ def large_job(stack: Stack, folder: Path, psf_file: Path) -> dict[str, Any]:
     write_image(folder / "large.fits", shape=(1024, 1024))
     image_id = stack.client.upload_image(folder / "large.fits")["id"]
     psf_id = stack.client.upload_psf(psf_file)["id"]
-    job = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=MANY_STEPS)
-    wait_for(lambda: stack.client.job(job["id"])["progress"]["step"] > 5, "the job is at work")
+    job = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=SOME_STEPS)
+    wait_for(lambda: stack.client.job(job["id"])["progress"]["step"] > 2, "the job is at work")
     return job
 
 
-def archive_run(stack: Stack, psf_file: Path, *, steps: int = 40, **more: Any) -> dict[str, Any]:
+def archive_run(stack: Stack, psf_file: Path, *, steps: int = 30, **more: Any) -> dict[str, Any]:
     """A bulk run of the images of an archive."""
     archive = stack.data.parent / "archive"
     for number in range(IMAGES):
@@ -120,6 +120,7 @@ def stored(stack: Stack) -> set[Path]:
     return {path for path in (stack.data / "blobs").rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow  # tests/workers/catalogue/test_waiting.py has the same without processes
 def test_the_single_job_of_one_owner_does_not_wait_for_the_forty_of_another(served: Stack) -> None:
     if served.worker_processes():
         served.kill_workers()

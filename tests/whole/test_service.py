@@ -1,4 +1,4 @@
-"""What a person does with a running service: an image in and a product out, and a job that is cancelled at work."""
+"""What a person does with a running service: an image in and a product out."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 from astropy.io import fits
 
-from service.client.http import ServiceError
 from tests.conftest import write_image
-from tests.whole.stack import EMBEDDED_FIRST, Stack, running, wait_for
+from tests.whole.stack import EMBEDDED_FIRST, Stack, running
 
 
 @pytest.fixture(scope="module", params=EMBEDDED_FIRST)
@@ -36,21 +35,6 @@ def test_an_image_in_and_a_product_out(stack: Stack, tmp_path: Path, psf_file: P
     again = stack.client.deconvolve(tmp_path / "image.fits", psf_id=psf_id)
     assert again == product
     assert [one["id"] for one in stack.client.products()].count(product["id"]) == 1
-
-
-def test_cancel_at_work(stack: Stack, tmp_path: Path, psf_file: Path) -> None:
-    write_image(tmp_path / "image.fits", shape=(1024, 1024), OBSERVER="cancelled")
-    image_id = stack.client.upload_image(tmp_path / "image.fits")["id"]
-    psf_id = stack.client.upload_psf(psf_file)["id"]
-    method = {"name": "richardson-lucy", "steps": 200}
-    job = stack.client.submit("deconvolve", image_id=image_id, psf_id=psf_id, method=method)
-    wait_for(lambda: stack.client.job(job["id"])["progress"]["step"] > 2, "the job is at work")
-    stack.client.cancel(job["id"])
-    with pytest.raises(ServiceError, match="cancelled"):
-        stack.client.wait(job, timeout_s=30)
-    ended = stack.client.job(job["id"])
-    assert ended["phase"] == "ABORTED" and ended["progress"]["step"] < 200
-    assert [one for one in stack.client.products() if one["image_id"] == image_id] == []
 
 
 @pytest.mark.slow

@@ -69,7 +69,7 @@ def long_job(astronomer: Astronomer, folder: Path, psf_file: Path) -> AsyncTAPJo
 
 
 def started_long_job(astronomer: Astronomer, folder: Path, psf_file: Path, **more: str) -> AsyncTAPJob:
-    write_image(folder / "image.fits", shape=(2048, 2048))
+    write_image(folder / "image.fits", shape=(1024, 1024))
     image_id = astronomer.client.upload_image(folder / "image.fits")["id"]
     psf_id = astronomer.client.upload_psf(psf_file)["id"]
     method = '{"name": "richardson-lucy", "steps": 200}'
@@ -140,6 +140,7 @@ def test_abort_at_work(astronomer: Astronomer, tmp_path: Path, psf_file: Path) -
     assert list(astronomer.client.products()) == []
 
 
+@pytest.mark.slow  # tests/workers/catalogue/test_uws_jobs.py: a worker loses the lease of a job that is destroyed
 def test_delete_at_work_stops_the_worker(astronomer: Astronomer, tmp_path: Path, psf_file: Path) -> None:
     job = long_job(astronomer, tmp_path, psf_file)
     job.delete()
@@ -148,6 +149,7 @@ def test_delete_at_work_stops_the_worker(astronomer: Astronomer, tmp_path: Path,
     assert list(astronomer.client.products()) == []
 
 
+@pytest.mark.slow  # tests/workers/catalogue/test_uws_jobs.py: the terms of jobs end them
 def test_a_job_that_executes_too_long_is_aborted_and_one_that_is_due_is_destroyed(
     astronomer: Astronomer, tmp_path: Path, psf_file: Path
 ) -> None:

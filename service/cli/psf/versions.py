@@ -33,7 +33,7 @@ from service.cli.options import (
 )
 from service.cli.progress import echo
 from service.cli.psf.make import say_fit
-from service.client.operations import given
+from service.client.operations import without_none
 from workers.versions import TOTAL, PsfStatus
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def _filter_options(command: Command) -> Command:
 @on_service
 def list_psfs(service: Client, **filters: Any) -> None:
     """List the PSFs of a service."""
-    filters = given(filters)
+    filters = without_none(filters)
     none = "no PSF with " + ", ".join(f"{name} {value}" for name, value in filters.items())
     if not filters:
         none = "no PSF yet; `heliopsf psf build` or the first deconvolution makes a PSF"
@@ -195,7 +195,7 @@ def best(
     """With --image, show the PSF that `heliopsf deconvolve` would use for the image, and why. Without it, find the PSF
     with the given properties. With --image and a --kind other than total, only certified PSFs or the PSFs of a context are
     searched."""
-    filters = given(filters)
+    filters = without_none(filters)
     if image is not None and set(filters) - {"context", "kind"}:
         raise click.UsageError(
             "--image can only be combined with --context and --kind; leave out the other filters"

@@ -99,18 +99,6 @@ def test_wrong_requests_make_nothing(service: Keyed) -> None:
     assert len(service.catalogue.keys.all()) == 1
 
 
-def test_keys_of_others_are_not_there(service: Keyed) -> None:
-    ann, bob = service.client("ann"), service.client("bob")
-    new = made(ann)
-    for method in ("GET", "DELETE"):
-        there = bob.request(method, f"/v1/keys/{new['id']}")
-        nothing = bob.request(method, f"/v1/keys/{'f' * 16}")
-        assert there.status_code == nothing.status_code == 404
-        assert there.text.replace(new["id"], "f" * 16) == nothing.text
-    assert {one["owner"] for one in bob.get("/v1/keys").json()["items"]} == {"bob"}
-    assert ann.get(f"/v1/keys/{new['id']}").json()["state"] == "valid"
-
-
 def test_a_key_is_not_revoked_by_one_that_allows_less(service: Keyed) -> None:
     strong, weak = service.client("ann"), service.client("ann", Scope.READ, Scope.SUBMIT)
     both = {row.id: set(row.scopes) for row in service.catalogue.keys.all()}

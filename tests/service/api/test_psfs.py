@@ -104,16 +104,6 @@ def test_invalid_changes_of_status_are_refused(api: TestClient, psfs: list[str])
     assert told["parents"] == [] and told["made"]["origin"] == "uploaded"
 
 
-def test_a_psf_that_is_not_there(shared_api: TestClient) -> None:
-    nothing = "0" * 64
-    for tail in ("status", "lineage", "affected"):
-        refusal(shared_api.get(f"/v1/psfs/{nothing}/{tail}"), 404, "no-such-psf")
-    refusal(certify(shared_api, nothing, "1.0.0"), 404, "no-such-psf")
-    refusal(shared_api.post(f"/v1/psfs/{nothing}/rerun"), 404, "no-such-psf")
-    refusal(shared_api.get(f"/v1/products/{nothing}/lineage"), 404, "no-such-product")
-    refusal(shared_api.get(f"/v1/images/{nothing}/psf"), 404, "no-such-image")
-
-
 def test_lists_by_properties_and_validity(api: TestClient, psfs: list[str]) -> None:
     certify(api, psfs[0], "1.0.0", 2020, 2021)
     certify(api, psfs[1], "1.1.0", 2021, 2022)

@@ -16,6 +16,7 @@ from tests.fitted_psfs import EARLY, LATE, interpolated_on_a_small_grid, write_f
 from tests.service.conftest import job_after, refusal, result_of, upload
 
 SEEN = {"TELESCOP": "SOLO/EUI/HRI_EUV", "DETECTOR": "HRI_EUV", "WAVELNTH": 174.0}
+TOTAL = "/v1/psfs?kind=total"
 SERIES = "/v1/series/hri_euv/174/total"
 QUICK = {"name": "richardson-lucy", "steps": 2}
 
@@ -24,13 +25,6 @@ QUICK = {"name": "richardson-lucy", "steps": 2}
 def _small_grid() -> Iterator[None]:
     with interpolated_on_a_small_grid():
         yield
-
-
-def uploaded(api: TestClient, path: Path) -> str:
-    answer = api.post("/v1/psfs", params={"kind": "total"}, content=path.read_bytes())
-    assert answer.status_code == 201, answer.text
-    identity: str = answer.json()["id"]
-    return identity
 
 
 def certify(api: TestClient, psf_id: str, version: str, start: str | None, end: str | None) -> None:
@@ -49,7 +43,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.fixture
 def ends(api: TestClient, fitted: tuple[Path, Path]) -> tuple[str, str]:
     """Two fitted PSFs, certified until the end of February 2022 and from March 2023."""
-    early, late = (uploaded(api, path) for path in fitted)
+    early, late = (upload(api, path, TOTAL) for path in fitted)
     certify(api, early, "1.0.0", None, "2022-03-01")
     certify(api, late, "1.1.0", "2023-03-01", None)
     return early, late
@@ -168,8 +162,8 @@ def between(before: str, after: str) -> dict[str, str]:
 def test_ends_that_do_not_fit_end_the_job_with_the_reason(
     api: TestClient, run_jobs: Callable[[], None], ends: tuple[str, str], tmp_path: Path
 ) -> None:
-    knee = uploaded(api, write_fitted(tmp_path / "knee.fits", LATE | {"bend": 0.1}, shape="knee"))
-    plain = uploaded(api, write_fitted(tmp_path / "plain.fits", LATE, fitted=None))
+    knee = upload(api, write_fitted(tmp_path / "knee.fits", LATE | {"bend": 0.1}, shape="knee"), TOTAL)
+    plain = upload(api, write_fitted(tmp_path / "plain.fits", LATE, fitted=None), TOTAL)
     cases = ((knee, "shapes-differ", "softened-power-law"), (plain, "psf-not-fitted", "heliopsf psf fit"))
     for other, code, words in cases:
         done = job_after(api, run_jobs, "psf-interpolate", **between(ends[0], other))
@@ -180,7 +174,7 @@ def test_ends_that_do_not_fit_end_the_job_with_the_reason(
         assert api.post("/v1/jobs", json=body).status_code == status
 
     # A PSF that an interpolated PSF was made from is not deleted.
-    draft = uploaded(api, write_fitted(tmp_path / "draft.fits", LATE | {"c": 2.6}))
+    draft = upload(api, write_fitted(tmp_path / "draft.fits", LATE | {"c": 2.6}), TOTAL)
     made = result_of(api, run_jobs, "psf-interpolate", **between(ends[0], draft))["id"]
     detail = refusal(api.delete(f"/v1/psfs/{draft}"), 409, "psf-in-use")
     assert made[:12] in detail

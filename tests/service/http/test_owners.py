@@ -100,6 +100,7 @@ def test_lists_show_one_s_own_alone(shared_service: Keyed, anns: dict[str, str])
             later = anns_page.json()["next"]
             if later is not None:  # a cursor is a place, and gives nobody a right
                 assert bob.get(later).json()["items"] == []
+    assert {one["owner"] for one in bob.get("/v1/keys").json()["items"]} == {"eve"}
     assert bob.get("/uws/jobs").text.count("jobref") == 0
     assert ann.get("/uws/jobs").text.count("</uws:jobref>") >= 2
     assert "<uws:ownerId>ann</uws:ownerId>" in ann.get(f"/uws/jobs/{anns['uws']}").text

@@ -172,9 +172,6 @@ def pages(running: Keyed, ids: dict[str, str], text: str) -> Iterator[tuple[str,
             yield from in_path(method, route.path, known, text)
             place, base = ("params", {}) if method == "GET" else ("data", form)
             yield method, here, {place: base | dict.fromkeys(names, text[:200])}
-            alone = ("context", "kind", "owner", "psf_id") if method == "GET" else sorted(names)
-            for name in alone if "\0" in text and not here.endswith("/delete") else ():
-                yield method, here, {place: base | {name: text}}
 
 
 def whole_things(ann: TestClient, folder: Path, ids: dict[str, str]) -> dict[str, str]:

@@ -159,7 +159,7 @@ def asked(api: TestClient, content: bytes, folder: Path, product: str) -> Iterat
     yield api.get("/vo/products", params={"POS": "CIRCLE 0 0 1"})
 
 
-@pytest.mark.parametrize("headers", [20, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("headers", [4, pytest.param(200, marks=pytest.mark.slow)])
 def test_cards_of_places_with_any_value(api: TestClient, tmp_path: Path, headers: int) -> None:
     product, answers = add_product(api, tmp_path)["product"], collections.Counter[int]()
     for seed in range(headers):

@@ -254,24 +254,12 @@ def test_bad_requests(shared_api: TestClient) -> None:
         assert shared_api.get(job).content == before, "nothing has changed"
 
 
-def test_jobs_that_are_not_there(shared_api: TestClient) -> None:
-    parts = ("", "/phase", "/parameters", "/results", "/results/result", "/error", "/owner", "/quote")
-    ids = ("0" * 31, "A" * 32, "%00", "%3Cscript%3E", "a b", "\uff10" * 32)
-    nowhere = "0" * 32
-    requests: list[tuple[str, str, dict[str, str]]] = [("GET", nowhere + part, {}) for part in parts]
-    requests += [("GET", one + part, {}) for one in ids for part in ("", "/results/result")]
-    requests += [
-        ("POST", nowhere, {"ACTION": "DELETE"}),
-        ("POST", f"{nowhere}/phase", {"PHASE": "RUN"}),
-        ("POST", f"{nowhere}/parameters", {"size": "64"}),
-        ("POST", f"{nowhere}/executionduration", {"EXECUTIONDURATION": "1"}),
-        ("POST", f"{nowhere}/destruction", {"DESTRUCTION": "2999-01-01"}),
-        ("DELETE", nowhere, {}),
-    ]
-    for method, address, fields in requests:
-        body = {"data": fields} if fields else {}
-        answer = shared_api.request(method, f"{JOBS}/{address}", follow_redirects=False, **body)
-        assert (answer.status_code, answer.headers["content-type"][:10]) == (404, "text/plain"), address
+def test_texts_that_are_no_ids(shared_api: TestClient) -> None:
+    """tests/service/http/test_owners.py asks every address for a job that is not there."""
+    for text in ("0" * 31, "A" * 32, "%00", "%3Cscript%3E", "a b", "\uff10" * 32):
+        for part in ("", "/results/result"):
+            answer = shared_api.get(f"{JOBS}/{text}{part}")
+            assert (answer.status_code, answer.headers["content-type"][:10]) == (404, "text/plain"), text
 
 
 def test_the_list_and_its_filters(api: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -365,7 +365,7 @@ def test_a_collection_beside_a_running_service_loses_no_file(
     local = InProcess(settings)
     psf = local.upload_psf(psf_file)
     product = local.deconvolve(image_file, psf_id=psf["id"], steps=1, changes=tmp_path / "e.png")
-    local.answer([psf["id"]], "curve", {})  # has tables and a picture made
+    local.wait(local.submit("psf-tables", psf_id=psf["id"]))  # tables and a picture
     store, catalogue = Store(settings.data_dir), Catalogue(settings.catalogue_url)
     before = {blob.digest for blob in store.blobs()}
     assert len(before) >= 5 and collect(catalogue, store, -60.0).removed == ()
