@@ -28,7 +28,8 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
 def steps_done(details: Mapping[str, Any]) -> str:
     """The number of steps, and why there were no more, if the request allowed more."""
     stopped = "" if details["stopped_because"].startswith("all ") else f" ({details['stopped_because']})"
-    return f"{details['steps_done']} steps{stopped}"
+    steps = details["steps_done"]
+    return f"{steps} step{'' if steps == 1 else 's'}{stopped}"
 
 
 def assumptions(provenance: Mapping[str, Any]) -> list[str]:
