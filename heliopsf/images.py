@@ -87,7 +87,7 @@ def deconvolve(  # type: ignore[misc]  # the overloads need not repeat the optio
 
     Parameters
     ----------
-    smap : Map, NDData, array, HDU, HDUList, path, Image or list
+    smap : Map, NDData, NDCube, array, HDU, HDUList, path, Image or list
         The image. The result is of the same class; for a path or an ``Image`` it is a ``Deconvolution``, for a MapSequence a
         MapSequence. Pixels that are NaN or masked are not used; they are NaN in the result.
     psf : Psf, path, name, array, optional

@@ -30,7 +30,7 @@ from psfcore.fits.observation import observation_of, read_observation
 from psfcore.fits.viewing.regions import moved_header
 from psfcore.image import Image
 
-_EXPECTED = "a sunpy Map, an NDData or CCDData, an array, an HDU or HDUList, a path of a FITS file, or a list of these"
+_EXPECTED = "a sunpy Map, an NDData, CCDData or NDCube, an array, an HDU or HDUList, a path of a FITS file, or a list of these"
 _HDUS = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
 
 
@@ -294,7 +294,7 @@ def cut(image: Any, box: Box) -> Any:
             if isinstance(meta, Header)
             else _moved(meta, columns, rows),
             mask=None if image.mask is None else image.mask[box.slices],
-            wcs=None if image.wcs is None else image.wcs[box.slices],
+            wcs=_part_of(image.wcs, box),
             unit=image.unit,
         )
     if isinstance(image, fits.HDUList):
@@ -303,6 +303,17 @@ def cut(image: Any, box: Box) -> Any:
         rows, columns = box.slices
         return type(image)(image.data[box.slices], moved_header(image.header, columns, rows))
     return image
+
+
+def _part_of(wcs: Any, box: Box) -> Any:
+    """The coordinates of a box. Those of a slice of a cube are no ``WCS``, and have no slices of their own."""
+    if wcs is None:
+        return None
+    if hasattr(wcs, "to_header"):
+        return wcs[box.slices]
+    from astropy.wcs.wcsapi import SlicedLowLevelWCS
+
+    return SlicedLowLevelWCS(wcs.low_level_wcs, box.slices)
 
 
 def _moved(meta: Mapping[str, Any], columns: slice, rows: slice) -> dict[str, Any]:

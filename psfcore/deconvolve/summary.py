@@ -10,10 +10,9 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
     """The lines. details: `psfcore.deconvolve.run.Product.details`."""
     psf, noise, region = details["psf"], details["noise"], details["region"]
     doubts = f": {', '.join(psf['assumed'])}" if psf["assumed"] else ""
-    stopped = "" if details["stopped_because"].startswith("all ") else f" ({details['stopped_because']})"
     lines = [
         f"{details['image']}, PSF {psf['name']} {psf['version']} ({psf['status']}{doubts})",
-        f"{details['steps_done']} steps{stopped}: flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
+        f"{steps_done(details)}: flux {percent(details['flux_change_pct'], 3)}, brightest 1 % of pixels "
         f"{percent(details['bright_change_pct'])}, darkest 1 % {percent(details['dark_change_pct'])}",
     ]
     if region is not None:
@@ -24,6 +23,13 @@ def summary_lines(details: Mapping[str, Any]) -> list[str]:
     if noise is not None:
         lines.append(f"errors from the noise: {noise['text']}")
     return lines
+
+
+def steps_done(details: Mapping[str, Any]) -> str:
+    """The number of steps, and why there were no more, if the request allowed more."""
+    stopped = "" if details["stopped_because"].startswith("all ") else f" ({details['stopped_because']})"
+    steps = details["steps_done"]
+    return f"{steps} step{'' if steps == 1 else 's'}{stopped}"
 
 
 def assumptions(provenance: Mapping[str, Any]) -> list[str]:

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 import shutil
 import tarfile
+import zlib
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, cast
@@ -31,16 +33,22 @@ from psfcore.transit.manifest import (
 from psfcore.transit.members import START_BYTES, Kind, archive_kind, could_be_archive, opened
 
 _CHUNK = 1 << 20
-_FITS_STARTS = (b"SIMPLE  =", b"\x1f\x8b")
+_GZIP = b"\x1f\x8b"
+_FITS_STARTS = (b"SIMPLE  =", _GZIP)
+_HEADER_BYTES = 4 * 2880  # contain the header of the first image, also if it is compressed in an extension
+_AXIS = re.compile(rb"(Z?NAXIS[12]) *= +(\d{1,9}) ")
+BYTES_A_PIXEL = 4  # of a file whose start does not tell its shape
 
 
 @dataclass(frozen=True)
 class ArchiveContents:
-    """The contents of an archive: its kind, its manifest, and the name and the declared bytes of each file."""
+    """The contents of an archive: its kind, its manifest, the name and the declared bytes of each file, and the number of
+    pixels of all images that the manifest names."""
 
     kind: Kind
     manifest: TransitManifest
     files: dict[str, int]
+    pixels: int
 
 
 @dataclass(frozen=True)
@@ -71,7 +79,7 @@ def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
     starts: dict[str, dict[str, bytes]] = {}
     with opened(Path(path), limits) as archive:
         for member in archive.members:
-            count = MAX_MANIFEST_BYTES + 1 if member.name == MANIFEST_NAME else len(_FITS_STARTS[0])
+            count = MAX_MANIFEST_BYTES + 1 if member.name == MANIFEST_NAME else _HEADER_BYTES
             sizes.setdefault(member.folder, {})[member.name] = member.size_bytes
             starts.setdefault(member.folder, {})[member.name] = member.read(count)
         main, kind = archive.gate.main_folder(), archive.kind
@@ -81,7 +89,7 @@ def list_archive(path: str | Path, limits: ArchiveLimits) -> ArchiveContents:
         raise DataError("no-manifest", f"expected a file {MANIFEST_NAME} in the archive; add it")
     manifest = parse_manifest(content)
     _check_files(manifest, first, "the archive")
-    return ArchiveContents(kind, manifest, files)
+    return ArchiveContents(kind, manifest, files, _pixels(manifest, first, files))
 
 
 def unpack(path: str | Path, folder: str | Path, limits: ArchiveLimits) -> tuple[str, ...]:
@@ -138,14 +146,14 @@ def pack(folder: str | Path, path: str | Path) -> TransitManifest:
 
     Raises the DataErrors of ``checked_folder``, before anything is written.
     """
-    manifest, _ = checked_folder(Path(folder))
+    manifest = checked_folder(Path(folder)).manifest
     with Path(path).open("wb") as file:
         _pack_into(Path(folder), manifest, file)
     return manifest
 
 
-def checked_folder(folder: Path) -> tuple[TransitManifest, dict[str, int]]:
-    """The manifest of the transit in a folder, and the size in bytes of each of its files.
+def checked_folder(folder: Path) -> ArchiveContents:
+    """The contents of the transit in a folder.
 
     Raises DataError "no-manifest", "bad-manifest", "missing-file" and "not-fits", as ``list_archive`` does.
     """
@@ -154,9 +162,24 @@ def checked_folder(folder: Path) -> tuple[TransitManifest, dict[str, int]]:
     for name in manifest.files:
         if (folder / name).is_file():
             with (folder / name).open("rb") as file:
-                starts[name] = file.read(len(_FITS_STARTS[0]))
+                starts[name] = file.read(_HEADER_BYTES)
     _check_files(manifest, starts, str(folder))
-    return manifest, {name: (folder / name).stat().st_size for name in (MANIFEST_NAME, *manifest.files)}
+    files = {name: (folder / name).stat().st_size for name in (MANIFEST_NAME, *manifest.files)}
+    return ArchiveContents("tar", manifest, files, _pixels(manifest, starts, files))
+
+
+def _pixels(manifest: TransitManifest, starts: Mapping[str, bytes], files: Mapping[str, int]) -> int:
+    """The pixels of all images, from the starts of their files."""
+    count = 0
+    for name in {image.file for image in manifest.images}:
+        start = starts[name]
+        if start.startswith(_GZIP):
+            with suppress(zlib.error):
+                start = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(start, _HEADER_BYTES)
+        axes = {key: int(length) for key, length in _AXIS.findall(start)}
+        ny, nx = (axes.get(b"ZNAXIS" + n, axes.get(b"NAXIS" + n, 0)) for n in (b"2", b"1"))
+        count += ny * nx or files[name] // BYTES_A_PIXEL
+    return count
 
 
 def _check_files(manifest: TransitManifest, starts: Mapping[str, bytes], where: str) -> None:
@@ -172,7 +195,7 @@ def _check_files(manifest: TransitManifest, starts: Mapping[str, bytes], where: 
     no_fits = [
         DataError(
             "not-fits",
-            f"{name}: expected a FITS file, which begins with 'SIMPLE  ='; got {start!r}",
+            f"{name}: expected a FITS file, which begins with 'SIMPLE  ='; got {start[: len(_FITS_STARTS[0])]!r}",
         )
         for name, start in starts.items()
         if name in manifest.files and not start.startswith(_FITS_STARTS)
@@ -187,10 +210,9 @@ def transit_in(folder: str | Path) -> FolderTransit:
     Raises the DataErrors of ``checked_folder``.
     """
     folder = Path(folder).resolve()
-    manifest, sizes = checked_folder(folder)
+    contents = checked_folder(folder)
     digest = _Digest()
-    _pack_into(folder, manifest, cast(IO[bytes], digest))
-    contents = ArchiveContents("tar", manifest, sizes)
+    _pack_into(folder, contents.manifest, cast(IO[bytes], digest))
     return FolderTransit(folder, digest.hash.hexdigest(), digest.bytes, contents)
 
 

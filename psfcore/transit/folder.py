@@ -66,7 +66,7 @@ def read_prepared(
     faults, one error names all of them.
     """
     folder = Path(folder)
-    manifest, _ = checked_folder(folder)
+    manifest = checked_folder(folder).manifest
     noise = noise or _noise(manifest)
 
     def summary(image: ImageEntry) -> HeaderSummary:

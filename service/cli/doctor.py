@@ -39,7 +39,7 @@ State = Literal["ok", "warning", "broken"]
 SIGNS: dict[State, str] = {"ok": "green", "warning": "yellow", "broken": "red"}
 PINS = Path(__file__).parents[2] / "constraints.txt"
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
-EXTRAS = ("service", "fit", "plot")  # the commands need all packages of these extras
+EXTRAS = ("service", "published", "plot")  # the commands need all packages of these extras
 LITTLE_ROOM_BYTES = 5 * 2**30
 # The finding and the advice for a database at another revision; "": the advice is that of the schema.
 OTHER_REVISIONS: dict[str, tuple[State, str]] = {

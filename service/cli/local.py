@@ -7,7 +7,6 @@ the command asks for a file of it.
 
 from __future__ import annotations
 
-import math
 import shutil
 import time
 import uuid
@@ -72,7 +71,7 @@ from workers.contract.requests import (
 )
 from workers.contract.suggestions import explained
 from workers.files.archive import safe_name
-from workers.intake.costs import BYTES_A_PIXEL, COSTS, linear_s
+from workers.intake.costs import COSTS, linear_s
 from workers.machine import cores, free_bytes
 from workers.settings import Settings, software_version
 from workers.stage_timer import StageTimer
@@ -263,12 +262,7 @@ class Local(Operations):
         """The estimated time of a job on a transit, s; None for other jobs, whose steps count the whole job."""
         if KINDS[kind].counted_whole or getattr(request, "transit_id", None) not in self._transits:
             return None
-        transit = self._transits[request.transit_id]
-        pixels = sum(transit.contents.files.values()) / BYTES_A_PIXEL
-        if transit.path.is_dir():
-            images = [image.file for image in transit.contents.manifest.images]
-            first = read_summary(transit.path / images[0], LIMITS)
-            pixels = len(images) * math.prod(first.shape)
+        pixels = self._transits[request.transit_id].contents.pixels
         return linear_s(kind, request.model_dump(), pixels) / cores() ** COSTS.threads_exponent
 
     def get(self, address: str) -> dict[str, Any]:

@@ -84,9 +84,8 @@ PSF_SECTIONS = {
 def main() -> None:
     """Determine the point-spread functions (PSFs) of solar EUV telescopes, and deconvolve images.
 
-    Most commands send a request to a service (option --server). `heliopsf serve` starts a service.
-    With --local these commands run in this process and need no service. The help of a command says whether it needs a
-    service: heliopsf COMMAND -h
+    Most commands need a service (option --server), which `heliopsf serve` starts, or run here with --local:
+    heliopsf COMMAND -h
     """
 
 

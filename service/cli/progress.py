@@ -96,7 +96,7 @@ class _Teller:
         with self.lock:
             left_s = self.pace.left_s(step, steps, now_s)
             # A job that takes longer than estimated has no time left, but goes on.
-            left = "" if left_s is None or left_s < 1 < steps - step else f", {duration(left_s)} left"
+            left = "" if left_s is None or left_s < 1 else f", {duration(left_s)} left"
             if self.bar:
                 filled = round(20 * step / max(steps, 1))
                 drawn = "#" * filled + "-" * (20 - filled)

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.background import BackgroundTasks
 
+from psfcore.deconvolve.summary import steps_done
 from service.api.bulk import LOOK_FROM
 from service.api.images import delete_product
 from service.api.lineage import get_product_lineage, rerun_product
@@ -126,13 +127,11 @@ def _made(details: dict[str, Any]) -> list[tuple[str, str]]:
     own = [
         f"{name} {value}"
         for name, value in method.items()
-        if value is not None and name not in ("name", "algorithm_version")
+        if value is not None and name not in ("name", "algorithm_version", "steps")
     ]
     return [
-        ("Method", method["name"]),
+        ("Method", f"{method['name']}, {steps_done(details)}"),
         *([("Options", ", ".join(own))] if own else []),
-        ("Steps", str(details["steps_done"])),
-        ("Stopped because", details["stopped_because"]),
         ("Edges", f"{details['edges']}, a band of {details['edge_band_px']} px depends on them"),
         ("Software", details["software_version"]),
     ]

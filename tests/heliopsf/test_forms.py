@@ -15,6 +15,7 @@ from astropy.io import fits
 from astropy.nddata import CCDData, NDData, StdDevUncertainty, UnknownUncertainty, VarianceUncertainty
 from astropy.utils.masked import Masked
 from astropy.wcs import WCS
+from astropy.wcs.wcsapi import HighLevelWCSWrapper, SlicedLowLevelWCS
 
 import heliopsf
 from heliopsf import DataError, DataWarning
@@ -113,6 +114,34 @@ def test_ccd_data_keeps_unit_wcs_and_header(psf: heliopsf.Psf) -> None:
     image = CCDData(pixels(), unit="DN", wcs=WCS(header(cdelt1=3.0, cdelt2=3.0)))
     with pytest.raises(DataError, match="plate-scale-mismatch"):
         heliopsf.deconvolve(image, psf)
+
+
+class Cube(NDData):
+    """The contract of an NDCube (package ndcube): coordinates are required, and may be those of a slice."""
+
+    def __init__(self, data: Any, wcs: Any = None, **more: Any) -> None:
+        if wcs is None:
+            raise TypeError("The WCS argument can not be None.")
+        super().__init__(data, wcs=wcs, **more)
+
+
+def test_a_cube_of_two_axes_stays_a_cube_with_its_coordinates(psf: heliopsf.Psf) -> None:
+    three = WCS(header(naxis=3, ctype3="UTC", cunit3="s", cdelt3=10.0, crpix3=1.0, crval3=0.0))
+    hidden = np.zeros(SHAPE, bool)
+    hidden[30, 40] = True
+    for wcs in (WCS(header()), HighLevelWCSWrapper(SlicedLowLevelWCS(three, 0))):
+        image = Cube(
+            pixels(), wcs, unit=u.DN, meta=cards(), mask=hidden, uncertainty=StdDevUncertainty(1 + pixels())
+        )
+        result = heliopsf.deconvolve(image, psf, error_draws=2)
+        assert type(result) is Cube and result.wcs is image.wcs and result.unit == u.DN
+        assert result.meta["PSFVERS"] == psf.version and "PSFVERS" not in image.meta
+        assert (result.uncertainty.array[~hidden] > 0).all()
+        np.testing.assert_array_equal(result.mask, hidden)
+        part = heliopsf.deconvolve(image, psf, region=np.s_[10:60, 20:90])
+        assert type(part) is Cube and part.data.shape == (50, 70)
+    with pytest.raises(DataError, match="not-2d"):
+        heliopsf.deconvolve(Cube(np.ones((3, *SHAPE)), three, unit=u.DN), psf)
 
 
 def test_pixels_without_a_value_stay_without_one_and_are_masked(psf: heliopsf.Psf) -> None:

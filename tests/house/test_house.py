@@ -86,6 +86,7 @@ def test_what_people_import_stands_on_the_core_the_client_the_folder_of_the_cach
 # Of psfcore the service reads what shows without a pixel: FITS headers, and a transit's archive and manifest, whose
 # table of contents is checked at upload as headers are. None of these loads numerics.
 LIGHT = (
+    "psfcore.deconvolve.summary",
     "psfcore.drawing.thumbnail",  # loaded by the first request for a picture
     "psfcore.fits.blocks",
     "psfcore.fits.cards",

@@ -25,12 +25,13 @@ from psfcore.deconvolve.memory import MIB, Demand, of_method, product_bytes
 from psfcore.errors import DataError
 from psfcore.instruments.model import parse_instrument
 from psfcore.instruments.workload import workload
+from psfcore.transit.archive import BYTES_A_PIXEL
 from workers.catalogue.catalogue import Catalogue
 from workers.catalogue.tables import ImageRow, PsfRow, TransitRow
 from workers.contract.identities import instrument_text
 from workers.contract.kinds import KINDS
 from workers.contract.requests import PsfBuild
-from workers.intake.costs import BYTES_A_PIXEL, COSTS, linear_s
+from workers.intake.costs import COSTS, linear_s
 from workers.settings import Settings
 
 # The factor is the median of the NEAREST jobs or images, by the estimated time, of the newest MOST_JOBS. Of short jobs
@@ -210,7 +211,10 @@ def _pixels(parameters: Mapping[str, Any], catalogue: Catalogue, owner: str) -> 
     """
     if parameters.get("transit_id"):
         transit = catalogue.get(TransitRow, parameters["transit_id"], owner)
-        return 0.0 if transit is None else transit.summary["unpacked_bytes"] / BYTES_A_PIXEL
+        if transit is None:
+            return 0.0
+        # Transits that were uploaded to a development version have no number of pixels.
+        return float(transit.summary.get("pixels", transit.summary["unpacked_bytes"] / BYTES_A_PIXEL))
     if parameters.get("image_id"):
         image = catalogue.get(ImageRow, parameters["image_id"], owner)
         return 0.0 if image is None else math.prod(image.summary["shape"])

@@ -48,6 +48,7 @@ def transit_row(
             "known_psf": manifest.known_psf,
             "files": [{"name": name, "bytes": contents.files[name]} for name in manifest.files],
             "unpacked_bytes": sum(contents.files.values()),
+            "pixels": contents.pixels,
         },
     )
 

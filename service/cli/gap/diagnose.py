@@ -121,7 +121,7 @@ def diagnose(
         written.append(str(corrected_file))
     if written:
         echo(f"written: {', '.join(written)}")
-    step = _next_step(report, transit, output, corrected_file)
+    step = _next_step(report, f"{transit}{' --local' if local else ''}", output, corrected_file)
     if step:
         echo(f"next: {step}")
     if corrected_file is not None and corrected is None:
@@ -130,7 +130,7 @@ def diagnose(
         )
 
 
-def _next_step(report: dict[str, Any], transit: Path, page: Path | None, corrected: Path | None) -> str:
+def _next_step(report: dict[str, Any], transit: str, page: Path | None, corrected: Path | None) -> str:
     """What to do with this verdict, in one line; empty if there is nothing to do."""
     if report["verdict"] in ("attributed", "tie") and corrected is None:
         return f"`heliopsf gap {transit} --corrected PSF.fits` writes the PSF without the effect"

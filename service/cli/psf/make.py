@@ -111,7 +111,8 @@ def fit(
     say_fit(found)
     for limit in found["limits"]:
         echo(f"  note: {limit}")
-    echo(f"next: `heliopsf report {transit} -o PAGE.html` tests the fit on images that it did not use")
+    here = " --local" if local else ""
+    echo(f"next: `heliopsf report {transit}{here} -o PAGE.html` tests the fit on images that it did not use")
 
 
 def say_fit(fit: dict[str, Any]) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from psfcore.errors import DataError
 from psfcore.transit import admission
@@ -133,6 +134,17 @@ def test_the_files_of_the_transit_are_unpacked_and_no_others(folder: Path, tmp_p
         assert sorted(unpack(path, out, LIMITS)) == sorted(content)
         assert {p.name: p.read_bytes() for p in out.iterdir()} == content, (top, order)
         shutil.rmtree(out)
+
+
+def test_pixels_are_counted_in_compressed_files_too(folder: Path, tmp_path: Path) -> None:
+    pixels = np.arange(60 * 40, dtype=np.int16).reshape(60, 40)
+    fits.CompImageHDU(pixels).writeto(folder / "000.fits", overwrite=True)
+    fits.PrimaryHDU(pixels).writeto(tmp_path / "plain.fits")
+    (folder / "001.fits").write_bytes(gzip.compress((tmp_path / "plain.fits").read_bytes()))
+    (folder / "002.fits").write_bytes(b"SIMPLE  =" + bytes(4 * 60 * 40 - 9))
+    for kind, make in KINDS.items():
+        assert list_archive(make(tmp_path / kind, members_of(folder)), LIMITS).pixels == 3 * pixels.size, kind
+    assert transit_in(folder).contents.pixels == 3 * pixels.size
 
 
 def test_long_and_foreign_names_in_a_tar(tmp_path: Path) -> None:

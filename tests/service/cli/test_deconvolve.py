@@ -53,7 +53,7 @@ def test_one_image_goes_into_a_file(folder: Path) -> None:
     done = run("deconvolve", folder / "in" / "0.fits", "-o", folder / "new.fits", *options(folder))
     assert done.exit_code == 0, done.output
     told = done.stdout.splitlines()
-    assert len(told) == 3 and "PSF psf 0.0.0+" in told[0] and told[1].startswith("1 steps: flux"), told
+    assert len(told) == 3 and "PSF psf 0.0.0+" in told[0] and told[1].startswith("1 step: flux"), told
     assert "--plot" in told[2]
     header = fits.getheader(folder / "new.fits")
     assert header["DCNVITER"] == 1 and "DCNVSATL" not in header

@@ -11,6 +11,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from service.cli.fields import METHODS
 from service.cli.lazy import LazyGroup
 from service.cli.main import main
 
@@ -55,6 +56,12 @@ def test_the_help_of_a_command_fits_a_screen_and_explains_every_option(subtests:
                 if isinstance(option, click.Option) and not option.hidden and not option.help
             ]
             assert unexplained == []
+
+
+def test_the_help_says_when_to_use_which_method() -> None:
+    lines = CliRunner().invoke(main, ["deconvolve", "-h"]).output.splitlines()
+    rows = dict(line.split(None, 1) for line in lines[lines.index("  Methods:") + 1 :])
+    assert list(rows) == list(METHODS) and len(set(rows.values())) == len(METHODS)
 
 
 def test_the_help_is_grouped() -> None:

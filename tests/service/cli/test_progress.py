@@ -81,6 +81,16 @@ def test_without_a_terminal_a_line_is_written_now_and_then(
     ]
 
 
+def test_a_job_that_takes_longer_than_estimated_has_no_time_left(
+    clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with progress_bar() as report:
+        for second in range(40):
+            report("fitting", min(10 * second, 99), 100)
+            clock[0] += 1
+    assert capsys.readouterr().err.splitlines() == [f"fitting: 99 % after {s} s" for s in (10, 20, 30)]
+
+
 def test_a_short_command_writes_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     with progress_bar() as report:
         report("reading", 1, 2)

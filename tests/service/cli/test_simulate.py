@@ -169,11 +169,6 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path, diffraction: Path) ->
     assert result.exit_code == 1 and "expected one scene image, or 3" in result.output
 
 
-def test_a_folder_without_truth_has_no_bound(tmp_path: Path) -> None:
-    result = run("bound", tmp_path)
-    assert result.exit_code == 1 and "truth.json" in result.output
-
-
 def test_output_that_cannot_be_written_is_said_first(tmp_path: Path) -> None:
     result = run("transit", "-o", tmp_path / "no/such/folder", *SMALL)
     assert result.exit_code == 1 and "there is no folder" in result.output

@@ -107,6 +107,7 @@ def test_a_run_from_the_form_uses_its_method_and_steps(api: TestClient, psf_id: 
         place = started(api, psf_id, name=str(number), **fields)
         method = api.get(f"/v1{place}").json()["request"]["parameters"]["method"]
         assert {key: method[key] for key in expected} == expected
+        assert f"<dd>{expected['name']}, {expected['steps']} steps</dd>" in api.get(place).text
 
 
 def test_a_run_from_the_form_takes_a_limited_number_of_images(

@@ -34,6 +34,7 @@ def test_a_high_artefact_score_comes_with_advice(
         page = api.get(f"/products/{product['id']}").text
         assert ("The artefact score is 1 or more" in page) == advised, score
         assert page.count(f'href="{again}"') == 1 + advised, score
+    assert "<dd>linear, 2 steps</dd>" in page
     engine.dispose()
 
 

@@ -117,6 +117,8 @@ def test_the_page_needs_no_other_file_and_begins_with_the_summary() -> None:
         ("gap with the named effects in the model", "after_pct"),
     ):
         assert said[name] == f"{interval_words(gap[key])} %"
+    unseen = values(page_of(replace(found(), rms=replace(found().rms, value=0.04))))
+    assert unseen.keys() == said.keys() - {"gap with the named effects in the model"}
     assert float(said["noise"].split()[0]) == pytest.approx(gap["noise_pct"], rel=0.05)
     names = [name.split()[0] for name in pictures(html())]
     assert names == ["Map", "Residuals", "Bars", "Map", "Bars", "Observed"]

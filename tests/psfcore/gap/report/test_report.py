@@ -16,6 +16,7 @@ from psfcore.gap.report.report import (
     gap_report,
     hypothesis_words,
     in_short_if_many,
+    p_words,
     percent_words,
 )
 from psfcore.gap.verdict.limits import Alike
@@ -158,6 +159,11 @@ def test_the_sentence_says_how_sure_a_gap_is() -> None:
     few = gap_report(replace(with_shares(SHARES["none"], images=5), residual=None))
     assert few["verdict"] == "inconclusive" and few["answer"] == []
     assert "No gap is visible" in few["sentence"] and "only a large gap" in few["sentence"]
+    # An axis that is first because of the answer is no evidence for the answer.
+    first, *others = found().where
+    for of_best in (True, False):
+        led = replace(judged("attributed"), where=(replace(first, of_best=of_best), *others))
+        assert ("as the best effect does" in gap_report(led)["sentence"]) is of_best
     # A gap is said to exist if "no gap" is not in the set.
     unsure = gap_report(with_shares({OFFSET: 0.6, UNKNOWN: 0.38, NONE: 0.02}))["sentence"]
     assert unsure.startswith("There is a gap of ") and "There may be" not in unsure
@@ -204,6 +210,7 @@ def test_a_gap_of_the_unocculted_field_alone_is_not_said_of_the_discs() -> None:
 def test_words_for_probabilities_and_hypotheses() -> None:
     percents = {1.0: "> 99 %", 0.9949: "99 %", 0.5: "50 %", 0.006: "1 %", 0.004: "< 1 %", 0.0: "< 1 %"}
     assert {share: percent_words(share) for share in percents} == percents
+    assert [p_words(p) for p in (2.3e-4, 0.0)] == ["0.00023", "< 1e-300"]
     assert in_short_if_many([1.0] * 12) is None
     assert in_short_if_many([3.0] + 15 * [0.0] + [4.0]) == "17 parameters, root sum of squares 5"
     assert (hypothesis_words(NONE), hypothesis_words(UNKNOWN)) == ("no gap", "a cause outside the library")

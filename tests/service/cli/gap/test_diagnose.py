@@ -126,6 +126,14 @@ def test_a_corrected_psf_that_there_is_not_is_said_after_all_else(
     assert json.loads(numbers.read_text())["verdict"] == "none"
 
 
+def test_the_next_step_is_a_command_that_works_here(
+    folder: Path, diagnosed: Diagnosed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer_at_once(monkeypatch, replace(diagnosed.found, corrected=()))
+    said = run(folder, "--local").output.splitlines()
+    assert said[-1].startswith(f"next: `heliopsf gap {folder} --local --corrected ")
+
+
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
     subtests: pytest.Subtests, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -33,5 +33,5 @@ def test_the_id_of_the_fitted_psf_is_printed(tmp_path: Path, monkeypatch: pytest
     assert lines[0].endswith("psf.fits: fit 0.1.0 (draft), id 0123456789ab"), done.output
     assert [" ".join(line.split()) for line in lines[1:]] == [
         "It fits.", "b 6.1500 ± 0.1000 px", "light beyond 10 px 12.50 ± 0.30 %", "note: one limit",
-        f"next: `heliopsf report {transit} -o PAGE.html` tests the fit on images that it did not use",
+        f"next: `heliopsf report {transit} --local -o PAGE.html` tests the fit on images that it did not use",
     ]  # fmt: skip

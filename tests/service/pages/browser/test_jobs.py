@@ -35,6 +35,7 @@ def test_a_job_is_followed_to_its_product_without_a_reload(page: Page, submit: S
     page.evaluate(MARK)
     expect(page.locator("[data-part=phase]")).to_have_text("EXECUTING", timeout=LONG_MS)
     expect(page.locator("#job [data-part=progress]")).to_contain_text("of 141")
+    expect(page.get_by_alt_text("The uploaded image")).to_be_visible()
     assert page.evaluate(NOT_RELOADED)
     page.evaluate(KEEP_STEPS)
     expect(page).to_have_url(re.compile("/products/[0-9a-f]{64}"), timeout=LONG_MS)
