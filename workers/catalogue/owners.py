@@ -62,6 +62,7 @@ from workers.contract.bulk import BULK_ENDED
 from workers.contract.phases import ENDED
 
 MIB = 2**20
+MOST_QUOTA_MIB = 2**31 - 1  # the largest number in the column of quotas
 ROWS_PER_MIB = 256
 WITH_FILES = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)
 # The tables without files, and how many rows each of their rows stands for.
