@@ -11,8 +11,8 @@ because the method cannot represent negative light.
 
 In the paper the scene is zero beyond the field (edges "zero"). In this case, the outermost rows of the result become 4
 to 6 % too dark: light that enters from beyond the field replaces the light that leaves the field, but only on average.
-If the mirror image of the field continues the scene, the error is at most 1.3 % (fields of 1024 px, cut
-out of scenes of 2048 px). The default is therefore "symmetric". A margin of about 64 px is enough, because the published step compensates for the
+If the mirror image of the field continues the scene, the error is at most 1.3 % (`python -m studies.edges`). The
+default is therefore "symmetric". A margin of about 64 px is enough, because the published step compensates for the
 light that crosses the edge of the margin.
 
 | symbol | name | unit |
