@@ -244,6 +244,7 @@ def send(running: Servers, folder: Path, jobs: int, px: int) -> dict[str, str]:
         write_psf(path)
         psf_id = patiently(client, "/v1/psfs", content=path.read_bytes())
         for seed in range(jobs):
+            path.unlink()
             write_image(path, shape=(px, px), seed=seed)
             image_id = patiently(client, "/v1/images", content=path.read_bytes())
             parameters = {"image_id": image_id, "psf_id": psf_id, "method": method}
