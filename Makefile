@@ -46,15 +46,14 @@ test-full: $(DEV)
 bench: $(DEV)
 	$(BIN)/python -m benchmarks
 
-# Other packages, each in its own environment, timed in turn with heliopsf on the same data: the table of docs/speed.md. The
-# third command writes docs/aia.md, the PSFs of AIA beside those of aiapy, if there is an image (level 1 at 171 angstrom). The
-# last one adds the times of a 4096 px image to this page.
+# Other packages, each in its own environment, timed in turn with heliopsf on the same data: the table of docs/speed.md, and of
+# docs/aia.md for a 4096 px image. The last command writes the PSFs of AIA beside those of aiapy into docs/aia.md, if there is an
+# image (level 1 at 171 angstrom).
 AIA_IMAGE ?= $(or $(HELIOPSF_SHARED),../shared)/data/real/aia/aia_171_cutout_20130310.fits
 bench-peers: $(DEV)
-	$(BIN)/python -m benchmarks.race.environments
 	$(BIN)/python -m benchmarks.race.peers --page docs/speed.md
-	$(BIN)/python -m benchmarks.race.aia .venv-peers/aiapy/bin/python "$(AIA_IMAGE)" docs/aia.md
-	$(BIN)/python -m benchmarks.race.aia_loop --rounds 3 --page docs/aia.md
+	$(BIN)/python -m benchmarks.race.peers --whole --rounds 3 --page docs/aia.md
+	$(BIN)/python -m benchmarks.race.aia "$(AIA_IMAGE)" docs/aia.md
 
 # Runs jobs while workers, Redis, PostgreSQL and the service are killed at random. Needs Redis and PostgreSQL.
 chaos: $(DEV)

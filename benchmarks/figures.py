@@ -112,10 +112,10 @@ def keep(figures: Iterable[Figure]) -> None:
 
 def change(figure: Figure, before: Figure) -> float:
     """How many times worse a figure is than before; below 1: better."""
-    ratio = figure.compared / before.compared if before.compared else float("inf")
+    now, then = figure.compared, before.compared
     if WANTED[figure.name].more:
-        return 1 / ratio if ratio else float("inf")
-    return ratio
+        now, then = then, now
+    return now / then if then else float("inf")
 
 
 def reached(figure: Figure) -> bool:
@@ -157,9 +157,7 @@ def table(figures: Iterable[Figure], earlier: Mapping[str, Mapping[str, Any]]) -
         if name in before and is_regression(figure, before[name]):
             worse = change(figure, before[name])
             lines.append(
-                f"REGRESSION: {name} is {worse:.2f} times as large as stored (limit {REGRESSION:.2f})"
-                if not WANTED[name].more
-                else f"REGRESSION: {name} has fallen to 1/{worse:.2f} of the stored figure"
+                f"REGRESSION: {name} is {worse:.2f} times worse than stored (limit {REGRESSION:.2f})"
             )
     lines += [f"not measured: {name}" for name in WANTED if name not in found]
     return "\n".join(lines)

@@ -17,24 +17,23 @@ printed.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import psutil
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from benchmarks.figures import tell
 from benchmarks.timing import reference
 from tests.chromium import VARIABLE, chromium
 from tests.service.pages.browser.conftest import SOFTWARE_GL
 from tests.service.pages.browser.products import made
-from tests.whole import stack as stacks
+from tests.whole.stack import Stack, embedded
 
 BLINKS = 20
-FIRST = "first page after start"
+LARGE, SMALL = (1280, 900), (390, 844)  # windows, px
 TIME_OF = "(name) => performance.getEntriesByName(name)[0]?.startTime ?? null"
 BLINK_MS = """async () => {
   const canvas = document.getElementById("canvas"), gl = canvas.getContext("webgl2"), end = new Uint8Array(4);
@@ -58,56 +57,48 @@ def moment(page: Page, name: str) -> float:
 
 
 def own_mb(kind: str) -> float:
-    """The unshared memory, MB, of the browser's process of this kind; the largest value if there are several
-    processes."""
+    """The unshared memory, MB, of the browser's process of this kind; the largest if there are several."""
     children = psutil.Process().children(recursive=True)
     found = [one for one in children if f"--type={kind}" in one.cmdline()]
     return max(one.memory_full_info().uss for one in found) / 1e6
 
 
-def subfolder(folder: str, name: str) -> Path:
-    """A new folder in a folder."""
-    made_folder = Path(folder) / name
-    made_folder.mkdir()
-    return made_folder
+def showing(
+    browser: Browser, stack: Stack, folder: Path, size: int, window: tuple[int, int], **image: Any
+) -> Page:
+    """A new page that has begun to show a new product."""
+    folder = folder / f"{size} {len(list(folder.iterdir()))}"
+    folder.mkdir()
+    product = made(stack.client, folder, (size, size), **image)
+    page = browser.new_page(viewport={"width": window[0], "height": window[1]})
+    page.goto("about:blank")
+    page.goto(f"{stack.client.server}{product.page}#mode=blink")
+    return page
 
 
 def main() -> None:
-    argparse.ArgumentParser(description=__doc__).parse_args()
     program = chromium()
     if program is None:
         raise SystemExit(
             f"expected Chromium on this machine; found none: install it, or set {VARIABLE} to the path of its program"
         )
     f_s = reference()
-    with TemporaryDirectory(prefix="heliopsf-viewer-") as folder, sync_playwright() as playwright:
+    with TemporaryDirectory(prefix="heliopsf-viewer-") as temporary, sync_playwright() as playwright:
+        folder = Path(temporary)
         browser = playwright.chromium.launch(executable_path=program, args=list(SOFTWARE_GL))
-        large: dict[str, Any] = {"viewport": {"width": 1280, "height": 900}}
-        small: dict[str, Any] = {"viewport": {"width": 390, "height": 844}}
-        with stacks.embedded(Path(folder)) as site:
-            earlier = made(site.client, subfolder(folder, "earlier"), (2048, 2048))
-            page = browser.new_page(**large)
-            page.goto(f"{site.client.server}{earlier.page}#mode=blink")
-            print(f"{FIRST:<24} {moment(page, 'overview'):6.3f} s (no goal)", flush=True)
+        with embedded(folder) as site:
+            page = showing(browser, site, folder, 2048, LARGE)
+            print(f"first page after start: {moment(page, 'overview'):6.3f} s (no goal)", flush=True)
             page.close()
-            product = made(site.client, subfolder(folder, "2048"), (2048, 2048), OBJECT="second")
-            page = browser.new_page(**large)
-            page.goto("about:blank")
-            page.goto(f"{site.client.server}{product.page}#mode=blink")
-            times = {
-                "first sight, 2048 px": moment(page, "overview"),
-                "all pixels, 2048 px": moment(page, "all pixels"),
-            }
+            page = showing(browser, site, folder, 2048, LARGE, OBJECT="second")
+            tell("viewer: first sight, 2048 px", moment(page, "overview"), f_s)
+            tell("viewer: all pixels, 2048 px", moment(page, "all pixels"), f_s)
             page.wait_for_load_state("networkidle")
             blinks = [page.evaluate(BLINK_MS) / 1000 for _ in range(BLINKS)]
-            times["a blink"] = statistics.median(blinks)
-            for what, took_s in times.items():
-                tell(f"viewer: {what}", took_s, f_s)
-            print(f"{'the slowest blink':<24} {max(blinks):6.3f} s of {BLINKS}", flush=True)
+            tell("viewer: a blink", statistics.median(blinks), f_s)
+            print(f"the slowest blink: {max(blinks):6.3f} s of {BLINKS}", flush=True)
             page.close()
-            product = made(site.client, subfolder(folder, "4096"), (4096, 4096))
-            page = browser.new_page(**small)
-            page.goto(f"{site.client.server}{product.page}")
+            page = showing(browser, site, folder, 4096, SMALL)
             moment(page, "overview")
             page.focus("#canvas")
             for key in ("1", "ArrowRight", "ArrowUp", "ArrowLeft", "-", "b", "b", "f", "1"):

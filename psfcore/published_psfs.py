@@ -2,7 +2,8 @@
 
 No PSF is shipped. `get` brings the published file through pooch, or takes it from a folder, checks it and keeps its weights as a
 PSF file of heliopsf (float32), whose header names instrument, version, citation (PSFREF) and DOI (PSFDOI). The SHA-256 of the
-published file is recorded at the first time; later files must have the same one.
+published file is recorded at the first time; later files must have the same one. A download that broke off is kept as
+NAME.part, and resumed by the next try, even of another process, if the server still has the same file.
 
 Sources of the addresses: AIA: data set doi:10.7910/DVN/DYT4ZL, numbers of the files as in the package pycatch; XRT: the
 directories of SolarSoft that xrtpy names. No public address of the files for EUVI could be confirmed.
@@ -10,6 +11,7 @@ directories of SolarSoft that xrtpy names. No public address of the files for EU
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 from collections.abc import Callable
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 MIB = 2**20
 TRIES_AGAIN = 4
 _TIMEOUT_S = 60  # without a byte
+_BLOCK_BYTES = 2**16
 
 
 @dataclass(frozen=True)
@@ -209,15 +212,17 @@ def _downloaded(one: Published, folder: Path, progress: Callable[[str, int, int]
         )
     pooch = module_of_extra("pooch")
     pooch.get_logger().setLevel("WARNING")
-    bar = _Bar(lambda done, of: progress(f"downloading {one.name} (MiB)", done // MIB, max(of // MIB, 1)))
+    part = folder.parent / f"{one.name}.part"
+    resuming = _Resuming(
+        part, lambda done, of: progress(f"downloading {one.name} (MiB)", done // MIB, max(of // MIB, 1))
+    )
     failures = []
     for address in one.addresses:
         brought = pooch.create(
             folder, "", registry={one.file: None}, urls={one.file: address}, retry_if_failed=TRIES_AGAIN
         )
         try:
-            downloader = pooch.HTTPDownloader(progressbar=bar, timeout=_TIMEOUT_S)
-            return Path(brought.fetch(one.file, downloader=downloader))
+            return Path(brought.fetch(one.file, downloader=resuming))
         except (OSError, ValueError) as error:  # those of requests are OSErrors
             failures.append(f"{address}: {error!s:.200}")
     raise DataError(
@@ -226,23 +231,42 @@ def _downloaded(one: Published, folder: Path, progress: Callable[[str, int, int]
     )
 
 
-@dataclass
-class _Bar:
-    """The progress of a download, as pooch reports it, in bytes."""
+@dataclass(frozen=True)
+class _Resuming:
+    """A downloader for pooch. It keeps what arrived in ``part``, and asks for the rest alone.
 
+    The version of the file (ETag or date of the answer) is kept beside it: a server that has another file sends the whole one.
+    say(done, of): the progress in bytes.
+    """
+
+    part: Path
     say: Callable[[int, int], None]
-    total: int = 0
-    done: int = 0
 
-    def update(self, count: int) -> None:
-        self.done += count
-        self.say(min(self.done, self.total), self.total)  # a second try counts again
+    def __call__(self, url: str, output_file: str, _: Any) -> None:
+        import requests  # pooch needs it
 
-    def reset(self) -> None:
-        self.done = 0
-
-    def close(self) -> None:
-        """Nothing stays open."""
+        version = self.part.with_suffix(".version")
+        with self.part.open("ab") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # BlockingIOError: another process downloads it
+            done = file.tell() if version.is_file() else 0
+            headers = {"Accept-Encoding": "identity"}
+            if done:
+                headers |= {"Range": f"bytes={done}-", "If-Range": version.read_text()}
+            with requests.get(url, headers=headers, stream=True, timeout=_TIMEOUT_S) as answer:
+                if answer.status_code in (requests.codes.ok, requests.codes.requested_range_not_satisfiable):
+                    done = 0
+                    file.truncate(0)
+                    version.unlink(missing_ok=True)
+                answer.raise_for_status()
+                total = done + int(answer.headers.get("Content-Length", 0))
+                if name := answer.headers.get("ETag") or answer.headers.get("Last-Modified"):
+                    version.write_text(name)
+                for block in answer.iter_content(_BLOCK_BYTES):
+                    file.write(block)
+                    done += len(block)
+                    self.say(done, total)
+            os.replace(self.part, output_file)
+        version.unlink(missing_ok=True)
 
 
 def _as_psf(one: Published, file: Path, sha256: str) -> Psf:

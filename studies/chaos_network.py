@@ -25,26 +25,24 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import s3fs
 
 from studies.chaos import (
-    REST_S,
+    CLI,
     START_S,
     Process,
     Servers,
-    check_rows,
+    environment_of,
     postgresql,
     redis_server,
-    send,
-    started,
-    wait_for_all,
+    worked_off,
 )
-from tests.whole.stack import QUICK, Missing, wait_for
+from tests.whole.stack import Missing, wait_for
 
 NETWORK, FIRST = "10.77.0.0/24", "10.77.0.1"
 WORKERS = {"worker 1": "10.77.0.11", "worker 2": "10.77.0.12"}
@@ -67,7 +65,6 @@ class Hosts:
         self._tag = f"heliopsf-{os.getpid()}"
         self.names = {name: f"{self._tag}-{k}" for k, name in enumerate(["first", *WORKERS])}
         self._cables = {name: f"cable{k + 1}" for k, name in enumerate(WORKERS)}
-        self.cuts = dict.fromkeys(WORKERS, 0)
 
     def make(self) -> None:
         """Make the namespaces, the bridge and the cables."""
@@ -93,7 +90,6 @@ class Hosts:
     def cut(self, worker: str) -> None:
         """Let all packets from and to a worker vanish."""
         _ip("-n", self.names["first"], "link", "set", self._cables[worker], "nomaster")
-        self.cuts[worker] += 1
 
     def join(self, worker: str) -> None:
         """End the cut."""
@@ -184,45 +180,29 @@ def _at(namespace: str, name: str, command: Sequence[str]) -> list[str]:
     return ["ip", "netns", "exec", namespace, *named, *command]
 
 
-@contextmanager
-def servers(folder: Path, made: Hosts, apart_s: float) -> Iterator[Servers]:
-    """Start all servers and wait until they answer; at the end, kill all of them. Raises Missing."""
-    database_url = f"postgresql://heliopsf@{FIRST}:{PORTS['postgresql']}/postgres"
-    shared = os.environ | QUICK | KEYS
-    shared |= {
-        "HELIOPSF_DATABASE_URL": database_url,
-        "HELIOPSF_BROKER_URL": f"redis://{FIRST}:{PORTS['redis']}/0",
-        "HELIOPSF_STORE_URL": f"s3://{BUCKET}/files",
-        "HELIOPSF_MAX_ATTEMPTS": "40",  # a job must not fail because its worker was lost several times
-        "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": str(Path(__file__).parents[1]),  # the processes start in another folder
-    }
-    library = _clock_library(folder)
-    python = [sys.executable, "-m", "service.cli"]
+def servers(folder: Path, made: Hosts, apart_s: float) -> Servers:
+    """All servers, not started yet. Raises Missing."""
+    shared = environment_of(folder, FIRST, PORTS["postgresql"], PORTS["redis"]) | KEYS
+    shared["HELIOPSF_STORE_URL"] = f"s3://{BUCKET}/files"
     s3 = [sys.executable, "-m", "moto.server", "-H", FIRST, "-p", str(PORTS["s3"])]
-    serve = [*python, "serve", "--host", "127.0.0.1", "--port", str(PORTS["service"])]
-    processes = {
-        "postgresql": postgresql(folder, PORTS["postgresql"], FIRST, NETWORK),
-        "redis": redis_server(folder, PORTS["redis"], FIRST, keeps=False),
-        "s3": Process("s3", s3, dict(os.environ), folder / "s3.log"),
-    }
-    clocks = {
-        worker: {"LD_PRELOAD": str(library), "CLOCK_OFFSET_S": f"{sign * apart_s / 2:.0f}"}
-        for worker, sign in zip(WORKERS, (-1, 1), strict=True)
-    }
-    own: dict[str, dict[str, str]] = {"service": {}, **clocks}
-    for name, clock in own.items():
+    processes = [
+        postgresql(folder, PORTS["postgresql"], FIRST, NETWORK),
+        redis_server(folder, PORTS["redis"], FIRST, keeps=False),
+        Process("s3", s3, os.environ, folder / "s3.log"),
+    ]
+    serve = [*CLI, "serve", "--host", "127.0.0.1", "--port", str(PORTS["service"])]
+    commands = {"service": serve} | {name: _at(made.names[name], name, [*CLI, "worker"]) for name in WORKERS}
+    offsets_s = {"service": 0.0} | dict(zip(WORKERS, (-apart_s / 2, apart_s / 2), strict=True))
+    library = _clock_library(folder)
+    for name, command in commands.items():
         data = folder / name.replace(" ", "-")
         data.mkdir()
-        command = serve if name == "service" else _at(made.names[name], name, [*python, "worker"])
-        environment = shared | {"HELIOPSF_DATA_DIR": str(data)} | clock
-        processes[name] = Process(name, command, environment, folder / f"{name}.log".replace(" ", "-"))
-    running = Servers(processes, f"http://127.0.0.1:{PORTS['service']}", database_url, folder / "service")
-    made_bucket = threading.Thread(target=_make_bucket, daemon=True)
-    made_bucket.start()
-    with started(running):
-        made_bucket.join()
-        yield running
+        own = {"HELIOPSF_DATA_DIR": str(data)}
+        if name in WORKERS:
+            own |= {"LD_PRELOAD": str(library), "CLOCK_OFFSET_S": f"{offsets_s[name]:.0f}"}
+        processes.append(Process(name, command, shared | own, data.with_suffix(".log")))
+    address = f"http://127.0.0.1:{PORTS['service']}"
+    return Servers({one.name: one for one in processes}, address, PORTS["postgresql"], FIRST)
 
 
 def _object_store() -> s3fs.S3FileSystem:
@@ -246,68 +226,39 @@ def _make_bucket() -> None:
     wait_for(done, "the S3 server answers", START_S)
 
 
-@contextmanager
-def disturbed(
-    running: Servers, made: Hosts, faults: int, cuts: int, cut_s: float, rng: random.Random
-) -> Iterator[threading.Thread]:
-    """In other threads: kills and cuts in random order. moto keeps objects in memory, so it is not killed."""
-    kinds = ["cut"] * cuts + ["kill"] * (faults - cuts)
-    rng.shuffle(kinds)
-    killable = sorted(running.processes.keys() - {"s3"})
-
-    def disturb() -> None:
-        cut_workers = rng.sample(list(WORKERS), len(WORKERS)) * cuts
-        for kind in kinds:
-            if running.stopped.wait(rng.uniform(0.5, 6.0)):
-                return
-            if kind == "cut":
-                worker = cut_workers.pop()
-                made.cut(worker)
-                running.stopped.wait(cut_s)
-                made.join(worker)
-            else:
-                process = running.processes[rng.choice(killable)]
-                process.resting = True  # otherwise `keep_running` would start it too
-                process.kill()
-                time.sleep(rng.uniform(*REST_S))
-                process.start()
-                process.resting = False
-
-    threads = [threading.Thread(target=disturb), threading.Thread(target=running.keep_running)]
-    for thread in threads:
-        thread.start()
-    try:
-        yield threads[0]
-    finally:
-        running.stopped.set()
-        for thread in threads:
-            thread.join()
-
-
-def run(
-    jobs: int, faults: int, px: int, seed: int, *, cuts: int, cut_s: float, apart_s: float
-) -> dict[str, int]:
-    """Run the study. Returns the counts. Raises AssertionError, Missing."""
+def run(jobs: int, faults: int, px: int, seed: int, *, cuts: int, cut_s: float, apart_s: float) -> None:
+    """Run the study. Raises AssertionError, Missing."""
     rng = random.Random(seed)
     with tempfile.TemporaryDirectory(prefix="heliopsf-chaos-") as temporary, hosts() as made:
         folder = Path(temporary)
-        with servers(folder, made, apart_s) as running:
-            with disturbed(running, made, faults, cuts, cut_s, rng) as disturber:
-                sent = send(running, folder, jobs, px)
-                disturber.join()
-                wait_for_all(running, jobs)
-            found, digests = check_rows(running, sent)
-            store = _object_store()
-            for digest in digests:
-                content = store.cat_file(f"{BUCKET}/files/blobs/{digest[:2]}/{digest}")
-                assert hashlib.sha256(content).hexdigest() == digest, f"{digest} is whole"
-            found |= {f"kills of {p.name}": p.kills for p in running.processes.values() if p.name != "s3"}
-            return found | {f"cuts of {worker}": count for worker, count in made.cuts.items()}
+        running = servers(folder, made, apart_s)
+
+        def cut(worker: str) -> None:
+            made.cut(worker)
+            running.stopped.wait(cut_s)
+            made.join(worker)
+
+        disturbances = [partial(cut, rng.choice(list(WORKERS))) for _ in range(cuts)]
+        # moto keeps objects in memory, so it is not killed.
+        disturbances += [partial(running.kill_one, rng, ("s3",))] * (faults - cuts)
+        rng.shuffle(disturbances)
+        bucket = threading.Thread(target=_make_bucket, daemon=True)
+        bucket.start()
+        with running.started():
+            bucket.join()
+            with running.disturbed(disturbances, rng) as disturber:
+                digests = worked_off(running, folder, jobs, px, disturber)
+                for digest in digests:
+                    content = _object_store().cat_file(f"{BUCKET}/files/blobs/{digest[:2]}/{digest}")
+                    assert hashlib.sha256(content).hexdigest() == digest, f"{digest} is whole"
+        print(f"every file in S3 is whole; clocks {apart_s:g} s apart, {cuts} cuts of {cut_s:g} s")
 
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--jobs", type=int, default=300)
     parser.add_argument("--faults", type=int, default=30, help="number of kills and cuts together")
     parser.add_argument("--cuts", type=int, default=2, help="number of cuts among the faults")
@@ -315,22 +266,17 @@ def main() -> None:
     parser.add_argument("--apart-s", type=float, default=90.0, help="difference of the workers' clocks, s")
     parser.add_argument("--px", type=int, default=64, help="side of an image, pixels")
     parser.add_argument("--seed", type=int, default=1)
-    asked = parser.parse_args()
+    chosen = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that servers and namespaces are removed
-    begun = time.perf_counter()
-    found = run(
-        asked.jobs,
-        asked.faults,
-        asked.px,
-        asked.seed,
-        cuts=asked.cuts,
-        cut_s=asked.cut_s,
-        apart_s=asked.apart_s,
+    run(
+        chosen.jobs,
+        chosen.faults,
+        chosen.px,
+        chosen.seed,
+        cuts=chosen.cuts,
+        cut_s=chosen.cut_s,
+        apart_s=chosen.apart_s,
     )
-    print(f"clocks {asked.apart_s:g} s apart, cuts of {asked.cut_s:g} s; {time.perf_counter() - begun:.0f} s")
-    print("all jobs completed, each image has one product, every file in S3 is whole, no job is stuck:")
-    for name, count in found.items():
-        print(f"  {name:<20} {count}")
 
 
 if __name__ == "__main__":

@@ -35,16 +35,37 @@ def boxes(image: Image) -> dict[str, Box]:
     size = image.pixels.shape[0]
     side, edge = size // 16, size // 5
     light = uniform_filter(image.pixels, side)[edge:-edge, edge:-edge]
-    places = {
-        "bright": np.argmax(light),
-        "quiet": np.argmin(np.abs(light - np.median(light))),
-        "dark": np.argmin(light),
-    }
+    usual = np.abs(light - np.median(light))
+    places = {"bright": np.argmax(light), "quiet": np.argmin(usual), "dark": np.argmin(light)}
     found = {}
     for name, place in places.items():
         y, x = (int(n) + edge - side // 2 for n in np.unravel_index(place, light.shape))
         found[name] = Box(x, x + side, y, y + side)
     return found | {"edge": Box(0, side, size // 2, size // 2 + side)}
+
+
+def compare(instrument: str, size: int) -> None:
+    """Print the rim, the bound and the differences of each box, for the PSF of an instrument."""
+    psf, scene = heliopsf.build_psf(instrument), solar_scene((size, size), 1)
+    pixels = observe(scene, psf, exposure_s=1, photon_gain_dn=2, read_noise_dn=2, seed=1)
+    image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN", 1.0)
+    for method in METHODS:
+        options = Options(method=method, threads=cores(), engine_for=PreparedPsfs().engine_for)
+        whole = Work(image, psf, options).run().pixels
+        for name, box in boxes(image).items():
+            what, mean = f"{instrument} {method} {name}", image.pixels[box.slices].mean() / 100
+            for error in ERRORS:
+                alone = box_work(Work(image, psf, replace(options, region_error=error)), box)
+                if alone.error == 0:
+                    print(f"{what:<46} for {100 * error:g} %: whole image")
+                    break
+                difference = alone.run().pixels - whole[box.slices]
+                largest, rms = np.abs(difference).max(), np.sqrt(np.mean(difference**2))
+                share = np.prod(alone.rim.shape) / pixels.size
+                told = f"{alone.error / mean:8.2f}%{largest / mean:8.2f}%{rms / mean:7.2f}%"
+                print(
+                    f"{what:<46}{alone.rim_px:6d}{share:7.2f}{told}{alone.error / largest:17.1f}", flush=True
+                )
 
 
 def main() -> None:
@@ -55,30 +76,7 @@ def main() -> None:
     size = parser.parse_args().size
     print(f"{'':<46}{'rim':>6}{'share':>7}{'bound':>9}{'largest':>9}{'rms':>8}{'bound / largest':>17}")
     for instrument in ("hri_euv", "aia_171"):
-        psf = heliopsf.build_psf(instrument)
-        pixels = observe(
-            solar_scene((size, size), 1), psf, exposure_s=1, photon_gain_dn=2, read_noise_dn=2, seed=1
-        )
-        image = Image(pixels, np.zeros(pixels.shape, np.uint8), Header(), "DN", 1.0)
-        for method in METHODS:
-            options = Options(method=method, threads=cores(), engine_for=PreparedPsfs().engine_for)
-            whole = Work(image, psf, options).run().pixels
-            for name, box in boxes(image).items():
-                mean = image.pixels[box.slices].mean() / 100
-                for error in ERRORS:
-                    alone = box_work(Work(image, psf, replace(options, region_error=error)), box)
-                    what = f"{instrument} {method} {name}"
-                    if alone.error == 0:
-                        print(f"{what:<46} for {100 * error:g} %: whole image")
-                        break
-                    difference = alone.run().pixels - whole[box.slices]
-                    largest, rms = np.abs(difference).max(), np.sqrt(np.mean(difference**2))
-                    share = np.prod(alone.rim.shape) / pixels.size
-                    print(
-                        f"{what:<46}{alone.rim_px:6d}{share:7.2f}{alone.error / mean:8.2f}%{largest / mean:8.2f}%"
-                        f"{rms / mean:7.2f}%{alone.error / largest:17.1f}",
-                        flush=True,
-                    )
+        compare(instrument, size)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from typing import Any
 
 from sqlalchemy import Engine, event, func, insert, select, text
 
+from studies.pages import with_part
 from workers.bulk.dry_run import product_bytes
 from workers.bulk.listing import MOST_IMAGES
 from workers.bulk.runs import KIND, MOST_TURNS, begin, keep_turns
@@ -35,17 +36,13 @@ from workers.settings import Settings
 
 DOCS = Path(__file__).parents[1] / "docs"
 GROWTH, MEASURED, PAGE = DOCS / "growth" / "measured.json", DOCS / "growth" / "scale.json", DOCS / "scale.md"
-BEGIN, END = "<!-- tables of studies.scale -->\n", "<!-- end of the tables -->\n"
 PX, DAY_S, YEARS = 4096, 86_400.0, 15
 DAY_IMAGES = 57_600  # eight every 12 s
 MISSION_IMAGES = round(DAY_IMAGES * 365.25 * YEARS)
 INPUT_BYTES = 2 * PX**2  # integers of 16 bits, not compressed
 FOLDERS = 256  # folders of the store
 SCRAPE_S = 10.0  # the default time limit of Prometheus for /metrics
-SLOW_S, SLOW = (
-    600.0,
-    0.1,
-)  # a slow store: in the first ten minutes of each hour it has a tenth of its bandwidth
+SLOW_S, SLOW = 600.0, 0.1  # a slow store has a tenth of its bandwidth in the first ten minutes of each hour
 FEW, MANY, COPIES = 4, 20, 50_000  # images of the two small runs, and copies of their rows
 
 
@@ -154,13 +151,6 @@ def simulated(case: Case, costs: Costs) -> Outcome:
     return outcome
 
 
-def locked_row_s(engine: Engine) -> float:
-    """The time in which PostgreSQL changes the row of a run and commits, s, without the network."""
-    loop = "FOR n IN 1..200 LOOP UPDATE bulks SET done = done + 1 WHERE phase = 'RUNNING'; COMMIT; END LOOP"
-    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-        return shortest_s(lambda: connection.execute(text(f"DO $$ BEGIN {loop}; END $$"))) / 200
-
-
 def shortest_s(work: Callable[[], object]) -> float:
     """The shortest of five times, s: other programs may use the machine."""
     times = []
@@ -226,7 +216,11 @@ def measure() -> dict[str, Any]:
         metrics_s = shortest_s(catalogue.census.tally_files) / COPIES
         quota_s = shortest_s(lambda: catalogue.owners.limited(DEFAULT_OWNER, 0)) / COPIES
         catalogue.bulks.create(bulk_row("timed"), [])
-        finish_s = locked_row_s(engine)
+        loop = (
+            "FOR n IN 1..200 LOOP UPDATE bulks SET done = done + 1 WHERE phase = 'RUNNING'; COMMIT; END LOOP"
+        )
+        with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+            finish_s = shortest_s(lambda: connection.execute(text(f"DO $$ BEGIN {loop}; END $$"))) / 200
         service.close()
     return {
         "statements": (spent["many"] - spent["few"]) / (MANY - FEW),
@@ -238,12 +232,10 @@ def measure() -> dict[str, Any]:
     }
 
 
-def breaking(costs: Costs, bandwidth: float) -> list[tuple[float, str, str]]:
-    """What breaks, by the number of products or the number of workers, smallest first: the number, its unit, what happens."""
-    a_store = bandwidth / costs.moved_bytes * costs.core_s
-    a_run = costs.core_s / costs.finish_s
+def breaking(costs: Costs, bandwidth: float) -> list[tuple[float, str]]:
+    """What breaks, by the number of products or the number of workers, smallest first: the number with its unit, what happens."""
     products = [
-        (float(MOST_IMAGES), "a bulk run takes no more images: split the archive into several runs"),
+        (MOST_IMAGES, "a bulk run takes no more images: split the archive into several runs"),
         (
             costs.core_s / costs.quota_s,
             "with a quota, its check takes as long as a deconvolution: give archives none",
@@ -257,23 +249,27 @@ def breaking(costs: Costs, bandwidth: float) -> list[tuple[float, str, str]]:
             "a folder of the store has a million files: keep files in S3, or use `--output` with `--only`",
         ),
         (
-            2.0**31 * 2**20 / costs.product_bytes,
+            2.0**51 / costs.product_bytes,
             "a quota cannot be larger (2^31 MiB): give archives none, or an owner for each year",
         ),
-        (
-            1e12 / costs.row_bytes,
-            "the tables have a terabyte: use `--only`, and delete runs that are done",
-        ),
+        (1e12 / costs.row_bytes, "the tables have a terabyte: use `--only`, and delete runs that are done"),
     ]
     workers = [
-        (a_store, f"the store moves {bandwidth / 1e9:g} GB/s, and all wait for it: a faster store"),
-        (float(MOST_TURNS), "a run has no more turns: split the archive into several runs"),
-        (a_run, "the row of a run is always locked: not reached, because a run has fewer workers"),
+        (
+            bandwidth / costs.moved_bytes * costs.core_s,
+            f"the store moves {bandwidth / 1e9:g} GB/s, and all wait for it: a faster store",
+        ),
+        (MOST_TURNS, "a run has no more turns: split the archive into several runs"),
+        (
+            costs.core_s / costs.finish_s,
+            "the row of a run is always locked: not reached, because a run has fewer workers",
+        ),
     ]
-    rows = [(n, "products", what) for n, what in products] + [
-        (n, "workers of one core", what) for n, what in workers
-    ]
-    return sorted(rows, key=lambda row: (row[1], row[0]))
+    return [
+        (number, f"{unit} | {what}")
+        for unit, rows in (("products", products), ("workers of one core", workers))
+        for number, what in sorted(rows)
+    ]  # fmt: skip
 
 
 def tables(costs: Costs) -> Iterator[str]:
@@ -298,8 +294,8 @@ def tables(costs: Costs) -> Iterator[str]:
     yield ""
     yield "| at | of | this breaks: what to do |"
     yield "|---|---|---|"
-    for number, unit, what in breaking(costs, bandwidth):
-        yield f"| {number:,.0f} | {unit} | {what} |"
+    for number, what in breaking(costs, bandwidth):
+        yield f"| {number:,.0f} | {what} |"
     yield ""
     yield "| a day of AIA | workers | 95 % of the products after | computed again |"
     yield "|---|---|---|---|"
@@ -328,8 +324,7 @@ def tables(costs: Costs) -> Iterator[str]:
 
 def written(page: str, costs: Costs) -> str:
     """The page with new tables."""
-    before, _, rest = page.partition(BEGIN)
-    return before + BEGIN + "\n".join(["", *tables(costs), ""]) + "\n" + END + rest.partition(END)[2]
+    return with_part(page, "studies.scale", "\n".join(tables(costs)))
 
 
 def main() -> None:

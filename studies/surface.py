@@ -19,8 +19,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import chdir
 from difflib import unified_diff
-from hashlib import sha256
-from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -32,6 +30,7 @@ from click.testing import CliRunner
 from psfcore.gap.report.report import gap_report
 from psfcore.psf import REACH_GRID_PX, crop_or_pad
 from psfcore.simulate.scatter_truth import total_kernel
+from psfcore.whole_files import sha256_of
 from service.cli.main import main as heliopsf
 from service.http.problems import STATUS_OF
 from service.openapi import description
@@ -43,7 +42,6 @@ from workers.settings_table import settings_table
 HELP_COLUMNS = 100
 TRANSIT_PSF_PX = 256
 VARYING = ("job_id", "software_version", "libraries")  # keys of the provenance of a report
-DIFFERENCE_LINES = 60  # of each part of the record; further lines are counted
 
 Record = dict[str, Any]
 
@@ -54,13 +52,13 @@ def record() -> Record:
         "openapi": json.loads(description()),
         "status of error codes": STATUS_OF,
         "settings": settings_table(),
-        "help": dict(_help(heliopsf, "heliopsf", None)),
-        **_results(),
+        "help": dict(help_of(heliopsf, "heliopsf", None)),
+        **results(),
         "gap report": gap_report(found()),
     }
 
 
-def _help(command: click.Command, name: str, parent: click.Context | None) -> Iterator[tuple[str, str]]:
+def help_of(command: click.Command, name: str, parent: click.Context | None) -> Iterator[tuple[str, str]]:
     """The help of a command and of all its subcommands, by the words of the command."""
     context = click.Context(command, parent, name, terminal_width=HELP_COLUMNS)
     yield context.command_path, command.get_help(context)
@@ -68,79 +66,62 @@ def _help(command: click.Command, name: str, parent: click.Context | None) -> It
         for word in command.list_commands(context):
             subcommand = command.get_command(context, word)
             assert subcommand is not None
-            yield from _help(subcommand, word, context)
+            yield from help_of(subcommand, word, context)
 
 
-def _results() -> Record:
+def results() -> Record:
     """The results of three commands in an empty folder: `psf build`, `deconvolve` and `report`."""
     with TemporaryDirectory() as folder, chdir(folder):
-        return _results_here()
+        os.environ["HELIOPSF_CACHE_DIR"] = folder  # PSFs of the user's cache are not read
+        Path("small.toml").write_text(SMALL_INSTRUMENT, "utf-8")
+        write_image(
+            Path("image.fits"), CDELT1=2.0, CDELT2=2.0, CUNIT1="arcsec", CUNIT2="arcsec", WAVELNTH=171
+        )
+        run("psf build --instrument small.toml --size 128 -o psf.fits")
+        run("deconvolve image.fits --psf psf.fits -o product.fits --errors 2 --noise 6 2")
+        write_simulated(Path("transit"))
+        kernel = crop_or_pad(total_kernel(TRUTH, diffraction(), REACH_GRID_PX), TRANSIT_PSF_PX)
+        fits.PrimaryHDU(kernel.astype("f4")).writeto("transit_psf.fits")
+        run("report transit --psf transit_psf.fits --json report.json")
+        report = json.loads(Path("report.json").read_text("utf-8"))
+        for key in VARYING:
+            del report["provenance"][key]
+        header = fits.getheader("product.fits")
+        return {
+            "SHA-256 of the PSF": sha256_of(Path("psf.fits")),
+            "SHA-256 of the product": sha256_of(Path("product.fits")),
+            "cards of the product": repr(header),
+            "ids": {"image": header["INPSHA"], "PSF": header["PSFID"], "product": header["PRODID"]},
+            "transit report": report,
+        }
 
 
-def _results_here() -> Record:
-    os.environ["HELIOPSF_CACHE_DIR"] = str(Path("cache").resolve())  # PSFs of the user's cache are not read
-    Path("small.toml").write_text(SMALL_INSTRUMENT, "utf-8")
-    write_image(Path("image.fits"), CDELT1=2.0, CDELT2=2.0, CUNIT1="arcsec", CUNIT2="arcsec", WAVELNTH=171)
-    _run("psf build --instrument small.toml --size 128 -o psf.fits")
-    _run("deconvolve image.fits --psf psf.fits -o product.fits --errors 2 --noise 6 2")
-    write_simulated(Path("transit"))
-    kernel = crop_or_pad(total_kernel(TRUTH, diffraction(), REACH_GRID_PX), TRANSIT_PSF_PX)
-    fits.PrimaryHDU(kernel.astype("f4")).writeto("transit_psf.fits")
-    _run("report transit --psf transit_psf.fits --json report.json")
-    report = json.loads(Path("report.json").read_text("utf-8"))
-    for key in VARYING:
-        del report["provenance"][key]
-    header = fits.getheader("product.fits")
-    return {
-        "SHA-256 of the PSF": _sha256("psf.fits"),
-        "SHA-256 of the product": _sha256("product.fits"),
-        "cards of the product": repr(header),
-        "ids": {"image": header["INPSHA"], "PSF": header["PSFID"], "product": header["PRODID"]},
-        "transit report": report,
-    }
-
-
-def _run(command: str) -> None:
+def run(command: str) -> None:
     """Run a command of heliopsf in this process. Exits with the output of the command if the command fails."""
     done = CliRunner().invoke(heliopsf, [*command.split(), "--local"])
     if done.exit_code:
         sys.exit(f"heliopsf {command}: {done.output}")
 
 
-def _sha256(path: str) -> str:
-    return sha256(Path(path).read_bytes()).hexdigest()
-
-
-def differences(before: Record, now: Record) -> list[str]:
-    """The lines that differ between two records, as a unified diff for each part of the record."""
-    lines: list[str] = []
-    for part in sorted(before.keys() | now.keys()):
-        texts = (_lines(before.get(part)), _lines(now.get(part)))
-        changed = unified_diff(*texts, f"before: {part}", f"now: {part}", lineterm="", n=1)
-        lines += islice(changed, DIFFERENCE_LINES)
-        further = sum(1 for _ in changed)
-        if further:
-            lines.append(f"... and {further} further lines of {part}")
-    return lines
-
-
-def _lines(part: Any) -> list[str]:
-    """A part of the record as lines of text. JSON shows line ends of a text as \\n; the lines of the text are shown."""
-    return json.dumps(part, indent=1, sort_keys=True, ensure_ascii=False).replace("\\n", "\n").splitlines()
+def lines_of(record: Record) -> list[str]:
+    """The record as lines of text. JSON shows line ends of a text as \\n; the lines of the text are shown."""
+    text = json.dumps(record, indent=1, sort_keys=True, ensure_ascii=False)
+    return text.replace("\\n", "\n").splitlines()
 
 
 def main() -> None:
-    """Run the study from the command line."""
-    parser = argparse.ArgumentParser(description="Record or compare the public surface of the product.")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     action = parser.add_mutually_exclusive_group(required=True)
     action.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the record to this file")
     action.add_argument("--compare", type=Path, metavar="FILE", help="compare with the record in this file")
-    arguments = parser.parse_args()
-    if arguments.output:
-        arguments.output.write_text(json.dumps(record(), indent=1, sort_keys=True) + "\n", "utf-8")
+    chosen = parser.parse_args()
+    if chosen.output:
+        chosen.output.write_text(json.dumps(record(), indent=1, sort_keys=True) + "\n", "utf-8")
         return
-    before = json.loads(arguments.compare.read_text("utf-8"))
-    changed = differences(before, json.loads(json.dumps(record())))
+    texts = (lines_of(json.loads(chosen.compare.read_text("utf-8"))), lines_of(record()))
+    changed = list(unified_diff(*texts, "before", "now", lineterm="", n=1))
     print("\n".join(changed) or "no difference")
     sys.exit(bool(changed))
 

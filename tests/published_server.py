@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from unittest.mock import patch
@@ -28,11 +29,13 @@ def published_fits(size: int = 96, *, total: float = 1.0) -> bytes:
 
 @dataclass
 class StandIn:
-    """The server's files by path. broken: how many of the next answers end too early. asked: the paths of all requests."""
+    """The server's files by path. broken: how many of the next answers end too early. asked: the paths of all requests. sent: how
+    many bytes each answer announced."""
 
     files: dict[str, bytes]
     broken: int = 0
     asked: list[str] = field(default_factory=list)
+    sent: list[int] = field(default_factory=list)
     address: str = ""
 
 
@@ -48,7 +51,14 @@ def stand_in(*paths: str) -> Iterator[StandIn]:
             if content is None:
                 self.send_error(404)
                 return
-            self.send_response(200)
+            version = f'"{sha256(content).hexdigest()}"'
+            first = int(self.headers.get("Range", "bytes=0-")[len("bytes=") : -1])
+            if self.headers.get("If-Range") != version:
+                first = 0
+            content = content[first:]
+            here.sent.append(len(content))
+            self.send_response(206 if first else 200)
+            self.send_header("ETag", version)
             self.send_header("Content-Length", str(len(content)))
             self.end_headers()
             here.broken -= 1

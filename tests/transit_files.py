@@ -10,6 +10,8 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from psfcore.fits.blocks import FitsLimits
+from psfcore.simulate.inputs import diffraction_kernel
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.transit import simulate, write
@@ -130,3 +132,14 @@ def write_simulated(folder: Path) -> Path:
     plan = default_plan(9, 128, oversampling=1, brightness=30.0)
     write(simulate(plan, TRUTH, diffraction(), seed=4), folder)
     return folder
+
+
+def drawn_truth(seed: int) -> ScatterTruth:
+    """A random power law similar to that of the paper."""
+    rng = np.random.default_rng([seed, 77])
+    return ScatterTruth(b_px=rng.uniform(5.0, 7.5), c=rng.uniform(2.40, 2.65), total=rng.uniform(0.38, 0.45))
+
+
+def hri_diffraction(size: int) -> NDArray[np.float64]:
+    """The diffraction of HRI_EUV on (size, size), sum 1."""
+    return diffraction_kernel("hri_euv", None, size, FitsLimits(max_pixels=size**2))

@@ -1,23 +1,22 @@
-"""`make bench-peers`: time Richardson-Lucy steps of heliopsf and of other packages, in turn on the same data.
+"""Richardson-Lucy steps of heliopsf beside other packages; part of `make bench-peers`.
 
-    python -m benchmarks.race.peers [NAME ...] [--rounds N] [--page FILE]
+    python -m benchmarks.race.peers [NAME ...] [--whole] [--rounds N] [--page FILE]
 
-The image has 2048 x 2048 px, the PSF 4096 x 4096 px; all results are those of the same 20 steps with no light beyond the field.
-In every round, each package runs in a process and an environment of its own (`benchmarks.race.environments`). A time contains
-everything from the image in memory to the result in memory, also the transform of the PSF. Compiling and planning, which happen
-once, are left out: each loop first runs for one step. The result is compared with that of heliopsf before a time is printed.
+All packages run in turn, each in a process and an environment of its own: `.venv-peers/NAME`, made if it is missing, with the
+numpy and scipy of constraints.txt. A time contains everything from the image in memory to the result in memory; each loop first
+runs for one step, so that compiling and planning are left out. The results are compared before a time is printed.
 
-heliopsf is the package as users call it, so are scikit-image and aiapy. For the other packages, which have FFTs but no
-deconvolution, the loop is the simplest one with their FFTs, in single precision with all threads. `benchmarks.race.fft_libraries`
-compares FFT libraries in heliopsf's own loop, which transforms fewer rows.
+By default the image has 2048 px and the PSF 4096 px, so that every package convolves linearly: zeros surround the image. Packages
+with a deconvolution run their own: heliopsf, scikit-image and aiapy. For the others, which have FFTs but no deconvolution, the
+loop is the simplest one with their FFTs, in single precision with all threads. --whole: an image of the whole Sun of 4096 px with
+a PSF of this size, for heliopsf and for the loop of aiapy in NumPy and in JAX. aiapy then continues the image periodically, so that
+light scattered beyond an edge comes back at the opposite one; the inner 1600 px, where this light hardly matters, are compared.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import re
 import subprocess
 import sys
 import time
@@ -31,30 +30,34 @@ from typing import Any
 import numpy as np
 
 from benchmarks.figures import kind_of_machine
-from benchmarks.race.environments import REPOSITORY, python_of
-from benchmarks.timing import THREADS, peak_gib, reference, seconds
+from benchmarks.timing import THREADS, answer_of, peak_gib, reference, seconds
 
+REPOSITORY = Path(__file__).parents[2]
 STEPS, ROUNDS = 20, 5
-IMAGE_PX, PSF_PX = 2048, 4096
-EDGE_PX = 256  # not compared: scikit-image needs a PSF of odd size, which lacks the outermost row and column
-AGREEMENT = 1e-4  # largest deviation from heliopsf, of the brightest pixel: single precision, 40 transforms
 FLOOR_OF_MAXIMUM = 2.0**-23
-HEADING = "## Beside other packages"
-SECTION = """{heading}
-
-`make bench-peers` makes this table: 20 Richardson-Lucy steps of an image of {image} px with a PSF of {psf} px on {machine}. All packages run in turn, {rounds} rounds, each in a
-process and an environment of its own. A time is the median of the rounds with its range, from the image in memory to the result in memory; compiling and planning are left out.
-1 F was {f}. The deviation is the largest one from the result of heliopsf, relative to the brightest pixel.
-
-| package | time (s) | time (F) | time / time of heliopsf (range) | peak memory (GiB) | deviation |
-|---|---|---|---|---|---|
-{rows}
-
-aiapy computes in double precision. The memory is that of the whole process.
-"""
+FLAT = 0.5  # of the brightest pixel: the start of scikit-image
+HEAD = "| package | time (s) | time (F) | time / time of heliopsf (range) | peak memory (GiB) | deviation |\n|---|---|---|---|---|---|"
 
 Array = Any
 Loop = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
+
+
+def python_of(requirement: str) -> str:
+    """The interpreter of the environment with this package, made if it is missing; that of this process for no package.
+
+    Raises subprocess.CalledProcessError if pip fails.
+    """
+    if not requirement:
+        return sys.executable
+    folder = REPOSITORY / ".venv-peers" / requirement.partition("=")[0].rstrip(">")
+    python, done = folder / "bin" / "python", folder / ".installed"
+    if not done.is_file() or done.read_text("utf-8") != requirement:
+        subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+        pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        constraints = ["-c", str(REPOSITORY / "constraints.txt")]
+        subprocess.run([*pip, *constraints, "numpy", "scipy", requirement], check=True)
+        done.write_text(requirement, "utf-8")
+    return str(python)
 
 
 def heliopsf(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
@@ -72,7 +75,7 @@ def heliopsf(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
 
 def plain_steps(
     padded: Array, transfer: Array, steps: int, forward: Callable[[Array], Array], inverse: Callable[[Array], Array],
-    at_least: Callable[[Array, float], Array], start: Array = None,
+    at_least: Callable[[Array, float], Array] = np.maximum, start: Array = None,
 ) -> Array:  # fmt: skip
     """The steps with any FFT. padded: the image on the plane of the PSF. at_least(a, b): the larger of both, by element.
     start: the first estimate; None: the image."""
@@ -83,11 +86,11 @@ def plain_steps(
     return estimate
 
 
-def on_plane(image: np.ndarray, psf: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The image on a plane of the shape of the PSF, and the PSF with its centre at [0, 0]; both float32."""
-    padded = np.zeros(psf.shape, np.float32)
+def on_plane(image: np.ndarray, psf: np.ndarray, kind: type = np.float32) -> tuple[np.ndarray, np.ndarray]:
+    """The image on a plane of the shape of the PSF, and the PSF with its centre at [0, 0]."""
+    padded = np.zeros(psf.shape, kind)
     padded[: image.shape[0], : image.shape[1]] = image
-    return padded, np.fft.ifftshift(psf.astype(np.float32))
+    return padded, np.fft.ifftshift(psf.astype(kind))
 
 
 def scipy_fft(image: np.ndarray, psf: np.ndarray, steps: int, first: np.ndarray | None = None) -> np.ndarray:
@@ -103,7 +106,7 @@ def scipy_fft(image: np.ndarray, psf: np.ndarray, steps: int, first: np.ndarray 
     def inverse(spectrum: Array) -> Array:
         return fft.irfft2(spectrum, s=psf.shape, workers=THREADS)
 
-    return np.asarray(plain_steps(padded, forward(kernel), steps, forward, inverse, np.maximum, start))
+    return np.asarray(plain_steps(padded, forward(kernel), steps, forward, inverse, start=start))
 
 
 def pyfftw(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
@@ -115,15 +118,10 @@ def pyfftw(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
         pyfftw.import_wisdom([text.encode() for text in json.loads(wisdom.read_text())])
     plane = pyfftw.empty_aligned(psf.shape, np.float32)
     half = pyfftw.empty_aligned((psf.shape[0], psf.shape[1] // 2 + 1), np.complex64)
-    plan: dict[str, Any] = {
-        "axes": (0, 1),
-        "threads": THREADS,
-        "flags": ("FFTW_MEASURE", "FFTW_DESTROY_INPUT"),
-    }
-    to, back = (
-        pyfftw.FFTW(plane, half, **plan),
-        pyfftw.FFTW(half, plane, **plan, direction="FFTW_BACKWARD"),
-    )
+    plan: dict[str, Any] = {"axes": (0, 1), "threads": THREADS}
+    plan["flags"] = ("FFTW_MEASURE", "FFTW_DESTROY_INPUT")
+    to = pyfftw.FFTW(plane, half, **plan)
+    back = pyfftw.FFTW(half, plane, **plan, direction="FFTW_BACKWARD")
     wisdom.write_text(json.dumps([text.decode() for text in pyfftw.export_wisdom()]))
     padded, kernel = on_plane(image, psf)
 
@@ -132,7 +130,7 @@ def pyfftw(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
         return to()
 
     transfer = forward(kernel).copy()
-    return np.asarray(plain_steps(padded, transfer, steps, forward, lambda s: back(s).copy(), np.maximum))
+    return np.asarray(plain_steps(padded, transfer, steps, forward, lambda s: back(s).copy()))
 
 
 def ducc0(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
@@ -146,7 +144,7 @@ def ducc0(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
     def inverse(spectrum: Array) -> Array:
         return fft.c2r(spectrum, axes=(0, 1), lastsize=psf.shape[1], forward=False, inorm=2, nthreads=THREADS)
 
-    return np.asarray(plain_steps(padded, forward(kernel), steps, forward, inverse, np.maximum))
+    return np.asarray(plain_steps(padded, forward(kernel), steps, forward, inverse))
 
 
 def torch(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
@@ -154,14 +152,13 @@ def torch(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
 
     torch.set_num_threads(THREADS)
     padded, kernel = (torch.from_numpy(plane) for plane in on_plane(image, psf))
+    transfer, forward = torch.fft.rfft2(kernel), torch.fft.rfft2
 
     def inverse(spectrum: Array) -> Array:
         return torch.fft.irfft2(spectrum, s=psf.shape)
 
     with torch.inference_mode():
-        done = plain_steps(
-            padded, torch.fft.rfft2(kernel), steps, torch.fft.rfft2, inverse, lambda a, b: a.clamp(min=b)
-        )
+        done = plain_steps(padded, transfer, steps, forward, inverse, lambda a, b: a.clamp(min=b))
     return np.asarray(done.numpy())
 
 
@@ -169,7 +166,7 @@ _COMPILED: dict[str, Any] = {}
 
 
 def jax(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
-    """The whole loop is compiled."""
+    """The whole loop is compiled. The precision is that of JAX_ENABLE_X64."""
     import jax
     import jax.numpy as jnp
 
@@ -186,18 +183,17 @@ def jax(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
             return jax.lax.fori_loop(0, steps, step, padded)
 
         _COMPILED["loop"] = jax.jit(loop)
-    return np.asarray(_COMPILED["loop"](*on_plane(image, psf), steps).block_until_ready())
+    planes = on_plane(image, psf, np.float64 if jax.config.jax_enable_x64 else np.float32)
+    return np.asarray(_COMPILED["loop"](*planes, steps).block_until_ready())
 
 
 def scikit_image(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
+    """The package expects the centre of the PSF in the middle of an odd array."""
     from skimage.restoration import richardson_lucy
 
-    odd = psf[1:, 1:]  # the package expects the centre in the middle of an odd array
     bright = image.max()
-    done = richardson_lucy(
-        (image / bright).astype(np.float32), odd.astype(np.float32), num_iter=steps, clip=False
-    )
-    return np.asarray(done * bright)
+    planes = [plane.astype(np.float32) for plane in (image / bright, psf[1:, 1:])]
+    return np.asarray(richardson_lucy(*planes, num_iter=steps, clip=False) * bright)
 
 
 def aiapy(image: np.ndarray, psf: np.ndarray, steps: int) -> np.ndarray:
@@ -213,13 +209,9 @@ def aia_map(pixels: np.ndarray) -> Any:
     import astropy.units as u
     import sunpy.map
 
-    header: dict[str, Any] = {
-        "ctype1": "HPLN-TAN",
-        "ctype2": "HPLT-TAN",
-        "cunit1": "arcsec",
-        "cunit2": "arcsec",
-    }
-    header |= {"cdelt1": 0.6, "cdelt2": 0.6, "crpix1": 1, "crpix2": 1, "crval1": 0, "crval2": 0}
+    header: dict[str, Any] = {f"ctype{n}": f"HP{name}-TAN" for n, name in ((1, "LN"), (2, "LT"))}
+    header |= {"cunit1": "arcsec", "cunit2": "arcsec", "cdelt1": 0.6, "cdelt2": 0.6}
+    header |= {"crpix1": 1, "crpix2": 1, "crval1": 0, "crval2": 0}
     header |= {"telescop": "SDO/AIA", "instrume": "AIA_3", "wavelnth": 171, "waveunit": "angstrom"}
     header |= {"date-obs": "2020-01-01T00:00:00", "hgln_obs": 0, "hglt_obs": 0, "dsun_obs": u.AU.to(u.m)}
     return sunpy.map.Map(pixels, header)
@@ -227,45 +219,73 @@ def aia_map(pixels: np.ndarray) -> Any:
 
 @dataclass(frozen=True)
 class Contender:
-    """A package of the race. environment: its environment; empty: that of heliopsf. flat_start: it begins with the same
-    value in all pixels, so it is compared with SciPy's loop from this start."""
+    """A package of the race. requirement: what pip installs into its environment; empty: the environment of heliopsf.
+    flat_start: it begins with the same value in all pixels, so it is compared with SciPy's loop from this start. double: in
+    double precision."""
 
     loop: Loop
-    environment: str = ""
+    requirement: str = ""
     flat_start: bool = False
+    double: bool = False
 
 
 CONTENDERS: dict[str, Contender] = {
     "heliopsf": Contender(heliopsf),
-    "JAX, compiled loop": Contender(jax, "jax"),
-    "ducc0": Contender(ducc0, "ducc0"),
+    "JAX, compiled loop": Contender(jax, "jax>=0.4"),
+    "ducc0": Contender(ducc0, "ducc0>=0.37"),
     "scipy.fft": Contender(scipy_fft, "scipy"),
-    "PyTorch": Contender(torch, "torch"),
-    "pyFFTW": Contender(pyfftw, "pyfftw"),
-    "scikit-image": Contender(scikit_image, "scikit-image", flat_start=True),
-    "aiapy": Contender(aiapy, "aiapy"),
+    # PyTorch is pinned because a new release would be a download of gigabytes; any version works.
+    "PyTorch": Contender(torch, "torch==2.13.0"),
+    "pyFFTW": Contender(pyfftw, "pyfftw>=0.14"),
+    "scikit-image": Contender(scikit_image, "scikit-image>=0.24", flat_start=True),
+    "aiapy": Contender(aiapy, "aiapy>=0.9"),
 }
-FLAT = 0.5  # of the brightest pixel: the start of scikit-image
+WHOLE = {
+    "heliopsf": CONTENDERS["heliopsf"],
+    "aiapy": CONTENDERS["aiapy"],
+    "the loop of aiapy in JAX, single precision": Contender(jax, "jax>=0.4"),
+    "the loop of aiapy in JAX, double precision": Contender(jax, "jax>=0.4", double=True),
+}
 
 
-def data() -> tuple[np.ndarray, np.ndarray]:
-    """A textured image, and a PSF with a sharp core and the softened power law of the paper."""
-    rng = np.random.default_rng(0)
-    y, x = np.indices((PSF_PX, PSF_PX), dtype=np.float32) - PSF_PX // 2
-    psf = 0.1525 / (6.15 + np.hypot(x, y)) ** 2.53
-    psf[PSF_PX // 2, PSF_PX // 2] = 1 - (psf.sum() - psf[PSF_PX // 2, PSF_PX // 2])
-    image = rng.gamma(2.0, 200.0, (IMAGE_PX, IMAGE_PX))
-    image[600:620, 900:930] += 20_000
-    return image.astype(np.float32), (psf / psf.sum()).astype(np.float32)
+@dataclass(frozen=True)
+class Race:
+    """The sizes of image and PSF, px; the contenders; the pixels that are compared; the largest deviation allowed, of the
+    brightest pixel, from heliopsf: single precision, and for the whole Sun the light across the edges."""
+
+    image_px: int
+    psf_px: int
+    contenders: dict[str, Contender]
+    edge_px: int
+    agreement: float
+
+    def data(self) -> tuple[np.ndarray, np.ndarray]:
+        """A textured image, and a PSF with a sharp core and the softened power law of the paper; both float32."""
+        y, x = np.indices((self.psf_px, self.psf_px), dtype=np.float32) - self.psf_px // 2
+        radius, centre = np.hypot(x, y), (self.psf_px // 2, self.psf_px // 2)
+        psf = 0.1525 / (6.15 + radius) ** 2.53
+        psf[centre] = 1 - (psf.sum(dtype=float) - psf[centre])
+        image = np.random.default_rng(0).gamma(2.0, 200.0, (self.image_px, self.image_px))
+        image[600:620, 900:930] += 20_000
+        if self.image_px == self.psf_px:
+            image = 1 + image / (1 + np.exp((radius - 1600) / 40))  # a disc of 1600 px
+        return image.astype(np.float32), (psf / psf.sum(dtype=float)).astype(np.float32)
 
 
-def run_one(name: str) -> None:
+RACES = {
+    # scikit-image needs a PSF of odd size, which lacks the outermost row and column.
+    False: Race(2048, 4096, CONTENDERS, edge_px=256, agreement=1e-4),
+    True: Race(4096, 4096, WHOLE, edge_px=1248, agreement=2e-3),
+}
+
+
+def run_one(contender: Contender) -> None:
     """Time one package in this process, with the arrays in the working folder, and save its result there."""
     image, psf = np.load("image.npy"), np.load("psf.npy")
-    loop, result = CONTENDERS[name].loop, []
-    loop(image, psf, 1)
-    took = seconds(lambda: result.append(loop(image, psf, STEPS)))
-    np.save("result.npy", result[0][:IMAGE_PX, :IMAGE_PX].astype(np.float32))
+    results: list[np.ndarray] = []
+    contender.loop(image, psf, 1)
+    took = seconds(lambda: results.append(contender.loop(image, psf, STEPS)))
+    np.save("result.npy", results[0][: image.shape[0], : image.shape[1]].astype(np.float32))
     print(json.dumps({"seconds": took, "peak_gib": peak_gib()}))
 
 
@@ -279,27 +299,23 @@ class Run:
     deviation: float
 
 
-def one_run(name: str, folder: Path, f_s: float) -> Run:
-    """Run a package, and compare its result. Raises SystemExit if it deviates by more than AGREEMENT."""
-    contender = CONTENDERS[name]
-    done = subprocess.run(
-        [python_of(contender.environment), "-m", "benchmarks.race.peers", "--one", name],
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(REPOSITORY), "JAX_PLATFORMS": "cpu"},
-    )
-    found = json.loads(done.stdout.splitlines()[-1])
+def one_run(race: Race, name: str, words: Sequence[str], folder: Path, f_s: float) -> Run:
+    """Run a package, and compare its result. Raises SystemExit if it deviates by more than the race allows."""
+    contender = race.contenders[name]
+    environment = {"PYTHONPATH": str(REPOSITORY), "JAX_PLATFORMS": "cpu"}
+    found = answer_of(
+        "benchmarks.race.peers", "--one", name, *words, python=python_of(contender.requirement), folder=folder,
+        JAX_ENABLE_X64=str(int(contender.double)), **environment,
+    )  # fmt: skip
     result = np.load(folder / "result.npy")
     if name == "heliopsf":
         np.save(folder / "heliopsf.npy", result)
     expected = np.load(folder / ("flat.npy" if contender.flat_start else "heliopsf.npy"))
-    inner = np.s_[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX]
-    apart = float(np.abs(result - expected)[inner].max() / expected.max())
-    if not apart <= AGREEMENT:
+    inner = np.s_[race.edge_px : -race.edge_px, race.edge_px : -race.edge_px]
+    apart = float(np.abs(result - expected)[inner].max() / expected[inner].max())
+    if not apart <= race.agreement:
         raise SystemExit(
-            f"peers: expected results within {AGREEMENT:g} of the brightest pixel; {name} deviates by {apart:.1e}"
+            f"expected results within {race.agreement:g} of the brightest pixel; {name}: {apart:.1e}"
         )
     return Run(found["seconds"], found["peak_gib"], f_s, apart)
 
@@ -317,17 +333,11 @@ def row(name: str, runs: Sequence[Run], ours: Sequence[Run]) -> str:
 
 
 def section(runs: dict[str, list[Run]]) -> str:
-    """The section of the page."""
+    """The machine, the unit of time and the table."""
     f_s = [run.f_s for run in runs["heliopsf"]]
-    return SECTION.format(
-        heading=HEADING,
-        image=IMAGE_PX,
-        psf=PSF_PX,
-        machine=f"{kind_of_machine()}, {time.strftime('%Y-%m-%d')}",
-        rounds=len(f_s),
-        f=f"{min(f_s):.2f} s to {max(f_s):.2f} s",
-        rows="\n".join(row(name, each, runs["heliopsf"]) for name, each in runs.items()),
-    )
+    rounds = f"{kind_of_machine()}, {time.strftime('%Y-%m-%d')}; {len(f_s)} rounds"
+    rows = [row(name, each, runs["heliopsf"]) for name, each in runs.items()]
+    return "\n".join([f"{rounds}; 1 F = {min(f_s):.2f} s to {max(f_s):.2f} s.\n", HEAD, *rows])
 
 
 def main() -> None:
@@ -335,43 +345,39 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="packages besides heliopsf; default: all")
+    parser.add_argument("--whole", action="store_true")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--page", type=Path, help="page whose section of this race is replaced")
-    asked = parser.parse_args()
-    if unknown := set(asked.names) - set(CONTENDERS):
-        parser.error(f"expected names among {', '.join(CONTENDERS)}; got {', '.join(sorted(unknown))}")
-    names = ["heliopsf", *(name for name in asked.names or CONTENDERS if name != "heliopsf")]
+    parser.add_argument("--one", help=argparse.SUPPRESS)
+    chosen = parser.parse_args()
+    race, words = RACES[chosen.whole], ["--whole"] if chosen.whole else []
+    if chosen.one:
+        run_one(race.contenders[chosen.one])
+        return
+    if unknown := set(chosen.names) - set(race.contenders):
+        parser.error(f"expected names among {', '.join(race.contenders)}; got {', '.join(sorted(unknown))}")
+    names = ["heliopsf", *(name for name in chosen.names or race.contenders if name != "heliopsf")]
     runs: dict[str, list[Run]] = {name: [] for name in names}
     with TemporaryDirectory(prefix="heliopsf-peers-") as place:
         folder = Path(place)
-        image, psf = data()
-        for label, array in (("image", image), ("psf", psf)):
+        image, psf = race.data()
+        flat = scipy_fft(image, psf, STEPS, np.full_like(image, FLAT * image.max()))[
+            : len(image), : len(image)
+        ]
+        for label, array in (("image", image), ("psf", psf), ("flat", flat)):
             np.save(folder / f"{label}.npy", array)
-        if any(CONTENDERS[name].flat_start for name in names):
-            flat = np.full_like(image, FLAT * image.max())
-            np.save(folder / "flat.npy", scipy_fft(image, psf, STEPS, flat)[:IMAGE_PX, :IMAGE_PX])
-        for number in range(asked.rounds):
+        for number in range(chosen.rounds):
             f_s = reference()
             for name in names:
-                run = one_run(name, folder, f_s)
-                runs[name].append(run)
-                ratio = run.seconds / runs["heliopsf"][-1].seconds
-                print(
-                    f"round {number + 1}: {name:<22}{run.seconds:8.2f} s {run.seconds / f_s:7.1f} F  x {ratio:.2f}",
-                    flush=True,
-                )
+                runs[name].append(one_run(race, name, words, folder, f_s))
+                print(f"round {number + 1}: {name:<44}{runs[name][-1]}", flush=True)
     text = section(runs)
     print(f"\n{text}")
-    if asked.page:
-        page = asked.page.read_text("utf-8")
-        found = re.compile(f"{re.escape(HEADING)}\n.*?(?=\n## |\\Z)", re.DOTALL)
-        if not found.search(page):
-            raise SystemExit(f"peers: expected a section {HEADING!r} in {asked.page}")
-        asked.page.write_text(found.sub(lambda _: text.rstrip() + "\n", page), "utf-8")
+    if chosen.page:
+        from studies.pages import write_part
+
+        write_part(chosen.page, "benchmarks.race.peers", text)
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--one"]:
-        run_one(sys.argv[2])
-    else:
-        main()
+    main()

@@ -1,8 +1,8 @@
 """Fast convolution with one PSF, and its adjoint, for fields of one shape, in single precision.
 
 The engine computes the same operators as `psfcore.convolution.convolver.Convolver`: H of Eq. (1) and H^T of Eq. (2) in
-that module. The engine is several times faster than SciPy (`python -m benchmarks.deconvolution` prints the ratios to
-SciPy and ducc0). There are three reasons:
+that module. The engine is several times faster than SciPy (`make bench-peers` prints the ratios to SciPy
+and ducc0). There are three reasons:
 
 - Zeros are not transformed. Along x, only the rows of the field are transformed, not the padding rows. Along y, a block
   of sixteen columns is padded, transformed, multiplied by the transfer function and transformed back while it is in the

@@ -23,7 +23,7 @@ from service.cli.psf.published import NAMES, SOURCE, brought
 from workers import checks
 from workers.catalogue.access import MEANINGS, OWNER, OWNER_RULE, Scope
 from workers.catalogue.catalogue import Catalogue
-from workers.catalogue.owners import MIB, Usage
+from workers.catalogue.owners import MIB, MOST_QUOTA_MIB, Usage
 from workers.catalogue.schema import SchemaError, SchemaStatus
 from workers.catalogue.tables import DEFAULT_OWNER, KeyRow
 from workers.files.collection import collect, examine
@@ -206,7 +206,7 @@ def usage(data: Path | None) -> None:
 
 @store.command("quota", short_help="Set the quota of an owner.")
 @click.argument("owner")
-@click.argument("mib", type=click.IntRange(0), required=False)
+@click.argument("mib", type=click.IntRange(0, MOST_QUOTA_MIB), required=False)
 @click.option("--default", "as_all", is_flag=True, help="Use the default limit again (HELIOPSF_QUOTA_MIB)")
 @DATA
 def quota(owner: str, mib: int | None, as_all: bool, data: Path | None) -> None:

@@ -43,6 +43,25 @@ def test_a_download_is_kept_as_a_psf_that_says_what_it_is(tmp_path: Path) -> Non
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{NAME}.fits", f"{NAME}.json"]
 
 
+def test_a_broken_download_is_resumed_if_the_server_has_the_same_file(tmp_path: Path) -> None:
+    whole = len(published_fits(200))
+    for again, rest in ((published_fits(200), False), (published_fits(200, total=0.5), True)):
+        folder = tmp_path / str(rest)
+        with stand_in("/psf") as server:
+            server.files["/psf"] = published_fits(200)
+            server.broken = 2  # both tries of the first download
+            with pytest.raises(DataError, match="psf-not-downloaded"):
+                get(folder, NAME)
+            kept = (folder / f"{NAME}.part").stat().st_size
+            assert 0 < kept < whole and server.sent[0] == whole > server.sent[1]
+            server.files["/psf"] = again
+            get(folder, NAME)
+        assert server.sent[2] == (whole if rest else whole - kept)
+        record = json.loads((folder / f"{NAME}.json").read_bytes())
+        assert record["sha256"] == hashlib.sha256(again).hexdigest()
+        assert sorted(path.name for path in folder.iterdir()) == [f"{NAME}.fits", f"{NAME}.json"]
+
+
 def test_another_file_than_the_first_time_is_refused(tmp_path: Path) -> None:
     with stand_in("/gone", "/psf") as server:
         kept = get(tmp_path, NAME)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.growth.axes import AXES
-from benchmarks.growth.figures import FITTED_POINTS, draw, exponent
+from benchmarks.growth import AXES, FITTED_POINTS, draw, exponent
 
 GROWTH = Path(__file__).parents[2] / "docs" / "growth"
 PAGE = (GROWTH.parent / "speed.md").read_text("utf-8")

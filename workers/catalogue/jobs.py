@@ -333,13 +333,20 @@ class Jobs(Queries):
         waits = (JobRow.phase == Phase.QUEUED, JobRow.kind != kind, no_equal_at_work())
         return self._database.any(select(JobRow.id).where(*waits))
 
-    def any_to_do(self, queues: Sequence[Queue], lease_s: float) -> bool:
-        """Whether a job of these queues waits and could start now, or has lost its worker: that job will wait soon.
+    def any_to_do(self, queues: Sequence[Queue], lease_s: float, worker: str) -> bool:
+        """Whether this worker runs a job of these queues, or one waits and could start now, or has lost its worker: that job
+        will wait soon.
 
         lease_s: time without a heartbeat after which a worker counts as lost, s.
         """
         silent = JobRow.heartbeat_at < self._database.now - lease_s
-        waits = [JobRow.phase == Phase.QUEUED, no_equal_at_work()], [JobRow.phase == Phase.EXECUTING, silent]
+        waits = (
+            [JobRow.phase == Phase.QUEUED, no_equal_at_work()],
+            [
+                JobRow.phase == Phase.EXECUTING,
+                or_(silent, JobRow.worker == worker),
+            ],
+        )
         of_queues = select(JobRow.id).where(JobRow.queue.in_(queues))
         return any(self._database.any(of_queues.where(*one)) for one in waits)
 

@@ -63,6 +63,7 @@ from workers.contract.bulk import BULK_ENDED
 from workers.contract.phases import ENDED
 
 MIB = 2**20
+MOST_QUOTA_MIB = 2**31 - 1  # the largest number in the column of quotas
 ROWS_PER_MIB = 256
 FileRow = ImageRow | TransitRow | PsfRow | ProductRow | ReportRow | SolutionRow
 WITH_FILES: tuple[type[FileRow], ...] = (ImageRow, TransitRow, PsfRow, ProductRow, ReportRow, SolutionRow)

@@ -111,8 +111,7 @@ class Stopping:
 class Idle:
     """For how long a worker has had nothing to do. Child processes that are forked later share this object.
 
-    A child reads the table of jobs, because the parent must hold no connection to the database when it forks. The
-    parent knows whether one of its children runs a job.
+    A child reads the table of jobs, because the parent must hold no connection to the database when it forks.
     """
 
     def __init__(self) -> None:

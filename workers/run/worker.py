@@ -138,9 +138,12 @@ def _look_for_jobs(within_s: float) -> None:
     """Tell the parent whether there is a job to do. A database that does not answer may have one."""
     from sqlalchemy.exc import SQLAlchemyError
 
+    from workers.run.runner import worker_name
+
     while not stopping.asked:
         try:
-            idle.tell(work=_catalogue().jobs.any_to_do(settings.queues, settings.lease_s))
+            work = _catalogue().jobs.any_to_do(settings.queues, settings.lease_s, worker_name())
+            idle.tell(work=work)
         except (SQLAlchemyError, MemoryError) as error:
             log.warning("could not look for jobs: %s", str(error).split("\n")[0])
             idle.tell(work=True)
@@ -148,9 +151,13 @@ def _look_for_jobs(within_s: float) -> None:
 
 
 def _end_when_idle(after_s: float) -> None:
-    """End this worker in the same way as SIGTERM, when it has had nothing to do for ``after_s`` seconds."""
+    """End this worker in the same way as SIGTERM, when it has had nothing to do for ``after_s`` seconds.
+
+    Messages do not count, because a long queue leaves many for jobs that have ended. Only the help for another worker's job is
+    not in the table of jobs.
+    """
     while not stopping.asked:
-        if state.reserved_requests:
+        if any(request.name == queue.ASSIST for request in state.active_requests):
             idle.tell(work=True)
         elif idle.seconds >= after_s:
             log.info("nothing to do for %g s: this worker ends", after_s)

@@ -29,9 +29,9 @@ from psfcore.simulate.plan import default_plan
 from psfcore.simulate.scatter_truth import ScatterTruth
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import folds
-from studies.transits import diffraction, drawn_truth
 from tests.psfcore.evaluation.small_evaluations import residual_against_pct, rms
 from tests.psfcore.small_transits import BRIGHT, IMAGES, observed, sky, solved
+from tests.transit_files import drawn_truth, hri_diffraction
 
 
 @cache
@@ -121,7 +121,7 @@ def test_held_out_discs_of_clean_transits_are_predicted() -> None:
     """
     off: dict[int, list[float]] = {1: [], 2: [], 3: []}
     for seed in (0, 1, 2):
-        made = simulate(default_plan(30, 512), drawn_truth(seed), diffraction(1024), seed)
+        made = simulate(default_plan(30, 512), drawn_truth(seed), hri_diffraction(1024), seed)
         found = evaluate(made.transit, held_out_kernels(invert(made.transit)))
         print("\n".join(["", f"seed {seed}", *summary_lines(report(found))]))
         for fov in off:

@@ -12,10 +12,26 @@ from psfcore.errors import DataError
 from psfcore.psf import squared_radii
 from psfcore.scatter.power_law import scatter_kernel
 from psfcore.scatter.segments import Segments, segment_sums, shells_as_published
-from tests.psfcore.scatter.ring_sum_references import segment_sums_plain
 
 PUBLISHED = shells_as_published(90.0)
 PIXEL_WIDE = tuple(np.arange(0.5, 91.0))
+
+
+def segment_sums_plain(
+    image: NDArray[np.floating], targets: NDArray[np.integer], segments: Segments
+) -> NDArray[np.float64]:
+    """Eq. (3) of psfcore.scatter.segments, (n, segments), by the label map."""
+    ny, nx = image.shape
+    # Targets lie on the image, so every offset is shorter than the longer side of the image.
+    size = 2 * max(ny, nx) + 1
+    label, middle = segments.label_map(size) + 1, size // 2
+    weights = np.asarray(image, dtype=np.float64)[::-1, ::-1].ravel()
+    out = np.empty((len(targets), segments.size))
+    for n, (y, x) in enumerate(targets):
+        # Labels of the offsets (y, x) - source, for sources from the last to the first.
+        seen = label[middle + y - ny + 1 : middle + y + 1, middle + x - nx + 1 : middle + x + 1]
+        out[n] = np.bincount(seen.ravel(), weights=weights, minlength=segments.size + 1)[1:]
+    return out
 
 
 def scene(shape: tuple[int, int], seed: int = 0) -> NDArray[np.float64]:

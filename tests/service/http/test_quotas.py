@@ -236,4 +236,5 @@ def test_the_command_line_tells_and_sets_quotas(tmp_path: Path, monkeypatch: pyt
     assert said("store", "quota", "me", "7") == "me 0.0 MiB of 7 MiB"
     assert said("store", "quota", "me", "0") == "me 0.0 MiB no limit"
     assert said("store", "quota", "me", "--default") == "me 0.0 MiB of 5 MiB" == said("store", "usage")
+    assert "2147483647" in said("store", "quota", "me", str(2**31), status=2)
     said("store", "quota", "me", status=2), said("store", "quota", "No Body", "1", status=2)

@@ -24,6 +24,7 @@ from workers.contract.queues import Queue
 from workers.settings import Settings
 
 LEASE_S, IDLE_S = 3.0, 6.0
+STILL_S = 180.0  # longest time without the end of a job, on a busy machine
 SHORT = """
 def task(context, _):
     context.report("at work", 1, 2)
@@ -35,17 +36,21 @@ WORKER = worker_of(SHORT, f"idle_s={IDLE_S}")
 
 @BOTH
 def test_only_jobs_that_a_worker_could_run_keep_it(catalogue: Catalogue) -> None:
-    jobs, own = catalogue.jobs, [Queue.INTERACTIVE]
-    assert not jobs.any_to_do(own, LEASE_S)
+    jobs = catalogue.jobs
+
+    def to_do(*queues: Queue, worker: str = "this worker") -> bool:
+        return jobs.any_to_do([Queue.INTERACTIVE, *queues], LEASE_S, worker)
+
+    assert not to_do()
     jobs.submit("psf-build", {}, "elsewhere", DEFAULT_OWNER, queue=Queue.BULK)
-    assert not jobs.any_to_do(own, LEASE_S) and jobs.any_to_do([*own, Queue.BULK], LEASE_S)
+    assert not to_do() and to_do(Queue.BULK)
     job, _ = jobs.submit("psf-build", {}, "here", DEFAULT_OWNER)
-    assert jobs.any_to_do(own, LEASE_S)
-    lease = claimed(catalogue, job.id)
-    assert not jobs.any_to_do(own, LEASE_S), "another worker runs it"
+    assert to_do()
+    lease = claimed(catalogue, job.id, worker="another worker")
+    assert to_do(worker="another worker") and not to_do(), "another worker runs it"
     change(catalogue, update(JobRow).where(JobRow.id == job.id).values(heartbeat_at=time.time() - 60.0))
-    assert jobs.any_to_do(own, LEASE_S), "its worker is lost"
-    assert jobs.complete(lease, "r") and not jobs.any_to_do(own, LEASE_S)
+    assert to_do(), "its worker is lost"
+    assert jobs.complete(lease, "r") and not to_do(worker="another worker")
 
 
 @pytest.mark.parametrize(
@@ -79,11 +84,14 @@ def test_each_job_ends_once_and_the_workers_leave(
         ]
         processes = [psutil.Process(worker.pid) for worker in started]
         try:
-            lost, chance, deadline = 0, random.Random(0), time.monotonic() + 300.0
+            lost, done, chance, deadline = 0, 0, random.Random(0), time.monotonic() + STILL_S
             while any(worker.poll() is None for worker in started):
                 assert time.monotonic() < deadline, [p.read_text()[-2000:] for p in tmp_path.glob("*.log")]
                 reconcile(catalogue, app, settings)
+                before = done
                 done = len(rows(catalogue, select(JobRow.id).where(JobRow.phase == Phase.COMPLETED)))
+                if done > before:
+                    deadline = time.monotonic() + STILL_S
                 if lost < kills and done > jobs * (lost + 1) / (kills + 2):
                     lost += 1
                     killed = processes.pop(chance.randrange(len(processes)))

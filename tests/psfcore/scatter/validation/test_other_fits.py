@@ -32,9 +32,9 @@ from psfcore.scatter.validation.shape_comparison import ComparedShape, compare_s
 from psfcore.simulate.plan import default_plan
 from psfcore.simulate.transit import simulate
 from psfcore.transit.transit import folds
-from studies.transits import diffraction, drawn_truth
 from tests.psfcore.evaluation.small_evaluations import offsets
 from tests.psfcore.small_transits import SIZE_PX, STRETCHED, observed, sky, solved, solved_noise_free
+from tests.transit_files import drawn_truth, hri_diffraction
 
 # --- other shapes --------------------------------------------------------------------------------------------
 
@@ -262,6 +262,6 @@ def test_weights_change_as_the_fitted_formulas_do() -> None:
 def test_dark_offsets_of_a_transit_of_the_usual_size() -> None:
     for brightness in (1.0, 3.0):
         plan = default_plan(30, 512, brightness=brightness)
-        study = dark_offset_study(simulate(plan, drawn_truth(0), diffraction(1024), 0).transit)
+        study = dark_offset_study(simulate(plan, drawn_truth(0), hri_diffraction(1024), 0).transit)
         assert study.largest("weight_change_pct") < 60 / brightness
         assert study.largest("curve_change_points") < 5 / brightness

@@ -16,7 +16,7 @@ from tests.service.keyed import Keyed
 from workers.bulk.runs import keep_turns
 from workers.catalogue.access import Scope
 from workers.catalogue.bulks import Bulks
-from workers.catalogue.tables import BulkRow, ProductRow
+from workers.catalogue.tables import ProductRow
 from workers.contract.phases import Phase
 from workers.settings import Settings
 

@@ -1,1 +1,0 @@
-"""How time and memory grow; see `benchmarks.growth.__main__`."""
