@@ -29,7 +29,8 @@ from scipy.optimize import minimize, minimize_scalar
 
 from heliopsf.psfs import LIMITS
 from psfcore.blind.case_set import BlindSet, SetPlan, make_set
-from psfcore.blind.score import required_causes, wilson
+from psfcore.blind.judged import required_causes
+from psfcore.blind.score import wilson
 from psfcore.build import known_diffraction
 from psfcore.errors import DataError
 from psfcore.gap.diagnose import linear_model_of
